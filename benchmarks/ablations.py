@@ -40,7 +40,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import report
-from benchmarks.bilateral import GradedScene
+from benchmarks.bilateral import BilateralTrainer
 from benchmarks.hidden_lights import hidden_flare
 from benchmarks.known_scene import KnownScene, score
 from core.capture import Camera, Capture, Light
@@ -49,11 +49,11 @@ from core.fit import fit
 from core.fit.frames import Frames
 from core.fit.rendering import render
 from core.fit.run import Run, ViewLayers
-from core.fit.settings import FitSettings, changed, preset
+from core.fit.settings import FitSettings, override_settings, preset
 from core.gaussians.scene import SceneGaussians
 from core.metrics.evaluation import evaluate
 from core.removal.inference.remover import Remover
-from core.removal.jobs.capture import remove_from
+from core.removal.jobs.capture import clean_capture
 from core.system.files import write_json
 from core.system.progress import Progress, TerminalProgress
 
@@ -99,13 +99,13 @@ def _seeded(seed: int, name: Preset, **form: Any) -> FitSettings:
 
 def ours(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
     """Our form at this length, with settings changed by dotted name (`__` for the dot)."""
-    return changed(length(mode=mode), {name.replace("__", "."): value for name, value in changes.items()})
+    return override_settings(length(mode=mode), {name.replace("__", "."): value for name, value in changes.items()})
 
 
 def papers(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
     """The paper's form and loss at the same length, with the same rates."""
     made = length(model="paper", mode=mode)
-    return changed(made, {name.replace("__", "."): value for name, value in changes.items()})
+    return override_settings(made, {name.replace("__", "."): value for name, value in changes.items()})
 
 
 def experiments(length: Length) -> list[Experiment]:
@@ -124,8 +124,8 @@ def experiments(length: Length) -> list[Experiment]:
         "without the line (2d)": ours(length, "2d"),
         "without occlusion": ours(length, flare__occlusion=False),
         "fine grids": ours(length, flare__form__levels=16, flare__form__base=16),
-        "fitted jointly throughout": ours(length, apart=0.0),
-        "fitted apart throughout": ours(length, apart=1.0),
+        "fitted jointly throughout": ours(length, separate_until=0.0),
+        "fitted apart throughout": ours(length, separate_until=1.0),
         "the paper's": papers(length),
     })
     made += of("comparison", {
@@ -143,18 +143,19 @@ def experiments(length: Length) -> list[Experiment]:
         for study, form in (("robustness", papers), ("robustness-ours", ours)):
             settings = form(length, flare__form__light_correction=light, flare__form__plane_offset=plane)
             if not light:  # as they are given, then
-                settings = changed(settings, {"flare.snap": False})
+                settings = override_settings(settings, {"flare.snap_lights": False})
             made += [Experiment(study, f"{corrections}, sigma {sigma:g}", settings, sigma) for sigma in SIGMAS]
     made += of("supervision", {"exact flare-free frames": ours(length), "none: split": ours(length, "split"),
                                "none: unsup": ours(length, "unsup")})
     made += [Experiment("supervision", "what remove makes, for exact", ours(length), frames="cleaned"),
              Experiment("supervision", "what remove makes: estimated", ours(length, "estimated"), frames="cleaned")]
-    many = {"flare.count": 900, "flare.density.most": 900}  # of each light, from the beginning to the end
-    alone = changed(ours(length), {**many, "flare.occlusion": False})
+    many = {"flare.count": 900, "flare.density.max_gaussians": 900}  # of each light, from the beginning to the end
+    alone = override_settings(ours(length), {**many, "flare.occlusion": False})
     made += [Experiment("known", "ours", alone, known_scene=True),
-             Experiment("known", "with arcs", changed(alone, {"flare.form.arcs": True}), known_scene=True),
-             Experiment("known", "without rings", changed(alone, {"flare.form.rings": False}), known_scene=True),
-             Experiment("known", "the paper's", changed(papers(length), many), known_scene=True)]
+             Experiment("known", "with arcs", override_settings(alone, {"flare.form.arcs": True}), known_scene=True),
+             Experiment("known", "without rings", override_settings(alone, {"flare.form.rings": False}),
+                        known_scene=True),
+             Experiment("known", "the paper's", override_settings(papers(length), many), known_scene=True)]
     made += [Experiment("extrapolation", "every n-th view", ours(length)),
              Experiment("extrapolation", "a stretch", ours(length), stretch=True),
              Experiment("extrapolation", "a stretch, the paper's", papers(length), stretch=True)]
@@ -211,7 +212,7 @@ def run(experiment: Experiment, folder: Path, capture: Path, width: int, progres
     return scores
 
 
-def _train(trainer: KnownScene | GradedScene, stage: str, iterations: int, progress: Progress) -> None:
+def _train(trainer: KnownScene | BilateralTrainer, stage: str, iterations: int, progress: Progress) -> None:
     progress.stage(stage, iterations)
     for _ in range(iterations):
         trainer.step()
@@ -236,7 +237,7 @@ class _SceneAlone:
 
 
 def _graded(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
-    trainer = GradedScene(capture, settings)
+    trainer = BilateralTrainer(capture, settings)
     _train(trainer, "scene with grids", settings.iterations, progress)
     return _scores(_SceneAlone(trainer.scene), capture.folder, settings, progress)
 
@@ -255,7 +256,7 @@ def _capture_of(folder: Path, capture: Path, **origins: str) -> Capture:
 def _cleaned(folder: Path, capture: Path, progress: Progress) -> Capture:
     made = _capture_of(folder, capture)
     if not made.has_removed:
-        remove_from(made, Remover(glow="taken"), progress)
+        clean_capture(made, Remover(glow="remove"), progress)
     return Capture.open(folder)
 
 
@@ -268,7 +269,7 @@ def _scores(made: Run | _SceneAlone, folder: Path, settings: FitSettings, progre
     held_out = capture.split(settings.holdout)[1]
     frames = Frames(capture, settings.width)
     found = evaluate(made, capture, {view: frames.camera(view) for view in held_out}, progress,
-                     frames.inside)
+                     frames.picture_area)
     scores: dict[str, Any] = {layer: part for layer, part in found.items() if isinstance(part, dict)}
     if settings.mode == "3dgs":  # what it calls a flare is nothing at all
         scores = {layer: part for layer, part in scores.items() if not layer.startswith("flare")}

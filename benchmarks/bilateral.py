@@ -70,7 +70,7 @@ class BilateralTrainer(Trainer):
         return figures
 
     def _flare_background(self, targets: Targets, scene: Tensor,  # noqa: ARG002 - the trainer's own door
-                      sources: Tensor | None) -> Tensor:  # noqa: ARG002
+                          light_discs: Tensor | None) -> Tensor:  # noqa: ARG002
         return self.grids(self._number(self._view()), scene)
 
     def _number(self, view: View) -> int:

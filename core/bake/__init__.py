@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Layers out: a run, rendered from its cameras, as multilayer EXR files that any compositor reads."""
+"""Bakes layers: renders a run or a shot from its cameras to multilayer EXR files, for any compositor."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One frame as one multilayer EXR file, and back.
+"""Reads and writes one frame as one multilayer EXR file.
 
-One part; root R G B A = composite, then scene.*, flare.*, flare_<light>.*, depth.Z (see `layers`).
-The header says what the file is: `software`, the `chromaticities` of its linear space, and `fitFlare`, a JSON text
-with the version, the view, the frame number, and the light that each flare layer belongs to.
+One part; root R G B A = composite, then scene.*, flare.*, flare_<light>.*, depth.Z (see `layers`). The header has
+`software`, the `chromaticities` of the linear space, and `fitFlare`, a JSON text with the version, the view, the frame
+number, and the light of each flare layer.
 """
 from __future__ import annotations
 
@@ -16,37 +16,36 @@ from typing import Any
 from ..colour import REC_709, Chromaticities
 from ..colour.srgb import Pixels
 from ..errors import FrameError
-from ..images.exr import read_exr, read_exr_header, window_of
+from ..images.exr import read_data_window, read_exr, read_exr_header
 from ..images.write import write_exr
 from .layers import FrameLayers, layer_names
 
-ATTRIBUTE = "fitFlare"
+HEADER_ATTRIBUTE = "fitFlare"
 VERSION = 1
 
 
 def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
                  notes: Mapping[str, Any] | None = None, chromaticities: Chromaticities | None = REC_709,
-                 pixel_aspect: float = 1.0, turn: AbstractContextManager[None] | None = None) -> None:
-    """Write a frame's layers atomically, ZIP compressed; depth stays 32 bit when the rest is `half`. turn: see
-    `atomic_path`.
+                 pixel_aspect: float = 1.0, commit_lock: AbstractContextManager[None] | None = None) -> None:
+    """Write a frame's layers atomically, ZIP compressed; depth stays 32 bit when the rest is `half`.
 
-    notes: JSON-able entries for the header (view, frame, …). chromaticities: of the layers' linear space. pixel_aspect:
-    as `Camera.pixel_aspect`.
+    notes: JSON-able entries for the header (view, frame, ...). chromaticities: of the layers' linear space.
+    pixel_aspect: as `Camera.pixel_aspect`. commit_lock: see `atomic_path`.
     """
     lights = {layer: light for light, layer in layer_names(layers.flares).items()}
     description = json.dumps({"version": VERSION, "lights": lights, **(notes or {})})
-    header: dict[str, Any] = {"software": "Fit Flare", ATTRIBUTE: description,
+    header: dict[str, Any] = {"software": "Fit Flare", HEADER_ATTRIBUTE: description,
                               "pixelAspectRatio": pixel_aspect}
     if chromaticities is not None:
         header["chromaticities"] = chromaticities
     if layers.window is not None:
         header |= layers.window.header()
-    write_exr(path, layers.channels(), half=half, header=header, turn=turn)
+    write_exr(path, layers.channels(), half=half, header=header, commit_lock=commit_lock)
 
 
 def read_description(path: Path | str) -> dict[str, Any]:
-    """What `write_layers` noted in the header. Raises FrameError where the file is not one of ours."""
-    text = read_exr_header(path).get(ATTRIBUTE)
+    """Return the header entries that `write_layers` wrote. Raises FrameError if the file is not a baked one."""
+    text = read_exr_header(path).get(HEADER_ATTRIBUTE)
     try:
         description = json.loads(text) if text else None
     except (TypeError, ValueError, RecursionError) as problem:
@@ -57,7 +56,7 @@ def read_description(path: Path | str) -> dict[str, Any]:
 
 
 def read_layers(path: Path | str) -> FrameLayers:
-    """The layers of a file that `write_layers` made. Raises FrameError where it is damaged or not one."""
+    """Read the layers of a file that `write_layers` made. Raises FrameError if it is damaged or not one."""
     import numpy as np
 
     lights = read_description(path)["lights"]
@@ -68,6 +67,6 @@ def read_layers(path: Path | str) -> FrameLayers:
 
     try:
         return FrameLayers(colour("scene"), {light: colour(layer) for layer, light in lights.items()},
-                           channels["depth.Z"], window_of(path))
+                           channels["depth.Z"], read_data_window(path))
     except KeyError as problem:
         raise FrameError(f"{path} lacks the channel {problem}; bake it again.") from problem

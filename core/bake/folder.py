@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A folder of baked layers as Blender reads it: one numbered sequence of EXR files."""
+"""A folder of baked layers as Blender reads it: one numbered sequence of EXR files. The add-on and `compose` open it.
+"""
 from __future__ import annotations
 
 import re
@@ -7,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import FrameError
-from ..images.exr import channel_names, exr_is_cut_off, exr_pixel_aspect
+from ..images.exr import channel_names, exr_pixel_aspect, is_exr_truncated
 from ..images.size import picture_size
 
 _NUMBERED = re.compile(r"(.*?)(\d+)\.exr", re.IGNORECASE)
@@ -15,16 +16,19 @@ _NUMBERED = re.compile(r"(.*?)(\d+)\.exr", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class LayerFolder:
-    """Frame numbers, in order, and the file of each. Numbers may leave gaps."""
+    """Frame numbers, in order, and the file of each. Numbers may have gaps."""
 
     folder: Path
     files: dict[int, Path]
 
     @classmethod
     def open(cls, folder: Path | str) -> LayerFolder:
-        """Raises FrameError where the folder holds no numbered EXR files, more than one sequence, or frames that do not
-        all have the same layers: Blender goes by the first, and would show the others without theirs. Also where
-        one is cut off, of which Blender would show the part there is."""
+        """Open a folder. Raises FrameError without numbered EXR files, for more than one sequence, and for frames that
+        differ in layers.
+
+        Blender takes the layers of the first frame, and would show the others without theirs. Also raised for a
+        truncated file, of which Blender would show the part that exists.
+        """
         folder = Path(folder).resolve()
         sequences: dict[str, dict[int, Path]] = {}
         for path in sorted(folder.glob("*")):
@@ -41,7 +45,7 @@ class LayerFolder:
             raise FrameError(f"{folder} holds more than one sequence ({heads}); keep each in a folder of its own.")
         files = next(iter(sequences.values()))
         files = dict(sorted(files.items()))
-        layers = {path: _layers_of(path) for path in files.values()}
+        layers = {path: _read_layer_names(path) for path in files.values()}
         first, *others = files.values()
         for path in others:
             if layers[path] != layers[first]:
@@ -60,15 +64,15 @@ class LayerFolder:
         return max(self.files)
 
     def size(self) -> tuple[int, int]:
-        """(width, height) of the first frame, from its header."""
+        """Return (width, height) of the first frame, from its header."""
         return picture_size(self.files[self.first])
 
     def pixel_aspect(self) -> float:
-        """Width of the first frame's pixels by their height."""
+        """Return the width of the first frame's pixels relative to their height."""
         return exr_pixel_aspect(self.files[self.first])
 
 
-def _layers_of(path: Path) -> set[str]:
-    if exr_is_cut_off(path):
+def _read_layer_names(path: Path) -> set[str]:
+    if is_exr_truncated(path):
         raise FrameError(f"{path} ends before its last lines; bake it again.")
     return {name.rpartition(".")[0] for name in channel_names(path)} - {""}

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The joint fit of scene and flare: settings, training, checkpoints, and the run folder it leaves."""
+"""The joint fit of scene and flare to a capture.
+
+`run_loop.fit` runs it: `initialise` makes the first scene and flare, `trainer` optimises them, and `run` is the folder
+of settings, checkpoint and results that `core.bake`, `core.metrics` and `core.transfer` read.
+"""
 from __future__ import annotations
 
 from .run import Run

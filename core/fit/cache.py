@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Decoded pictures, kept for as long as a fit looks at them: in memory as far as that goes, then on disk.
+"""Keeps decoded frames for as long as a fit uses them: in memory up to a limit, then on disk.
 
-To decode a frame of 4K and make it small takes far longer than an iteration of a fit at 960 pixels.
+`frames` fills it. Decoding a 4K frame and reducing it takes far longer than an iteration of a fit at 960 pixels.
 """
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 MEMORY = 1 << 29
-"""Bytes that are kept in memory: 86 frames of 960x540 with their flare-free pairs."""
+"""Bytes kept in memory: 86 frames of 960x540 with their clean frames."""
 DISK_LEFT = 1 << 31
-"""Bytes that stay free on the disk."""
+"""Bytes left free on the disk."""
 
 Codes = NDArray[np.uint16]
 
@@ -30,7 +30,7 @@ class _Place(NamedTuple):
 
 
 class PictureCache:
-    """Arrays of 16 bit by name. What fits neither memory nor disk is not kept, and `get` knows nothing of it."""
+    """Caches 16 bit arrays by name. `get` returns None for an array that fitted neither in memory nor on disk."""
 
     def __init__(self, memory: int = MEMORY) -> None:
         self._left = memory
@@ -41,8 +41,11 @@ class PictureCache:
 
     @contextlib.contextmanager
     def overflowing_into(self, folder: Path) -> Iterator[None]:
-        """Within it, keep what exceeds memory in a file in `folder`, which is gone afterwards, however this process
-        ends; but for Windows it has no name even before."""
+        """Keep what exceeds memory in a temporary file in `folder`; it is deleted at the end, however this process
+        ends.
+
+        Except on Windows the file has no name.
+        """
         # Without a file, as without room in it, pictures are decoded again.
         with contextlib.suppress(OSError):
             self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115 - closed below
@@ -53,7 +56,7 @@ class PictureCache:
             self._close()
 
     def get(self, name: str) -> Codes | None:
-        """What was put under a name, if it is there."""
+        """Return the array stored under a name, or None."""
         place = self._on_disk.get(name)
         if place is None or self._file is None:
             return self._in_memory.get(name)
@@ -66,7 +69,7 @@ class PictureCache:
             return None
 
     def put(self, name: str, codes: Codes) -> None:
-        """Keep an array."""
+        """Store an array under a name."""
         if codes.nbytes <= self._left:
             self._left -= codes.nbytes
             self._in_memory[name] = codes

@@ -1,24 +1,34 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The state of an unfinished fit on disk: one safetensors file, whole or absent.
+"""The state of an unfinished fit on disk, and the inputs that it was made from.
 
-A state is a nested dictionary of tensors and of what JSON holds: numbers, strings, and lists, nested ones too.
-Big tables of which training has touched a few rows are stored as those rows. Nothing is pickled.
+A state is a nested dictionary of tensors and JSON values, written whole or not at all as one safetensors file. Large
+tables of which training has touched a few rows are stored as those rows. `run_loop` saves and loads it; `Trainer` makes
+it, with `FitInputs`, and refuses one of other inputs.
 """
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ..capture import LIGHTS, Capture, View
 from ..errors import RunError
-from ..system import tensor_files as on_disk
+from ..system import tensor_files
+from ..system.files import content_hash
+from ..system.reading import parse_json
 
 VERSION = 1
-_MANY_ROWS = 100_000
+_SPARSE_FROM_ROWS = 100_000
+_MAX_TABLE = 1 << 32
+"""Bound of the numbers in a table that is stored by its rows."""
+LIGHT_TOLERANCE = 1e-5
+"""Distance up to which a light counts as unmoved, relative to the capture's extent."""
 State = dict[str, Any]
 
 
@@ -32,7 +42,7 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
             values[name] = value
             continue
         tensor = value.detach().cpu().contiguous()
-        if tensor.ndim == 2 and len(tensor) > _MANY_ROWS:
+        if tensor.ndim == 2 and len(tensor) > _SPARSE_FROM_ROWS:
             rows = tensor.abs().amax(1).nonzero()[:, 0]
             if len(rows) < len(tensor) // 4:
                 shapes[name] = list(tensor.shape)
@@ -40,30 +50,48 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
                 continue
         tensors[name] = tensor
     description = json.dumps({"version": VERSION, "values": values, "shapes": shapes})
-    on_disk.write(path, tensors, {"checkpoint": description})
+    tensor_files.write(path, tensors, {"checkpoint": description})
 
 
 def load(path: Path) -> State:
-    """Read what `save` wrote. Raises RunError where the file is damaged or of another version."""
+    """Read a state that `save` wrote. Raises RunError if the file is damaged or of another version."""
     try:
-        tensors, about = on_disk.read(path)
-        description = json.loads(about["checkpoint"])
+        tensors, metadata = tensor_files.read(path)
+        description = parse_json(metadata["checkpoint"])
         if description["version"] != VERSION:
             raise RunError(f"{path} was written by another version of Fit Flare; start the fit anew.")
         for name, shape in description["shapes"].items():
             rows, values = tensors.pop(f"{name}@rows"), tensors.pop(f"{name}@values")
+            if not _is_table_shape(shape) or shape[1:] != list(values.shape[1:]):
+                raise ValueError(f"the table {name} has the shape {shape!r:.80}")
             tensors[name] = torch.zeros(shape, dtype=values.dtype).index_copy_(0, rows, values)
         flat = {**description["values"], **tensors}
-    except (KeyError, TypeError, ValueError, RuntimeError, OSError) as problem:
+        return _nest(flat)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, RuntimeError,
+            OSError) as problem:
         raise RunError(f"{path} is damaged ({problem}); remove it and start the fit anew.") from problem
+
+
+def _nest(flat: Mapping[str, Any]) -> State:
+    """Return nested tables by the names "table/.../value". Raises ValueError where a name is a table and a value."""
     state: State = {}
     for name, value in flat.items():
         *keys, last = name.split("/")
         table = state
         for key in keys:
             table = table.setdefault(key, {})
+            if not isinstance(table, dict):
+                raise ValueError(f"{name} lies in a value")
+        if isinstance(table.get(last), dict):
+            raise ValueError(f"{name} is a table and a value")
         table[last] = value
     return state
+
+
+def _is_table_shape(shape: Any) -> bool:
+    """True for [rows, columns] of a table that memory may hold."""
+    return (isinstance(shape, list) and len(shape) == 2 and all(type(size) is int and size > 0 for size in shape)
+            and shape[0] * shape[1] <= _MAX_TABLE)
 
 
 def _leaves(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
@@ -72,3 +100,64 @@ def _leaves(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
             yield from _leaves(value, f"{prefix}{key}/")
         else:
             yield f"{prefix}{key}", value
+
+
+class FitInputs:
+    """The lights of a capture, and a digest of each view's camera, frame and, with `removed`, clean frame.
+
+    A checkpoint holds them; a fit resumes only with the same inputs. lights: False for a fit without flare.
+    """
+
+    def __init__(self, capture: Capture, *, removed: bool, lights: bool) -> None:
+        self._capture, self._removed = capture, removed
+        self._lights = [[light.name, light.xyz.tolist()] for light in capture.lights] if lights else None
+        self._views: list[list[str]] | None = None
+
+    def state(self) -> dict[str, Any]:
+        """Return the entries for the checkpoint: "views" ([name, digest]) and, if the fit has lights, "lights" ([name,
+        [x,         y, z]]).
+
+        Lights are those of the capture, even where the fit has moved them.
+        """
+        if self._views is None:
+            self._views = [[view.name, self._digest(view)] for view in self._capture.views]
+        return {"views": self._views, **({} if self._lights is None else {"lights": self._lights})}
+
+    def check(self, stored: dict[str, Any]) -> None:
+        """Raise RunError if the entries of a checkpoint are of other inputs.
+
+        Flares belong to lights by their order, and what was learned of a frame belongs to that frame. Checkpoints of
+        older formats have fewer entries.
+        """
+        current = self.state()
+        tolerance = LIGHT_TOLERANCE * self._capture.extent
+        if "lights" in current and stored.get("lights") is not None and (
+                changed := _describe_change(stored["lights"], current["lights"], tolerance)):
+            raise RunError(f"{self._capture.folder / LIGHTS} has changed since the fit began ({changed}); put "
+                           "the old one back, or begin the fit anew in another folder.")
+        before, after = dict(stored.get("views") or []), dict(current["views"])
+        if before and (others := [name for name in {**before, **after} if before.get(name) != after.get(name)]):
+            raise RunError(f"{self._capture.folder} has changed since the fit began ({len(others)} of {len(after)} "
+                           f"views have another frame, flare-free frame or camera, {others[0]} first); put the old "
+                           "ones back, or begin the fit anew in another folder.")
+
+    def _digest(self, view: View) -> str:
+        capture, camera = self._capture, view.camera
+        files = [capture.frame_path(view), *([capture.removed_path(view)] if self._removed else [])]
+        rotation, place = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        numbers = [*np.round(rotation, 5).ravel() + 0.0, *place, camera.fx, camera.fy, camera.cx, camera.cy]
+        what = [*map(content_hash, files), *(f"{number:.5g}" for number in numbers), str(view.lens)]
+        return hashlib.blake2b(" ".join(what).encode(), digest_size=8).hexdigest()
+
+
+def _describe_change(old: list[Any], new: list[Any], tolerance: float) -> str:
+    """Return what differs between two lists of [name, [x, y, z]], or "": the names, else the first position.
+
+    Positions may differ by `tolerance`, and by what Blender's single precision rounds to.
+    """
+    before, after = ([name for name, _ in lights] for lights in (old, new))
+    if before != after:
+        return f"its lights were {', '.join(map(repr, before))}, and are {', '.join(map(repr, after))} now"
+    return next((f"{name!r} was at {was}, and is at {now} now"
+                 for (name, was), (_, now) in zip(old, new, strict=True)
+                 if not np.allclose(was, now, rtol=1e-6, atol=tolerance)), "")

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How each frame of a capture is exposed, by how bright it shows the capture's points; and at which light all clip.
+"""Measures the exposure of each frame by the brightness of the capture's points, and the light at which frames clip.
 
-A camera left to itself darkens the picture as a lamp comes into it, which is where its flare begins; to a fit that
-takes the exposure to be fixed the difference is flare. What a frame shows of points is a straight line over what is
-known of them: the slope is its exposure, while a veil of flare only lifts the line.
+An automatic exposure darkens the frame as a lamp comes into it, which is where its flare begins; a fit with a fixed
+exposure would take the difference for flare. The luminances that a frame shows of the points are a linear function of
+those in a usual frame: the slope is the exposure, and a veil of flare only adds an offset. `trainer` and `run_loop`
+call this before a fit.
 """
 from __future__ import annotations
 
@@ -17,74 +18,76 @@ from numpy.typing import NDArray
 
 from ..capture import Capture, View
 from ..colour.srgb import LUMINANCE, linear_from_srgb
-from ..conventions.exposures import LEAST
-from ..images.read import holds_floats
+from ..conventions.exposures import MIN_EXPOSURE
+from ..images.read import has_float_pixels
 from ..system.progress import Progress
-from ..thinning import thinned
-from .frames import Frames, colours_at
+from .frames import Frames, sample_colours, subsample
 from .settings import FitSettings
 
-UNLIKE = 0.25
-"""Stops, the spread over the frames, from which on they are taken to be exposed otherwise."""
-SURE = 0.1
-"""Stops, the standard error from which on a frame does not tell its exposure."""
-ASKED = 40
-"""About as many frames are looked at first."""
-FEWEST, POINTS = 50, 500
-"""Points that a frame has to show at least, and about as many of them that are looked at. What a solve says of their
-colours is of no use: they follow the exposure of the few frames that each was found in."""
-DARK, BRIGHT = 0.05, 0.9
-"""Display values between which pixels tell."""
-RARE = 0.1
-"""Share of the frames, to either side, that do not count."""
-ROUNDS, REFINED, SETTLED = 20, 3, 1e-3
-SOFT = 0.05
-"""Linear light that is added to what errors are parts of: those of dark points are rounding."""
-WHITEST = 64.0
-"""Scene-linear light at which frames that hold light above white are clipped: six stops above it, as far as cameras
-reach; a fit that is shown a rendered sun is not drawn to it alone."""
+MIN_SPREAD = 0.25
+"""Spread of the exposures, stops, above which they are not taken for equal."""
+MAX_STANDARD_ERROR = 0.1
+"""Standard error, stops, above which a frame's exposure counts as unknown."""
+SAMPLED_VIEWS = 40
+"""Approximate number of frames that are measured first."""
+MIN_POINTS, SAMPLED_POINTS = 50, 500
+"""Points that a frame must show, and the approximate number that is used of it. The solve's colours of points are
+useless here: they follow the exposure of the few frames in which each was found."""
+MIN_LEVEL, MAX_LEVEL = 0.05, 0.9
+"""Display values between which pixels are used."""
+OUTLIER_SHARE = 0.1
+"""Share of the frames, on either side, that the spread ignores."""
+MAX_ROUNDS, REFINEMENTS, TOLERANCE = 20, 3, 1e-3
+ERROR_FLOOR = 0.05
+"""Linear light added to the base of relative errors: those of dark points are rounding."""
+MAX_WHITE = 64.0
+"""Scene-linear light at which frames with light above white are clipped: six stops above it, which is as far as cameras
+reach, so that a rendered sun does not dominate the fit."""
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-def found(capture: Capture, frames: Frames, progress: Progress | None = None) -> dict[str, float]:
-    """Of each view, times the light of the frame in the middle; empty where all are exposed alike, or too few tell.
-    Views that do not tell are taken for as exposed as the nearest, by name, that do. Raises Cancelled when asked to
-    stop."""
+def measure_exposures(capture: Capture, frames: Frames, progress: Progress | None = None) -> dict[str, float]:
+    """Return the exposure of each view relative to the median frame; empty if all are equal, or too few can be
+    measured.
+
+    A view that cannot be measured takes the exposure of the nearest one, by name, that can. Raises Cancelled.
+    """
     progress = progress or Progress()
-    stops = Seen.of(capture, thinned(capture.views, ASKED), frames, progress).stops()
-    if spread(stops) >= UNLIKE and len(stops) < len(capture.views):  # all only where some differ
-        stops = Seen.of(capture, capture.views, frames, progress).stops()
-    if spread(stops) < UNLIKE:
+    stops = PointObservations.of(capture, subsample(capture.views, SAMPLED_VIEWS), frames, progress).stops()
+    if spread(stops) >= MIN_SPREAD and len(stops) < len(capture.views):  # all only where some differ
+        stops = PointObservations.of(capture, capture.views, frames, progress).stops()
+    if spread(stops) < MIN_SPREAD:
         return {}
-    filled = _filled(stops, [Path(view.name).parent for view in capture.views]) - np.nanmedian(stops)
-    times = 2 ** filled.clip(math.log2(LEAST), -math.log2(LEAST))
+    filled = _fill_unmeasured(stops, [Path(view.name).parent for view in capture.views]) - np.nanmedian(stops)
+    times = 2 ** filled.clip(math.log2(MIN_EXPOSURE), -math.log2(MIN_EXPOSURE))
     return {view.name: round(float(one), 6) for view, one in zip(capture.views, times, strict=True)}
 
 
-def _filled(stops: Floats, folders: Sequence[Path]) -> Floats:
-    """Those that do not tell by the nearest that does, of the same folder if there is one: a camera's, often."""
-    tells = np.flatnonzero(np.isfinite(stops))
+def _fill_unmeasured(stops: Floats, folders: Sequence[Path]) -> Floats:
+    """Replace exposures that are not finite by the nearest finite one, of the same folder if possible: often that of
+    one camera."""
+    usable = np.flatnonzero(np.isfinite(stops))
 
     def nearest(at: int) -> int:
-        return int(min(tells, key=lambda other: (folders[other] != folders[at], abs(other - at))))
+        return int(min(usable, key=lambda other: (folders[other] != folders[at], abs(other - at))))
 
     return np.asarray(stops[[nearest(at) for at in range(len(stops))]])
 
 
 def spread(stops: Floats) -> float:
-    """Stops by which exposures (n,) differ, but for the darkest and the brightest tenth; 0 where fewer than three, or
-    half of all, tell (the others are not finite)."""
-    tells = stops[np.isfinite(stops)]
-    if len(tells) < max(3, len(stops) / 2):
+    """Return the spread, stops, of exposures (n,) without the darkest and the brightest tenth; 0 if fewer than three,
+    or half of all, are finite."""
+    usable = stops[np.isfinite(stops)]
+    if len(usable) < max(3, len(stops) / 2):
         return 0.0
-    low, high = np.quantile(tells, (RARE, 1 - RARE))
+    low, high = np.quantile(usable, (OUTLIER_SHARE, 1 - OUTLIER_SHARE))
     return float(high - low)
 
 
-def says(exposures: Mapping[str, float]) -> tuple[str, ...]:
-    """Sentences for the person who asked for the fit."""
+def exposure_warnings(exposures: Mapping[str, float]) -> tuple[str, ...]:
+    """Return sentences for the user about exposures that differ."""
     if not exposures:
         return ()
     stops = spread(np.log2(list(exposures.values())))
@@ -93,9 +96,9 @@ def says(exposures: Mapping[str, float]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What views show of points: (n,) luminances, scene-linear, each of a view, by its place among `count`, and of a
-    point, by its index."""
+class PointObservations:
+    """The luminances that views show of points, scene-linear (n,); for each the view, an index below `count`, and the
+    point's index."""
 
     count: int
     views: Indices
@@ -103,9 +106,11 @@ class Seen:
     light: Floats
 
     @classmethod
-    def of(cls, capture: Capture, views: Sequence[View], frames: Frames, progress: Progress) -> Seen:
-        """Where the solve found the points, neither too dark nor clipped, in the flare-free frames if there are any."""
-        step = max(int(np.median([len(view.points) for view in views])) // POINTS, 1)  # the same points of all views
+    def of(cls, capture: Capture, views: Sequence[View], frames: Frames, progress: Progress) -> PointObservations:
+        """Sample the frames where the solve found the points, neither too dark nor clipped; clean frames where there
+        are any."""
+        # The same points of all views.
+        step = max(int(np.median([len(view.points) for view in views])) // SAMPLED_POINTS, 1)
         parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
         progress.stage("look at exposures", len(views))
         for number, view in enumerate(views):
@@ -113,54 +118,57 @@ class Seen:
             chosen = view.points[view.points % step == 0]
             if not len(chosen):
                 continue
-            camera, frame, removed = frames.targets(view)
-            inside, shown = colours_at(capture.points.xyz[chosen], camera, frame if removed is None else removed)
-            tells = ((shown > DARK) & (shown < BRIGHT)).all(-1)
-            points = chosen[inside][tells]
-            light = linear_from_srgb(shown[tells]).astype(np.float64) @ LUMINANCE
+            camera, frame, clean = frames.targets(view)
+            inside, observed = sample_colours(capture.points.xyz[chosen], camera, frame if clean is None else clean)
+            usable = ((observed > MIN_LEVEL) & (observed < MAX_LEVEL)).all(-1)
+            points = chosen[inside][usable]
+            light = linear_from_srgb(observed[usable]).astype(np.float64) @ LUMINANCE
             parts.append((np.full(len(points), number), points, light))
         numbers, points, light = (np.concatenate(part) for part in zip(*parts, strict=True))
         return cls(len(views), numbers, points, light)
 
     def stops(self) -> Floats:
-        """Exposure of each view (count,); not finite where it does not tell. What the points show in a view of the
-        usual exposure is found along with it."""
-        usual = self._usual()
-        for _ in range(REFINED):
-            slopes, veils = self._lines(usual)
-            usual = _medians((self.light - veils[self.views]) / slopes[self.views], self.points, len(usual))
-        return np.log2(self._lines(usual)[0])
+        """Return the exposure of each view (count,), not finite where it cannot be measured.
 
-    def _usual(self) -> Floats:
-        """Luminance of each point in a view of the usual exposure, by index, as if there were no veils."""
+        The points' luminances in a usual view are estimated with it.
+        """
+        luminances = self._initial_luminances()
+        for _ in range(REFINEMENTS):
+            slopes, veils = self._fit_lines(luminances)
+            exposed = (self.light - veils[self.views]) / slopes[self.views]
+            luminances = _group_medians(exposed, self.points, len(luminances))
+        return np.log2(self._fit_lines(luminances)[0])
+
+    def _initial_luminances(self) -> Floats:
+        """Estimate the luminance of each point in a view of the usual exposure, by index, without veils."""
         light, stops = np.log2(self.light), np.zeros(self.count)
         most = int(self.points.max(initial=-1)) + 1
-        for _ in range(ROUNDS):
-            before, usual = stops, _medians(light - stops[self.views], self.points, most)
-            stops = _medians(light - usual[self.points], self.views, self.count)
-            if np.allclose(before, stops, atol=SETTLED, equal_nan=True):
+        for _ in range(MAX_ROUNDS):
+            before, luminances = stops, _group_medians(light - stops[self.views], self.points, most)
+            stops = _group_medians(light - luminances[self.points], self.views, self.count)
+            if np.allclose(before, stops, atol=TOLERANCE, equal_nan=True):
                 break
-        return np.asarray(2**usual)
+        return np.asarray(2**luminances)
 
-    def _lines(self, usual: Floats) -> tuple[Floats, Floats]:
-        """Slope and veil of each view (count,), given the points' usual luminances; not finite where it does not
-        tell."""
+    def _fit_lines(self, luminances: Floats) -> tuple[Floats, Floats]:
+        """Return slope and veil of each view (count,) for the points' luminances; not finite where they cannot be
+        measured."""
         lines = np.full((2, self.count), np.nan)
         for number in range(self.count):
-            own = self.views == number
-            known, shown = usual[self.points[own]], self.light[own]
-            there = np.isfinite(known)
-            if there.sum() >= FEWEST:
-                line, error = _line(known[there], shown[there])
-                if line[0] > 0 and error / line[0] < SURE * np.log(2):
+            in_view = self.views == number
+            known, observed = luminances[self.points[in_view]], self.light[in_view]
+            finite = np.isfinite(known)
+            if finite.sum() >= MIN_POINTS:
+                line, error = _fit_line(known[finite], observed[finite])
+                if line[0] > 0 and error / line[0] < MAX_STANDARD_ERROR * np.log(2):
                     lines[:, number] = line
         return lines[0], lines[1]
 
 
-def _medians(values: Floats, groups: Indices, count: int) -> Floats:
-    """(count,): the (lower) median of each group's values that are finite; not finite for groups without any."""
-    there = np.isfinite(values)
-    values, groups = values[there], groups[there]
+def _group_medians(values: Floats, groups: Indices, count: int) -> Floats:
+    """Return the lower median of each group's finite values (count,); not finite for a group without any."""
+    finite = np.isfinite(values)
+    values, groups = values[finite], groups[finite]
     order = np.lexsort((values, groups))
     begins = np.searchsorted(groups[order], np.arange(count + 1))
     first, sizes = begins[:-1], np.diff(begins)
@@ -169,29 +177,30 @@ def _medians(values: Floats, groups: Indices, count: int) -> Floats:
     return medians
 
 
-def _line(known: Floats, shown: Floats) -> tuple[Floats, float]:
-    """(slope, veil) of shown = slope * known + veil, both (n,) linear light, and the slope's standard error. Errors
-    count in parts of the light, and less the larger they are (Cauchy's weights): the glow about a light lifts the
-    points beside it."""
+def _fit_line(known: Floats, observed: Floats) -> tuple[Floats, float]:
+    """Fit shown = slope * known + veil, both (n,) linear light; return (slope, veil) and the slope's standard error.
+
+    Errors are relative, with Cauchy weights: the glow about a light lifts the points beside it.
+    """
     columns = np.stack([known, np.ones_like(known)], 1)
-    parts = 1 / (known.clip(min=0) + SOFT) ** 2
-    line = np.array([np.median(shown / known.clip(min=SOFT)), 0.0])
-    for _ in range(ROUNDS):
-        errors = (shown - columns @ line) ** 2 * parts
-        trust = 1 / (1 + errors / (2.2 * np.median(errors) + 1e-12))
-        weights = trust * parts
+    error_weights = 1 / (known.clip(min=0) + ERROR_FLOOR) ** 2
+    line = np.array([np.median(observed / known.clip(min=ERROR_FLOOR)), 0.0])
+    for _ in range(MAX_ROUNDS):
+        errors = (observed - columns @ line) ** 2 * error_weights
+        robust_weights = 1 / (1 + errors / (2.2 * np.median(errors) + 1e-12))
+        weights = robust_weights * error_weights
         product = columns.T @ (weights[:, None] * columns)
         if np.linalg.cond(product) > 1e9:  # points of one brightness
             return np.zeros(2), np.inf
-        line = np.linalg.solve(product, columns.T @ (weights * shown))
-    scatter = weights @ (shown - columns @ line) ** 2 / max(trust.sum() - 2, 1)
+        line = np.linalg.solve(product, columns.T @ (weights * observed))
+    scatter = weights @ (observed - columns @ line) ** 2 / max(robust_weights.sum() - 2, 1)
     return line, float(np.sqrt(scatter * np.linalg.inv(product)[0, 0]))
 
 
-def with_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings, tuple[str, ...]]:
-    """The settings with the light at which frames are clipped, where that was left open, and what is to be said of it.
+def resolve_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings, tuple[str, ...]]:
+    """Return the settings with `white` resolved, and sentences for the user.
 
-    It is 1, the white of most formats, or more where all are float files and some frame holds more.
+    It is 1, the white of most formats, or MAX_WHITE if all frames are float files and one of them holds more than 1.
     """
     if settings.white is not None:
         return settings, ()
@@ -199,16 +208,16 @@ def with_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings, tu
     if not any(_is_above_white(capture, view) for view in views):
         return replace(settings, white=1.0), ()
     files = [capture.frame_path(view) for view in views]
-    if capture.has_removed and settings.looks_at_removed:
+    if capture.has_removed and settings.needs_clean_frames:
         files += [capture.removed_path(view) for view in views]
-    clipped = next((path for path in files if not holds_floats(path)), None)
+    clipped = next((path for path in files if not has_float_pixels(path)), None)
     if clipped is not None:
         return replace(settings, white=1.0), (
             f"The frames hold light above white (1.0), and {clipped} cannot: it is fitted as white, and flares that "
             "are brighter come out wrong; EXR files for all would keep it.",)
-    return replace(settings, white=WHITEST), (
-        f"The frames hold light above white (1.0); it is fitted up to {WHITEST:g}.",)
+    return replace(settings, white=MAX_WHITE), (
+        f"The frames hold light above white (1.0); it is fitted up to {MAX_WHITE:g}.",)
 
 
 def _is_above_white(capture: Capture, view: View) -> bool:
-    return holds_floats(capture.frame_path(view)) and bool(capture.frame(view).pixels.max() > 1)
+    return has_float_pixels(capture.frame_path(view)) and bool(capture.frame(view).pixels.max() > 1)

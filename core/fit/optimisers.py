@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What steps scene and flare, and how its rates fall along a fit."""
+"""The optimisers of scene and flare, and their learning rates along a fit; `trainer` steps them."""
 from __future__ import annotations
 
 import torch
@@ -13,57 +13,58 @@ from ..gaussians.scene import COEFFICIENTS, SceneGaussians
 from .checkpoint import State
 from .settings import FitSettings
 
-RATE_ABOVE_WHITE = 3.0
-"""Times the rate of a scene's colours where frames go on above white: theirs is a longer way. Lamps of 32 times white
-end a sixth off instead of three fifths (`desk`, preset draft)."""
+COLOUR_RATE_FACTOR = 3.0
+"""Factor on the learning rate of the scene's colours where frames go above white, which is farther to go. Lamps of 32
+times white end a sixth off instead of three fifths (`desk`, preset draft)."""
 
 
 class Optimisers:
-    """Of a fit: scene, flare (networks and Gaussians) and grids, the last two None where there is no flare."""
+    """The optimisers of the scene, of the flare (networks and Gaussians) and of its grids; the last two are None
+    without a flare."""
 
     def __init__(self, scene: SceneGaussians, flare: FlareModel | None, settings: FitSettings, extent: float,
                  display_white: float) -> None:
-        """extent: of the capture, world units. display_white: display value that frames go up to."""
+        """extent: of the capture, world units. display_white: largest display value of the frames."""
         self._settings, self._extent = settings, extent
         rates = settings.scene.rates
         features = torch.full((COEFFICIENTS, 1), rates.features_rest)
-        features[0] = rates.features * (RATE_ABOVE_WHITE if display_white > 1 else 1)
-        chosen: dict[str, float | Tensor] = {
+        features[0] = rates.features * (COLOUR_RATE_FACTOR if display_white > 1 else 1)
+        rate_by_name: dict[str, float | Tensor] = {
             "means": self._means_rate(0.0), "log_scales": rates.scale, "quaternions": rates.rotation,
             "opacity_logits": rates.opacity, "sh": features.expand(COEFFICIENTS, 3).contiguous(),
         }
-        self.scene = Adam(dict(scene.named_parameters()), chosen)
-        self.flare, self.grids = _of_flare(flare, settings)
+        self.scene = Adam(dict(scene.named_parameters()), rate_by_name)
+        self.flare, self.grids = _flare_optimisers(flare, settings)
         self._flare_rates = dict(self.flare.rates) if self.flare else {}
 
     def set_rates(self, iteration: int) -> None:
-        """Those of an iteration, from 1."""
+        """Set the learning rates of an iteration, from 1."""
         progress = iteration / self._settings.iterations
         self.scene.rates["means"] = self._means_rate(progress)
         if self.flare is None or self.grids is None:
             return
         rates = self._settings.flare.rates
-        settled = _decayed(1.0, rates.settled, 2 * progress - 1)
+        decay = _decay(1.0, rates.final_ratio, 2 * progress - 1)
         for name, rate in self._flare_rates.items():
             position = name.endswith("gaussians.positions")
-            now = _decayed(rates.position, rates.position_final, progress) if position else rate * settled
+            now = _decay(rates.position, rates.position_final, progress) if position else rate * decay
             self.flare.rates[name] = now
         for group in self.grids.param_groups:
-            group["lr"] = rates.grids * settled
+            group["lr"] = rates.grids * decay
 
     def _means_rate(self, progress: float) -> float:
         rates = self._settings.scene.rates
-        return _decayed(rates.position, rates.position_final, progress) * self._extent
+        return _decay(rates.position, rates.position_final, progress) * self._extent
 
     def step(self, *, scene: bool) -> None:
-        """Step by the gradients, and forget them; the scene, too, if it is fitted."""
+        """Step by the gradients and clear them; the scene only if `scene`."""
         for optimiser in (self.scene if scene else None, self.flare, self.grids):
             if optimiser is not None:
                 optimiser.step()
                 optimiser.zero_grad()
 
     def state(self) -> State:
-        """Their moments, as `checkpoint.save` takes them."""
+        """Return the moments, in the form of `checkpoint.save`."""
         state: State = {"scene_adam": self.scene.state_dict()}
         if self.flare is not None and self.grids is not None:
             state["flare_adam"] = self.flare.state_dict()
@@ -71,7 +72,7 @@ class Optimisers:
         return state
 
     def load_state(self, state: State) -> None:
-        """Go on from these moments. Raises KeyError, RuntimeError, TypeError or ValueError where they do not fit."""
+        """Restore the moments. Raises KeyError, RuntimeError, TypeError or ValueError where they do not fit."""
         self.scene.load_state_dict(state["scene_adam"])
         if self.flare is not None and self.grids is not None:
             self.flare.load_state_dict(state["flare_adam"])
@@ -80,29 +81,31 @@ class Optimisers:
             self.grids.load_state_dict({"state": moments, "param_groups": groups})
 
 
-def _decayed(first: float, last: float, progress: float) -> float:
-    """Exponential decay from `first` to `last` as progress goes from 0 to 1."""
+def _decay(first: float, last: float, progress: float) -> float:
+    """Decay exponentially from `first` to `last` as progress goes from 0 to 1."""
     return first * (last / first) ** min(max(progress, 0.0), 1.0)
 
 
-def _of_flare(flare: FlareModel | None, settings: FitSettings) -> tuple[Adam | None, torch.optim.SparseAdam | None]:
-    """Adam for networks and Gaussians; for the grids one that updates only the rows that a view touched."""
+def _flare_optimisers(flare: FlareModel | None,
+                      settings: FitSettings) -> tuple[Adam | None, torch.optim.SparseAdam | None]:
+    """Return Adam for networks and Gaussians, and for the grids an optimiser that updates only the rows that a view
+    touched."""
     if flare is None:
         return None, None
     rates = settings.flare.rates
-    of_gaussians = {
+    gaussian_rates = {
         "positions": rates.position, "log_scales": rates.scale, "rotations": rates.rotation,
         "opacity_logits": rates.opacity, "sh": rates.features, "offsets": rates.offset, "rings": rates.ring,
         "arcs": rates.arc, "latent": rates.latent,
     }
     dense: dict[str, Parameter] = {}
     tables: list[Parameter] = []
-    chosen: dict[str, float | Tensor] = {}
+    rate_by_name: dict[str, float | Tensor] = {}
     for name, parameter in flare.flares.named_parameters():
         if name.endswith(TABLE):
             tables.append(parameter)
             continue
         dense[name] = parameter
         last = name.rsplit(".", 1)[1]
-        chosen[name] = of_gaussians[last] if ".gaussians." in name else rates.network
-    return Adam(dense, chosen), torch.optim.SparseAdam(tables, lr=rates.grids)
+        rate_by_name[name] = gaussian_rates[last] if ".gaussians." in name else rates.network
+    return Adam(dense, rate_by_name), torch.optim.SparseAdam(tables, lr=rates.grids)

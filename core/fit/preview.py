@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A picture of how a fit stands: frame | composite | scene | flare, one row for each of some views."""
+"""Preview pictures of a fit: frame | composite | scene | flare, one row for each of some views. `run_loop` writes them.
+"""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -15,11 +16,12 @@ from ..images.write import write_png
 from .rendering import RenderedView
 
 GAP = 4
-SMALL = 512  # pixels of the longer side of a small preview
+MAX_SMALL_SIDE = 512  # pixels of the longer side of a small preview
 
 
-def row(frame: torch.Tensor, view: RenderedView) -> NDArray[np.float32]:
-    """One view as a strip (height, 4 widths and gaps, 3), display values. The flare is shown as light on black."""
+def preview_row(frame: torch.Tensor, view: RenderedView) -> NDArray[np.float32]:
+    """Return one view as a strip (height, 4 widths and gaps, 3), display values; the flare is shown as light on black.
+    """
     flare = encode(view.layers.flare.clamp_min(0)).clamp(0, 1)
     pictures = [frame, view.composite, view.scene.colour.clamp(0, 1), flare]
     gap = np.full((frame.shape[0], GAP, 3), 0.5, np.float32)
@@ -28,7 +30,7 @@ def row(frame: torch.Tensor, view: RenderedView) -> NDArray[np.float32]:
 
 
 def write_preview(path: Path, rows: Sequence[NDArray[np.float32]]) -> None:
-    """Rows below each other as PNG; they may differ in width by a pixel or two of rounding."""
+    """Write rows below each other as PNG; their widths may differ by a pixel or two of rounding."""
     if not rows:
         return
     width = min(one.shape[1] for one in rows)
@@ -37,16 +39,16 @@ def write_preview(path: Path, rows: Sequence[NDArray[np.float32]]) -> None:
     write_png(path, np.concatenate(strips[:-1], axis=0))
 
 
-def write_small(path: Path, strip: NDArray[np.float32]) -> None:
-    """One view, its composite above its flare, small enough to be read again and again by a panel."""
+def write_small_preview(path: Path, strip: NDArray[np.float32]) -> None:
+    """Write one view's composite above its flare, small enough for a panel that reads it again and again."""
     width = (strip.shape[1] - 3 * GAP) // 4
     composite, flare = (strip[:, at * (width + GAP):at * (width + GAP) + width] for at in (1, 3))
     both = np.ascontiguousarray(np.concatenate([composite, flare]), np.float32)
-    share = min(SMALL / max(both.shape[:2]), 1.0)
+    share = min(MAX_SMALL_SIDE / max(both.shape[:2]), 1.0)
     picture = Picture(both, "srgb").resized(max(round(both.shape[1] * share), 1), max(round(both.shape[0] * share), 1))
     write_png(path, picture.pixels)
 
 
-def spread(count: int, wanted: int) -> list[int]:
-    """At most `wanted` indices, evenly spread over `count`."""
-    return sorted({round(index) for index in np.linspace(0, count - 1, min(wanted, count))})
+def spread_indices(count: int, number: int) -> list[int]:
+    """Return at most `number` indices, evenly spread over `count`."""
+    return sorted({round(index) for index in np.linspace(0, count - 1, min(number, count))})

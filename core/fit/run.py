@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The folder of a run: where a fit keeps its settings, state and results.
+"""The folder of a run, with the settings, state and results of a fit; bakes, scores and transfers read it.
 
-    config.toml   every setting, resolved
-    capture.txt   the capture's folder
-    exposures.json   times the usual light that each frame was exposed to, where they differ
-    flare.flare   the flare            scene.ply   the scene, standard 3DGS
-    checkpoint/   state.safetensors    what a resumed fit needs
-    metrics.jsonl one line of figures now and then; preview.png, preview_small.png; eval.json; log.txt
+    config.toml     every setting, resolved
+    capture.txt     the capture's folder
+    exposures.json  exposure of each frame relative to the median frame, where they differ
+    flare.flare     the flare            scene.ply   the scene, standard 3DGS
+    checkpoint/     state.safetensors    the state that a resumed fit needs
+    metrics.jsonl   one line of figures at intervals; preview.png, preview_small.png; eval.json; log.txt
 """
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits
 from ..look import read as read_look
-from ..system.files import digest_of, remove_file, write_json, write_text
+from ..system.files import hash_files, remove_file, write_json, write_text
+from ..system.progress import Progress
+from ..system.reading import MAX_PATH_BYTES, read_text
 from ..typed import is_utf8
 from .rendering import RenderedView, render
 from .settings import FitSettings, read_config, write_config
@@ -36,7 +38,7 @@ from .settings import FitSettings, read_config, write_config
 
 @dataclass(frozen=True)
 class ViewLayers:
-    """Scene-linear layers of a view, numpy: scene (h, w, 3), each light's flare (h, w, 3), depth (h, w).
+    """Scene-linear layers of a view, numpy: scene (h, w, 3), flare of each light (h, w, 3), depth (h, w).
 
     The flares sum to composite - scene. Depth is along the camera's axis, world units, 0 where nothing is.
     """
@@ -47,7 +49,7 @@ class ViewLayers:
 
 
 class Run:
-    """A run folder that a fit has made or is making; made by `Run.create` or `Run.open`."""
+    """The folder of a finished or unfinished fit; made by `Run.create` or `Run.open`."""
 
     def __init__(self, folder: Path, settings: FitSettings, capture_folder: Path) -> None:
         self.folder = folder
@@ -56,7 +58,7 @@ class Run:
 
     @staticmethod
     def check_free(folder: Path) -> None:
-        """Raises RunError where the folder holds a run already, or cannot be one."""
+        """Raise RunError if the folder holds a run, or cannot be one."""
         if (folder / CONFIG).exists():
             raise RunError(f"{folder} holds a run already; go on with it by --resume, or choose another folder.")
         if folder.exists() and not folder.is_dir():
@@ -65,8 +67,11 @@ class Run:
     @classmethod
     def create(cls, folder: Path | str, settings: FitSettings, capture_folder: Path,
                exposed: Mapping[str, float] | None = None) -> Run:
-        """A new run folder, with its settings written. exposed: its `exposures`. RunError where the folder holds a run
-        already, or the capture's name cannot be written down."""
+        """Make a new run folder with its settings.
+
+        exposed: the exposures of the frames. Raises RunError if the folder holds a run, or the capture's name is not
+        UTF-8.
+        """
         folder = Path(folder)
         cls.check_free(folder)
         run = cls(folder, settings, capture_folder.resolve())
@@ -81,14 +86,15 @@ class Run:
         return run
 
     @classmethod
-    def open(cls, folder: Path | str) -> Run:
-        """A run folder as it is. RunError where it is none."""
+    def open(cls, folder: Path | str, progress: Progress | None = None) -> Run:
+        """Open the run in a folder; with `progress`, old names of settings are reported. Raises RunError if it is not
+        one."""
         folder = Path(folder)
         if not (folder / CONFIG).is_file():
             raise RunError(f"{folder} is not the folder of a run (it has no {CONFIG}); name one that fit has written.")
-        settings = read_config(folder / CONFIG)
+        settings = read_config(folder / CONFIG, progress)
         try:
-            capture = Path((folder / CAPTURE).read_text(encoding="utf-8").removesuffix("\n"))
+            capture = Path(read_text(folder / CAPTURE, MAX_PATH_BYTES).removesuffix("\n"))
         except OSError as problem:
             raise RunError(f"{folder / CAPTURE} cannot be read ({problem.strerror}); start the fit anew.") from problem
         except UnicodeDecodeError as problem:
@@ -99,36 +105,40 @@ class Run:
 
     @cached_property
     def exposures(self) -> dict[str, float]:
-        """By view, times the usual light; empty where all frames are exposed alike. Raises RunError."""
+        """Exposure of each view relative to the median frame; empty if all are equal. Raises RunError."""
         return exposures.read(self.folder)
 
-    def capture(self, given: Path | None = None, *, need_frames: bool = True) -> Capture:
-        """What it was fitted to, from the folder given or where it was then; the exposures of its frames and the places
-        of its lights are those that the fit found, and views whose frames are not needed and not there are as large as
-        those that were fitted. Raises RunError, CaptureError, FrameError."""
-        found = Capture.open(self.find_capture(given), need_frames=need_frames).exposed(self.exposures)
+    def capture(self, folder: Path | None = None, *, need_frames: bool = True) -> Capture:
+        """Open the capture of the run, in `folder` or where it was fitted, with the exposures and light positions of
+        the         fit.
+
+        Without `need_frames`, views whose frames are missing have the size of the fitted frames. Raises RunError,
+        CaptureError, FrameError.
+        """
+        capture = Capture.open(self.find_capture(folder), need_frames=need_frames).with_exposures(self.exposures)
         if not (self.folder / FLARE).is_file() or self.flare is None:
-            return found
+            return capture
         model, lens = self.flare.model, self.flare.camera
         if not need_frames:
-            found = found.sized((lens.width, lens.height))
-        return found.lit(dict(zip(model.names, model.positions.numpy().astype(np.float64), strict=True)))
+            capture = capture.with_frame_size((lens.width, lens.height))
+        return capture.with_lights_at(dict(zip(model.names, model.positions.numpy().astype(np.float64), strict=True)))
 
-    def find_capture(self, given: Path | None) -> Path:
-        """The folder of its capture: the one given, else the one it was fitted to. RunError where that is gone."""
-        if given is None and not self.capture_folder.is_dir():
+    def find_capture(self, folder: Path | None) -> Path:
+        """Return the folder of the capture: `folder`, else the one that was fitted. Raises RunError if that is missing.
+        """
+        if folder is None and not self.capture_folder.is_dir():
             raise RunError(f"The capture that {self.folder} was fitted to, {self.capture_folder}, is not there; say "
                            "where it is now with --capture.")
-        return given or self.capture_folder
+        return folder or self.capture_folder
 
     @property
     def finished(self) -> bool:
-        """Whether the fit ran to its end: the flare is written last."""
+        """True if the fit ran to its end: the flare is written last."""
         return (self.folder / FLARE).is_file() or (self.settings.mode == "3dgs" and (self.folder / SCENE).is_file())
 
     @property
-    def without_flare(self) -> str:
-        """Why there is no flare in it, as a sentence."""
+    def missing_flare_message(self) -> str:
+        """Sentence on why the run has no flare."""
         if self.settings.mode == "3dgs":
             return f"{self.folder} is a fit of the scene alone (mode 3dgs) and has no flare; fit with another --mode."
         return f"{self.folder} has no {FLARE} yet; finish the fit with --resume first."
@@ -136,17 +146,17 @@ class Run:
     @cached_property
     def flare(self) -> FlareFile | None:
         """The fitted flare; None for plain 3DGS."""
-        return None if self.settings.mode == "3dgs" else flare_file.load(self._needed(FLARE))
+        return None if self.settings.mode == "3dgs" else flare_file.load(self._require(FLARE))
 
     @cached_property
     def scene(self) -> SceneGaussians:
         """The fitted scene."""
-        return read_ply(self._needed(SCENE))
+        return read_ply(self._require(SCENE))
 
     @cached_property
     def look(self) -> Look | None:
-        """The fitted flare as edits see it; None for plain 3DGS."""
-        return None if self.settings.mode == "3dgs" else read_look(self._needed(FLARE))
+        """The fitted flare for edits; None for plain 3DGS."""
+        return None if self.settings.mode == "3dgs" else read_look(self._require(FLARE))
 
     @property
     def lights(self) -> tuple[str, ...]:
@@ -160,26 +170,26 @@ class Run:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Changes whenever a picture of this run would."""
-        return digest_of(self.folder / name for name in (SCENE, FLARE))
+        """A digest that changes with any picture of this run."""
+        return hash_files(self.folder / name for name in (SCENE, FLARE))
 
-    def view(self, camera: Camera, edits: LookEdits | None = None) -> RenderedView:
-        """Scene, flares and composite as tensors."""
-        model, sampling = (self.flare.model, self.flare.sampling) if self.flare else (None, None)
+    def render_view(self, camera: Camera, edits: LookEdits | None = None) -> RenderedView:
+        """Render scene, flares and composite of a view as tensors."""
+        model, pixel_grid = (self.flare.model, self.flare.pixel_grid) if self.flare else (None, None)
         return render(self.scene, model, self.settings.blend, camera, self.settings.kernels,
-                      visibility=self.settings.flare.occluded_by_scene, look=None if edits is None else self.look,
-                      edits=edits, sampling=sampling)
+                      visibility=self.settings.flare.active_visibility, look=None if edits is None else self.look,
+                      edits=edits, pixel_grid=pixel_grid)
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
-        """The layers of a view at the camera's size, the flare as `edits` change it."""
-        view = self.view(camera, edits)
+        """Render the layers of a view at the camera's size, with the flare under `edits`."""
+        view = self.render_view(camera, edits)
         flares = {name: layer.numpy() for name, layer in view.layers.flares.items()}
         dark = np.zeros_like(view.layers.scene.numpy())
         return ViewLayers(view.layers.scene.numpy(), {name: flares.get(name, dark) for name in self.lights},
                           view.scene.depth.numpy())
 
-    def _needed(self, name: str) -> Path:
+    def _require(self, name: str) -> Path:
         if not (self.folder / name).is_file():
-            raise RunError(self.without_flare if name == FLARE else
+            raise RunError(self.missing_flare_message if name == FLARE else
                            f"{self.folder} has no {name} yet; finish the fit with --resume first.")
         return self.folder / name

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A fit from beginning to end, in a run folder that any stop leaves whole."""
+"""Runs a fit from start to end in a run folder that any stop leaves whole; the entry of `core.fit`."""
 from __future__ import annotations
 
 import contextlib
@@ -11,69 +11,70 @@ from pathlib import Path
 import torch
 
 from ..capture import Capture
-from ..conventions.pixel_grid import Sampling
+from ..conventions.pixel_grid import PixelGrid
 from ..conventions.run_files import CHECKPOINT, CONFIG, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW
 from ..errors import Cancelled, RunError
 from ..flare import file as flare_file
 from ..flare.file import FlareFile
 from ..gaussians.ply import write_ply
-from ..look import TrainedCamera, list_elements
-from ..system.files import atomic_path, remove_file, remove_partial
-from ..system.folder_lock import held
+from ..look import TrainedCamera, store_elements
+from ..system.files import atomic_path, remove_file, remove_partials_below
+from ..system.folder_lock import folder_lock
 from ..system.progress import Progress
+from ..system.reading import append_text, parse_json, read_text
 from . import checkpoint
-from .metering import with_white
-from .preview import row, spread, write_preview, write_small
+from .metering import resolve_white
+from .preview import preview_row, spread_indices, write_preview, write_small_preview
 from .rendering import render
 from .run import Run
 from .settings import FitSettings
 from .trainer import Trainer
-from .warnings import unlike
+from .warnings import outlier_warnings
 
-FIGURES_EVERY = 50
+METRICS_INTERVAL = 50
 PREVIEW_ROWS = 4
 
 
 def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: Progress | None = None, *,
         resume: bool = False) -> Run:
-    """Fit scene and flare of a capture; the run's folder holds everything that comes of it.
+    """Fit scene and flare of a capture; the results are in the run's folder.
 
-    With `resume` an unfinished run in `folder` goes on from its checkpoint, with the settings it was begun
-    with, and gives the fit that an unbroken one gives; without a run there, one is begun.
+    With `resume`, an unfinished run in `folder` continues from its checkpoint with its own settings, and gives the same
+    fit as an uninterrupted one; without a run there, one is started.
 
-    Raises CaptureError, RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint, if
-    it has begun).
+    Raises CaptureError, RunError, SettingsError, and Cancelled after a requested stop (with a checkpoint, if the fit
+    had started).
     """
     progress, folder = progress or Progress(), Path(folder)
     if resume and (folder / CONFIG).exists():
-        with held(folder):
-            run = Run.open(folder)
+        with folder_lock(folder):
+            run = Run.open(folder, progress)
             _check_capture(run, capture)
             if run.finished:
                 progress.say(f"The fit in {folder} is finished already.")
             else:
                 trainer = Trainer(capture, run.settings, run.exposures)
-                remove_partial(folder)
+                remove_partials_below(folder)
                 if (folder / CHECKPOINT).exists():
                     trainer.load_state(checkpoint.load(folder / CHECKPOINT))
                 else:
-                    _say(trainer.says, run, progress)
-                _carry_through(trainer, run, progress)
+                    _report(trainer.warnings, run, progress)
+                _run_to_end(trainer, run, progress)
         return run
-    settings, said = with_white(settings.checked(), capture)
+    settings, said = resolve_white(settings.validated(), capture)
     trainer = Trainer(capture, settings, progress=progress)  # before anything is written: it may refuse the capture
-    with held(folder):
+    with folder_lock(folder):
         run = Run.create(folder, settings, capture.folder, trainer.exposures)
-        _say((*said, *trainer.says), run, progress)
-        _carry_through(trainer, run, progress)
+        _report((*said, *trainer.warnings), run, progress)
+        _run_to_end(trainer, run, progress)
     return run
 
 
-def _carry_through(trainer: Trainer, run: Run, progress: Progress) -> None:
-    """From where the trainer stands to the results."""
+def _run_to_end(trainer: Trainer, run: Run, progress: Progress) -> None:
+    """Train from the trainer's iteration on, and write the results."""
     folder = run.folder
-    _forget_after(folder / METRICS, trainer.iteration)
-    _log(run, f"begun at iteration {trainer.iteration} of {run.settings.iterations}")
+    _truncate_metrics(folder / METRICS, trainer.iteration)
+    _log(run, f"started at iteration {trainer.iteration} of {run.settings.iterations}")
     progress.stage("fit", run.settings.iterations, trainer.iteration)
     with trainer.frames.cache.overflowing_into(folder):
         try:
@@ -84,42 +85,41 @@ def _carry_through(trainer: Trainer, run: Run, progress: Progress) -> None:
             raise
         _finish(trainer, run)
     if len(trainer.losses) == len(trainer.views):  # each has been looked at
-        _say(unlike(trainer.losses), run, progress)
+        _report(outlier_warnings(trainer.losses), run, progress)
     _log(run, f"finished at iteration {trainer.iteration}")
 
 
-def _say(texts: Iterable[str], run: Run, progress: Progress) -> None:
-    """To the person who watches, and to the log."""
+def _report(texts: Iterable[str], run: Run, progress: Progress) -> None:
+    """Report sentences to the user and to the log."""
     for text in texts:
         progress.say(text)
         _log(run, text)
 
 
 def _check_capture(run: Run, capture: Capture) -> None:
-    """Raises RunError where the run was begun with another capture, which is still there: it did not move."""
-    begun = run.capture_folder
-    if begun.is_dir() and not begun.samefile(capture.folder):
-        raise RunError(f"{run.folder} holds a fit of {begun}, not of {capture.folder}; choose another folder for this "
-                       "one.")
+    """Raise RunError if the run was made from another capture that still exists: a moved one is accepted."""
+    expected = run.capture_folder
+    if expected.is_dir() and not expected.samefile(capture.folder):
+        raise RunError(f"{run.folder} holds a fit of {expected}, not of {capture.folder}; choose another folder for "
+                       "this one.")
 
 
 def _train(trainer: Trainer, run: Run, progress: Progress) -> None:
     settings, path = run.settings, run.folder / CHECKPOINT
-    saved, began, first = time.monotonic(), time.monotonic(), trainer.iteration
+    saved, started, first = time.monotonic(), time.monotonic(), trainer.iteration
     while trainer.iteration < settings.iterations:
         figures = trainer.step()
         here = trainer.iteration
-        if here % FIGURES_EVERY == 0 or here == settings.iterations:
+        if here % METRICS_INTERVAL == 0 or here == settings.iterations:
             trainer.check_finite()
             counts = {"scene_gaussians": len(trainer.scene.means),
                       "flare_gaussians": trainer.flare.count if trainer.flare else 0}
-            pace = (time.monotonic() - began) / (here - first)
+            pace = (time.monotonic() - started) / (here - first)
             line = {"iteration": here, **figures, **counts, "seconds_per_iteration": round(pace, 5)}
-            with open(run.folder / METRICS, "a", encoding="utf-8") as stream:
-                stream.write(json.dumps(line) + "\n")
+            append_text(run.folder / METRICS, json.dumps(line) + "\n")
             figures = {**figures, **counts}
         if here % settings.preview_every == 0:
-            _preview(trainer, run)
+            _write_previews(trainer, run)
         # Saved before the progress speaks, since that is where a stop is noticed.
         if time.monotonic() - saved > settings.checkpoint_every_s:
             checkpoint.save(path, trainer.state())
@@ -128,61 +128,63 @@ def _train(trainer: Trainer, run: Run, progress: Progress) -> None:
 
 
 def _finish(trainer: Trainer, run: Run) -> None:
-    """Results first, the flare last and whole, then the checkpoint goes: a kill in between repeats the last steps, and
-    loses nothing."""
-    _preview(trainer, run)
-    sampling = Sampling.of(trainer.frames.camera(view).focal_length for view in trainer.views)
+    """Write the results, the flare last and whole, then delete the checkpoint.
+
+    After a kill in between, a resumed fit repeats these steps and loses nothing.
+    """
+    _write_previews(trainer, run)
+    pixel_grid = PixelGrid.from_focal_lengths(trainer.frames.camera(view).focal_length for view in trainer.views)
     if not run.settings.scene.frozen:
-        trainer.scene.sampling = sampling
+        trainer.scene.pixel_grid = pixel_grid
     write_ply(run.folder / SCENE, trainer.scene)
     if trainer.flare is not None:
         camera = trainer.views[0].camera
         lens = TrainedCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        seen = trainer.flare.seen_from([torch.from_numpy(view.camera.world_to_camera) for view in trainer.views])
+        poses = [torch.from_numpy(view.camera.world_to_camera) for view in trainer.views]
+        training_views = trainer.flare.training_views(poses)
         with atomic_path(run.folder / FLARE) as unnamed:
-            flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, seen=seen,
-                                                sampling=sampling))
-            list_elements(unnamed)
+            flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, training_views=training_views,
+                                                pixel_grid=pixel_grid))
+            store_elements(unnamed)
     with contextlib.suppress(OSError):  # the fit is whole without that
         remove_file(run.folder / CHECKPOINT)
 
 
 @torch.no_grad()
-def _preview(trainer: Trainer, run: Run) -> None:
-    """Some of the held-out views, or of all where none is held out."""
+def _write_previews(trainer: Trainer, run: Run) -> None:
+    """Write previews of some held-out views, or of some of all where none is held out."""
     _, held_out = trainer.capture.split(run.settings.holdout)
     views = held_out or trainer.views
     rows = []
-    for index in spread(len(views), PREVIEW_ROWS):
+    for index in spread_indices(len(views), PREVIEW_ROWS):
         camera, frame, _ = trainer.frames.targets(views[index])
         view = render(trainer.scene, trainer.flare, run.settings.blend, camera, run.settings.kernels,
-                      visibility=run.settings.flare.occluded_by_scene)
-        rows.append(row(frame, view))
+                      visibility=run.settings.flare.active_visibility)
+        rows.append(preview_row(frame, view))
     write_preview(run.folder / PREVIEW, rows)
     if rows:
-        write_small(run.folder / SMALL_PREVIEW, rows[len(rows) // 2])
+        write_small_preview(run.folder / SMALL_PREVIEW, rows[len(rows) // 2])
 
 
-def _forget_after(path: Path, iteration: int) -> None:
-    """Drop the lines of figures that a resumed fit will make again."""
+def _truncate_metrics(path: Path, iteration: int) -> None:
+    """Drop the lines of metrics that a resumed fit writes again."""
     if not path.exists():
         return
-    kept = []
-    for line in path.read_text(encoding="utf-8").splitlines():
+    lines = []
+    for line in read_text(path, errors="replace").splitlines():
         try:
-            if json.loads(line)["iteration"] <= iteration:
-                kept.append(line + "\n")
+            if parse_json(line)["iteration"] <= iteration:
+                lines.append(line + "\n")
         except (ValueError, KeyError, TypeError):
             continue  # the line that a kill cut short
     with atomic_path(path) as temporary:
-        temporary.write_text("".join(kept), encoding="utf-8", newline="\n")
+        temporary.write_text("".join(lines), encoding="utf-8", newline="\n")
 
 
 def _log(run: Run, text: str) -> None:
     stamp = time.strftime("%Y-%m-%d %H:%M:%S")
     try:
-        with open(run.folder / LOG, "a", encoding="utf-8") as stream:
-            stream.write(f"{stamp}  {text}\n")
+        append_text(run.folder / LOG, f"{stamp}  {text}\n")
     except OSError as problem:
         raise RunError(f"{run.folder / LOG} cannot be written ({problem.strerror}); make room or choose another "
                        "folder.") from problem

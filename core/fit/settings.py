@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Every setting of a fit, its presets, and the config.toml that a run keeps.
 
-Defaults are the paper's (appendix "Flare representation"); the presets change length and rates so that a
-fit ends in minutes on two CPU cores.
+Defaults are the paper's (appendix "Flare representation"); the presets change length and rates so that a fit ends in
+minutes on two CPU cores. `fit` of the commands takes a preset and overrides of it; `trainer` follows them.
 """
 from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from operator import attrgetter
@@ -17,23 +16,26 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..choices import BY_PARALLAX, ITERATIONS, LONGER_BY_PARALLAX, Blend, Kernels, Mode, Model, Preset
+from ..choices import ITERATIONS, PARALLAX_LENGTH_FACTOR, PARALLAX_MODES, Blend, Kernels, Mode, Model, Preset
 from ..colour.srgb import srgb_from_linear
 from ..errors import RunError, SettingsError
 from ..flare.density import DensitySettings
 from ..flare.model import OURS, PAPER
 from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
-from ..look.look import FORM_BOUNDS, MOST_GAUSSIANS, FlareForm
-from ..system.files import WRITTEN_BY_HAND, write_text
-from ..typed import MOST_SEED, WHOLE_DIGITS, Bounds, field_of, table_of
+from ..look.form import FORM_BOUNDS, FlareForm
+from ..look.look import MAX_GAUSSIANS
+from ..system.files import write_text
+from ..system.progress import Progress
+from ..system.reading import MAX_TOML_BYTES, UTF8_SIG, parse_toml, read_text
+from ..typed import MAX_INT_DIGITS, MAX_SEED, Bounds, parse_field, parse_table
 
 
 @dataclass(frozen=True)
 class FlareRates:
-    """Adam's learning rates for the flare; `position` decays exponentially to `position_final`.
+    """Adam's learning rates for the flare. `position` decays exponentially to `position_final`.
 
-    settled: the share of the others that is left at the end, to which they fall exponentially from the middle on.
+    final_ratio: factor that the other rates reach at the end, exponentially from the middle of the fit on.
     """
 
     network: float = 1e-4
@@ -48,7 +50,7 @@ class FlareRates:
     ring: float = 5e-3
     arc: float = 5e-3
     latent: float = 5e-3
-    settled: float = 1.0
+    final_ratio: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -66,16 +68,18 @@ class SceneRates:
 
 @dataclass(frozen=True)
 class FlareSettings:
-    """The flare: its form, the Gaussians that a light starts with, density control, rates, occlusion.
+    """The flare: its form, the number of Gaussians a light starts with, density control, rates, occlusion.
 
-    `detection` False puts every light at the centroid of the points plus uniform noise (ablation).
-    `occlusion` scales each flare by the share of its light that the scene leaves visible (`visibility`).
-    `begin`: share of the iterations in which the scene is fitted alone first, where it has flare-free frames: a
-    flare that is fitted before the scene hides its light learns to vanish by itself, and in the views beside, too.
-    `snap`: lights that were given beside their flares are put where those are (`lights.snap`), where flare-free frames
-    show them.
-    `steady`: weight of the squared delta_l in the loss. Where a light is hidden nothing else holds delta_l, and Adam
-    makes of the faintest gradient a full step: it wanders out of the frame and takes the views beside along.
+    detection: False puts every light at the centroid of the points plus uniform noise (ablation). occlusion: scale each
+    flare by the visibility of its light behind the scene (`visibility`).
+
+    scene_only_until: share of the iterations in which the scene is fitted alone, if it has clean frames. A flare that
+    is fitted before the scene hides its light learns to vanish by itself, in neighbouring views too.
+
+    snap_lights: move lights to where clean frames show their flares (`lights.snap`).
+
+    correction_weight: of the squared delta_l in the loss. Where a light is hidden nothing else holds delta_l, and Adam
+    makes a full step of the faintest gradient: delta_l would leave the frame, in neighbouring views too.
     """
 
     form: FlareForm = PAPER
@@ -85,13 +89,13 @@ class FlareSettings:
     rates: FlareRates = field(default_factory=FlareRates)
     detection: bool = True
     occlusion: bool = False
-    begin: float = 0.0
-    snap: bool = False
-    steady: float = 0.0
+    scene_only_until: float = 0.0
+    snap_lights: bool = False
+    correction_weight: float = 0.0
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
 
     @property
-    def occluded_by_scene(self) -> VisibilitySettings | None:
+    def active_visibility(self) -> VisibilitySettings | None:
         """How the scene hides lights; None where it does not."""
         return self.visibility if self.occlusion else None
 
@@ -100,9 +104,9 @@ class FlareSettings:
 class SceneSettings:
     """The scene: 3DGS from the capture's points, with one of two strategies of densification.
 
-    `sh_every`: iterations between degrees of spherical harmonics. `reorder_every`: iterations between sorts
-    along the Morton curve, which keeps neighbours together in memory. `start`: a 3DGS PLY in the capture's world
-    to begin with, instead of the points; `frozen`: it stays as it is, and only the flare is fitted.
+    sh_every: iterations between degrees of spherical harmonics. reorder_every: iterations between sorts along the
+    Morton curve, which keeps neighbours together in memory. start: a 3DGS PLY in the capture's world to start from
+    instead of the points. frozen: keep that scene unchanged and fit only the flare.
     """
 
     start: str = ""
@@ -117,48 +121,53 @@ class SceneSettings:
 
 @dataclass(frozen=True)
 class SplitSettings:
-    """Modes `split` and `estimated`: how a scene is told from flare without exact flare-free frames.
+    """Modes `split` and `estimated`: separation of scene and flare without exact clean frames, by parallax.
 
-    A flare adds light, and its place in the picture changes from view to view as no part of the scene's does. So the
-    scene is fitted alone first, until every view was looked at `rounds` times (a third of the iterations at most), to
-    what the frames agree on from below: where a frame is brighter than the scene, that counts for `excess` of what it
-    counts where it is darker. Longer, and it takes up the glow about the lights; shorter, and the flare takes walls.
-    From then on both are fitted to the frames, the scene besides from below with `weight`, in the end only where it is
-    brighter than a frame; and its light costs `glow` near where a light is seen, half of that at `reach` of the width
-    beside: what could be either's is the flare's. `sh_degree`: of the scene's colours for the share `plain` of the
-    iterations, since they could follow a flare if they were free to change with the direction. `sky`: points far away
-    to begin with.
-    When the flare is due it is asked whether the scene has been found: flares only add, but errors go both ways. Where
-    the square of what the frames have more than the scene is less than `found` times that of what they have less, the
-    flare's light costs `haze` away from the lights: what could be either's is the flare's near them alone.
-    Mode `estimated`: from the moment the flare is due to the middle of the fit the scene is drawn to the estimated
-    flare-free frames as well, less and less: what they have left of the flare goes again by parallax. Of what they say
-    that the flare adds nothing costs `haze` just below `found`, all at `lost` times and less.
+    A flare adds light, and it moves through the frame from view to view as no part of the scene does. So the scene is
+    fitted alone first, in `scene_only_rounds` passes over the views (a third of the iterations at most), with a
+    quantile loss: where a frame is brighter than the scene, the error counts `excess_weight` times as much. Longer, and
+    the scene takes up the glow about the lights; shorter, and the flare takes walls.
+
+    Then both are fitted to the frames. The quantile loss of the scene stays, with `scene_weight`, and by the middle of
+    the fit counts only where the scene is brighter than a frame. The scene's light near a visible light costs
+    `near_scene_penalty`, half of that at `light_radius` of the width: what both could make goes to the flare. The
+    scene's colours have degree `sh_degree` for the share `low_sh_until` of the iterations, since they could follow a
+    flare if they changed freely with direction. sky: add far points at the start.
+
+    When the flare starts, the scene is tested for convergence: flares only add light, while errors have both signs. If
+    the squared excess of the frames over the scene is less than `converged_ratio` times their squared deficit, the
+    flare's light far from the lights costs `far_flare_penalty`: what both could make goes to the flare near the lights
+    only.
+
+    Mode `estimated`: until the middle of the fit the scene is also fitted to the estimated clean frames, with a falling
+    weight; the flare that these still hold is removed by parallax. Of the flare that they show, nothing is penalised
+    just below `converged_ratio`, and all of it at `diverged_ratio` and below.
     """
 
-    rounds: int = 2
-    excess: float = 0.25
-    weight: float = 0.05
-    glow: float = 0.05
-    reach: float = 0.05
+    scene_only_rounds: int = 2
+    excess_weight: float = 0.25
+    scene_weight: float = 0.05
+    near_scene_penalty: float = 0.05
+    light_radius: float = 0.05
     sh_degree: int = 1
-    plain: float = 0.7
+    low_sh_until: float = 0.7
     sky: bool = True
-    found: float = 26.0
-    lost: float = 18.0
-    haze: float = 0.1
+    converged_ratio: float = 26.0
+    diverged_ratio: float = 18.0
+    far_flare_penalty: float = 0.1
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """A whole fit. `width`: the working width in pixels at most; 0 keeps the frames' own size.
+    """All settings of a fit. width: largest working width in pixels; 0 keeps the frames' own size.
 
-    ssim_share is 1 - lambda of the paper's loss. `apart`: share of the iterations at the beginning in which the
-    flare is put before the flare-free frames instead of the scene; 0 in the paper. `holdout`: a number N (every N-th
-    view is held out; 0: none), a split file's name, or None (the capture's split.json, else every 8th).
-    exposure: "found" looks for frames that are exposed otherwise than most, "fixed" takes all for alike.
-    `white`: scene-linear light at which frames are clipped; None where a fit has yet to look whether its frames hold
-    more than 1, which only float frames can, and in runs of versions that clipped all there.
+    ssim_share is 1 - lambda of the paper's loss. separate_until: share of the iterations, from the start, in which the
+    flare is composited over the clean frames instead of the scene; 0 in the paper. holdout: a number N (every N-th view
+    is held out; 0: none), a split file's name, or None (the capture's split.json, else every 8th). exposure: "measured"
+    finds frames whose exposure differs from most, "fixed" takes all for equal.
+
+    white: scene-linear light at which frames are clipped; None where the frames have not been checked for more than 1,
+    which only float frames can hold, and in runs of versions that clipped all at 1.
     """
 
     mode: Mode = "default"
@@ -167,10 +176,10 @@ class FitSettings:
     width: int = 0
     seed: int = 0
     ssim_share: float = 0.1
-    apart: float = 0.0
+    separate_until: float = 0.0
     holdout: str | int | None = None
     white: float | None = None
-    exposure: Literal["found", "fixed"] = "found"
+    exposure: Literal["measured", "fixed"] = "measured"
     kernels: Kernels = "auto"
     checkpoint_every_s: float = 60.0
     preview_every: int = 1000
@@ -180,17 +189,17 @@ class FitSettings:
 
     @property
     def supervised(self) -> bool:
-        """Whether the scene is taught by flare-free frames that are taken for exact."""
+        """True if clean frames that are taken for exact supervise the scene."""
         return self.mode in ("default", "2d")
 
     @property
-    def by_parallax(self) -> bool:
-        """Whether scene and flare are told apart by parallax."""
-        return self.mode in BY_PARALLAX
+    def uses_parallax(self) -> bool:
+        """True if scene and flare are separated by parallax."""
+        return self.mode in PARALLAX_MODES
 
     @property
-    def looks_at_removed(self) -> bool:
-        """Whether the fit needs flare-free frames, exact or estimated."""
+    def needs_clean_frames(self) -> bool:
+        """True if the fit needs clean frames, exact or estimated."""
         return self.supervised or self.mode == "estimated"
 
     @property
@@ -198,17 +207,18 @@ class FitSettings:
         """`white` as a display value; 1 where it is not known."""
         return 1.0 if self.white is None else float(srgb_from_linear(np.array(self.white)))
 
-    def checked(self) -> FitSettings:
-        """Itself; raises SettingsError where a number lies outside of its `BOUNDS`, or values do not go together."""
+    def validated(self) -> FitSettings:
+        """Return the settings. Raises SettingsError if a number is outside its `BOUNDS`, or values contradict each
+        other."""
         for name, bounds in BOUNDS.items():
             value = attrgetter(name)(self)
-            if isinstance(value, int | float) and not bounds.hold(value):
+            if isinstance(value, int | float) and not bounds.contains(value):
                 raise SettingsError(f"The settings cannot be used: {name} must lie {bounds}.")
         checks = (
-            (_is_holdout(self.holdout), "holdout must be a number of a few digits or the name of a split file"),
+            (_is_valid_holdout(self.holdout), "holdout must be a number of a few digits or the name of a split file"),
             (not self.scene.frozen or bool(self.scene.start), "a frozen scene needs a PLY to start from"),
             (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),
-            (self.flare.form.consistent, "a form with arcs needs rings, and ellipses instead of solid Gaussians"),
+            (self.flare.form.is_consistent, "a form with arcs needs rings, and ellipses instead of solid Gaussians"),
         )
         for good, sentence in checks:
             if not good:
@@ -216,110 +226,117 @@ class FitSettings:
         return self
 
 
-def _is_holdout(holdout: str | int | None) -> bool:
-    """Whether text that reads as a number is one that can be counted to: `Capture.split` takes it for that."""
+def _is_valid_holdout(holdout: str | int | None) -> bool:
+    """True unless it is a number of too many digits: `Capture.split` takes text of digits for a number."""
     if not isinstance(holdout, str) or not holdout.strip().lstrip("+-").isdigit():
         return True
-    return re.fullmatch(rf"[+-]?\d{{1,{WHOLE_DIGITS}}}", holdout.strip()) is not None
+    return re.fullmatch(rf"[+-]?\d{{1,{MAX_INT_DIGITS}}}", holdout.strip()) is not None
 
 
 # ---- what the numbers may be ----------------------------------------------------------------------
 
-_COUNTED = 2**63 - 1  # TOML has no greater whole numbers
-_LARGE = 1e30  # what float32 still computes with
-_FROM_0, _FROM_1 = Bounds(0, _COUNTED), Bounds(1, _COUNTED)
-_SHARE = Bounds(0, 1)
-_BETWEEN = Bounds(0, 1, above=True, below=True)  # has a logit
-_AMOUNT = Bounds(0, _LARGE)  # a weight, or a rate: at 0 what it is of stays as it is
-_POSITIVE = Bounds(0, _LARGE, above=True)  # a rate that falls by a ratio, or is refused at 0 by its optimiser
+_MAX_INT = 2**63 - 1  # TOML has no greater whole numbers
+_MAX_FLOAT = 1e30  # what float32 still computes with
+_FROM_0, _FROM_1 = Bounds(0, _MAX_INT), Bounds(1, _MAX_INT)
+_UNIT = Bounds(0, 1)
+_OPEN_UNIT = Bounds(0, 1, exclusive_minimum=True, exclusive_maximum=True)  # has a logit
+_NON_NEGATIVE = Bounds(0, _MAX_FLOAT)  # a weight, or a rate: at 0 what it is of stays as it is
+# A rate that falls by a ratio, or that its optimiser refuses at 0.
+_POSITIVE = Bounds(0, _MAX_FLOAT, exclusive_minimum=True)
 
 BOUNDS: dict[str, Bounds] = {
-    "iterations": Bounds(1, 10**9), "width": _FROM_0, "seed": Bounds(0, MOST_SEED), "ssim_share": _SHARE,
-    "apart": _SHARE, "holdout": _FROM_0, "white": Bounds(1, 65504), "checkpoint_every_s": _AMOUNT,
+    "iterations": Bounds(1, 10**9), "width": _FROM_0, "seed": Bounds(0, MAX_SEED), "ssim_share": _UNIT,
+    "separate_until": _UNIT, "holdout": _FROM_0, "white": Bounds(1, 65504), "checkpoint_every_s": _NON_NEGATIVE,
     "preview_every": _FROM_1,
 
-    "flare.count": Bounds(1, MOST_GAUSSIANS), "flare.opacity": _BETWEEN, "flare.begin": Bounds(0, 1, below=True),
-    "flare.steady": _AMOUNT,
+    "flare.count": Bounds(1, MAX_GAUSSIANS), "flare.opacity": _OPEN_UNIT,
+    "flare.scene_only_until": Bounds(0, 1, exclusive_maximum=True),
+    "flare.correction_weight": _NON_NEGATIVE,
     **{f"flare.form.{name}": bounds for name, bounds in FORM_BOUNDS.items()},
     "flare.density.start": _FROM_0, "flare.density.stop": _FROM_0, "flare.density.every": _FROM_1,
-    "flare.density.clone_above": _SHARE, "flare.density.clone_ratio": _SHARE, "flare.density.noise": _AMOUNT,
-    "flare.density.prune_below": _SHARE, "flare.density.most": Bounds(0, MOST_GAUSSIANS),
+    "flare.density.clone_above": _UNIT, "flare.density.clone_ratio": _UNIT, "flare.density.noise": _NON_NEGATIVE,
+    "flare.density.prune_below": _UNIT, "flare.density.max_gaussians": Bounds(0, MAX_GAUSSIANS),
     **dict.fromkeys((f"flare.rates.{name}" for name in (
-        "network", "features", "opacity", "scale", "rotation", "offset", "ring", "arc", "latent")), _AMOUNT),
+        "network", "features", "opacity", "scale", "rotation", "offset", "ring", "arc", "latent")), _NON_NEGATIVE),
     **dict.fromkeys(("flare.rates.grids", "flare.rates.position", "flare.rates.position_final"), _POSITIVE),
-    "flare.rates.settled": Bounds(0, 1, above=True),
-    "flare.visibility.radius": Bounds(1e-6, 1), "flare.visibility.margin": _SHARE,
+    "flare.rates.final_ratio": Bounds(0, 1, exclusive_minimum=True),
+    "flare.visibility.radius": Bounds(1e-6, 1), "flare.visibility.margin": _UNIT,
     "flare.visibility.pixels": Bounds(1, 1024),
 
     "scene.sh_every": _FROM_1, "scene.reorder_every": _FROM_1,
     "scene.classic.start": _FROM_0, "scene.classic.stop": _FROM_0, "scene.classic.every": _FROM_1,
-    "scene.classic.gradient": _AMOUNT, "scene.classic.small": _AMOUNT, "scene.classic.large": _POSITIVE,
-    "scene.classic.faint": Bounds(0, 1, below=True), "scene.classic.reset_every": _FROM_1,
-    "scene.classic.reset_to": _BETWEEN, "scene.classic.cap": _FROM_1,
+    "scene.classic.gradient": _NON_NEGATIVE, "scene.classic.small": _NON_NEGATIVE, "scene.classic.large": _POSITIVE,
+    "scene.classic.faint": Bounds(0, 1, exclusive_maximum=True), "scene.classic.reset_every": _FROM_1,
+    "scene.classic.reset_to": _OPEN_UNIT, "scene.classic.cap": _FROM_1,
     "scene.mcmc.cap": _FROM_1, "scene.mcmc.start": _FROM_0, "scene.mcmc.stop": _FROM_0, "scene.mcmc.every": _FROM_1,
-    "scene.mcmc.growth": Bounds(1, 100), "scene.mcmc.faint": Bounds(0, 1, below=True), "scene.mcmc.noise": _AMOUNT,
-    "scene.mcmc.opacity_weight": _AMOUNT, "scene.mcmc.scale_weight": _AMOUNT,
+    "scene.mcmc.growth": Bounds(1, 100),
+    "scene.mcmc.faint": Bounds(0, 1, exclusive_maximum=True), "scene.mcmc.noise": _NON_NEGATIVE,
+    "scene.mcmc.opacity_weight": _NON_NEGATIVE, "scene.mcmc.scale_weight": _NON_NEGATIVE,
     **dict.fromkeys((f"scene.rates.{name}" for name in (
-        "features", "features_rest", "opacity", "scale", "rotation")), _AMOUNT),
+        "features", "features_rest", "opacity", "scale", "rotation")), _NON_NEGATIVE),
     **dict.fromkeys(("scene.rates.position", "scene.rates.position_final"), _POSITIVE),
 
-    "split.rounds": _FROM_0, "split.excess": _SHARE, "split.found": _AMOUNT, "split.lost": _AMOUNT,
-    "split.haze": _AMOUNT, "split.weight": _AMOUNT, "split.glow": _AMOUNT, "split.reach": Bounds(1e-6, 1e6),
-    "split.plain": _SHARE, "split.sh_degree": Bounds(0, 3),
+    "split.scene_only_rounds": _FROM_0, "split.excess_weight": _UNIT, "split.light_radius": Bounds(1e-6, 1e6),
+    **dict.fromkeys((f"split.{name}" for name in (
+        "converged_ratio", "diverged_ratio", "far_flare_penalty", "scene_weight", "near_scene_penalty")),
+        _NON_NEGATIVE),
+    "split.low_sh_until": _UNIT, "split.sh_degree": Bounds(0, 3),
 }
-"""What each number among the settings may be, by its dotted name; some may be None or text instead."""
+"""Range of each numeric setting, by its dotted name; some may be None or text instead."""
 
 
-APART = 0.7
-"""Share of the iterations in which our form fits scene and flare apart."""
-BEGIN = 0.08
-"""Share of the iterations in which our form fits the scene alone."""
-STEADY = 0.1
-"""Far less than what the picture holds delta_l with where there is a flare, far more than what pulls it elsewhere."""
-SETTLED = 0.05
-"""Share of the flare's rates that is left at the end of a short schedule."""
+SEPARATE_UNTIL = 0.7
+"""`separate_until` of our form."""
+SCENE_ONLY_UNTIL = 0.08
+"""`flare.scene_only_until` of our form."""
+CORRECTION_WEIGHT = 0.1
+"""`flare.correction_weight` of our form: far below what the frames hold delta_l with where there is a flare, far above
+what pulls it elsewhere."""
+FINAL_RATIO = 0.05
+"""`flare.rates.final_ratio` of the short presets."""
 
 
 def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
            blend: Blend | None = None, iterations: int | None = None) -> FitSettings:
-    """Settings by name, with every schedule stretched to the number of iterations.
+    """Return the settings of a preset, with every schedule scaled to the number of iterations.
 
-    paper     the paper's form and figures, 30,000 iterations
-    draft, standard, high: our form, shorter schedules with higher rates (README has times and figures)
-
-    All are a fifth longer in the modes `estimated` and `split`, unless `iterations` says how long. `model` and `blend`
+    `paper` has the paper's form and figures, 30,000 iterations. `draft`, `standard` and `high` have our form, shorter
+    schedules and higher rates.
+    All are a fifth longer in the modes `estimated` and `split`, unless `iterations` is given. `model` and `blend`
     choose another form: the paper's covers in display space, ours adds in linear light and is hidden by the scene.
     """
     if name not in ITERATIONS:
         raise SettingsError(f"There is no preset {name!r}; choose {', '.join(ITERATIONS)}.")
     length = iterations
     if length is None:
-        length = round(ITERATIONS[name] * (LONGER_BY_PARALLAX if mode in BY_PARALLAX else 1))
+        length = round(ITERATIONS[name] * (PARALLAX_LENGTH_FACTOR if mode in PARALLAX_MODES else 1))
     model = model or ("paper" if name == "paper" else "ours")
     form = replace(PAPER if model == "paper" else OURS, line=mode != "2d")
     if blend is None:
         blend = "over" if model == "paper" else "add"
     flare = FlareSettings(form=form)
     if model == "ours":
-        flare = replace(flare, occlusion=True, begin=BEGIN, snap=True, steady=STEADY)
+        flare = replace(flare, occlusion=True, scene_only_until=SCENE_ONLY_UNTIL, snap_lights=True,
+                        correction_weight=CORRECTION_WEIGHT)
+    # Validated before schedules are computed from its length.
     settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=flare,
-                           apart=APART if model == "ours" else 0.0).checked()  # schedules are computed from its length
+                           separate_until=SEPARATE_UNTIL if model == "ours" else 0.0).validated()
     if name == "paper":
-        settings = _stretched(settings, length / ITERATIONS["paper"])
+        settings = _scale_schedule(settings, length / ITERATIONS["paper"])
     else:
         count, most = {"draft": (300, 40_000), "standard": (500, 60_000), "high": (700, 200_000)}[name]
-        settings = _shortened(settings, count, most)
+        settings = _shorten_schedule(settings, count, most)
     if blend == "add":
         # Light that adds is fainter than what covers: a ghost is a hundredth of white, not a tenth of opaque.
         density = replace(settings.flare.density, clone_above=5e-4, prune_below=2e-4)
         settings = replace(settings, flare=replace(settings.flare, opacity=0.01, density=density))
-    return settings.checked()
+    return settings.validated()
 
 
-def _stretched(settings: FitSettings, times: float) -> FitSettings:
-    """The same events at the same shares of a fit that is so many times as long."""
+def _scale_schedule(settings: FitSettings, factor: float) -> FitSettings:
+    """Scale every schedule by a factor, so that events keep their share of a fit that is that much longer."""
     def at(iteration: int) -> int:
-        return max(round(iteration * times), 1)
+        return max(round(iteration * factor), 1)
 
     density, scene = settings.flare.density, settings.scene
     density = replace(density, start=at(density.start), stop=at(density.stop), every=at(density.every))
@@ -331,21 +348,22 @@ def _stretched(settings: FitSettings, times: float) -> FitSettings:
                    scene=replace(scene, classic=classic, mcmc=mcmc, sh_every=at(scene.sh_every)))
 
 
-def _shortened(settings: FitSettings, count: int, most: int) -> FitSettings:
-    """A schedule for a short fit: the same events at the same shares of the whole, and higher rates.
+def _shorten_schedule(settings: FitSettings, count: int, max_gaussians: int) -> FitSettings:
+    """Return a schedule for a short fit: events at the same shares of the whole, and higher rates.
 
-    A light starts with `count` Gaussians; the scene has at most `most`.
+    A light starts with `count` Gaussians; the scene has at most `max_gaussians`.
     """
     length = settings.iterations
     every = max(round(length / 40), 20)
-    begin = settings.flare.begin
+    begin = settings.flare.scene_only_until
     density = replace(settings.flare.density, start=max(round(length * (begin + 0.1)), every),
                       stop=round(length * (begin * 0.6 + 0.6)), every=every, clone_ratio=0.1)
     rates = replace(settings.flare.rates, network=1e-3, grids=5e-3, position=1.6e-3, position_final=1.6e-5,
-                    features=1e-2, scale=0.02, rotation=5e-3, ring=2e-2, arc=2e-2, settled=SETTLED)
+                    features=1e-2, scale=0.02, rotation=5e-3, ring=2e-2, arc=2e-2, final_ratio=FINAL_RATIO)
     classic = replace(settings.scene.classic, start=round(length * 0.05), stop=round(length * 0.6),
-                      every=max(round(length / 50), 20), reset_every=10 * length, cap=most)
-    mcmc = replace(settings.scene.mcmc, start=classic.start, stop=round(length * 0.8), every=classic.every, cap=most)
+                      every=max(round(length / 50), 20), reset_every=10 * length, cap=max_gaussians)
+    mcmc = replace(settings.scene.mcmc, start=classic.start, stop=round(length * 0.8), every=classic.every,
+                   cap=max_gaussians)
     scene = replace(settings.scene, classic=classic, mcmc=mcmc, sh_every=max(round(length / 6), 1),
                     rates=replace(settings.scene.rates, position=3.2e-4, position_final=3.2e-6))
     flare = replace(settings.flare, count=count, density=density, rates=rates)
@@ -355,8 +373,58 @@ def _shortened(settings: FitSettings, count: int, most: int) -> FitSettings:
 # ---- config.toml ----------------------------------------------------------------------------------
 
 
+RENAMED = {
+    "apart": "separate_until", "flare.begin": "flare.scene_only_until", "flare.snap": "flare.snap_lights",
+    "flare.steady": "flare.correction_weight", "flare.density.most": "flare.density.max_gaussians",
+    "flare.rates.settled": "flare.rates.final_ratio", "split.rounds": "split.scene_only_rounds",
+    "split.excess": "split.excess_weight", "split.weight": "split.scene_weight",
+    "split.glow": "split.near_scene_penalty", "split.reach": "split.light_radius", "split.plain": "split.low_sh_until",
+    "split.found": "split.converged_ratio", "split.lost": "split.diverged_ratio",
+    "split.haze": "split.far_flare_penalty"}
+"""The present name of each setting that was renamed, by its name in runs of format 0; both are read."""
+RENAMED_VALUES = {("exposure", "found"): "measured"}
+"""The present value of settings whose values were renamed, by (present name, value in runs of format 0)."""
+
+
+def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return settings by dotted name under their present names and values, and the present name of each old one used.
+
+    Of an old and a present name of one setting the later counts.
+    """
+    current, renamed = {}, {}
+    for name, value in values.items():
+        present = RENAMED.get(name, name)
+        if present != name:
+            renamed[name] = present
+        known = isinstance(value, str) and (present, value) in RENAMED_VALUES
+        current[present] = RENAMED_VALUES[present, value] if known else value
+    return current, renamed
+
+
+def _flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values of nested tables by dotted name; an empty table stays one."""
+    flat: dict[str, Any] = {}
+    for name, value in table.items():
+        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) and value else {prefix + name: value}
+    return flat
+
+
+def _nest(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Undo `_flatten`. Raises ValueError where a name is both a value and a table."""
+    tables: dict[str, Any] = {}
+    for name, value in flat.items():
+        *keys, last = name.split(".")
+        table = tables
+        for key in keys:
+            table = table.setdefault(key, {})
+            if not isinstance(table, dict):
+                raise ValueError(f"{key} is both a value and a table")
+        table[last] = value
+    return tables
+
+
 def write_config(path: Path, settings: FitSettings) -> None:
-    """Every setting, resolved, as TOML."""
+    """Write every setting, resolved, as TOML."""
     lines: list[str] = []
     _write_table(lines, [], settings)
     write_text(path, "\n".join(lines).lstrip("\n") + "\n")
@@ -369,13 +437,13 @@ def _write_table(lines: list[str], keys: list[str], table: Any) -> None:
     for entry in plain:
         value = getattr(table, entry.name)
         if value is not None:  # TOML has no null; what is absent has its default, None
-            lines.append(f"{entry.name} = {_toml(value)}")
+            lines.append(f"{entry.name} = {_to_toml(value)}")
     for entry in fields(table):
         if entry not in plain:
             _write_table(lines, [*keys, entry.name], getattr(table, entry.name))
 
 
-def _toml(value: Any) -> str:
+def _to_toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -384,32 +452,45 @@ def _toml(value: Any) -> str:
     return repr(value)
 
 
-def read_config(path: Path) -> FitSettings:
-    """The settings of a run. Raises RunError where the file is missing, damaged, or holds unknown names."""
+def read_config(path: Path, progress: Progress | None = None) -> FitSettings:
+    """Read the settings of a run; with `progress`, old names are reported in one line.
+
+    Raises RunError if the file is missing, damaged, or has unknown names.
+    """
     try:
-        data = tomllib.loads(path.read_text(encoding=WRITTEN_BY_HAND))
+        data = parse_toml(read_text(path, MAX_TOML_BYTES, UTF8_SIG))
         if "mode" not in data:  # what is cut off would pass for settings that are left as they come
             raise ValueError("it has no mode")
-        if isinstance(data.get("split"), dict):
-            data["split"].pop("excess_unfound", None)  # of versions whose scenes went on alone when not found
-        return table_of(FitSettings, data).checked()
+        values, renamed = current_names(_flatten(data))
+        values.pop("split.excess_unfound", None)  # of versions that fitted an unconverged scene alone
+        settings: FitSettings = parse_table(FitSettings, _nest(values)).validated()
     except OSError as problem:
         raise RunError(f"{path} cannot be read ({problem.strerror}); is this the folder of a run?") from problem
     except (ValueError, TypeError, SettingsError) as problem:
         raise RunError(f"{path} is not a fit's configuration ({problem}); start the fit anew.") from problem
+    if renamed and progress is not None:
+        names = ", ".join(f"{old} is now {new}" for old, new in renamed.items())
+        progress.say(f"{path} has old names of settings, which still work in this version: {names}.")
+    return settings
 
 
-def changed(settings: FitSettings, values: Mapping[str, Any]) -> FitSettings:
-    """Settings with some replaced by dotted name, e.g. {"flare.rates.network": 1e-3}.
+def override_settings(settings: FitSettings, values: Mapping[str, Any],
+                      progress: Progress | None = None) -> FitSettings:
+    """Return settings with some replaced by dotted name, such as {"flare.rates.network": 1e-3}.
 
-    Raises SettingsError for a name or a kind of value that does not exist.
+    Old names work too, and with `progress` the present ones are reported. Raises SettingsError for an unknown name or a
+    value of the wrong kind.
     """
+    values, renamed = current_names(values)
+    for old, new in renamed.items():
+        if progress is not None:
+            progress.say(f"The setting {old} is now {new}; the old name still works in this version.")
     for name, value in values.items():
-        settings = _changed(settings, name.split("."), value, name)
-    return settings.checked()
+        settings = _override(settings, name.split("."), value, name)
+    return settings.validated()
 
 
-def _changed(table: Any, keys: list[str], value: Any, name: str) -> Any:
+def _override(table: Any, keys: list[str], value: Any, name: str) -> Any:
     known = {entry.name for entry in fields(table)}
     if keys[0] not in known:
         raise SettingsError(f"There is no setting {name!r}; here there are {', '.join(sorted(known))}.")
@@ -417,8 +498,8 @@ def _changed(table: Any, keys: list[str], value: Any, name: str) -> Any:
     if len(keys) > 1:
         if not is_dataclass(now):
             raise SettingsError(f"There is no setting {name!r}; {keys[0]} has no parts.")
-        return replace(table, **{keys[0]: _changed(now, keys[1:], value, name)})
+        return replace(table, **{keys[0]: _override(now, keys[1:], value, name)})
     try:
-        return replace(table, **{keys[0]: field_of(type(table), keys[0], value)})
+        return replace(table, **{keys[0]: parse_field(type(table), keys[0], value)})
     except (ValueError, TypeError) as problem:
         raise SettingsError(f"The setting {name!r} cannot be used so ({problem}).") from problem

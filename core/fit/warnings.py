@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is told of footage that a flare can hardly be learned from, before a fit begins and as it ends, and of lights
-that it put elsewhere."""
+"""Warnings on footage that a flare can hardly be learned from, on outlier frames, and on lights that were moved.
+
+`trainer` collects them before a fit, `run_loop` adds those after it.
+"""
 from __future__ import annotations
 
 import math
@@ -11,69 +13,70 @@ import numpy as np
 from ..capture import Capture, View
 from ..colour.srgb import LUMINANCE, linear_from_srgb
 from ..flare.model import FlareModel
-from ..images.read import holds_floats
-from ..thinning import thinned
-from .frames import Frames
+from ..images.read import has_float_pixels
+from .frames import Frames, subsample
 from .settings import FitSettings
 
-FEW = 12
-"""Views: of 6 the sample's flare comes to 28.8 dB, of 50 to 33.6."""
-ASKED = 8
-"""About as many frames are asked for their light."""
-GREY, FAR_FROM_GREY = 0.18, 3.0
-"""Scene-linear light in the middle of a usual frame, and stops from there at which a fit does badly: the sample's
-frames as EXR times 16, or a sixteenth, leave nine tenths of the flare unfound."""
+MIN_VIEWS = 12
+"""Views below which a fit warns: with 6 the sample's flare reaches 28.8 dB, with 50 33.6."""
+SAMPLED_VIEWS = 8
+"""Approximate number of frames whose light is measured."""
+MIDDLE_GREY, MAX_STOPS_FROM_GREY = 0.18, 3.0
+"""Scene-linear median of a usual frame, and the distance from it in stops above which a fit does badly: with the
+sample's frames as EXR times 16, or a sixteenth, nine tenths of the flare are missed."""
 
-ASTRAY = 1e4
-"""Extents of the capture, at which the cameras' middle is too far from the world's origin: points are kept in 32 bits,
-a thousandth of the extent and more apart there."""
+MAX_ORIGIN_DISTANCE = 1e4
+"""Distance of the cameras' centre from the world's origin, in extents of the capture, above which 32 bit positions are
+too coarse: they are a thousandth of the extent or more apart there."""
 
-UNLIKE, FEW_UNLIKE = 4.0, 0.1
-"""Times the usual loss, at which a frame does not look like what the others make of it; in more than which part of the
-frames it is the fit that is bad."""
-SEEN = 0.01
-"""Loss below which nothing is unlike."""
-NAMED = 5
-"""Of the frames that are unlike, so many are told by name."""
-
-
-def doubts(capture: Capture, settings: FitSettings, views: Sequence[View], frames: Frames) -> tuple[str, ...]:
-    """Sentences on footage that a flare can hardly be told from."""
-    found = []
-    if settings.by_parallax and capture.only_turns:
-        found.append("The camera only turns: without parallax scene and flare cannot be told apart; give flare-free "
-                     "frames in removed/, or footage for which the camera moves.")
-    if settings.mode != "3dgs" and len(views) < FEW:
-        found.append(f"{len(views)} frames are few to learn a flare from, which shows itself by how it changes with "
-                     "the lights' places in the picture; it will be worse than it could be from twenty or more.")
-    off, extent = float(np.linalg.norm(capture.centre)), capture.extent
-    if off > ASTRAY * extent:
-        found.append(f"The world's origin is far away: the cameras' middle lies {off:.3g} units from it, in a capture "
-                     f"of {extent:.3g}, and what 32 bits hold of places there is too coarse. Move cameras, points and "
-                     "lights to the middle first, by COLMAP's model_transformer or model_aligner for instance.")
-    if all(holds_floats(capture.frame_path(view)) for view in views):
-        light = [linear_from_srgb(frames.frame(view).numpy()) @ LUMINANCE for view in thinned(views, ASKED)]
-        middle = float(np.median([np.median(one) for one in light]))
-        if middle > 0 and abs(math.log2(middle / GREY)) > FAR_FROM_GREY:
-            found.append(f"The frames' light is {middle:.2g} in the middle, where a fit expects about {GREY:g}: what "
-                         "is far brighter or darker is learned badly. Bring the files' exposure there first.")
-    return tuple(found)
+OUTLIER_RATIO, MAX_OUTLIER_SHARE = 4.0, 0.1
+"""Factor on the median loss above which a frame is an outlier, and the largest share of the frames that may be
+outliers; with more the fit itself is bad."""
+MIN_OUTLIER_LOSS = 0.01
+"""Loss below which no frame is an outlier."""
+MAX_NAMES = 5
+"""Number of outlier frames that are named."""
 
 
-def unlike(losses: Mapping[str, float]) -> tuple[str, ...]:
-    """A sentence on the few frames, by name, whose loss at the end of a fit is many times that of most."""
-    usual = float(np.median(list(losses.values()))) if losses else 0.0
-    names = [name for name, loss in losses.items() if loss > max(UNLIKE * usual, SEEN)]
-    if not names or len(names) > max(FEW_UNLIKE * len(losses), 1):
+def footage_warnings(capture: Capture, settings: FitSettings, views: Sequence[View], frames: Frames) -> tuple[str, ...]:
+    """Return sentences on footage from which a flare can hardly be separated."""
+    warnings = []
+    if settings.uses_parallax and capture.is_rotation_only:
+        warnings.append("The camera only turns: without parallax scene and flare cannot be told apart; give clean "
+                        "frames in removed/, or footage in which the camera moves.")
+    if settings.mode != "3dgs" and len(views) < MIN_VIEWS:
+        warnings.append(f"{len(views)} frames are few to learn a flare from: it shows in how it changes with the "
+                        "lights' positions in the frame; with twenty or more it will be better.")
+    distance, extent = float(np.linalg.norm(capture.centre)), capture.extent
+    if distance > MAX_ORIGIN_DISTANCE * extent:
+        warnings.append(f"The world's origin is far away: the cameras' centre lies {distance:.3g} units from it, in a "
+                        f"capture of {extent:.3g}, and 32 bit positions are too coarse there. Move cameras, points "
+                        "and lights to the origin first, with COLMAP's model_transformer or model_aligner for "
+                        "instance.")
+    if all(has_float_pixels(capture.frame_path(view)) for view in views):
+        light = [linear_from_srgb(frames.frame(view).numpy()) @ LUMINANCE for view in subsample(views, SAMPLED_VIEWS)]
+        median = float(np.median([np.median(luminances) for luminances in light]))
+        if median > 0 and abs(math.log2(median / MIDDLE_GREY)) > MAX_STOPS_FROM_GREY:
+            warnings.append(f"The frames' median light is {median:.2g}, and a fit expects about {MIDDLE_GREY:g}: "
+                            "frames that are far brighter or darker are fitted badly. Change the files' exposure "
+                            "first.")
+    return tuple(warnings)
+
+
+def outlier_warnings(losses: Mapping[str, float]) -> tuple[str, ...]:
+    """Return a sentence that names the few frames whose loss at the end of a fit is many times the median."""
+    median = float(np.median(list(losses.values()))) if losses else 0.0
+    names = [name for name, loss in losses.items() if loss > max(OUTLIER_RATIO * median, MIN_OUTLIER_LOSS)]
+    if not names or len(names) > max(MAX_OUTLIER_SHARE * len(losses), 1):
         return ()
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return (f"{', '.join(names[:NAMED])}{more}: what the fit makes of the shot does not look like it; it may be of "
-            "another scene, or its camera be wrong. Take it out of the capture, and fit again.",)
+    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+    return (f"{', '.join(names[:MAX_NAMES])}{more}: the fit does not reproduce the shot; it may be of "
+            "another scene, or its camera may be wrong. Take it out of the capture, and fit again.",)
 
 
-def moved_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
-    """A sentence for each light that is not where the capture has it."""
+def moved_light_warnings(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
+    """Return a sentence for each light that the fit moved from its position in the capture."""
     away = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
             zip(capture.lights, flare.positions.numpy(), strict=True)]
-    return tuple(f"The light {light.name!r} was put where its flare is, {distance:.3g} from where it was given."
+    return tuple(f"The light {light.name!r} was moved to its flare, {distance:.3g} units from where lights.json has it."
                  for light, distance in zip(capture.lights, away, strict=True) if distance > 0)

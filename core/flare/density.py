@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cloning and pruning of flare Gaussians (paper, appendix "Flare representation")."""
+"""Clones and prunes flare Gaussians (paper, appendix "Flare representation"); the trainer calls it."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -15,9 +15,9 @@ from .model import LightFlare
 class DensitySettings:
     """When and how flare Gaussians are cloned and pruned; the defaults are the paper's.
 
-    Iterations `start` to `stop`, every `every`; those with opacity above `clone_above` are cloned with
-    probability `clone_ratio` and moved by Gaussian noise of `noise` in mu; those below `prune_below` go.
-    `most` bounds the Gaussians of one light.
+    Iterations `start` to `stop`, every `every`. Gaussians with opacity above `clone_above` are cloned with probability
+    `clone_ratio` and moved by Gaussian noise of `noise` in mu; those below `prune_below` are pruned. `max_gaussians`
+    bounds those of one light.
     """
 
     start: int = 1000
@@ -27,9 +27,10 @@ class DensitySettings:
     clone_ratio: float = 0.2
     noise: float = 0.02
     prune_below: float = 0.002
-    most: int = 20000
+    max_gaussians: int = 20000
 
-    def due(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
+        """True if an iteration clones and prunes."""
         return self.start <= iteration <= self.stop and iteration % self.every == 0
 
 
@@ -37,15 +38,15 @@ def clone_and_prune(flare: LightFlare, optimiser: Adam, names: Mapping[str, str]
                     generator: torch.Generator) -> None:
     """Clone and prune one light's canonical Gaussians in place, with their moments.
 
-    `names`: what the optimiser calls each of `flare.gaussians`.
+    names: the optimiser's name of each of `flare.gaussians`.
     """
     opacity = flare.gaussians["opacity_logits"].detach().sigmoid()[:, 0]
-    kept = (opacity >= settings.prune_below).nonzero()[:, 0]
-    drawn = torch.rand(len(opacity), generator=generator) < settings.clone_ratio
-    cloned = (drawn & (opacity > settings.clone_above)).nonzero()[:, 0]
-    cloned = cloned[: max(settings.most - len(kept), 0)]
+    keep = (opacity >= settings.prune_below).nonzero()[:, 0]
+    chosen = torch.rand(len(opacity), generator=generator) < settings.clone_ratio
+    cloned = (chosen & (opacity > settings.clone_above)).nonzero()[:, 0]
+    cloned = cloned[: max(settings.max_gaussians - len(keep), 0)]
     clones = {names[name]: rows.detach()[cloned] for name, rows in flare.gaussians.items()}
-    place = clones[names["positions"]]
-    place += settings.noise * torch.randn(place.shape, generator=generator)
-    optimiser.keep(kept, names.values())
-    optimiser.append(clones)
+    positions = clones[names["positions"]]
+    positions += settings.noise * torch.randn(positions.shape, generator=generator)
+    optimiser.keep_rows(keep, names.values())
+    optimiser.append_rows(clones)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Input encodings of the deformation network (paper, appendix "Flare representation").
 
-The light and the camera are the same for all Gaussians of a view, so each hash grid is asked for one
-point a view: 8 corners on each level. Gradients therefore touch 8 rows a level (of the paper's 16 levels
-128, of millions); the tables give sparse gradients and are meant for an optimiser that updates those rows alone.
+Light and camera are the same for all Gaussians of a view, so each hash grid is evaluated at one point per view: 8
+corners on each level. Gradients therefore touch 8 rows a level (of the paper's 16 levels 128, of millions); the tables
+give sparse gradients, for an optimiser that updates those rows only.
 """
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from torch import Tensor, nn
 from ..look.network import CORNERS, PRIMES
 
 TABLE = "table.weight"
-"""End of the name of a grid's table among a model's parameters."""
+"""Suffix of the name of a grid's table among a model's parameters."""
 
 
 class HashGrid(nn.Module):
     """Multiresolution hash grid over the unit cube (Müller et al. 2022, section 3).
 
-    levels x features table entries, level k at resolution `base * growth**k`; levels that fit in the
-    table are stored densely, the others hashed. Input (3,) in 0..1 (clamped), output (levels * features,).
+    levels x features table entries, level k at resolution `base * growth**k`; levels that fit in the table are stored
+    densely, the others hashed. Input (3,) in 0..1 (clamped), output (levels * features,).
     """
 
     _resolutions: Tensor
@@ -52,12 +52,13 @@ class HashGrid(nn.Module):
         self.register_buffer("_corners", torch.from_numpy(CORNERS.copy()), persistent=False)
 
     def forward(self, point: Tensor) -> Tensor:
+        """Interpolate the grid at a point (3,) in 0..1."""
         indices, weights = self._cell(point.detach())
         rows = self.table(indices)  # (levels, 8, features)
         return (rows * weights[..., None]).sum(1).reshape(-1)
 
     def _cell(self, point: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows (levels, 8) of the corners around the point and their trilinear weights."""
+        """Return rows (levels, 8) of the corners around the point and their trilinear weights."""
         resolutions, rows, primes, corners = self._resolutions, self._rows, self._primes, self._corners
         scaled = point.clamp(0, 1)[None] * resolutions[:, None]
         low = torch.minimum(scaled.floor(), resolutions[:, None] - 1.0)
@@ -73,7 +74,7 @@ class HashGrid(nn.Module):
 
 
 def frequency_encoding(values: Tensor, bands: int) -> Tensor:
-    """sin and cos of 2^k pi x for k < bands (Mildenhall et al. 2020, eq. 4): (n, d) to (n, 2 * bands * d)."""
+    """Return sin and cos of 2^k pi x for k < bands (Mildenhall et al. 2020, eq. 4): (n, d) to (n, 2 * bands * d)."""
     octaves = math.pi * 2.0 ** torch.arange(bands, dtype=values.dtype, device=values.device)
     angles = (values[..., None] * octaves).flatten(-2)
     return torch.cat([angles.sin(), angles.cos()], -1)

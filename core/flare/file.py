@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The .flare file: one captured flare look, as safetensors with a JSON description.
+"""Reads and writes the .flare file: one captured flare look, as safetensors with a JSON description.
 
-The description (metadata key "fit_flare") is readable without the tensors: format version, blend, form,
-lights with positions and the ranges they were trained on, training camera, elements, licence, notes.
-Hash tables are stored as the rows that training touched; the others are zero. Nothing is unpickled.
+The description (metadata key "fit_flare") is readable without the tensors: format version, blend, form, lights with
+positions and the ranges they were trained on, training camera, elements, licence, notes. Hash tables are stored as the
+rows that training touched; the others are zero. Nothing is unpickled. `core.look` reads it without torch.
 """
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ import torch
 from torch import Tensor
 
 from ..choices import Blend
-from ..conventions.pixel_grid import Sampling
+from ..conventions.pixel_grid import PixelGrid
 from ..errors import FlareFileError
-from ..look.look import KEY, VERSION, FlareForm, TrainedCamera, checked
-from ..system import tensor_files as on_disk
+from ..look.form import FlareForm
+from ..look.look import METADATA_KEY, VERSION, TrainedCamera, parse_description
+from ..system import tensor_files
 from .deformation import QueryRange
 from .encoding import TABLE
 from .model import FlareModel, LightFlare
@@ -28,10 +29,10 @@ from .model import FlareModel, LightFlare
 
 @dataclass
 class FlareFile:
-    """A flare model and what an artist needs to know of it.
+    """A flare model with its description.
 
-    seen: by light, camera x, y, z (world) and light x, y (normalised) of each training view that had it in front.
-    sampling: the grid of the frames that it was fitted to, at the size at which they were.
+    training_views: by light, camera x, y, z (world) and light x, y (normalised) of each training view that had it in
+    front. pixel_grid: the grid of the frames that it was fitted to, at their working size.
     """
 
     model: FlareModel
@@ -40,8 +41,8 @@ class FlareFile:
     licence: str = ""
     notes: str = ""
     elements: list[dict[str, Any]] = field(default_factory=list)
-    seen: dict[str, list[list[float]]] = field(default_factory=dict)
-    sampling: Sampling | None = None
+    training_views: dict[str, list[list[float]]] = field(default_factory=dict)
+    pixel_grid: PixelGrid | None = None
 
 
 def save(path: Path | str, flare: FlareFile) -> None:
@@ -54,35 +55,36 @@ def save(path: Path | str, flare: FlareFile) -> None:
                                                  flare.model.lights, flare.model.clear.tolist(), strict=True)
     ]
     description = {"version": VERSION, "blend": flare.blend, "lights": lights, "camera": asdict(flare.camera),
-                   "elements": flare.elements, "seen": flare.seen, "licence": flare.licence, "notes": flare.notes}
-    if flare.sampling is not None:
-        description["sampling"] = asdict(flare.sampling)
-    on_disk.write(path, _packed(flare.model), {KEY: json.dumps(description)})
+                   "elements": flare.elements, "seen": flare.training_views, "licence": flare.licence,
+                   "notes": flare.notes}
+    if flare.pixel_grid is not None:
+        description["sampling"] = flare.pixel_grid.to_entry()
+    tensor_files.write(path, _pack(flare.model), {METADATA_KEY: json.dumps(description)})
 
 
 def load(path: Path | str) -> FlareFile:
-    """Read a .flare. Raises FlareFileError where it is missing, damaged, newer, or not a flare."""
+    """Read a .flare. Raises FlareFileError if it is missing, damaged, newer, or not a flare."""
     path = Path(path)
     if not path.is_file():
         raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.")
     try:
-        tensors, about = on_disk.read(path)
+        tensors, metadata = tensor_files.read(path)
     except (ValueError, OSError) as problem:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
-    description = checked(path, about)
+    description = parse_description(path, metadata)
     try:
-        return _unpacked(description, tensors)
+        return _unpack(description, tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as problem:
         raise FlareFileError(f"{path} is damaged: its tensors do not fit its description ({problem}).") from problem
 
 
-def _triple(values: Any) -> tuple[float, float, float]:
+def _to_triple(values: Any) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
     return x, y, z
 
 
-def _packed(model: FlareModel) -> dict[str, Tensor]:
-    """State with every hash table as its rows that are not zero."""
+def _pack(model: FlareModel) -> dict[str, Tensor]:
+    """Return the state, with every hash table as its rows that are not zero."""
     packed: dict[str, Tensor] = {}
     for name, tensor in model.flares.state_dict().items():
         tensor = tensor.detach().contiguous().cpu()
@@ -94,17 +96,17 @@ def _packed(model: FlareModel) -> dict[str, Tensor]:
     return packed
 
 
-def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> FlareFile:
+def _unpack(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> FlareFile:
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise ValueError(f"{name} holds values that are not finite")
     flares, names, positions, clear = [], [], [], []
     for light in description["lights"]:
-        low, high, reach = (_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
+        low, high, reach = (_to_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
         flares.append(LightFlare(FlareForm(**light["form"]), QueryRange(low, high, reach), int(light["count"]),
                                  torch.Generator()))
         names.append(str(light["name"]))
-        positions.append(_triple(light["xyz"]))
+        positions.append(_to_triple(light["xyz"]))
         clear.append(float(light.get("clear", 1.0)))
     model = FlareModel(names, torch.tensor(positions, dtype=torch.float64).reshape(-1, 3), flares)
     model.clear.copy_(torch.tensor(clear))
@@ -119,4 +121,4 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     return FlareFile(model, description["blend"], TrainedCamera(**description["camera"]),
                      str(description.get("licence", "")), str(description.get("notes", "")),
                      list(description.get("elements", [])), dict(description.get("seen", {})),
-                     Sampling.read(description.get("sampling")))
+                     PixelGrid.read(description.get("sampling")))

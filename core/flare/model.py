@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The flare of one light: canonical Gaussians and the network that deforms them.
 
-The paper's form and ours are one model with switches (`FlareForm`), so that every design choice can be
-taken away and measured. A `FlareModel` holds one such flare for each light of a capture.
+The paper's form and ours are one model with switches (`FlareForm`), so that every design choice can be removed and
+measured. A `FlareModel` holds one such flare for each light of a capture; `core.fit` optimises it.
 """
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ import torch
 from torch import Tensor, nn
 
 from ..gaussians.spherical_harmonics import colours
-from ..look.look import FlareForm
+from ..look.form import FlareForm
 from ..look.plane import PLANE_DEPTH
-from ..system.files import rounded
+from ..system.files import round_for_text
 from . import placement
 from .deformation import DeformationNetwork, QueryRange
 from .placement import PlaneGaussians
 
-TEACHES = 0.2
-"""Visible share of a light from which a view says something about its flare."""
+MIN_TRAINING_VISIBILITY = 0.2
+"""Visibility of a light below which a view gives no gradient to its flare."""
 
-RING_EVERY = 4
-"""One in so many Gaussians is a ring at first, where the form has them."""
-SIZES = 0.01, 0.06
-"""Standard deviations of Gaussians at first, in the normalised plane (a 50 mm frame is about 0.7 wide)."""
-RING_RADII = 3.0, 8.5
-"""r0 of rings at first, in standard deviations, from the smallest to the largest: up to half of the plane. A ring that
-none lies near is not found; and thin ones, unlike larger Gaussians, leave the frame free."""
-RING_WIDTH = 0.5
+RING_INTERVAL = 4
+"""One Gaussian in this many is a ring at first, where the form has rings."""
+INITIAL_SIZES = 0.01, 0.06
+"""Range of the Gaussians' standard deviations at first, in the normalised plane (a 50 mm frame is about 0.7 wide)."""
+INITIAL_RING_RADII = 3.0, 8.5
+"""r0 of rings at first, in standard deviations, from the smallest to the largest: up to half of the plane. A ring with
+no Gaussian near it is not learned; and thin rings, unlike larger Gaussians, leave the frame free."""
+INITIAL_RING_WIDTH = 0.5
 """w of rings at first, in standard deviations."""
 
 
@@ -41,10 +41,10 @@ OURS = replace(PAPER, solid=False, sh_degree=0, static_offset=True, rings=True, 
 
 
 class ViewOfLight(NamedTuple):
-    """One light seen from one camera: what a flare is a function of.
+    """One light seen from one camera: the input of a flare.
 
-    camera (3,) position in the world, rotation (3, 3) world to camera, light (2,) normalised coordinates,
-    depth of the light along the axis, world units; not positive means behind the camera.
+    camera (3,) position in the world, rotation (3, 3) world to camera, light (2,) normalised coordinates, depth of the
+    light along the axis, world units; not positive means behind the camera.
     """
 
     camera: Tensor
@@ -54,7 +54,7 @@ class ViewOfLight(NamedTuple):
 
     @classmethod
     def of(cls, world_to_camera: Tensor, xyz: Tensor) -> ViewOfLight:
-        """From a pose (4, 4) and the light's position (3,) in the world; float32 comes out."""
+        """Make it, in float32, from a pose (4, 4) and the light's position (3,) in the world."""
         pose = world_to_camera.double()
         x, y, z = (pose[:3, :3] @ xyz.double() + pose[:3, 3]).tolist()
         camera = -pose[:3, :3].T @ pose[:3, 3]
@@ -65,10 +65,9 @@ class ViewOfLight(NamedTuple):
 class LightFlare(nn.Module):
     """Canonical Gaussians of one light and their deformation.
 
-    `gaussians` holds one row for each Gaussian: positions (n, 1) along the line or (n, 2) on the plane,
-    log_scales (n, 3 | 2), rotations (n, 4) quaternions or (n, 2) directions, opacity_logits (n, 1),
-    sh (n, k * 3), and where the form has them offsets (n, 2), rings (n, 2) as r0 and log w, arcs (n, 2) in deviations
-    along the axes, latent (n, d).
+    `gaussians` holds one row for each Gaussian: positions (n, 1) along the line or (n, 2) on the plane, log_scales (n,
+    3 | 2), rotations (n, 4) quaternions or (n, 2) directions, opacity_logits (n, 1), sh (n, k * 3), and where the form
+    has them offsets (n, 2), rings (n, 2) as r0 and log w, arcs (n, 2) in deviations along the axes, latent (n, d).
     """
 
     def __init__(self, form: FlareForm, query_range: QueryRange, count: int, generator: torch.Generator,
@@ -76,7 +75,7 @@ class LightFlare(nn.Module):
         super().__init__()
         self.form, self.query_range = form, query_range
         self.gaussians = nn.ParameterDict(
-            {name: nn.Parameter(rows) for name, rows in _canonical(form, count, opacity, generator).items()})
+            {name: nn.Parameter(rows) for name, rows in _initial_gaussians(form, count, opacity, generator).items()})
         deformed = [name for name in self.gaussians if name not in ("offsets", "latent")]
         heads = {name: self.gaussians[name].shape[1] for name in deformed}
         if form.line and form.plane_offset:
@@ -86,10 +85,11 @@ class LightFlare(nn.Module):
 
     @property
     def count(self) -> int:
+        """Number of Gaussians."""
         return len(self.gaussians["positions"])
 
     def forward(self, view: ViewOfLight) -> PlaneGaussians:
-        """The flare's Gaussians in this view (paper, eq. 1 to 3), on the normalised plane.
+        """Return the flare's Gaussians in this view (paper, eq. 1 to 3), on the normalised plane.
 
         Raises ValueError for a light behind the camera: it has no flare (paper, "Flare Representation").
         """
@@ -131,18 +131,19 @@ class LightFlare(nn.Module):
 
 
 def _rings(raw: Tensor) -> Tensor:
-    """r0 as learned and w = exp(log w), kept wide enough for the sampling of a picture."""
+    """Return r0 as learned and w = exp(log w), kept wide enough for the pixel grid of a picture."""
     return torch.stack([raw[:, 0], raw[:, 1].clamp(-3, 3).exp()], -1)
 
 
-def _canonical(form: FlareForm, count: int, opacity: float, generator: torch.Generator) -> dict[str, Tensor]:
-    """`count` Gaussians spread along the line, small enough to leave most of the frame free; SIZES are log-uniform."""
+def _initial_gaussians(form: FlareForm, count: int, opacity: float, generator: torch.Generator) -> dict[str, Tensor]:
+    """Return `count` Gaussians spread along the line, of log-uniform INITIAL_SIZES that leave most of the frame free.
+    """
     if form.line:
         positions = torch.linspace(-1.2, 1.4, count)[:, None]
     else:
         positions = torch.rand(count, 2, generator=generator) - 0.5
-    share = torch.rand(count, 1, generator=generator)
-    size = _log_between(*SIZES, share)
+    fraction = torch.rand(count, 1, generator=generator)
+    size = _log_interpolate(*INITIAL_SIZES, fraction)
     if form.solid:
         log_scales = (size + math.log(PLANE_DEPTH)).repeat(1, 3)
         rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
@@ -160,8 +161,8 @@ def _canonical(form: FlareForm, count: int, opacity: float, generator: torch.Gen
     if form.rings:
         # A disc finds the way to a ring through worse pictures; so some begin as rings.
         rows["rings"] = torch.zeros(count, 2)
-        rows["rings"][::RING_EVERY, 0] = _log_between(*RING_RADII, share[::RING_EVERY, 0]).exp()
-        rows["rings"][::RING_EVERY, 1] = math.log(RING_WIDTH)
+        rows["rings"][::RING_INTERVAL, 0] = _log_interpolate(*INITIAL_RING_RADII, fraction[::RING_INTERVAL, 0]).exp()
+        rows["rings"][::RING_INTERVAL, 1] = math.log(INITIAL_RING_WIDTH)
     if form.arcs:
         rows["arcs"] = torch.zeros(count, 2)
     if form.latent:
@@ -169,16 +170,17 @@ def _canonical(form: FlareForm, count: int, opacity: float, generator: torch.Gen
     return rows
 
 
-def _log_between(low: float, high: float, share: Tensor) -> Tensor:
-    """Logarithm of what lies a share (0..1) of the way from low to high, by ratio."""
-    return math.log(low) + (math.log(high) - math.log(low)) * share
+def _log_interpolate(low: float, high: float, fraction: Tensor) -> Tensor:
+    """Return the logarithm of the value at a fraction (0..1) between low and high, by ratio."""
+    return math.log(low) + (math.log(high) - math.log(low)) * fraction
 
 
 class FlareModel(nn.Module):
     """The flares of a capture: one `LightFlare` for each light, by name, in the capture's order.
 
-    clear: (lights,) the share of each light that the fitted scene leaves where nothing hides it, 0..1. Less than 1,
-    since something in the scene shows the lamp itself, and a sky may stand nearer than the sun. 0: shares are 1.
+    clear: (lights,) the visibility of each light behind the fitted scene where nothing hides it, 0..1. It is less than
+    1, since Gaussians that show the lamp itself, or a sky nearer than the sun, stand before it. 0: unknown, and
+    visibilities are 1.
     """
 
     positions: Tensor
@@ -198,47 +200,52 @@ class FlareModel(nn.Module):
 
     @property
     def count(self) -> int:
-        """Gaussians in all flares together."""
+        """Number of Gaussians in all flares."""
         return sum(flare.count for flare in self.lights)
 
     def views(self, world_to_camera: Tensor) -> list[ViewOfLight]:
-        """Every light seen from one pose (4, 4)."""
+        """Return every light seen from one pose (4, 4)."""
         return [ViewOfLight.of(world_to_camera, xyz) for xyz in self.positions]
 
-    def seen_from(self, poses: Sequence[Tensor]) -> dict[str, list[list[float]]]:
-        """By light, camera x, y, z and normalised light x, y in each of these poses (4, 4) that has it in front."""
-        seen: dict[str, list[list[float]]] = {name: [] for name in self.names}
+    def training_views(self, poses: Sequence[Tensor]) -> dict[str, list[list[float]]]:
+        """Return by light camera x, y, z and normalised light x, y in each of these poses (4, 4) that has it in front.
+        """
+        views_by_light: dict[str, list[list[float]]] = {name: [] for name in self.names}
         for pose in poses:
             for name, view in zip(self.names, self.views(pose), strict=True):
                 if view.depth > 0:
-                    seen[name].append([rounded(value) for value in (*view.camera.tolist(), *view.light.tolist())])
-        return seen
+                    views_by_light[name].append([round_for_text(value)
+                                       for value in (*view.camera.tolist(), *view.light.tolist())])
+        return views_by_light
 
-    def corrections(self, world_to_camera: Tensor) -> Tensor:
-        """delta_l (n, 2) of the n lights in front of one pose (4, 4), normalised coordinates.
+    def light_corrections(self, world_to_camera: Tensor) -> Tensor:
+        """Return delta_l (n, 2) of the n lights in front of one pose (4, 4), normalised coordinates.
 
-        Its gradient stops at the features of the view, which the whole flare shares: rows of the grids that only a
-        view with a hidden light touches would move by full steps for its sake.
+        Its gradient stops at the view's features, which the whole flare shares: rows of the grids that only a view with
+        a hidden light touches would move by full steps because of it.
         """
-        found = [flare.network.light_correction(flare.network.view_features(view.camera, view.light).detach())
+        corrections = [flare.network.light_correction(flare.network.view_features(view.camera, view.light).detach())
                  for flare, view in zip(self.lights, self.views(world_to_camera), strict=True) if view.depth > 0]
-        return torch.stack(found) if found else torch.zeros(0, 2)
+        return torch.stack(corrections) if corrections else torch.zeros(0, 2)
 
-    def forward(self, world_to_camera: Tensor, shares: Mapping[str, Tensor] | None = None) -> dict[str, PlaneGaussians]:
-        """The Gaussians of every light in front of the camera, by the light's name.
+    def forward(self, world_to_camera: Tensor,
+                visibilities: Mapping[str, Tensor] | None = None) -> dict[str, PlaneGaussians]:
+        """Return the Gaussians of every light in front of the camera, by the light's name.
 
-        shares: how much of each light is visible, 0..1 (see `visibility`); it scales the opacities. A light of which
-        less than `TEACHES` is left hands no gradient to its flare: there is nothing to be learned from next to nothing,
-        and Adam would learn it at full rate, from the little by which the share is wrong.
+        visibilities: of each light, 0..1 (see `visibility`); they scale the opacities. A light below
+        MIN_TRAINING_VISIBILITY gives no gradient to its flare: there is next to nothing to learn, and Adam would learn
+        it at full rate, from the error of the visibility.
         """
-        seen = zip(self.names, self.lights, self.views(world_to_camera), strict=True)
-        flares = {name: flare(view) for name, flare, view in seen if view.depth > 0}
-        if shares is None:
+        lights = zip(self.names, self.lights, self.views(world_to_camera), strict=True)
+        flares = {name: flare(view) for name, flare, view in lights if view.depth > 0}
+        if visibilities is None:
             return flares
-        seen_flares = {name: one if shares[name] >= TEACHES else _untaught(one) for name, one in flares.items()}
-        return {name: one._replace(opacities=one.opacities * shares[name]) for name, one in seen_flares.items()}
+        flares = {name: gaussians if visibilities[name] >= MIN_TRAINING_VISIBILITY else _detached(gaussians)
+                  for name, gaussians in flares.items()}
+        return {name: gaussians._replace(opacities=gaussians.opacities * visibilities[name])
+                for name, gaussians in flares.items()}
 
 
-def _untaught(gaussians: PlaneGaussians) -> PlaneGaussians:
-    """The same, without a way back for gradients."""
+def _detached(gaussians: PlaneGaussians) -> PlaneGaussians:
+    """Return the Gaussians without gradients."""
     return PlaneGaussians(*(None if part is None else part.detach() for part in gaussians))  # type: ignore[arg-type]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where flare Gaussians lie in the picture (paper, section "Flare Representation").
+"""Places flare Gaussians in the picture (paper, section "Flare Representation").
 
-Everything is in normalised image coordinates (x/z, y/z, origin at the principal point p, y down), so a
-flare does not depend on resolution and a change of focal length moves it as a lens would. A camera's
-intrinsics enter in `pixels` and `slopes` alone.
+Everything is in normalised image coordinates (x/z, y/z, origin at the principal point p, y down), so a flare does not
+depend on resolution and a change of focal length moves it as a lens would. A camera's intrinsics enter in `pixels` and
+`pixel_arcs` only. `core.look.plane` has the same in numpy.
 """
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..conventions.pixel_grid import Sampling, dilation
+from ..conventions.pixel_grid import PixelGrid, dilation
 from ..gaussians.rendering import STRENGTH2_MIN
-from ..look.plane import ARC_SOFT, PLANE_DEPTH
+from ..look.plane import ARC_SOFTNESS, PLANE_DEPTH
 
 
 class PlaneGaussians(NamedTuple):
     """Gaussians on the normalised plane, ready to be splatted.
 
-    means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1 (with arcs above 1, too: see
-    `opacity_gain`), colours (n, 3), and rings (n, 2) as r0 and w in Mahalanobis radii (ours) or None. arcs (n, 2) or
-    None: the way covariance b from the mean towards the side that exp(b·d) makes brighter; a vector of the plane, which
-    is scaled and turned as it is.
+    means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1 (with arcs above 1, too: see `opacity_gain`),
+    colours (n, 3), and rings (n, 2) as r0 and w in Mahalanobis radii (ours) or None. arcs (n, 2) or None: covariance
+    times b, a vector of the plane from the mean towards the side that exp(b·d) brightens; it scales and turns with the
+    plane.
     """
 
     means: Tensor
@@ -37,15 +37,15 @@ class PlaneGaussians(NamedTuple):
 
 
 def on_line(mu: Tensor, light: Tensor) -> Tensor:
-    """mu (n, 1) to the plane (n, 2): 0 at the principal point, 1 at the light (2,), its delta_l included."""
+    """Map mu (n, 1) to the plane (n, 2): 0 at the principal point, 1 at the light (2,), its delta_l included."""
     return mu * light
 
 
 def covariance_of_solid(means: Tensor, log_scales: Tensor, quaternions: Tensor) -> Tensor:
-    """Covariances (n, 3) on the plane of 3D Gaussians in the camera frame at depth `PLANE_DEPTH`.
+    """Return covariances (n, 3) on the plane of 3D Gaussians in the camera frame at depth `PLANE_DEPTH`.
 
-    means (n, 2) on the plane, log_scales (n, 3) in world units, quaternions (n, 4) wxyz. The local affine
-    approximation of the projection (Zwicker et al. 2002): J = [1 0 -x; 0 1 -y] / depth.
+    means (n, 2) on the plane, log_scales (n, 3) in world units, quaternions (n, 4) wxyz. The local affine approximation
+    of the projection (Zwicker et al. 2002): J = [1 0 -x; 0 1 -y] / depth.
     """
     rotation = rotation_matrices(quaternions)
     x, y = means[:, :1], means[:, 1:]
@@ -56,7 +56,7 @@ def covariance_of_solid(means: Tensor, log_scales: Tensor, quaternions: Tensor) 
 
 
 def covariance_of_ellipse(log_scales: Tensor, directions: Tensor) -> Tensor:
-    """Covariances (n, 3) of ellipses: log_scales (n, 2), directions (n, 2) of the first axis, any length."""
+    """Return covariances (n, 3) of ellipses: log_scales (n, 2), directions (n, 2) of the first axis, any length."""
     axis = functional.normalize(directions, dim=-1, eps=1e-12)
     variances = (2 * log_scales).exp()
     c, s = axis[:, 0], axis[:, 1]
@@ -65,27 +65,26 @@ def covariance_of_ellipse(log_scales: Tensor, directions: Tensor) -> Tensor:
 
 
 def arcs_of_ellipse(arcs: Tensor, log_scales: Tensor, directions: Tensor) -> Tensor:
-    """(n, 2) on the plane of arcs (n, 2) in deviations along the axes: R diag(s) a, so that |a| is the strength beta
-    whatever the size."""
+    """Return arcs (n, 2) on the plane of arcs (n, 2) in deviations along the axes: R diag(s) a, so that |a| is the
+    strength beta at every size."""
     axis = functional.normalize(directions, dim=-1, eps=1e-12)
     along, aside = (arcs * log_scales.exp()).unbind(-1)
     return along[:, None] * axis + aside[:, None] * torch.stack([-axis[:, 1], axis[:, 0]], -1)
 
 
 def opacity_gain(arcs: Tensor, rings: Tensor) -> Tensor:
-    """(n,) by which opacities are multiplied so that they are smooth in arcs (n, 2), in deviations, at zero.
+    """Return the factors (n,) that make opacities smooth in arcs (n, 2), in deviations, at zero.
 
-    A profile that keeps its peak loses r0 beta from its mean logarithm, and beta has a kink at zero. There the strength
-    below stands for it, which is quadratic at first and beta soon: an opacity is that of the brightest place, but for
-    3 % of r0 at most.
+    A profile that keeps its peak loses r0 beta from its mean logarithm, and beta has a kink at zero. A strength that is
+    quadratic at first and beta soon replaces it there: an opacity is that of the brightest point, up to 3 % of r0.
     """
     squared = arcs.square().sum(-1)
     beta = squared.clamp(min=STRENGTH2_MIN).sqrt()
-    return torch.exp(rings[:, 0] * (beta - squared * (squared + ARC_SOFT**2).rsqrt()))
+    return torch.exp(rings[:, 0] * (beta - squared * (squared + ARC_SOFTNESS**2).rsqrt()))
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """(n, 4) wxyz, any length but zero, to (n, 3, 3)."""
+    """Convert quaternions (n, 4) wxyz, any length but zero, to (n, 3, 3)."""
     w, x, y, z = functional.normalize(quaternions, dim=-1, eps=1e-12).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -95,22 +94,24 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
-def pixels(gaussians: PlaneGaussians, intrinsics: Tensor, sampling: Sampling | None = None) -> tuple[Tensor, Tensor]:
-    """Centres (n, 2) px and covariances (n, 3) px^2 under intrinsics (3, 3), with the low-pass added, that of the grid
-    on which they were learned where it is known."""
+def pixels(gaussians: PlaneGaussians, intrinsics: Tensor, pixel_grid: PixelGrid | None = None) -> tuple[Tensor, Tensor]:
+    """Return centres (n, 2) px and covariances (n, 3) px^2 under intrinsics (3, 3), with the low-pass added.
+
+    The low-pass is that of the pixel grid at which they were fitted, where it is known.
+    """
     focal, centre = intrinsics.diagonal()[:2], intrinsics[:2, 2]
     fx, fy = focal
     stretch = torch.stack([fx * fx, fx * fy, fy * fy])
-    wide = dilation(sampling, math.sqrt(float(fx * fy)))
+    wide = dilation(pixel_grid, math.sqrt(float(fx * fy)))
     low_pass = torch.tensor([wide, 0.0, wide], dtype=stretch.dtype, device=stretch.device)
     return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass
 
 
-def slopes(arcs: Tensor, covariances: Tensor, intrinsics: Tensor) -> Tensor:
-    """b (n, 2), px^-1, of arcs (n, 2) on the plane, for Gaussians of these covariances (n, 3), px^2, under intrinsics.
+def pixel_arcs(arcs: Tensor, covariances: Tensor, intrinsics: Tensor) -> Tensor:
+    """Return b (n, 2), px^-1, of arcs (n, 2) on the plane, for Gaussians of covariances (n, 3), px^2, under intrinsics.
 
-    With the low-pass in the covariance it is exact for a plain Gaussian, whose mean an arc shifts: the shift stays.
-    In double precision, for needles.
+    With the low-pass in the covariance it is exact for a plain Gaussian, whose mean an arc shifts: the shift stays. In
+    double precision, for needles.
     """
     x, y = (arcs * intrinsics.diagonal()[:2]).double().unbind(-1)
     xx, xy, yy = covariances.double().unbind(-1)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How well a fit separates: picture scores, and the evaluation of a run against its references."""
+"""Scores: of one picture against another, and of a run's layers against its references."""

@@ -1,25 +1,26 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A run against its references: scores of composite, scene and flare, by view and on average.
+"""Scores a run against its references: composite, scene and flare, by view and on average. The command `eval` calls it.
 
-The flare of a view is |composite - scene| in display space, against |frame - reference scene|, as the
-paper measures it. Where the exact flare is known, `flare_linear` compares the linear layer itself, with
-the pixels that the camera clipped left out, since nothing can be learned from those: exact layers tell which
-they are, where the frame's codes no longer do (noise and JPEG leave a clipped pixel just below white). PSNR
-flatters faint flares, so each flare score stands beside that of an empty flare.
+The flare of a view is |composite - scene| in display space, against |frame - reference scene|, as in the paper. Where
+the exact flare is known, `flare_linear` compares the linear layer itself, without the pixels that the camera clipped,
+from which nothing can be learned: exact layers tell which they are where the frame's codes no longer do (noise and JPEG
+leave a clipped pixel just below white). PSNR flatters faint flares, so each flare score stands beside that of an empty
+flare.
 """
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Camera, Capture, View
+from ..capture.renderer import ViewRenderer
 from ..colour.srgb import srgb_from_linear
-from ..images.borders import Inside
+from ..images.borders import PictureArea
 from ..images.picture import Picture
 from ..system.progress import Progress
 from .pictures import Perceptual, flip, psnr, relative_l2, ssim
@@ -29,34 +30,19 @@ Scores = dict[str, float | None]
 Reference = Literal["truth", "removed", "none"]
 
 LAYERS = ("composite", "scene", "flare", "flare_linear")
-_BESIDE_NONE = ("psnr", "empty_psnr", "relative_l2")
+_COMPARED_TO_EMPTY = ("psnr", "empty_psnr", "relative_l2")
 """Scores of a flare that are read beside those of an empty one."""
-_CLIPPED = 254.5 / 255
+_CLIP_LEVEL = 254.5 / 255
 
 
-class Rendering(Protocol):
-    """Scene-linear layers of a view: scene (h, w, 3) and each light's flare (h, w, 3)."""
-
-    @property
-    def scene(self) -> Array: ...
-    @property
-    def flare_by_light(self) -> Mapping[str, Array]: ...
-
-
-class Renderer(Protocol):
-    """A fitted run, as `evaluate` uses it."""
-
-    def render(self, camera: Camera) -> Rendering: ...
-
-
-def evaluate(renderer: Renderer, capture: Capture, cameras: Mapping[View, Camera],
-             progress: Progress | None = None, inside: Inside | None = None,
+def evaluate(renderer: ViewRenderer, capture: Capture, cameras: Mapping[View, Camera],
+             progress: Progress | None = None, area: PictureArea | None = None,
              lpips: Perceptual | None = None) -> dict[str, Any]:
-    """Scores of the given views, each rendered from its camera: the content of eval.json.
+    """Return the content of eval.json: the scores of the given views, each rendered from its camera.
 
-    Scene and flare are scored against truth/ where the capture has it, else against removed/, else not. inside: what
-    lies inside the frames' black borders, which alone is scored. lpips is null where no weights for it were given.
-    Raises FrameError for pictures that cannot be read, and Cancelled when asked to stop.
+    Scene and flare are scored against truth/ if the capture has it, else against removed/, else not at all. area: the
+    area inside the frames' black borders; only that is scored. lpips is null without its weights. Raises FrameError for
+    pictures that cannot be read, and Cancelled.
     """
     progress = progress or Progress()
     reference: Reference = "truth" if capture.has_truth else "removed" if capture.has_removed else "none"
@@ -65,77 +51,79 @@ def evaluate(renderer: Renderer, capture: Capture, cameras: Mapping[View, Camera
     for view, camera in cameras.items():
         rendering = renderer.render(camera)
         composite = sum(rendering.flare_by_light.values(), rendering.scene)
-        part = (slice(None), slice(None)) if inside is None else inside.part
-        clean = {"truth": capture.truth_scene, "removed": capture.removed}.get(reference, _nothing)
-        flare = capture.truth_flare if reference == "truth" else _nothing
+        part = (slice(None), slice(None)) if area is None else area.slices
+        clean = {"truth": capture.truth_scene, "removed": capture.removed}.get(reference, _no_picture)
+        flare = capture.truth_flare if reference == "truth" else _no_picture
         known, exact = (None if picture is None else replace(picture, pixels=picture.pixels[part])
                         for picture in (clean(view, camera.size), flare(view, camera.size)))
         filmed = capture.frame(view, camera.size)
         scored.append((view.name, score_view(
             composite[part], rendering.scene[part], replace(filmed, pixels=filmed.pixels[part]), known, exact,
-            out_of_range(capture, view, camera.size)[part], lpips)))
+            unscored_mask(capture, view, camera.size)[part], lpips)))
         progress.advance()
     size = next(iter(cameras.values())).size if cameras else (0, 0)
-    return summary(reference, scored, size)
+    return summarise(reference, scored, size)
 
 
-def _nothing(_view: View, _size: tuple[int, int]) -> None:
+def _no_picture(_view: View, _size: tuple[int, int]) -> None:
     return None
 
 
 def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: Picture | None,
-               flare_truth: Picture | None = None, hidden: NDArray[np.bool_] | None = None,
+               flare_truth: Picture | None = None, unscored: NDArray[np.bool_] | None = None,
                lpips: Perceptual | None = None) -> dict[str, Scores]:
-    """Scores of one view by layer: psnr, ssim, lpips (null without weights), flip.
+    """Return the scores of one view by layer: psnr, ssim, lpips (null without weights), flip.
 
-    composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size. hidden:
-    (height, width), where the linear flare is not judged; by default where the frame is clipped.
-    A flare also has `empty_psnr`, what no flare at all would score.
+    composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size. unscored: (height,
+    width), pixels in which the linear flare is not scored; by default the clipped ones. A flare also has `empty_psnr`,
+    the score of an empty flare.
     """
-    shown, clean, filmed = _display(composite), _display(scene), frame.display()
-    scores = {"composite": _picture_scores(shown, filmed, lpips)}
+    displayed, clean, filmed = _to_display(composite), _to_display(scene), frame.display()
+    scores = {"composite": _score_picture(displayed, filmed, lpips)}
     if scene_reference is not None:
         reference = scene_reference.display()
         flare, flare_reference = displayed_flare(composite, scene), np.abs(filmed - reference)
-        scores["scene"] = _picture_scores(clean, reference, lpips)
-        scores["flare"] = {**_picture_scores(flare, flare_reference, lpips),
+        scores["scene"] = _score_picture(clean, reference, lpips)
+        scores["flare"] = {**_score_picture(flare, flare_reference, lpips),
                            "empty_psnr": psnr(np.zeros_like(flare), flare_reference)}
     if flare_truth is not None:
-        truth, layer, keep = flare_truth.linear(), composite - scene, ~(clipped(frame) if hidden is None else hidden)
+        truth, layer = flare_truth.linear(), composite - scene
+        mask = ~(clipped_mask(frame) if unscored is None else unscored)
         scores["flare_linear"] = {
-            "psnr": psnr(layer, truth, keep), "relative_l2": relative_l2(layer, truth, keep),
-            "empty_psnr": psnr(np.zeros_like(layer), truth, keep)}
+            "psnr": psnr(layer, truth, mask), "relative_l2": relative_l2(layer, truth, mask),
+            "empty_psnr": psnr(np.zeros_like(layer), truth, mask)}
     return scores
 
 
-def out_of_range(capture: Capture, view: View, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
-    """(height, width): where the camera clipped and the linear flare is not judged.
+def unscored_mask(capture: Capture, view: View, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
+    """Return (height, width), the pixels where the camera clipped, in which the linear flare is not scored.
 
-    Pixels that carry the frame's brightest code and, where the exact layers are known, all those in which scene and
-    flare together reach white in any channel. size: (width, height) of the result, the camera's by default.
+    They have the frame's brightest code or, where the exact layers are known, scene and flare together reach white in
+    any channel. size: (width, height) of the result, the camera's by default.
     """
     frame, scene, flare = capture.frame(view), capture.truth_scene(view), capture.truth_flare(view)
-    white = clipped(frame)
+    white = clipped_mask(frame)
     if scene is not None and flare is not None and frame.encoding != "linear":
         reached = (scene.linear() + flare.linear() >= 1).any(-1)
         white = white | reached if reached.shape == white.shape else white
-    return _reduced(white, frame.size, size)
+    return _downscale_mask(white, frame.size, size)
 
 
-def clipped(frame: Picture, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
-    """(height, width): where a frame's brightest code hides how bright it was. A linear frame hides nothing.
+def clipped_mask(frame: Picture, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
+    """Return (height, width), the pixels of a frame's brightest code, which hides how bright they were; none in a
+    linear     frame.
 
     size: (width, height) of the result, where the frame is larger: pixels with a clipped one among theirs.
     """
     if frame.encoding == "linear":
         white = np.zeros(frame.pixels.shape[:2], np.bool_)
     else:
-        white = (frame.pixels >= _CLIPPED).any(-1)
-    return _reduced(white, frame.size, size)
+        white = (frame.pixels >= _CLIP_LEVEL).any(-1)
+    return _downscale_mask(white, frame.size, size)
 
 
-def _reduced(mask: NDArray[np.bool_], full: tuple[int, int], size: tuple[int, int] | None) -> NDArray[np.bool_]:
-    """A mask at another size: pixels with a set one among theirs."""
+def _downscale_mask(mask: NDArray[np.bool_], full: tuple[int, int], size: tuple[int, int] | None) -> NDArray[np.bool_]:
+    """Return a mask at another size: pixels with a set one among theirs."""
     if size is None or size == full:
         return mask
     import cv2
@@ -144,60 +132,60 @@ def _reduced(mask: NDArray[np.bool_], full: tuple[int, int], size: tuple[int, in
 
 
 def displayed_flare(composite: Array, scene: Array) -> Array:
-    """|composite - scene| in display values (height, width, 3), of scene-linear layers: a flare as the paper measures
-    it."""
-    return np.abs(_display(composite) - _display(scene))
+    """Return |composite - scene| in display values (height, width, 3), of scene-linear layers: the paper's measure of a
+    flare."""
+    return np.abs(_to_display(composite) - _to_display(scene))
 
 
-def _display(linear: Array) -> Array:
+def _to_display(linear: Array) -> Array:
     return np.clip(srgb_from_linear(linear), 0, 1)
 
 
-def _picture_scores(image: Array, target: Array, lpips: Perceptual | None) -> Scores:
+def _score_picture(image: Array, target: Array, lpips: Perceptual | None) -> Scores:
     return {"psnr": psnr(image, target), "ssim": ssim(image, target),
             "lpips": lpips(image, target) if lpips else None, "flip": flip(image, target)}
 
 
-def summary(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]]],
+def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]]],
             size: tuple[int, int]) -> dict[str, Any]:
-    """The content of eval.json: means over views, then each view. Not-finite numbers become null.
+    """Return the content of eval.json: means over views, then each view. Numbers that are not finite become null.
 
     A flare's PSNR, that of an empty one and the relative error are means over the views whose reference holds a flare:
-    where it is black, an empty one would be exact, and no mean could hold that.
+    where it is black, an empty one is exact, and no mean could hold that.
     """
     mean = {layer: _mean([scores[layer] for _, scores in views if layer in scores]) for layer in LAYERS}
     return {
         "reference": reference,
         "size": list(size),
         "ssim_borders": "valid",
-        **{layer: _finite(scores) for layer, scores in mean.items() if scores},
-        "views": [{"name": name, **{layer: _finite(part) for layer, part in scores.items()}}
+        **{layer: _null_if_infinite(scores) for layer, scores in mean.items() if scores},
+        "views": [{"name": name, **{layer: _null_if_infinite(part) for layer, part in scores.items()}}
                   for name, scores in views],
     }
 
 
 def _mean(parts: list[Scores]) -> Scores:
     means: Scores = {}
-    flared = [part for part in parts if not _is_without_flare(part)]
+    flared = [part for part in parts if not _has_no_flare(part)]
     for key in parts[0] if parts else ():
-        values = [value for part in (flared if key in _BESIDE_NONE else parts)
+        values = [value for part in (flared if key in _COMPARED_TO_EMPTY else parts)
                   if (value := part[key]) is not None and math.isfinite(value)]
         means[key] = sum(values) / len(values) if values else None
     return means
 
 
-def _is_without_flare(scores: Scores) -> bool:
-    """Whether there is none in the reference of one view's flare, by scores as they are or as eval.json has them."""
+def _has_no_flare(scores: Scores) -> bool:
+    """True if the reference of one view holds no flare, by its scores before or after eval.json."""
     empty = scores.get("empty_psnr", 0.0)
     return empty is None or not math.isfinite(empty)
 
 
-def _finite(scores: Scores) -> Scores:
+def _null_if_infinite(scores: Scores) -> Scores:
     return {key: value if value is not None and math.isfinite(value) else None for key, value in scores.items()}
 
 
-def table(scores: dict[str, Any]) -> str:
-    """The means of eval.json as text, with the view that scored lowest in each layer."""
+def format_table(scores: dict[str, Any]) -> str:
+    """Return the means of eval.json as text, with the view that scored lowest in each layer."""
     count = len(scores["views"])
     against = {"truth": "scene and flare against the exact layers",
                "removed": "scene and flare against the frames of removed/",
@@ -209,28 +197,28 @@ def table(scores: dict[str, Any]) -> str:
         if layer not in scores:
             continue
         part = scores[layer]
-        cells = [cell(part.get(key), decimals) for key, decimals in
+        cells = [format_cell(part.get(key), decimals) for key, decimals in
                  (("psnr", 2), ("empty_psnr", 2), ("ssim", 4), ("lpips", 4), ("flip", 4))]
         scored = [view for view in scores["views"] if view.get(layer, {}).get("psnr") is not None]
         worst = min(scored, key=lambda view: view[layer]["psnr"], default=None)
         where = f"{worst[layer]['psnr']:.2f} in {worst['name']}" if worst else "-"
         lines.append(f"{layer:13}{''.join(f'{text:>8}' for text in cells)}"
-                     f"{cell(part.get('relative_l2'), 3):>9}  {where}")
+                     f"{format_cell(part.get('relative_l2'), 3):>9}  {where}")
     for layer in LAYERS:
-        without = sum(_is_without_flare(view[layer]) for view in scores["views"] if layer in view)
+        without = sum(_has_no_flare(view[layer]) for view in scores["views"] if layer in view)
         if without:
             lines.append(f"{without} of {count} views show no flare to be scored against: PSNR, empty and rel. L2 of "
                          f"{layer} are of the others.")
     return "\n".join(lines)
 
 
-def worse_than_none(scores: dict[str, Any]) -> bool:
-    """Whether an empty flare would score more, by eval.json."""
+def is_worse_than_empty(scores: dict[str, Any]) -> bool:
+    """True if an empty flare would score more, by eval.json."""
     flare = scores.get("flare", {})
-    found, empty = flare.get("psnr"), flare.get("empty_psnr")
-    return found is not None and empty is not None and found < empty
+    fitted, empty = flare.get("psnr"), flare.get("empty_psnr")
+    return fitted is not None and empty is not None and fitted < empty
 
 
-def cell(value: float | None, decimals: int) -> str:
-    """A number of a table; a dash where there is none."""
+def format_cell(value: float | None, decimals: int) -> str:
+    """Format a number of a table; a dash where there is none."""
     return "-" if value is None else f"{value:.{decimals}f}"

@@ -24,29 +24,29 @@ _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
 
 class Lpips:
-    """Distance of two pictures of display values 0..1; 0 is equal."""
+    """LPIPS distance of two pictures of display values 0..1; 0 is equal."""
 
     def __init__(self, folder: Path | str) -> None:
-        """Raises SettingsError where the folder lacks weights or holds others."""
+        """Raises SettingsError if the folder lacks weights or holds others."""
         self._weights: dict[str, Tensor] = {}
         for path in sorted(Path(folder).glob("*")):
-            self._weights.update(_read(path))
-        wanted = [f"features.{layer[0]}.{kind}" for layer in _LAYERS for kind in ("weight", "bias")]
-        wanted += [f"lin{k}.model.1.weight" for k in range(5)]
-        lacking = [name for name in wanted if name not in self._weights]
-        if lacking:
-            raise SettingsError(f"{folder} lacks weights of LPIPS, first {lacking[0]}; put AlexNet's features and the "
+            self._weights.update(_read_weights(path))
+        required = [f"features.{layer[0]}.{kind}" for layer in _LAYERS for kind in ("weight", "bias")]
+        required += [f"lin{k}.model.1.weight" for k in range(5)]
+        missing = [name for name in required if name not in self._weights]
+        if missing:
+            raise SettingsError(f"{folder} lacks weights of LPIPS, first {missing[0]}; put AlexNet's features and the "
                                 "metric's five layers there.")
 
     @torch.inference_mode()
     def __call__(self, image: Pixels, target: Pixels) -> float:
-        """Pictures (height, width, 3), 32 pixels a side at least."""
+        """Return the distance of two pictures (height, width, 3), at least 32 pixels a side."""
         stacked = (torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32))[None]
                    for picture in (image, target))
         return float(self.distance(*stacked))
 
     def distance(self, image: Tensor, target: Tensor) -> Tensor:
-        """The same of (n, 3, h, w), on average, with gradients."""
+        """Return the mean distance of pictures (n, 3, h, w), with gradients."""
         total = torch.zeros((), device=image.device)
         for level, (a, b) in enumerate(zip(self._features(image), self._features(target), strict=True)):
             weight = self._weights[f"lin{level}.model.1.weight"].reshape(1, -1, 1, 1).to(a)
@@ -56,17 +56,17 @@ class Lpips:
     def _features(self, x: Tensor) -> list[Tensor]:
         shift, scale = (torch.tensor(values, device=x.device).reshape(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
         x = (x * 2 - 1 - shift) / scale
-        found = []
+        features = []
         for index, stride, padding, pooled in _LAYERS:
             if pooled:
                 x = F.max_pool2d(x, 3, 2)
             kernel, bias = (self._weights[f"features.{index}.{kind}"].to(x) for kind in ("weight", "bias"))
             x = F.relu(F.conv2d(x, kernel, bias, stride, padding))
-            found.append(x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt())
-        return found
+            features.append(x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt())
+        return features
 
 
-def _read(path: Path) -> dict[str, Tensor]:
+def _read_weights(path: Path) -> dict[str, Tensor]:
     if path.suffix == ".safetensors":
         from safetensors.torch import load_file
 

@@ -24,65 +24,64 @@ WINDOW = 11
 SIGMA = 1.5
 
 
-def psnr(image: Array, target: Array, keep: Array | None = None) -> float:
-    """Peak signal-to-noise ratio in dB for a peak of 1; infinite where the pictures are equal.
+def psnr(image: Array, target: Array, mask: Array | None = None) -> float:
+    """Return the peak signal-to-noise ratio in dB for a peak of 1; infinite if the pictures are equal.
 
-    keep: (height, width) bool, the pixels that count; NaN where none does. Raises SettingsError where
-    the sizes differ.
+    mask: (height, width) bool, the pixels to score; NaN if there are none. Raises SettingsError if the sizes differ.
     """
-    difference = _difference(image, target, keep)
+    difference = _masked_difference(image, target, mask)
     if difference.size == 0:
         return math.nan
     error = float(np.mean(np.square(difference)))
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
-def relative_l2(image: Array, target: Array, keep: Array | None = None) -> float:
-    """|image - target| / |target| in the L2 norm: 0 is exact, 1 is what an empty picture scores.
+def relative_l2(image: Array, target: Array, mask: Array | None = None) -> float:
+    """Return |image - target| / |target| in the L2 norm: 0 is exact, 1 is the score of an empty picture.
 
-    keep: as in `psnr`. NaN where the target is empty.
+    mask: as in `psnr`. NaN if the target is empty.
     """
-    error = float(np.linalg.norm(_difference(image, target, keep)))
-    size = float(np.linalg.norm(_difference(target, np.zeros_like(target), keep)))
+    error = float(np.linalg.norm(_masked_difference(image, target, mask)))
+    size = float(np.linalg.norm(_masked_difference(target, np.zeros_like(target), mask)))
     return error / size if size > 0 else math.nan
 
 
-def _difference(image: Array, target: Array, keep: Array | None) -> NDArray[np.float64]:
-    _same_size(image, target)
+def _masked_difference(image: Array, target: Array, mask: Array | None) -> NDArray[np.float64]:
+    _check_same_size(image, target)
     difference = np.asarray(image, np.float64) - np.asarray(target, np.float64)
-    return difference.ravel() if keep is None else difference[keep].ravel()
+    return difference.ravel() if mask is None else difference[mask].ravel()
 
 
-def _same_size(image: Array, target: Array) -> None:
+def _check_same_size(image: Array, target: Array) -> None:
     if image.shape != target.shape:
         raise SettingsError(f"Pictures of sizes {image.shape} and {target.shape} cannot be compared; "
                             f"resize one of them.")
 
 
 def ssim(image: Array, target: Array, borders: Borders = "valid") -> float:
-    """Structural similarity, Wang et al. 2004, eq. 13: 11x11 Gaussian window of sigma 1.5, K = 0.01, 0.03.
+    """Return the structural similarity, Wang et al. 2004, eq. 13: 11x11 Gaussian window of sigma 1.5, K = 0.01, 0.03.
 
-    borders: "valid" counts only windows that lie inside the picture, as the authors' program does;
-    "same" pads with zeros and counts every pixel, as the 3DGS losses and tables do (higher, a little).
-    The mean is over pixels and channels. Raises SettingsError for a picture smaller than the window.
+    borders: "valid" counts only windows inside the picture, as the authors' program does; "same" pads with zeros and
+    counts every pixel, as the 3DGS losses and tables do (slightly higher). The mean is over pixels and channels. Raises
+    SettingsError for a picture smaller than the window.
     """
-    _same_size(image, target)
+    _check_same_size(image, target)
     if borders == "valid" and min(image.shape[:2]) < WINDOW:
         raise SettingsError(f"SSIM needs pictures of {WINDOW} pixels or more a side, not "
                             f"{image.shape[1]} x {image.shape[0]}.")
     x, y = np.asarray(image, np.float64), np.asarray(target, np.float64)
     c1, c2 = 0.01 ** 2, 0.03 ** 2
-    mean_x, mean_y = _blurred(x, borders), _blurred(y, borders)
-    variance_x = _blurred(x * x, borders) - mean_x ** 2
-    variance_y = _blurred(y * y, borders) - mean_y ** 2
-    covariance = _blurred(x * y, borders) - mean_x * mean_y
+    mean_x, mean_y = _blur(x, borders), _blur(y, borders)
+    variance_x = _blur(x * x, borders) - mean_x ** 2
+    variance_y = _blur(y * y, borders) - mean_y ** 2
+    covariance = _blur(x * y, borders) - mean_x * mean_y
     similarity = ((2 * mean_x * mean_y + c1) * (2 * covariance + c2)
                   / ((mean_x ** 2 + mean_y ** 2 + c1) * (variance_x + variance_y + c2)))
     return float(similarity.mean())
 
 
-def _blurred(picture: NDArray[np.float64], borders: Borders) -> NDArray[np.float64]:
-    """The Gaussian window, one axis after the other."""
+def _blur(picture: NDArray[np.float64], borders: Borders) -> NDArray[np.float64]:
+    """Convolve with the Gaussian window, one axis after the other."""
     at = np.arange(WINDOW) - WINDOW // 2
     window = np.exp(-at ** 2 / (2 * SIGMA ** 2))
     window /= window.sum()
@@ -97,16 +96,17 @@ def _blurred(picture: NDArray[np.float64], borders: Borders) -> NDArray[np.float
 
 
 def has_flip() -> bool:
-    """Whether NVIDIA's `flip-evaluator` is installed here."""
+    """True if NVIDIA's `flip-evaluator` is installed."""
     return importlib.util.find_spec("flip_evaluator") is not None
 
 
 def flip(image: Array, target: Array) -> float | None:
-    """Mean LDR-FLIP (Andersson et al. 2020), 0 equal .. 1, at the default 67 pixels a degree.
+    """Return the mean LDR-FLIP (Andersson et al. 2020), 0 for equal pictures, up to 1, at the default 67 pixels a
+    degree.
 
-    None where `flip-evaluator` is not installed.
+    None if `flip-evaluator` is not installed.
     """
-    _same_size(image, target)
+    _check_same_size(image, target)
     if not has_flip():
         return None
     import flip_evaluator

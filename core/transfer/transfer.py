@@ -36,6 +36,7 @@ from ..images.picture import Picture
 from ..look import LookEdits, PlacedLight, ViewOfLight, read
 from ..system.files import check_no_overwrite
 from ..system.progress import Progress
+from ..system.reading import read_bytes
 from . import query as queries
 from .plates import AUTO, ColouredPlate
 from .target import Target, TargetFrame, background
@@ -83,7 +84,7 @@ class Transfer:
     @cached_property
     def fingerprint(self) -> str:
         """A hash that changes whenever all pictures would; a frame renderer's fingerprint covers the single frame."""
-        digest = hashlib.sha256(self.flare.read_bytes())
+        digest = hashlib.sha256(read_bytes(self.flare))
         digest.update(self.target.fingerprint().encode())
         plates = self.settings.plate_space
         meaning = "" if plates == AUTO else colour_space(plates, self.config).fingerprint

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from ...core.choices import Blend, Mode, Model, Preset
 from ...core.errors import SettingsError
-from ...core.system.files import UTF8_SIG
 from ...core.system.progress import Progress
+from ...core.system.reading import UTF8_SIG, read_text
 from ...core.typed import MAX_INT_DIGITS
 from .. import jobs
 from ..command import Command, Step, check_at_least_one, parse_seed, reject_unused_options
@@ -153,7 +153,7 @@ def resolve_folders(args: argparse.Namespace) -> tuple[Path, Path]:
 def read_list(path: Path) -> list[Path]:
     """Read a list of captures: one folder per line, relative to the list; # begins a comment. Raises SettingsError."""
     try:
-        lines = path.read_text(encoding=UTF8_SIG).splitlines()
+        lines = read_text(path, encoding=UTF8_SIG).splitlines()
     except (OSError, UnicodeDecodeError) as problem:
         raise SettingsError(f"{path} cannot be read ({problem}); it should have a folder on each line.") from problem
     folders = [path.parent / line.strip() for line in lines if line.strip() and not line.startswith("#")]

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from core.bake import bake as baking
-from core.bake.bake import RECORD, BakeSettings, bake, read_record
+from core.bake.bake import MANIFEST, BakeSettings, bake, read_manifest
 from core.bake.exr import read_description, read_layers, write_layers
-from core.bake.layers import FARTHEST, FrameLayers, layer_names, layers_of
+from core.bake.layers import EMPTY_DEPTH, FrameLayers, layer_names, to_layers
 from core.capture.camera import Camera
 from core.colour import REC_709, colour_space
-from core.conventions.frame_numbers import absent, chosen, numbered, plates_by_number
+from core.conventions.frame_numbers import missing_numbers, number_views, plates_by_number, select_frames
 from core.errors import Cancelled, FrameError, RunError, SettingsError
 from core.fit.run import ViewLayers
-from core.images.exr import exr_space, read_exr, read_exr_header
+from core.images.exr import exr_colour_space, read_exr, read_exr_header
 from core.images.write import write_exr
 from core.look import KeyedEdits, LookEdits
 from core.system.files import write_json
@@ -63,11 +63,11 @@ def camera(mark: int) -> Camera:
 
 VIEWS = ("0003.png", "0004.png", "0010.png")
 CAMERAS = {name: camera(index + 1) for index, name in enumerate(VIEWS)}
-FRAMES = numbered(VIEWS)
+FRAMES = number_views(VIEWS)
 
 
 def layers(mark: int = 1) -> FrameLayers:
-    return layers_of(FakeRenderer().render(camera(mark)))
+    return to_layers(FakeRenderer().render(camera(mark)))
 
 
 # ---- layers and files -----------------------------------------------------------------------------
@@ -92,7 +92,7 @@ def test_channels_are_those_of_the_format(tmp_path: Path) -> None:
     expected = {*rgba, "scene.R", "scene.G", "scene.B", "depth.Z"} | {
         f"{layer}.{name}" for layer in ("flare", "flare_lamp", "flare_key_light") for name in rgba}
     assert set(channels) == expected
-    assert channels["depth.Z"][0, 0] == np.float32(FARTHEST)
+    assert channels["depth.Z"][0, 0] == np.float32(EMPTY_DEPTH)
     assert (channels["A"] == 1).all()
     brightest = np.max([channels[f"flare.{name}"] for name in "RGB"], axis=0)
     np.testing.assert_allclose(channels["flare.A"], np.clip(brightest, 0, 1), rtol=HALF)
@@ -106,7 +106,7 @@ def test_depth_stays_32_bit_beside_half_colour(tmp_path: Path) -> None:
     assert not np.array_equal(channels["scene.R"], frame.scene[..., 0])
 
 
-def test_layers_come_back_with_their_lights_and_notes(tmp_path: Path) -> None:
+def test_written_layers_are_read_with_their_lights_and_notes(tmp_path: Path) -> None:
     frame = layers()
     write_layers(tmp_path / "a.exr", frame, half=False, notes={"view": "0003.png"})
     again = read_layers(tmp_path / "a.exr")
@@ -116,7 +116,7 @@ def test_layers_come_back_with_their_lights_and_notes(tmp_path: Path) -> None:
     assert read_description(tmp_path / "a.exr")["view"] == "0003.png"
 
 
-def test_a_strange_exr_is_refused_by_name(tmp_path: Path) -> None:
+def test_a_foreign_exr_is_refused_by_name(tmp_path: Path) -> None:
     write_exr(tmp_path / "other.exr", {"R": np.zeros((4, 4))})
     (tmp_path / "broken.exr").write_bytes(b"\x76\x2f\x31\x01 and then nothing")
     for name in ("other.exr", "broken.exr", "absent.exr"):
@@ -124,7 +124,7 @@ def test_a_strange_exr_is_refused_by_name(tmp_path: Path) -> None:
             read_layers(tmp_path / name)
 
 
-def test_light_names_become_safe_and_stay_apart() -> None:
+def test_layer_names_are_safe_and_unique() -> None:
     names = layer_names(["lamp", "Lamp", "desk.lamp/2", "Lampe é", "灯", "", "x" * 90])
     assert list(names.values())[:6] == [
         "flare_lamp", "flare_Lamp_2", "flare_desk_lamp_2", "flare_Lampe_e", "flare_light", "flare_light_2"]
@@ -160,14 +160,14 @@ def test_edits_multiply() -> None:
 @pytest.mark.parametrize("edit", ["lamp", "lamp.intensity", "lamp.intensity=", "lamp.intensity=much", "sun.intensity=1",
                                   "lamp.intensity=-1", "lamp.intensity=nan", "lamp.tint=1,2", "lamp.size=2",
                                   "lamp.tint=#12345", "=2", ".intensity=2"])
-def test_an_edit_that_makes_no_sense_is_refused(edit: str) -> None:
+def test_an_invalid_edit_is_refused(edit: str) -> None:
     with pytest.raises(SettingsError, match="edit"):
         gains([edit], ["lamp"])
 
 
 def test_frame_numbers_come_from_names_or_else_from_the_order() -> None:
     def of(*views: str) -> list[tuple[str, int, str]]:
-        return [(frame.view, frame.number, frame.file) for frame in numbered(views)]
+        return [(frame.view, frame.number, frame.file) for frame in number_views(views)]
 
     assert of("0003.png", "DSC_0000.JPG") == [
         ("DSC_0000.JPG", 0, "layers.0000.exr"), ("0003.png", 3, "layers.0003.exr")]
@@ -180,29 +180,30 @@ def test_frame_numbers_come_from_names_or_else_from_the_order() -> None:
 
 
 def test_long_numbers_are_whole_and_those_below_0_refused(tmp_path: Path) -> None:
-    assert [frame.number for frame in numbered(["sh.999999.exr", "sh.1000000.exr"])] == [999999, 1000000]
-    assert [frame.number for frame in numbered(["1700000002.png", "1700000001.png"])] == [1, 2]  # times, not numbers
+    assert [frame.number for frame in number_views(["sh.999999.exr", "sh.1000000.exr"])] == [999999, 1000000]
+    assert [frame.number for frame in number_views(["1700000002.png", "1700000001.png"])] == [1, 2], "times"
     assert plates_by_number([tmp_path / "sh.1000000.png"]) == {1000000: tmp_path / "sh.1000000.png"}
-    assert [frame.number for frame in numbered(["take-0010.png"])] == [10]
-    for read in (lambda: numbered(["sh.0001.png", "sh.-0001.png"]), lambda: plates_by_number([Path("sh_-0001.png")])):
+    assert [frame.number for frame in number_views(["take-0010.png"])] == [10]
+    for read in (lambda: number_views(["sh.0001.png", "sh.-0001.png"]),
+                 lambda: plates_by_number([Path("sh_-0001.png")])):
         with pytest.raises(SettingsError, match=r"-0001\.png has a frame number below 0"):
             read()
 
 
 def test_frames_are_chosen_by_ranges() -> None:
-    assert [frame.number for frame in chosen(FRAMES, None)] == [3, 4, 10]
-    assert [frame.number for frame in chosen(FRAMES, "1-3, 10")] == [3, 10]
-    assert [frame.number for frame in chosen(FRAMES, "2-10:2")] == [4, 10]
+    assert [frame.number for frame in select_frames(FRAMES, None)] == [3, 4, 10]
+    assert [frame.number for frame in select_frames(FRAMES, "1-3, 10")] == [3, 10]
+    assert [frame.number for frame in select_frames(FRAMES, "2-10:2")] == [4, 10]
     for text in ("", "a", "3-", "5-4", "20-30", "-3", "1-9:0", "1:2", "4-4000000000000000000000"):
         with pytest.raises(SettingsError):
-            chosen(FRAMES, text)
+            select_frames(FRAMES, text)
 
 
-def test_what_is_asked_for_and_is_not_there_is_told() -> None:
-    assert absent(FRAMES, None) == absent(FRAMES, "3-4,10") == ""
-    assert absent(FRAMES, "1-12, 99") == "1-2,5-9,11-12,99"
-    assert absent(FRAMES, "2-14:2") == "2,6-8:2,12-14:2"
-    assert absent(FRAMES, "3-999999999") == "5-9,11-999999999"
+def test_missing_frame_numbers_are_reported() -> None:
+    assert missing_numbers(FRAMES, None) == missing_numbers(FRAMES, "3-4,10") == ""
+    assert missing_numbers(FRAMES, "1-12, 99") == "1-2,5-9,11-12,99"
+    assert missing_numbers(FRAMES, "2-14:2") == "2,6-8:2,12-14:2"
+    assert missing_numbers(FRAMES, "3-999999999") == "5-9,11-999999999"
 
 
 # ---- bake -----------------------------------------------------------------------------------------
@@ -211,7 +212,7 @@ def test_what_is_asked_for_and_is_not_there_is_told() -> None:
 def test_bake_writes_every_frame_at_the_size_asked_for(tmp_path: Path) -> None:
     record = bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path, BakeSettings(24, edits=("lamp.intensity=2",)))
     assert [entry["file"] for entry in record["frames"]] == [frame.file for frame in FRAMES]
-    assert record == read_record(tmp_path)
+    assert record == read_manifest(tmp_path)
     again = read_layers(tmp_path / FRAMES[0].file)
     assert again.scene.shape == (16, 24, 3)
     rendering = FakeRenderer().render(camera(1).scaled(24, 16))
@@ -219,7 +220,7 @@ def test_bake_writes_every_frame_at_the_size_asked_for(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.flares["key light"], rendering.flare_by_light["key light"], rtol=HALF, atol=1e-6)
 
 
-def test_layers_of_squeezed_frames_say_so(tmp_path: Path) -> None:
+def test_layers_keep_the_pixel_aspect(tmp_path: Path) -> None:
     """A compositor would show them half as wide as their plates; a solve's focal lengths that differ a little do not
     make a pixel oblong."""
     cameras = {name: replace(camera(60), fx=fx) for name, fx in zip(VIEWS, (30.0, 60.0, 60.3), strict=True)}
@@ -258,28 +259,28 @@ class StopAfter(Progress):
         super().advance(steps, **figures)
 
 
-def test_a_stopped_bake_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_stopped_bake_resumes(tmp_path: Path) -> None:
     first, second = FakeRenderer(), FakeRenderer()
     with pytest.raises(Cancelled):
         bake(first, FRAMES, CAMERAS, tmp_path, progress=StopAfter(1))
     assert first.rendered == [1]
-    assert len(read_record(tmp_path)["frames"]) == 1
+    assert len(read_manifest(tmp_path)["frames"]) == 1
     bake(second, FRAMES, CAMERAS, tmp_path)
     assert second.rendered == [2, 3]
-    assert len(read_record(tmp_path)["frames"]) == 3
+    assert len(read_manifest(tmp_path)["frames"]) == 3
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_lost_file_is_made_again_and_others_stay_listed(tmp_path: Path) -> None:
+def test_a_deleted_frame_is_baked_again_and_others_stay_listed(tmp_path: Path) -> None:
     bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)
     (tmp_path / FRAMES[1].file).unlink()
     again = FakeRenderer()
     bake(again, FRAMES[1:2], CAMERAS, tmp_path)
     assert again.rendered == [2]
-    assert [entry["frame"] for entry in read_record(tmp_path)["frames"]] == [3, 4, 10]
+    assert [entry["frame"] for entry in read_manifest(tmp_path)["frames"]] == [3, 4, 10]
 
 
-def test_a_frame_that_is_cut_off_is_made_again(tmp_path: Path) -> None:
+def test_a_truncated_frame_is_baked_again(tmp_path: Path) -> None:
     bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)
     whole = (tmp_path / FRAMES[1].file).read_bytes()
     (tmp_path / FRAMES[1].file).write_bytes(whole[:-100])
@@ -289,16 +290,16 @@ def test_a_frame_that_is_cut_off_is_made_again(tmp_path: Path) -> None:
     assert (tmp_path / FRAMES[1].file).read_bytes() == whole
 
 
-def test_other_settings_do_not_mix_with_what_is_there(tmp_path: Path) -> None:
+def test_a_bake_with_other_settings_is_refused(tmp_path: Path) -> None:
     bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)
     changed = BakeSettings(edits=("lamp.intensity=2",))
     with pytest.raises(RunError, match="other settings"):
         bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path, changed)
     bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path, changed, overwrite=True)
-    assert [path.name for path in sorted(tmp_path.iterdir())] == [RECORD, FRAMES[0].file]
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [MANIFEST, FRAMES[0].file]
 
 
-def test_frames_of_other_lights_do_not_mix_with_what_is_there(tmp_path: Path) -> None:
+def test_a_bake_with_other_lights_is_refused(tmp_path: Path) -> None:
     """A light's layer that a frame lacks is taken from the composite by Blender, and added twice."""
     bake(FakeRenderer(), FRAMES[:2], CAMERAS, tmp_path)
     alone = FakeRenderer()
@@ -306,10 +307,10 @@ def test_frames_of_other_lights_do_not_mix_with_what_is_there(tmp_path: Path) ->
     with pytest.raises(RunError, match=r"layers of the lights lamp, key light, and these frames have lamp:"):
         bake(alone, FRAMES[2:], CAMERAS, tmp_path)
     bake(alone, FRAMES[2:], CAMERAS, tmp_path, overwrite=True)
-    assert [path.name for path in sorted(tmp_path.iterdir())] == [RECORD, FRAMES[2].file]
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [MANIFEST, FRAMES[2].file]
 
 
-def test_a_frame_whose_camera_changed_is_made_again(tmp_path: Path) -> None:
+def test_a_frame_whose_camera_changed_is_baked_again(tmp_path: Path) -> None:
     """A capture that was solved again has other cameras under the same names."""
     bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)
     again = FakeRenderer()
@@ -327,46 +328,46 @@ def test_plates_have_the_numbers_of_their_names(tmp_path: Path) -> None:
     assert plates_by_number(unnumbered) == {1: unnumbered[1], 2: unnumbered[0]}
 
 
-def test_a_damaged_record_is_one_sentence(tmp_path: Path) -> None:
+def test_a_damaged_manifest_is_one_line(tmp_path: Path) -> None:
     good = bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path)
-    whole = (tmp_path / RECORD).read_text()
+    whole = (tmp_path / MANIFEST).read_text()
     number, file = f'"frame": {FRAMES[0].number}', f'"file": "{FRAMES[0].file}"'
     damaged = [whole.replace(old, new) for old, new in (
         (number, '"frame": "3"'), (number, '"frame": true'), (file, '"file": 5'), (file, f'{file}, "rest": "ab"'),
         (file, f'{file}, "rest": [5]'))]
     for text in ("", "[]", "{}", '{"version": 99}', *damaged):
         assert text != whole
-        (tmp_path / RECORD).write_text(text)
+        (tmp_path / MANIFEST).write_text(text)
         with pytest.raises(RunError, match=r"bake\.json"):
             bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path)
     assert good["frames"][0]["file"] == FRAMES[0].file
 
 
-def test_a_record_cannot_reach_outside_its_folder(tmp_path: Path) -> None:
+def test_a_manifest_cannot_name_files_outside_its_folder(tmp_path: Path) -> None:
     out = tmp_path / "out"
     record = bake(FakeRenderer(), FRAMES[:1], CAMERAS, out)
     treasure = tmp_path / "treasure.exr"
     treasure.write_text("mine")
     record["frames"][0]["file"] = "../treasure.exr"
-    write_json(out / RECORD, record)
+    write_json(out / MANIFEST, record)
     with pytest.raises(RunError):
         bake(another_fit(), FRAMES[:1], CAMERAS, out, overwrite=True)
     assert treasure.read_text() == "mine"
 
 
-def test_what_lies_beside_layers_cannot_be_outside_either(tmp_path: Path) -> None:
+def test_extra_files_cannot_be_outside_the_folder(tmp_path: Path) -> None:
     out, treasure = tmp_path / "out", tmp_path / "treasure.png"
     record = bake(FakeRenderer(), FRAMES[:1], CAMERAS, out)
     treasure.write_text("mine")
     record["frames"][0]["rest"] = ["../treasure.png"]
-    write_json(out / RECORD, record)
+    write_json(out / MANIFEST, record)
     with pytest.raises(RunError):
         bake(another_fit(), FRAMES[:1], CAMERAS, out, overwrite=True)
     assert treasure.read_text() == "mine"
 
 
 @pytest.mark.parametrize("after", [1, 2])
-def test_bakes_at_once_with_other_settings_do_not_mix(tmp_path: Path, after: int) -> None:
+def test_a_concurrent_bake_with_other_settings_is_refused(tmp_path: Path, after: int) -> None:
     """The one that comes second to a frame is refused, and writes over none of the other's."""
     class Meanwhile(FakeRenderer):
         def render(self, camera: Camera, edits: LookEdits | None = None) -> FakeRendering:
@@ -378,13 +379,13 @@ def test_bakes_at_once_with_other_settings_do_not_mix(tmp_path: Path, after: int
     with pytest.raises(RunError, match="Another bake, of another fit or with other settings"):
         bake(first, FRAMES, CAMERAS, tmp_path)
     assert len(first.rendered) == after
-    assert len(read_record(tmp_path)["frames"]) == 3
+    assert len(read_manifest(tmp_path)["frames"]) == 3
     again = another_fit()
     bake(again, FRAMES, CAMERAS, tmp_path)
     assert again.rendered == [], "nothing of the other's was lost, the frame that was being written least of all"
 
 
-def test_of_two_bakes_that_begin_in_one_new_folder_one_is_refused(tmp_path: Path) -> None:
+def test_one_of_two_concurrent_bakes_in_a_new_folder_is_refused(tmp_path: Path) -> None:
     """Neither has a frame yet when the other begins."""
     class Meanwhile(FakeRenderer):
         def render(self, camera: Camera, edits: LookEdits | None = None) -> FakeRendering:
@@ -396,7 +397,7 @@ def test_of_two_bakes_that_begin_in_one_new_folder_one_is_refused(tmp_path: Path
     assert {read_description(tmp_path / frame.file)["renderer"] for frame in FRAMES} == {"another"}
 
 
-def test_a_bake_that_came_to_nothing_is_in_nobody_s_way(tmp_path: Path) -> None:
+def test_an_empty_manifest_does_not_block_another_bake(tmp_path: Path) -> None:
     class Broken(FakeRenderer):
         fingerprint = "broken"
 
@@ -408,18 +409,18 @@ def test_a_bake_that_came_to_nothing_is_in_nobody_s_way(tmp_path: Path) -> None:
     assert len(bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)["frames"]) == 3
 
 
-def test_another_task_may_clear_the_folder_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bake_survives_a_folder_cleared_by_another_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)
-    usual = baking.locked
+    usual = baking.file_lock
 
     @contextlib.contextmanager
     def cleared_meanwhile(lock: Path) -> Iterator[None]:
-        (tmp_path / RECORD).unlink(missing_ok=True)
-        monkeypatch.setattr(baking, "locked", usual)
+        (tmp_path / MANIFEST).unlink(missing_ok=True)
+        monkeypatch.setattr(baking, "file_lock", usual)
         with usual(lock):
             yield
 
-    monkeypatch.setattr(baking, "locked", cleared_meanwhile)
+    monkeypatch.setattr(baking, "file_lock", cleared_meanwhile)
     assert len(bake(another_fit(), FRAMES, CAMERAS, tmp_path, overwrite=True)["frames"]) == 3
 
 
@@ -429,22 +430,22 @@ def another_fit() -> FakeRenderer:
     return renderer
 
 
-def test_colours_of_layers_are_light_and_plain_factors_exact() -> None:
+def test_layer_colours_keep_light_nonnegative_and_diagonal_factors_exact() -> None:
     """A covering flare may take light away: a factor leaves that, so that scene + flare stays the composite."""
     layer = np.full((2, 2, 3), (1.0, 0.0, -0.25), np.float32)
     rendering = ViewLayers(np.zeros_like(layer), {"lamp": layer}, layer[..., 0])
     vivid, hardly, double = (LookEdits.parse([f"lamp.{edit}"], ["lamp"]).matrices(["lamp"])
                              for edit in ("saturation=2", "saturation=0.999", "intensity=2"))
     light = ViewLayers(np.zeros_like(layer), {"lamp": np.abs(layer)}, layer[..., 0])
-    assert (layers_of(light, vivid).flares["lamp"] >= 0).all()
-    np.testing.assert_allclose(layers_of(rendering, hardly).flares["lamp"], layer, atol=2e-3)
-    np.testing.assert_array_equal(layers_of(rendering, double).flares["lamp"], 2 * layer)
+    assert (to_layers(light, vivid).flares["lamp"] >= 0).all()
+    np.testing.assert_allclose(to_layers(rendering, hardly).flares["lamp"], layer, atol=2e-3)
+    np.testing.assert_array_equal(to_layers(rendering, double).flares["lamp"], 2 * layer)
 
 
-def test_a_file_tells_what_its_light_is_in(tmp_path: Path) -> None:
+def test_a_file_names_its_colour_space(tmp_path: Path) -> None:
     layers = FrameLayers(np.ones((2, 3, 3), np.float32), {}, np.ones((2, 3), np.float32))
     red_is_cyan = (0.2, 0.3, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
     spaces = {"rec709": REC_709, "untold": None, "acescg": colour_space("acescg").chromaticities, "own": red_is_cyan}
     for name, chromaticities in spaces.items():
         write_layers(tmp_path / f"{name}.exr", layers, chromaticities=chromaticities)
-    assert [exr_space(tmp_path / f"{name}.exr") for name in spaces] == ["linear", "linear", "acescg", ""]
+    assert [exr_colour_space(tmp_path / f"{name}.exr") for name in spaces] == ["linear", "linear", "acescg", ""]

@@ -21,13 +21,13 @@ def frame(folder: Path, number: int, lights: Sequence[str]) -> Path:
     return path
 
 
-def test_frames_of_the_same_layers_are_a_sequence_with_gaps_or_none(tmp_path: Path) -> None:
+def test_frames_with_equal_layers_form_a_sequence_with_or_without_gaps(tmp_path: Path) -> None:
     files = {number: frame(tmp_path, number, ["sun", "lamp"]) for number in (0, 3, 4)}
     layers = LayerFolder.open(tmp_path)
     assert (layers.files, layers.first, layers.last, layers.size()) == (files, 0, 4, (6, 4))
 
 
-def test_frames_of_other_lights_are_not_taken_for_one_sequence(tmp_path: Path) -> None:
+def test_frames_with_other_layers_are_refused(tmp_path: Path) -> None:
     """Blender goes by the layers of the first: the lamp would be gone in silence."""
     frame(tmp_path, 1, ["sun"])
     frame(tmp_path, 2, ["sun"])
@@ -36,7 +36,7 @@ def test_frames_of_other_lights_are_not_taken_for_one_sequence(tmp_path: Path) -
         LayerFolder.open(tmp_path)
 
 
-def test_layers_that_lie_one_folder_down_are_named(tmp_path: Path) -> None:
+def test_layers_in_subfolders_are_named(tmp_path: Path) -> None:
     (tmp_path / "cam0").mkdir()
     frame(tmp_path / "cam0", 1, ["sun"])
     with pytest.raises(FrameError, match=r"holds its layers in cam0; choose"):

@@ -22,7 +22,7 @@ from core.metrics.evaluation import evaluate
 from core.removal.inference.remover import Remover
 from tests.core.captures import picture
 from tests.core.flared import HEIGHT, WIDTH, flared_capture
-from tests.core.heard import Heard
+from tests.core.recording_progress import RecordingProgress
 from tests.core.removal_cases import network_file
 from tests.core.test_fit import flare_psnr, quick
 
@@ -121,7 +121,7 @@ def test_a_fit_leaves_borders_out(tmp_path: Path, boxed: Capture) -> None:
     whole = boxed.views[0].camera
     point = np.array([[0.1, 0.1, 0.3]])
     assert np.allclose(camera.project(point)[0] + [0, 6 + BORDER_MARGIN], whole.project(point)[0])
-    heard = Heard()
+    heard = RecordingProgress()
     settings = quick(400, **{"flare.density.stop": 200, "flare.density.every": 50})
     run = fit(boxed, settings, tmp_path / "run", heard)
     assert any("black borders (7 and 7 rows, 0 and 0 columns of 64x40)" in text for text in heard.texts)

@@ -26,11 +26,18 @@ from core.conventions.run_files import CHECKPOINT, FLARE, SCENE
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError, SettingsError
 from core.fit import FitSettings, Run, checkpoint, fit, preset
 from core.fit.frames import Frames
-from core.fit.initialise import NEAREST_PART, nearest_depth
-from core.fit.parallax_losses import FOUND_WHOLLY, from_below, haze, nearness, scene_beside_flare, times_found
+from core.fit.initialise import NEAR_PLANE_FACTOR, nearest_depth
+from core.fit.parallax_losses import (
+    MAX_EXCESS_RATIO,
+    excess_ratio,
+    far_flare_penalty,
+    light_proximity,
+    quantile_loss,
+    scene_loss,
+)
 from core.fit.rendering import render_flare
-from core.fit.settings import SplitSettings, changed
-from core.fit.sky import COUNT, with_sky
+from core.fit.settings import SplitSettings, override_settings
+from core.fit.sky import SKY_POINTS, add_sky_points
 from core.fit.trainer import Trainer
 from core.flare.compositing import composite
 from core.flare.model import OURS, PAPER
@@ -38,11 +45,11 @@ from core.gaussians.rendering import NEAR
 from core.images.read import read_picture
 from core.images.write import write_png
 from core.look import LookEdits, draw
-from core.look.look import FORM_BOUNDS
-from core.system.folder_lock import held
+from core.look.form import FORM_BOUNDS
+from core.system.folder_lock import folder_lock
 from core.system.progress import Progress
 from tests.core.flared import flared_capture
-from tests.core.heard import Heard
+from tests.core.recording_progress import RecordingProgress
 
 ROOT = Path(__file__).parents[2]
 
@@ -67,7 +74,7 @@ def quick(iterations: int = 40, **changes: Any) -> FitSettings:
     Without occlusion: in this capture the light shines through whatever stands before it.
     """
     settings = preset("draft", iterations=iterations)
-    return changed(settings, {
+    return override_settings(settings, {
         "flare.count": 60, "flare.occlusion": False, "holdout": 4, "preview_every": 15, "flare.density.start": 10,
         "flare.density.every": 10, "flare.density.stop": 30, "scene.classic.start": 5, "scene.classic.every": 10,
         "scene.reorder_every": 12, "scene.sh_every": 8, **changes})
@@ -107,7 +114,7 @@ def flare_psnr(run: Run, capture: Capture) -> tuple[float, float]:
     return -10 * float(np.log10(np.mean(errors))), -10 * float(np.log10(np.mean(empty)))
 
 
-def test_a_fit_finds_the_flare(tmp_path: Path, capture: Capture) -> None:
+def test_a_fit_separates_the_flare_from_the_scene(tmp_path: Path, capture: Capture) -> None:
     run = fit(capture, quick(400, **{"flare.density.stop": 200, "flare.density.every": 50}), tmp_path / "run")
     fitted, empty = flare_psnr(run, capture)
     assert fitted > empty + 6
@@ -119,7 +126,7 @@ def test_a_fit_finds_the_flare(tmp_path: Path, capture: Capture) -> None:
     assert lines[-1]["flare_gaussians"] > 60
 
 
-def test_colours_take_up_directions_by_and_by(capture: Capture) -> None:
+def test_sh_degree_rises_during_a_fit(capture: Capture) -> None:
     trainer = Trainer(capture, quick())
     degrees = []
     for trainer.iteration in (0, 7, 8, 20, 39):
@@ -127,24 +134,24 @@ def test_colours_take_up_directions_by_and_by(capture: Capture) -> None:
     assert degrees == [0, 0, 1, 2, 3]
 
 
-def test_the_light_itself_is_not_what_its_flare_lies_before(capture: Capture) -> None:
+def test_a_light_disc_is_black_behind_its_additive_flare(capture: Capture) -> None:
     trainer = Trainer(capture, quick())
     targets = trainer.frames.targets(trainer.views[0])
-    assert targets.removed is not None
+    assert targets.clean is not None
     (x, y), = targets.camera.project(capture.lights[0].xyz)[0].astype(int)
-    white = targets.removed.clone()
+    white = targets.clean.clone()
     white[y, x] = white[0, 0] = 1
-    clean, scene = targets._replace(removed=white), torch.full_like(white, 0.25)
+    clean, scene = targets._replace(clean=white), torch.full_like(white, 0.25)
     for progress, behind in ((1, white), (trainer.settings.iterations, scene)):
         trainer.iteration = progress
-        seen = trainer._behind_flare(clean, scene, trainer._sources(clean))
+        seen = trainer._flare_background(clean, scene, trainer._light_disc_mask(clean))
         assert not seen[y, x].any()
         expected = behind.clone()
         expected[y, x] = 0
         assert torch.equal(seen, expected)
 
 
-def test_a_light_given_beside_its_flare_is_put_there(tmp_path: Path) -> None:
+def test_a_displaced_light_is_snapped_to_its_flare(tmp_path: Path) -> None:
     capture = Capture.open(flared_capture(tmp_path / "capture"))
     lamp = capture.lights[0]
     for view in capture.views:  # the lamp itself, which the painted flare lacks
@@ -155,16 +162,16 @@ def test_a_light_given_beside_its_flare_is_put_there(tmp_path: Path) -> None:
             picture[max(y - 1, 0):y + 2, max(x - 1, 0):x + 2] = 1
             write_png(path, picture)
     capture.lights = (Light(lamp.name, lamp.xyz + np.array([0.2, 0.15, 0.3])),)
-    heard = Heard()
+    heard = RecordingProgress()
     for snap in (True, False):
-        run = fit(capture, quick(4, **{"flare.snap": snap}), tmp_path / f"run {snap}", heard)
+        run = fit(capture, quick(4, **{"flare.snap_lights": snap}), tmp_path / f"run {snap}", heard)
         off = np.linalg.norm(run.flare.model.positions.numpy()[0] - lamp.xyz)
         assert off < 0.1 if snap else off > 0.35
         assert np.linalg.norm(run.capture().lights[0].xyz - run.flare.model.positions.numpy()[0]) < 1e-6
-    assert [text.split(" was put")[0] for text in heard.texts if " was put" in text] == ["The light 'lamp'"]
+    assert [text.split(" was moved")[0] for text in heard.texts if " was moved" in text] == ["The light 'lamp'"]
 
 
-def test_stopped_and_resumed_is_bit_for_bit_the_unbroken_fit(tmp_path: Path, capture: Capture) -> None:
+def test_a_resumed_fit_equals_the_uninterrupted_one_bit_for_bit(tmp_path: Path, capture: Capture) -> None:
     whole = fit(capture, quick(), tmp_path / "whole")
     for steps in (7, 11, 13):
         with pytest.raises(Cancelled):
@@ -177,17 +184,17 @@ def test_stopped_and_resumed_is_bit_for_bit_the_unbroken_fit(tmp_path: Path, cap
         assert torch.equal(tensor, got[name]), name
 
 
-def test_two_fits_do_not_share_a_folder(tmp_path: Path, capture: Capture) -> None:
+def test_a_second_fit_in_one_folder_is_refused(tmp_path: Path, capture: Capture) -> None:
     with pytest.raises(Cancelled):
         fit(capture, quick(), tmp_path / "run", StopAt(2))
-    with held(tmp_path / "run"):
+    with folder_lock(tmp_path / "run"):
         for resume in (True, False):
             with pytest.raises(RunError, match="Another process"):
                 fit(capture, quick(), tmp_path / "run", resume=resume)
     assert fit(capture, quick(), tmp_path / "run", resume=True).finished
 
 
-def test_killed_and_resumed_leaves_nothing_half_written(tmp_path: Path, capture: Capture) -> None:
+def test_a_killed_fit_resumes_and_leaves_no_partial_file(tmp_path: Path, capture: Capture) -> None:
     folder = tmp_path / "run"
     script = (f"import torch; torch.set_num_threads(1)\n"
               f"from core.capture import Capture; from core.fit import fit\n"
@@ -226,7 +233,8 @@ def test_killed_and_resumed_leaves_nothing_half_written(tmp_path: Path, capture:
     ("default", {"scene.strategy": "mcmc", "scene.mcmc.start": 5, "scene.mcmc.every": 5}),
 ])
 def test_every_mode_runs_and_renders(tmp_path: Path, capture: Capture, mode: Any, changes: dict[str, Any]) -> None:
-    settings = changed(preset("draft", mode=mode, iterations=12), {"flare.count": 40, "holdout": 4, **changes})
+    settings = override_settings(preset("draft", mode=mode, iterations=12),
+                                 {"flare.count": 40, "holdout": 4, **changes})
     run = fit(capture, settings, tmp_path / "run")
     reopened = Run.open(tmp_path / "run")
     assert reopened.settings == run.settings == replace(settings, white=1.0)
@@ -236,7 +244,7 @@ def test_every_mode_runs_and_renders(tmp_path: Path, capture: Capture, mode: Any
     assert list(layers.flare_by_light) == ([] if mode == "3dgs" else ["lamp"])
 
 
-def test_scene_and_flare_come_apart_without_a_flare_free_frame(tmp_path: Path, capture: Capture) -> None:
+def test_mode_split_separates_scene_and_flare_without_clean_frames(tmp_path: Path, capture: Capture) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(capture.folder, bare, ignore=shutil.ignore_patterns("removed", "truth"))
 
@@ -244,7 +252,7 @@ def test_scene_and_flare_come_apart_without_a_flare_free_frame(tmp_path: Path, c
         """Means of three seeds, between which fits this short and small differ by more than a dB."""
         fits = []
         for seed in range(3):
-            settings = changed(quick(400), {"mode": mode, "flare.density.stop": 120, "seed": seed})
+            settings = override_settings(quick(400), {"mode": mode, "flare.density.stop": 120, "seed": seed})
             fits.append(flare_psnr(fit(Capture.open(bare), settings, tmp_path / f"{mode} {seed}"), capture))
         return float(np.mean([one for one, _ in fits])), fits[0][1]
 
@@ -256,29 +264,30 @@ def test_scene_and_flare_come_apart_without_a_flare_free_frame(tmp_path: Path, c
     assert estimated > split + 2, (estimated, split)
 
 
-def test_what_frames_agree_on_from_below_is_a_quantile() -> None:
+def test_the_quantile_loss_fits_the_quantile_of_several_frames() -> None:
     frames = torch.tensor([0.2, 0.2, 0.2, 0.3, 0.9])[:, None]
     levels = torch.linspace(0, 1, 101)
-    costs = torch.stack([from_below(level.expand(5, 1), frames, excess=0.25) for level in levels])
+    costs = torch.stack([quantile_loss(level.expand(5, 1), frames, excess_weight=0.25) for level in levels])
     assert levels[costs.argmin()] == pytest.approx(0.2, abs=0.01)
-    evenly = torch.stack([from_below(level.expand(5, 1), frames, excess=1.0) for level in levels])
+    evenly = torch.stack([quantile_loss(level.expand(5, 1), frames, excess_weight=1.0) for level in levels])
     assert torch.allclose(evenly, (levels[:, None] - frames[:, 0]).abs().mean(-1), atol=1e-6)
 
 
-def test_a_scene_is_found_once_what_frames_have_more_is_mostly_flare() -> None:
+def test_the_excess_ratio_is_high_where_residuals_are_mostly_flare() -> None:
     errors = torch.randn(4, 20, 30, 3, generator=torch.Generator().manual_seed(0)) * 0.02
     flare = torch.zeros(20, 30, 3)
     flare[5:15, 5:15] = 0.3
-    assert times_found(errors) == pytest.approx(1, abs=0.1)
-    assert times_found(errors + flare) > 5
-    assert times_found(errors - flare) < 0.1
-    assert times_found(iter(())) == times_found([flare]) == FOUND_WHOLLY, "nothing is missing"
+    assert excess_ratio(errors) == pytest.approx(1, abs=0.1)
+    assert excess_ratio(errors + flare) > 5
+    assert excess_ratio(errors - flare) < 0.1
+    assert excess_ratio(iter(())) == excess_ratio([flare]) == MAX_EXCESS_RATIO, "nothing is missing"
 
 
-def test_light_costs_a_flare_away_from_the_lights_where_the_scene_is_not_found(capture: Capture) -> None:
+def test_far_flare_light_falls_where_the_scene_has_not_converged(capture: Capture) -> None:
     def away(found: float) -> float:
         """Light of the flare away from the lights, of a fit that was stopped and went on."""
-        settings = changed(quick(120), {"mode": "split", "split.rounds": 1, "split.found": found, "split.haze": 3.0})
+        settings = override_settings(quick(120), {"mode": "split", "split.scene_only_rounds": 1,
+                                                  "split.converged_ratio": found, "split.far_flare_penalty": 3.0})
         trainer = Trainer(capture, settings)
         for _ in range(len(trainer.views) + 5):
             trainer.step()
@@ -291,18 +300,18 @@ def test_light_costs_a_flare_away_from_the_lights_where_the_scene_is_not_found(c
             camera = view.camera
             black = torch.zeros(camera.height, camera.width, 3)
             alone = composite(black, render_flare(trainer.flare, settings.blend, camera), settings.blend).detach()
-            light += float((alone.mean(-1) * (1 - nearness(camera, lights, settings.split.reach))).sum())
+            light += float((alone.mean(-1) * (1 - light_proximity(camera, lights, settings.split.reach))).sum())
         return light
 
     assert away(found=1e9) < 0.5 * away(found=0.0)
 
 
-def test_a_haze_costs_by_its_light_and_by_how_far_it_is_from_the_lights(capture: Capture) -> None:
+def test_the_far_flare_penalty_grows_with_light_and_distance(capture: Capture) -> None:
     camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
     added = torch.full((camera.height, camera.width, 3), 0.1, requires_grad=True)
     settings = SplitSettings(haze=2.0, reach=0.05)
-    loss = haze(added, None, 0.0, camera, lights, settings)
-    far = torch.from_numpy(1 - nearness(camera, lights, 0.05))
+    loss = far_flare_penalty(added, None, 0.0, camera, lights, settings)
+    far = torch.from_numpy(1 - light_proximity(camera, lights, 0.05))
     assert float(loss.detach()) == pytest.approx(2 * 0.1 * float(far.mean()), rel=1e-4)
     loss.backward()
     assert added.grad is not None
@@ -310,22 +319,23 @@ def test_a_haze_costs_by_its_light_and_by_how_far_it_is_from_the_lights(capture:
 
 
 @pytest.mark.parametrize(("found", "believed"), [(5.0, 0), (10.0, 0), (15.0, 0.5), (19.9, 0.99), (25.0, 1)])
-def test_of_a_haze_that_an_estimate_tells_of_the_less_costs_the_more_the_scene_is_found(
+def test_the_far_flare_penalty_exempts_more_of_an_estimate_the_nearer_convergence(
         capture: Capture, found: float, believed: float) -> None:
     camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
     added = torch.full((camera.height, camera.width, 3), 0.1)
     told = torch.linspace(-0.1, 0.3, added.numel()).reshape(added.shape)
     settings = SplitSettings(haze=2.0, lost=10.0, found=20.0)
-    far = torch.from_numpy(1 - nearness(camera, lights, settings.reach))
+    far = torch.from_numpy(1 - light_proximity(camera, lights, settings.reach))
     expected = 2 * ((0.1 - believed * told.clamp(min=0)).clamp(min=0) * far[..., None]).mean()
-    assert float(haze(added, told, found, camera, lights, settings)) == pytest.approx(float(expected), rel=1e-4)
+    penalty = far_flare_penalty(added, told, found, camera, lights, settings)
+    assert float(penalty) == pytest.approx(float(expected), rel=1e-4)
 
 
-def test_what_could_be_either_is_the_flare_s_but_a_light_s_own_disc(capture: Capture) -> None:
+def test_ambiguous_light_goes_to_the_flare_but_a_light_disc_to_the_scene(capture: Capture) -> None:
     view = capture.views[0]
     targets, lights = Frames(capture).targets(view), np.array([light.xyz for light in capture.lights])
     (x, y), = view.camera.project(lights)[0].astype(int)
-    near = nearness(targets.camera, lights, 0.05)
+    near = light_proximity(targets.camera, lights, 0.05)
     assert near[y, x] > 0.9 and near[y, x] == near.max() and near.min() < 0.05
     half = round(0.05 * targets.camera.width)
     assert near[y, x + half if x + half < near.shape[1] else x - half] == pytest.approx(0.5, abs=0.15)
@@ -334,7 +344,7 @@ def test_what_could_be_either_is_the_flare_s_but_a_light_s_own_disc(capture: Cap
 
     def slope(scene: torch.Tensor) -> torch.Tensor:
         scene = scene.clone().requires_grad_()
-        scene_beside_flare(scene, targets, lights, discs, SplitSettings(), progress=1.0).backward()
+        scene_loss(scene, targets, lights, discs, SplitSettings(), progress=1.0).backward()
         assert scene.grad is not None
         return scene.grad.sum(-1)
 
@@ -344,7 +354,7 @@ def test_what_could_be_either_is_the_flare_s_but_a_light_s_own_disc(capture: Cap
     assert (brighter[~discs] > darker[~discs] * 1.5).all(), "no frame is darker than the scene"
 
 
-def test_a_light_that_frames_show_is_uncovered_where_the_scene_hides_it_from_everywhere(capture: Capture) -> None:
+def test_a_visible_light_hidden_by_the_scene_from_everywhere_is_uncovered(capture: Capture) -> None:
     trainer = Trainer(capture, quick(**{"flare.occlusion": True}))
     assert trainer.flare is not None
     targets = trainer.frames.targets(trainer.views[0])
@@ -354,21 +364,21 @@ def test_a_light_that_frames_show_is_uncovered_where_the_scene_hides_it_from_eve
         along = torch.linspace(0.3, 0.7, len(trainer.scene.means))[:, None]
         trainer.scene.means.copy_(camera + along * (light - camera))
         trainer.scene.opacity_logits.fill_(3.0)
-    assert trainer._covered(white) is None, "as long as some views see the light"
+    assert trainer._occlusion_loss(white) is None, "as long as some views see the light"
     trainer.flare.clear.zero_()
-    assert trainer._covered(targets._replace(frame=torch.zeros_like(targets.frame))) is None, "nothing says it is seen"
-    loss = trainer._covered(white)
+    assert trainer._occlusion_loss(targets._replace(frame=torch.zeros_like(targets.frame))) is None, "it is not visible"
+    loss = trainer._occlusion_loss(white)
     assert loss is not None
     loss.backward()
     slopes = trainer.scene.opacity_logits.grad
     assert slopes is not None and (slopes >= 0).all() and (slopes > 0).any()
 
 
-def test_a_sky_lies_about_the_points_in_colours_that_the_frames_have(capture: Capture) -> None:
+def test_sky_points_surround_the_capture_in_colours_of_the_frames(capture: Capture) -> None:
     views, frames = capture.views, Frames(capture)
-    found = with_sky(capture, views, frames)
+    found = add_sky_points(capture, views, frames)
     added = found.xyz[len(capture.points):]
-    assert 20 < len(added) < COUNT, "only what some view sees"
+    assert 20 < len(added) < SKY_POINTS, "only what some view sees"
     middle = np.mean([view.camera.position for view in views], 0)
     away = np.linalg.norm(added - middle, axis=1)
     assert away.min() > np.linalg.norm(capture.points.xyz - middle, axis=1).max()
@@ -380,10 +390,10 @@ def test_a_sky_lies_about_the_points_in_colours_that_the_frames_have(capture: Ca
 
 
 @pytest.mark.parametrize("model", ["paper", "ours"])
-def test_a_light_of_which_nothing_is_left_has_no_flare(tmp_path: Path, capture: Capture, model: Any) -> None:
+def test_a_fully_hidden_light_has_no_flare(tmp_path: Path, capture: Capture, model: Any) -> None:
     """A lamp without a flare: all its Gaussians fade and are pruned."""
     settings = replace(quick(40), flare=replace(quick(40).flare, form=PAPER if model == "paper" else OURS))
-    settings = changed(settings, {"flare.density.prune_below": 1.0})
+    settings = override_settings(settings, {"flare.density.prune_below": 1.0})
     run = fit(capture, settings, tmp_path / "run")
     assert run.flare is not None and run.look is not None and run.flare.model.count == 0
     camera = capture.views[0].camera
@@ -395,14 +405,14 @@ def test_a_light_of_which_nothing_is_left_has_no_flare(tmp_path: Path, capture: 
 
 
 def test_ours_runs_in_linear_light(tmp_path: Path, capture: Capture) -> None:
-    settings = changed(preset("draft", model="ours", iterations=12), {"flare.count": 40, "holdout": 4})
+    settings = override_settings(preset("draft", model="ours", iterations=12), {"flare.count": 40, "holdout": 4})
     assert settings.blend == "add"
     run = fit(capture, settings, tmp_path / "run")
     assert run.flare is not None and run.flare.blend == "add"
     assert all((layer >= 0).all() for layer in run.render(capture.views[0].camera).flare_by_light.values())
 
 
-def test_a_capture_without_what_the_mode_needs_is_refused_and_nothing_written(tmp_path: Path, capture: Capture) -> None:
+def test_a_capture_without_the_inputs_of_a_mode_is_refused_before_writing(tmp_path: Path, capture: Capture) -> None:
     for missing, word, modes in (("removed", "removed", ["default"]), ("lights.json", "lights", ["default", "unsup"])):
         folder = tmp_path / f"without {missing}"
         shutil.copytree(capture.folder, folder)
@@ -414,7 +424,7 @@ def test_a_capture_without_what_the_mode_needs_is_refused_and_nothing_written(tm
     assert not (tmp_path / "run").exists()
 
 
-def test_a_fit_that_diverges_says_so_and_writes_no_result(tmp_path: Path, capture: Capture) -> None:
+def test_a_diverging_fit_fails_and_writes_no_result(tmp_path: Path, capture: Capture) -> None:
     settings = quick(120, **{"scene.rates.features": 1e30})
     with pytest.raises(RunError, match="diverged"):
         fit(capture, settings, tmp_path / "run")
@@ -429,7 +439,7 @@ def test_a_form_at_its_bounds_is_fitted_and_read(tmp_path: Path, capture: Captur
     assert getattr(run.flare.model.lights[0].form, name) == getattr(run.look.lights[0].form, name) == value
 
 
-def test_settings_that_nobody_has_checked_are_before_anything_is_written(tmp_path: Path, capture: Capture) -> None:
+def test_invalid_settings_are_refused_before_anything_is_written(tmp_path: Path, capture: Capture) -> None:
     with pytest.raises(SettingsError, match="preview_every"):
         fit(capture, replace(quick(), preview_every=0), tmp_path / "run")
     assert not (tmp_path / "run").exists()
@@ -443,7 +453,7 @@ def test_a_run_finds_its_capture_by_any_name(tmp_path: Path, capture: Capture, n
 
 
 @pytest.mark.parametrize("damage", [b"", b"\n", b"/cap\xff\n"])
-def test_a_run_that_does_not_say_of_what_is_refused(tmp_path: Path, capture: Capture, damage: bytes) -> None:
+def test_a_run_without_a_capture_name_is_refused(tmp_path: Path, capture: Capture, damage: bytes) -> None:
     made = Run.create(tmp_path / "run", quick(), capture.folder)
     (made.folder / "capture.txt").write_bytes(damage)
     with pytest.raises(RunError, match=r"capture\.txt (names no capture|is not UTF-8)"):
@@ -460,7 +470,7 @@ def test_a_capture_whose_name_cannot_be_written_down_is_refused(tmp_path: Path, 
     assert not (tmp_path / "run").exists()
 
 
-def test_a_fit_whose_checkpoint_is_held_by_another_program_is_done(tmp_path: Path, capture: Capture,
+def test_a_fit_finishes_while_another_program_holds_its_checkpoint(tmp_path: Path, capture: Capture,
                                                                     monkeypatch: pytest.MonkeyPatch) -> None:
     unlink = Path.unlink
 
@@ -482,7 +492,7 @@ def test_a_run_folder_is_not_overwritten(tmp_path: Path, capture: Capture) -> No
         _ = Run.open(tmp_path / "run").scene
 
 
-def test_a_run_goes_on_with_its_own_capture(tmp_path: Path, capture: Capture) -> None:
+def test_a_run_resumes_only_with_its_own_capture(tmp_path: Path, capture: Capture) -> None:
     other = Capture.open(shutil.copytree(capture.folder, tmp_path / "other"))
     with pytest.raises(Cancelled):
         fit(capture, quick(), tmp_path / "run", StopAt(2))
@@ -493,7 +503,7 @@ def test_a_run_goes_on_with_its_own_capture(tmp_path: Path, capture: Capture) ->
         fit(other, quick(), tmp_path / "run", StopAt(1), resume=True)
 
 
-def test_a_fit_goes_on_with_the_lights_it_began_with(tmp_path: Path, capture: Capture) -> None:
+def test_a_fit_resumes_only_with_unchanged_lights(tmp_path: Path, capture: Capture) -> None:
     """Flares are kept by the order of their lights, which keep the names and places that lights.json has."""
     (lamp,) = capture.lights
     both = (lamp, Light("sun", lamp.xyz + 0.1))
@@ -517,7 +527,7 @@ def test_a_fit_goes_on_with_the_lights_it_began_with(tmp_path: Path, capture: Ca
 
 
 @pytest.mark.parametrize("what", ["images", "removed", "the camera"])
-def test_a_fit_goes_on_with_the_views_it_began_with(what: str, tmp_path: Path, capture: Capture) -> None:
+def test_a_fit_resumes_only_with_unchanged_views(what: str, tmp_path: Path, capture: Capture) -> None:
     own = Capture.open(shutil.copytree(capture.folder, tmp_path / "own"))
     with pytest.raises(Cancelled):
         fit(own, quick(), tmp_path / "run", StopAt(1))
@@ -532,7 +542,7 @@ def test_a_fit_goes_on_with_the_views_it_began_with(what: str, tmp_path: Path, c
         fit(own, quick(), tmp_path / "run", resume=True)
 
 
-def test_a_light_that_the_fit_has_moved_is_still_the_one_it_was_given(capture: Capture) -> None:
+def test_a_fit_resumes_after_it_moved_a_light(capture: Capture) -> None:
     first, second = (Trainer(capture, quick()) for _ in range(2))
     assert first.flare is not None
     first.flare.positions += 0.25
@@ -540,7 +550,7 @@ def test_a_light_that_the_fit_has_moved_is_still_the_one_it_was_given(capture: C
     assert second.flare is not None and torch.equal(second.flare.positions, first.flare.positions)
 
 
-def test_a_checkpoint_of_an_earlier_version_goes_on(capture: Capture) -> None:
+def test_a_checkpoint_without_inputs_resumes(capture: Capture) -> None:
     """It does not say which lights and frames the fit was given."""
     earlier = Trainer(capture, quick())
     earlier.step()
@@ -555,7 +565,7 @@ def test_a_checkpoint_of_an_earlier_version_goes_on(capture: Capture) -> None:
     assert all(torch.equal(value, state["scene"][name]) for name, value in trainer.scene.state_dict().items())
 
 
-def test_a_world_of_small_units_is_fitted_as_others_are(capture: Capture) -> None:
+def test_a_capture_in_small_units_has_a_nearer_near_plane(capture: Capture) -> None:
     """Gaussians are culled before what the frames show, however small its units."""
     assert Trainer(capture, quick()).scene.near == NEAR
     for scale in (0.1, 0.01):
@@ -568,11 +578,11 @@ def test_a_world_of_small_units_is_fitted_as_others_are(capture: Capture) -> Non
         small = copy.copy(capture)
         small.views, small.points = tuple(views), points
         near, nearest = Trainer(small, quick()).scene.near, nearest_depth(small)
-        assert near <= NEAREST_PART * nearest
-        assert near == pytest.approx(min(NEAR, NEAREST_PART * nearest_depth(capture) * scale), rel=1e-3)
+        assert near <= NEAR_PLANE_FACTOR * nearest
+        assert near == pytest.approx(min(NEAR, NEAR_PLANE_FACTOR * nearest_depth(capture) * scale), rel=1e-3)
 
 
-def test_a_damaged_checkpoint_or_result_is_one_sentence(tmp_path: Path, capture: Capture) -> None:
+def test_a_damaged_checkpoint_or_result_is_one_line(tmp_path: Path, capture: Capture) -> None:
     folder = tmp_path / "run"
     with pytest.raises(Cancelled):
         fit(capture, quick(), folder, StopAt(2))
@@ -591,7 +601,7 @@ def test_a_damaged_checkpoint_or_result_is_one_sentence(tmp_path: Path, capture:
         Run.open(tmp_path)
 
 
-def test_a_run_is_known_by_its_scene_and_its_flare(tmp_path: Path) -> None:
+def test_a_fingerprint_changes_with_scene_and_flare(tmp_path: Path) -> None:
     def fingerprint(scene: bytes, flare: bytes) -> str:
         (tmp_path / SCENE).write_bytes(scene)
         (tmp_path / FLARE).write_bytes(flare)
@@ -600,40 +610,40 @@ def test_a_run_is_known_by_its_scene_and_its_flare(tmp_path: Path) -> None:
     assert len({fingerprint(b"a", b"x"), fingerprint(b"b", b"x"), fingerprint(b"a", b"y")}) == 3
 
 
-def test_one_view_past_which_the_light_goes_leaves_the_flare_of_the_others_alone(capture: Capture) -> None:
+def test_a_view_that_the_light_passes_leaves_other_views_unchanged(capture: Capture) -> None:
     """What the network tells of places in the frame is as fine as without that view."""
     camera = capture.views[5].camera
     beside = camera.position + camera.world_to_camera[:3].T[:3] @ np.array([3.0, 0.0, 0.03])
-    trainer = Trainer(capture.lit({"lamp": beside}), quick(1, **{"flare.snap": False}))
+    trainer = Trainer(capture.with_lights_at({"lamp": beside}), quick(1, **{"flare.snap_lights": False}))
     assert trainer.flare is not None
     seen = [float(light.light.norm()) for view in trainer.views
             for light in trainer.flare.views(torch.from_numpy(view.camera.world_to_camera)) if light.depth > 0]
     assert max(seen) > 90
-    assert trainer.flare.lights[0].query_range.light_high[2] < 2 * max(camera.reach, min(seen))
+    assert trainer.flare.lights[0].query_range.light_high[2] < 2 * max(camera.corner_radius, min(seen))
 
 
-def test_a_scene_that_is_fitted_alone_has_no_loss_of_the_composite(tmp_path: Path) -> None:
+def test_a_scene_only_iteration_has_no_composite_loss(tmp_path: Path) -> None:
     """None is told, where a nought would pass for a perfect fit."""
     trainer = Trainer(Capture.open(flared_capture(tmp_path / "c", 5)), quick(120, mode="split"))
-    told = [trainer.step() for _ in range(trainer._head_start + 1)]
+    told = [trainer.step() for _ in range(trainer._scene_only_iterations + 1)]
     assert all("loss" not in figures and figures["scene_loss"] > 0 for figures in told[:-1])
     assert told[-1]["loss"] > 0
 
 
 @pytest.mark.parametrize("found", [True, False])
-def test_a_checkpoint_of_a_version_whose_scene_went_on_alone_goes_on(capture: Capture, found: bool) -> None:
+def test_checkpoints_of_older_formats_restore_the_excess_ratio(capture: Capture, found: bool) -> None:
     """It says until when the scene was alone, for longer where it had not been found; a later one whether it was."""
-    settings = changed(quick(120), {"mode": "split", "split.rounds": 1})
+    settings = override_settings(quick(120), {"mode": "split", "split.scene_only_rounds": 1})
     earlier, trainer = (Trainer(capture, settings) for _ in range(2))
     state = earlier.state()
     del state["times_found"]
     for told in ({"alone_until": len(earlier.views) if found else settings.iterations // 3}, {"scene_is_found": found}):
-        trainer._times_found = 13.5
+        trainer._excess_ratio = 13.5
         trainer.load_state({**state, **told})
-        assert trainer._times_found == (FOUND_WHOLLY if found else 0)
+        assert trainer._excess_ratio == (MAX_EXCESS_RATIO if found else 0)
 
 
-def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> None:
+def test_a_checkpoint_restores_state_outside_the_optimisers(tmp_path: Path) -> None:
     """How clear each view is, where the lights are, and whether the scene was found."""
     capture = Capture.open(flared_capture(tmp_path / "c", 5))
     first, second = (Trainer(capture, quick(mode="split")) for _ in range(2))
@@ -641,9 +651,9 @@ def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> Non
     assert second.flare is not None
     first.flare.clear.fill_(0.3)
     first.flare.positions += 0.25
-    first._times_found = 13.5
+    first._excess_ratio = 13.5
     checkpoint.save(tmp_path / "state.safetensors", first.state())
     second.load_state(checkpoint.load(tmp_path / "state.safetensors"))
     assert torch.equal(second.flare.clear, first.flare.clear)
     assert torch.equal(second.flare.positions, first.flare.positions)
-    assert second._times_found == 13.5
+    assert second._excess_ratio == 13.5

@@ -25,7 +25,7 @@ def codes(seed: int) -> np.ndarray:
 ROOM = 2 * codes(0).nbytes
 
 
-def test_what_exceeds_memory_lies_on_disk(tmp_path: Path) -> None:
+def test_arrays_beyond_the_memory_limit_are_on_disk(tmp_path: Path) -> None:
     cache = PictureCache(ROOM)
     with cache.overflowing_into(tmp_path):
         for number in range(5):
@@ -38,14 +38,14 @@ def test_what_exceeds_memory_lies_on_disk(tmp_path: Path) -> None:
     assert [cache.get(f"{number}") is None for number in range(5)] == [False, False, True, True, True]
 
 
-def test_without_a_folder_the_rest_is_not_kept() -> None:
+def test_arrays_beyond_the_memory_limit_are_dropped_without_a_folder() -> None:
     cache = PictureCache(ROOM)
     for number in range(3):
         cache.put(f"{number}", codes(number))
     assert [cache.get(f"{number}") is None for number in range(3)] == [False, False, True]
 
 
-def test_room_is_left_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_leaves_free_space_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     free = DISK_LEFT + codes(0).nbytes
     monkeypatch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=free))
     cache = PictureCache(0)
@@ -57,7 +57,7 @@ def test_room_is_left_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert cache.get("does not") is None
 
 
-def test_a_disk_that_fails_costs_time_and_no_fit(tmp_path: Path) -> None:
+def test_a_failing_disk_empties_the_cache_without_an_error(tmp_path: Path) -> None:
     cache = PictureCache(0)
     with cache.overflowing_into(tmp_path / "none"):
         cache.put("a", codes(0))
@@ -73,7 +73,7 @@ def test_a_disk_that_fails_costs_time_and_no_fit(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name == "nt", reason="limits of files are POSIX's")
 @pytest.mark.parametrize("short", [1, 100, codes(0).nbytes])
-def test_a_quota_that_ends_within_a_picture_costs_that_picture(short: int, tmp_path: Path) -> None:
+def test_a_picture_cut_off_by_a_quota_is_not_cached(short: int, tmp_path: Path) -> None:
     import resource
 
     cache, before = PictureCache(0), resource.getrlimit(resource.RLIMIT_FSIZE)

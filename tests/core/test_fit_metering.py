@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from core.capture import Camera, Capture
 from core.colour.srgb import linear_from_srgb, srgb_from_linear
-from core.colour.srgb_torch import clipped, decode, encode, exposed
+from core.colour.srgb_torch import clip_straight_through, decode, encode, expose
 from core.errors import Cancelled, RunError
 from core.fit import Run, fit, metering
 from core.fit.frames import Frames
-from core.fit.sky import with_sky
+from core.fit.sky import add_sky_points
 from core.fit.trainer import Trainer
 from core.images.write import write_png
 from core.system.files import write_text
 from tests.core.flared import cameras, flared_capture
-from tests.core.heard import Heard
+from tests.core.recording_progress import RecordingProgress
 from tests.core.test_fit import StopAt, quick
 
 Light = NDArray[np.float32]
@@ -69,10 +69,10 @@ def _image(number: int, camera: Camera, xyz: NDArray[np.float64]) -> str:
 
 
 def found(capture: Capture) -> dict[str, float]:
-    return metering.found(capture, Frames(capture))
+    return metering.measure_exposures(capture, Frames(capture))
 
 
-def test_frames_of_one_exposure_are_left_alone(tmp_path: Path) -> None:
+def test_equal_exposures_stay_unmeasured(tmp_path: Path) -> None:
     assert not found(wall(tmp_path / "a", lambda _number, light: light))
     noise = np.random.default_rng(1).uniform(0.9, 1.1, (COUNT, 1, 1, 3)).astype(np.float32)
     grain = np.random.default_rng(2).uniform(0.8, 1.25, (SCALE * 40, SCALE * 64, 1)).astype(np.float32)
@@ -81,7 +81,7 @@ def test_frames_of_one_exposure_are_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("veil", [0.0, 0.1])
-def test_what_changes_is_found_whatever_veil_lies_over_it(tmp_path: Path, veil: float) -> None:
+def test_exposures_are_measured_under_a_veil(tmp_path: Path, veil: float) -> None:
     """A camera left to itself: the more flare, the less it is exposed."""
     stops = 0.6 * np.sin(np.arange(COUNT))
     capture = wall(tmp_path / "a", lambda number, light: (light + veil * (stops[number] < 0)) * 2 ** stops[number])
@@ -89,11 +89,11 @@ def test_what_changes_is_found_whatever_veil_lies_over_it(tmp_path: Path, veil: 
     assert told == pytest.approx(stops - np.median(stops), abs=0.06)
 
 
-def test_a_veil_by_itself_is_no_exposure(tmp_path: Path) -> None:
+def test_a_veil_alone_does_not_change_the_exposure(tmp_path: Path) -> None:
     assert not found(wall(tmp_path / "a", lambda number, light: light + np.float32(0.15 * (number % 2))))
 
 
-def test_what_a_light_glows_on_does_not_count(tmp_path: Path) -> None:
+def test_points_in_a_glow_are_outliers_of_the_exposure(tmp_path: Path) -> None:
     def glowing(number: int, light: Light) -> Light:
         lit = light.copy()
         lit[:, : lit.shape[1] // 4] += 0.3 * (number % 3)
@@ -104,7 +104,7 @@ def test_what_a_light_glows_on_does_not_count(tmp_path: Path) -> None:
     assert max(told[::2].std(), told[1::2].std()) < 0.1
 
 
-def test_frames_that_tell_nothing_are_as_the_nearest(tmp_path: Path) -> None:
+def test_frames_without_points_take_the_nearest_exposure(tmp_path: Path) -> None:
     """Not as something between: a light is switched on from one frame to the next."""
     def filmed(number: int, light: Light) -> Light:
         return light * (0.0 if number in (4, 5, 6, 7) else 2.0 if number < 6 else 1.0)
@@ -116,7 +116,7 @@ def test_frames_that_tell_nothing_are_as_the_nearest(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("why", ["few points are lit", "something else lies over it"])
-def test_a_frame_that_hardly_tells_is_as_the_nearest(tmp_path: Path, why: str) -> None:
+def test_a_frame_with_an_uncertain_exposure_takes_the_nearest(tmp_path: Path, why: str) -> None:
     def filmed(number: int, light: Light) -> Light:
         if number != 4:
             return light * (2.0 if number < 6 else 1.0)
@@ -131,25 +131,25 @@ def test_a_frame_that_hardly_tells_is_as_the_nearest(tmp_path: Path, why: str) -
     assert told["0004.png"] == told["0003.png"]
 
 
-def test_one_frame_that_is_lit_otherwise_leaves_the_exposure_fixed(tmp_path: Path) -> None:
+def test_one_frame_of_another_exposure_leaves_the_exposure_fixed(tmp_path: Path) -> None:
     """A flash, or lightning."""
     assert not found(wall(tmp_path / "a", lambda number, light: light * (1.5 if number == 5 else 1.0)))
 
 
-def test_a_camera_that_tells_nothing_is_not_taken_for_another() -> None:
-    assert metering._filled(np.array([1.0, np.nan, np.nan, 3.0]), [Path(name) for name in ("a", "a", "b", "b")]
+def test_unmeasured_exposures_come_from_the_same_folder() -> None:
+    assert metering._fill_unmeasured(np.array([1.0, np.nan, np.nan, 3.0]), [Path(name) for name in ("a", "a", "b", "b")]
                             ).tolist() == [1.0, 1.0, 3.0, 3.0]
 
 
-def test_what_is_found_can_be_read_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_measured_exposures_can_be_read_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Even where the solve makes nonsense of it."""
     capture = wall(tmp_path / "a", lambda number, light: light * 2.0 ** (number % 2))
-    monkeypatch.setattr(metering.Seen, "stops", lambda _: np.linspace(-30, 30, COUNT))
+    monkeypatch.setattr(metering.PointObservations, "stops", lambda _: np.linspace(-30, 30, COUNT))
     run = Run.create(tmp_path / "run", quick(10), capture.folder, found(capture))
     assert len(Run.open(run.folder).exposures) == COUNT
 
 
-def test_without_what_a_solve_has_found_nothing_is_told(tmp_path: Path) -> None:
+def test_exposures_are_not_measured_without_points_of_views(tmp_path: Path) -> None:
     capture = wall(tmp_path / "a", lambda number, light: light * 2.0 ** (number % 2))
     assert found(capture)
     model = capture.folder / "sparse" / "0" / "images.txt"
@@ -160,7 +160,7 @@ def test_without_what_a_solve_has_found_nothing_is_told(tmp_path: Path) -> None:
     assert not found(Capture.open(capture.folder))
 
 
-def test_frames_that_are_all_black_tell_nothing(tmp_path: Path) -> None:
+def test_black_frames_have_no_measured_exposure(tmp_path: Path) -> None:
     assert not found(wall(tmp_path / "a", lambda _number, light: 0 * light))
 
 
@@ -198,13 +198,13 @@ def flare_error(capture: Capture, run: Run) -> float:
 
 
 @pytest.mark.parametrize("mode", ["default", "split"])
-def test_a_fit_goes_by_them(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, mode: str,
+def test_a_fit_uses_measured_exposures(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, mode: str,
                             monkeypatch: pytest.MonkeyPatch) -> None:
     capture, exposures = drifting
-    monkeypatch.setattr(metering, "found", lambda *_: exposures)
+    monkeypatch.setattr(metering, "measure_exposures", lambda *_: exposures)
     fixed = fit(capture, quick(400, mode=mode, exposure="fixed"), tmp_path / "fixed")
     assert not (fixed.folder / "exposures.json").exists()
-    heard = Heard()
+    heard = RecordingProgress()
     as_found = fit(capture, quick(400, mode=mode), tmp_path / "found", heard)
     assert any("exposure changes, by about 1.4 stops" in text for text in heard.texts)
     assert as_found.exposures == exposures
@@ -212,10 +212,10 @@ def test_a_fit_goes_by_them(drifting: tuple[Capture, dict[str, float]], tmp_path
 
 
 @pytest.mark.parametrize("blend", ["add", "over"])
-def test_a_view_is_rendered_as_it_was_exposed(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, blend: str,
+def test_a_view_is_rendered_at_its_exposure(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, blend: str,
                                               monkeypatch: pytest.MonkeyPatch) -> None:
     capture, exposures = drifting
-    monkeypatch.setattr(metering, "found", lambda *_: exposures)
+    monkeypatch.setattr(metering, "measure_exposures", lambda *_: exposures)
     run = Run.open(fit(capture, quick(20, blend=blend), tmp_path / "run").folder)
     view = next(view for view in run.capture(need_frames=False).views if exposures[view.name] < 1)
     own, usual = run.render(view.camera), run.render(replace(view.camera, exposure=1.0))
@@ -229,38 +229,39 @@ def test_a_view_is_rendered_as_it_was_exposed(drifting: tuple[Capture, dict[str,
         assert 0.3 < np.abs(flare).sum() / np.abs(of_usual).sum() < 0.9
 
 
-def test_a_fit_that_was_stopped_goes_on_with_them(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
+def test_a_resumed_fit_keeps_its_exposures(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
                                                   monkeypatch: pytest.MonkeyPatch) -> None:
     capture, exposures = drifting
-    monkeypatch.setattr(metering, "found", lambda *_: exposures)
+    monkeypatch.setattr(metering, "measure_exposures", lambda *_: exposures)
     whole = fit(capture, quick(30), tmp_path / "whole")
     with pytest.raises(Cancelled):
         fit(capture, quick(30), tmp_path / "run", StopAt(12))
-    monkeypatch.setattr(metering, "found", lambda *_: pytest.fail("they are known"))
+    monkeypatch.setattr(metering, "measure_exposures", lambda *_: pytest.fail("they are known"))
     assert fit(capture, quick(30), tmp_path / "run", resume=True).fingerprint == whole.fingerprint
 
 
-def test_a_fit_may_be_stopped_while_they_are_looked_for(drifting: tuple[Capture, dict[str, float]],
+def test_a_fit_stops_while_exposures_are_measured(drifting: tuple[Capture, dict[str, float]],
                                                         tmp_path: Path) -> None:
     with pytest.raises(Cancelled, match="look at exposures"):
         fit(drifting[0], quick(10), tmp_path / "run", StopAt(3, "look at exposures"))
     assert not (tmp_path / "run").exists()
 
 
-def test_a_fit_without_them_is_not_given_any_later(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
+def test_a_resumed_fit_without_exposures_gets_none(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
                                                    monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs of versions that did not look."""
     capture, exposures = drifting
-    monkeypatch.setattr(metering, "found", lambda *_: {})
+    monkeypatch.setattr(metering, "measure_exposures", lambda *_: {})
     with pytest.raises(Cancelled):
         fit(capture, quick(30), tmp_path / "run", StopAt(12))
-    monkeypatch.setattr(metering, "found", lambda *_: exposures)
+    monkeypatch.setattr(metering, "measure_exposures", lambda *_: exposures)
     assert fit(capture, quick(30), tmp_path / "run", resume=True).exposures == {}
 
 
 @pytest.mark.parametrize("content", ['{"0000.png": 0}', '{"0000.png": "1"}', '{"0000.png": 1e9}', '{"0000.png": NaN}',
                                      "[1]", "{"])
-def test_a_damaged_list_is_told(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, content: str) -> None:
+def test_damaged_exposures_are_refused(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
+                                       content: str) -> None:
     run = Run.create(tmp_path / "run", quick(10), drifting[0].folder, {"0000.png": 1.5})
     assert Run.open(run.folder).exposures == {"0000.png": 1.5}
     (run.folder / "exposures.json").write_text(content, encoding="utf-8")
@@ -268,13 +269,13 @@ def test_a_damaged_list_is_told(drifting: tuple[Capture, dict[str, float]], tmp_
         _ = Run.open(run.folder).exposures
 
 
-def test_what_a_killed_beginning_left_is_not_taken(drifting: tuple[Capture, dict[str, float]], tmp_path: Path) -> None:
+def test_exposures_of_a_killed_start_are_removed(drifting: tuple[Capture, dict[str, float]], tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "exposures.json").write_text(json.dumps({"0000.png": 1.5}), encoding="utf-8")
     assert Run.create(tmp_path / "run", quick(10), drifting[0].folder).exposures == {}
 
 
-def test_a_trainer_shows_each_view_its_own(drifting: tuple[Capture, dict[str, float]]) -> None:
+def test_a_trainer_renders_each_view_at_its_exposure(drifting: tuple[Capture, dict[str, float]]) -> None:
     capture, exposures = drifting
     trainer = Trainer(capture, quick(5), exposures)
     assert {view.name: view.camera.exposure for view in trainer.views}.items() <= exposures.items()
@@ -283,52 +284,54 @@ def test_a_trainer_shows_each_view_its_own(drifting: tuple[Capture, dict[str, fl
     assert capture.views[0].camera.exposure == 1
 
 
-def test_where_exposures_differ_a_scene_is_clipped_as_its_frames_are(drifting: tuple[Capture, dict[str, float]]
+def test_with_unequal_exposures_a_scene_is_clipped_like_its_frames(drifting: tuple[Capture, dict[str, float]]
                                                                      ) -> None:
     """What one frame shows below white may be above it in another."""
     capture, exposures = drifting
     bright = torch.full((2, 2, 3), 1.5)
-    assert float(Trainer(capture, quick(5), exposures)._as_filmed(bright).max()) == 1
-    assert Trainer(capture, quick(5), {})._as_filmed(bright) is bright
+    assert float(Trainer(capture, quick(5), exposures)._clip_as_filmed(bright).max()) == 1
+    assert Trainer(capture, quick(5), {})._clip_as_filmed(bright) is bright
 
 
-def test_the_sky_begins_as_a_usual_frame_shows_it(drifting: tuple[Capture, dict[str, float]], tmp_path: Path) -> None:
+def test_sky_points_have_colours_at_the_median_exposure(drifting: tuple[Capture, dict[str, float]],
+                                                        tmp_path: Path) -> None:
     capture, exposures = drifting
     steady = Capture.open(flared_capture(tmp_path / "steady"))
 
     def sky(one: Capture) -> NDArray[np.float64]:
-        points = with_sky(one, one.views, Frames(one))
+        points = add_sky_points(one, one.views, Frames(one))
         return linear_from_srgb(points.rgb[len(one.points):] / np.float32(255)).mean(0)
 
-    off, off_without = (np.abs(sky(one) / sky(steady) - 1).mean() for one in (capture.exposed(exposures), capture))
+    off, off_without = (np.abs(sky(one) / sky(steady) - 1).mean() for one in (
+        capture.with_exposures(exposures), capture))
     assert off < 0.5 * off_without
 
 
 # ---- the arithmetic -------------------------------------------------------------------------------
 
 
-def test_exposing_is_done_in_light() -> None:
+def test_exposure_is_applied_in_linear_light() -> None:
     display = torch.linspace(0, 1.2, 25)
-    assert exposed(display, 1.0) is display
+    assert expose(display, 1.0) is display
     for times in (0.4, 2.5):
-        assert torch.allclose(exposed(display, times), encode(times * decode(display)), atol=1e-6)
+        assert torch.allclose(expose(display, times), encode(times * decode(display)), atol=1e-6)
 
 
-def test_gradients_of_exposing() -> None:
+def test_expose_has_correct_gradients() -> None:
     display = torch.tensor([0.01, 0.03, 0.2, 0.7, 1.1], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda one: exposed(one, 1.7), display)
+    assert torch.autograd.gradcheck(lambda one: expose(one, 1.7), display)
 
 
-def test_what_is_clipped_can_come_down_again() -> None:
+def test_a_clipped_value_has_a_straight_through_gradient() -> None:
     display = torch.tensor([0.5, 1.4], requires_grad=True)
-    shown = clipped(display, 1.0)
+    shown = clip_straight_through(display, 1.0)
     shown.sum().backward()
     assert shown.tolist() == [0.5, 1.0]
     assert display.grad is not None
     assert display.grad.tolist() == [1.0, 1.0]
 
 
-def test_a_camera_of_usual_exposure_has_the_numbers_it_had() -> None:
+def test_a_camera_of_exposure_1_has_unchanged_numbers() -> None:
     """Bakes of earlier versions are kept."""
     camera = cameras(1)[0]
     numbers: Any = camera.numbers

@@ -13,7 +13,7 @@ import torch
 from core.capture import Capture
 from core.errors import FlareFileError, SettingsError
 from core.fit import FitSettings, fit, preset
-from core.fit.settings import changed
+from core.fit.settings import override_settings
 from core.fit.trainer import Trainer
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import read_ply, write_ply
@@ -48,11 +48,12 @@ def _one_thread() -> Iterator[None]:
 
 
 def settings(scene: Path, **changes: Any) -> FitSettings:
-    return changed(preset("draft", iterations=20), {"flare.count": 40, "holdout": 0, "scene.start": str(scene),
-                                                    "scene.classic.start": 5, "scene.classic.every": 5, **changes})
+    return override_settings(preset("draft", iterations=20), {
+        "flare.count": 40, "holdout": 0, "scene.start": str(scene),
+        "scene.classic.start": 5, "scene.classic.every": 5, **changes})
 
 
-def test_a_frozen_scene_stays_and_the_flare_learns(capture: Capture, scene: Path, tmp_path: Path) -> None:
+def test_a_frozen_scene_is_unchanged_while_the_flare_is_fitted(capture: Capture, scene: Path, tmp_path: Path) -> None:
     run = fit(capture, settings(scene, **{"scene.frozen": True}), tmp_path / "run")
     assert (tmp_path / "run" / "scene.ply").read_bytes() == scene.read_bytes()
     begun = Trainer(capture, settings(scene, **{"scene.frozen": True})).flare
@@ -63,7 +64,7 @@ def test_a_frozen_scene_stays_and_the_flare_learns(capture: Capture, scene: Path
     assert len(first) != len(last) or not torch.equal(first, last)
 
 
-def test_a_refined_scene_begins_there(capture: Capture, scene: Path) -> None:
+def test_a_refined_scene_starts_from_the_ply(capture: Capture, scene: Path) -> None:
     trainer = Trainer(capture, settings(scene, mode="unsup"))
     for name, parameter in read_ply(scene).named_parameters():
         assert torch.equal(parameter, trainer.scene.get_parameter(name)), name
@@ -71,8 +72,8 @@ def test_a_refined_scene_begins_there(capture: Capture, scene: Path) -> None:
     assert not torch.equal(read_ply(scene).means, trainer.scene.means)
 
 
-def test_what_makes_no_sense_is_refused(capture: Capture, tmp_path: Path) -> None:
+def test_an_unusable_initial_scene_is_refused(capture: Capture, tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="PLY to start from"):
-        changed(preset("draft"), {"scene.frozen": True})
+        override_settings(preset("draft"), {"scene.frozen": True})
     with pytest.raises(FlareFileError, match="cannot be read"):
         Trainer(capture, settings(tmp_path / "none.ply", **{"scene.frozen": True}))

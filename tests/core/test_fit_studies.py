@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from benchmarks.bilateral import GradedScene
+from benchmarks.bilateral import BilateralTrainer
 from benchmarks.known_scene import KnownScene
 from core.capture import Capture
 from core.fit import preset
-from core.fit.settings import changed
+from core.fit.settings import override_settings
 from tests.core.flared import flared_capture
 
 
@@ -19,7 +19,8 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def test_the_flare_alone_is_fitted_over_the_exact_scene(capture: Capture) -> None:
-    settings = changed(preset("draft", iterations=4), {"flare.count": 60, "flare.occlusion": False, "holdout": 4})
+    settings = override_settings(preset("draft", iterations=4),
+                                 {"flare.count": 60, "flare.occlusion": False, "holdout": 4})
     trainer = KnownScene(capture, settings)
     assert trainer.flare is not None
     before = _values(trainer.flare)
@@ -30,8 +31,8 @@ def test_the_flare_alone_is_fitted_over_the_exact_scene(capture: Capture) -> Non
 
 
 def test_a_scene_and_the_grid_of_the_frame_are_fitted_together(capture: Capture) -> None:
-    settings = changed(preset("draft", iterations=4, mode="3dgs"), {"holdout": 4})
-    trainer = GradedScene(capture, settings)
+    settings = override_settings(preset("draft", iterations=4, mode="3dgs"), {"holdout": 4})
+    trainer = BilateralTrainer(capture, settings)
     scene, cells = _values(trainer.scene), _values(trainer.grids)
     assert trainer.step()["loss"] > 0
     assert _changed(scene, _values(trainer.scene))

@@ -19,21 +19,21 @@ from core.conventions.run_files import FLARE
 from core.errors import SettingsError
 from core.fit import FitSettings, Run, fit, preset
 from core.fit.frames import Frames, Targets
-from core.fit.metering import WHITEST, with_white
-from core.fit.settings import changed
-from core.fit.sky import with_sky
+from core.fit.metering import MAX_WHITE, resolve_white
+from core.fit.settings import override_settings
+from core.fit.sky import add_sky_points
 from core.fit.trainer import Trainer
-from core.flare.compositing import composite, layers
+from core.flare.compositing import composite, linear_layers
 from core.gaussians import Splats
 from core.images.picture import Picture
-from core.images.read import holds_floats
+from core.images.read import has_float_pixels
 from core.images.write import write_png
 from core.look.shot import Shot, ShotFrame
 from tests.core.flared import flared_capture, write_light
-from tests.core.heard import Heard
+from tests.core.recording_progress import RecordingProgress
 
 GAIN = 8.0  # the brightest of the flare is 3.6 then
-SHOWN = float(srgb_from_linear(np.array(WHITEST)))
+SHOWN = float(srgb_from_linear(np.array(MAX_WHITE)))
 
 
 @pytest.fixture(scope="module")
@@ -42,29 +42,30 @@ def bright(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def quick(iterations: int = 400) -> FitSettings:
-    return changed(preset("draft", iterations=iterations), {
+    return override_settings(preset("draft", iterations=iterations), {
         "flare.count": 60, "flare.occlusion": False, "holdout": 4, "flare.density.every": 50, "seed": 1})
 
 
 @pytest.mark.parametrize(("lit", "mode", "white", "said"), [
-    (3, "default", WHITEST, "up to 64"), (None, "default", 1.0, ""),
-    (3, "split", WHITEST, "up to 64"), (3, "3dgs", WHITEST, "up to 64"),
+    (3, "default", MAX_WHITE, "up to 64"), (None, "default", 1.0, ""),
+    (3, "split", MAX_WHITE, "up to 64"), (3, "3dgs", MAX_WHITE, "up to 64"),
 ])
-def test_white_is_where_float_frames_end(lit: int | None, mode: str, white: float, said: str, tmp_path: Path) -> None:
+def test_white_is_raised_for_float_frames_above_1(lit: int | None, mode: str, white: float, said: str,
+                                                  tmp_path: Path) -> None:
     """lit: the one view that holds light above white, late and for a moment."""
     capture = Capture.open(flared_capture(tmp_path / "c", 6, float_gain=0.3))
     if lit is not None:
         write_light(capture.frame_path(capture.views[lit]), np.full((40, 64, 3), 1.5, np.float32))
-    found, says = with_white(replace(quick(), mode=mode), Capture.open(capture.folder))
+    found, says = resolve_white(replace(quick(), mode=mode), Capture.open(capture.folder))
     assert found.white == white
     assert said in "".join(says) and bool(said) == bool(says)
 
 
 @pytest.mark.parametrize(("folder", "mode", "white"), [
-    ("removed", "default", 1.0), ("removed", "split", WHITEST), ("images", "default", 1.0), ("images", "split", 1.0),
+    ("removed", "default", 1.0), ("removed", "split", MAX_WHITE), ("images", "default", 1.0), ("images", "split", 1.0),
 ])
 @pytest.mark.parametrize("number", [0, 3])
-def test_one_file_that_ends_at_white_decides(folder: str, mode: str, white: float, number: int,
+def test_one_clipped_file_keeps_white_at_1(folder: str, mode: str, white: float, number: int,
                                              tmp_path: Path) -> None:
     where = flared_capture(tmp_path / "c", 6, float_gain=GAIN)
     path = where / folder / f"{number:04d}.exr"
@@ -75,28 +76,28 @@ def test_one_file_that_ends_at_white_decides(folder: str, mode: str, white: floa
         images.write_text(images.read_text(encoding="utf-8").replace(path.name, path.with_suffix(".png").name),
                           encoding="utf-8")
     settings = replace(quick(), mode=mode, holdout=0)
-    found, says = with_white(settings, Capture.open(where))
+    found, says = resolve_white(settings, Capture.open(where))
     assert found.white == white
     assert (f"{number:04d}.png cannot" in "".join(says)) == (white == 1)
 
 
-def test_frames_that_are_no_floats_end_at_white(tmp_path: Path) -> None:
+def test_integer_frames_keep_white_at_1(tmp_path: Path) -> None:
     capture = Capture.open(flared_capture(tmp_path / "c", 5))
-    assert with_white(quick(), capture) == (replace(quick(), white=1.0), ())
+    assert resolve_white(quick(), capture) == (replace(quick(), white=1.0), ())
 
 
 @pytest.mark.parametrize(("name", "kind", "floats"), [
     ("a.exr", np.float32, True), ("a.tif", np.float32, True), ("a.tif", np.uint16, False), ("a.png", np.uint8, False)])
-def test_float_files_are_told_from_others(name: str, kind: type, floats: bool, tmp_path: Path) -> None:
+def test_float_files_are_recognised(name: str, kind: type, floats: bool, tmp_path: Path) -> None:
     path = tmp_path / name
     if name == "a.exr":
         write_light(path, np.ones((4, 5, 3), np.float32))
     else:
         assert cv2.imwrite(str(path), np.ones((4, 5, 3), kind))
-    assert holds_floats(path) == floats
+    assert has_float_pixels(path) == floats
 
 
-def test_frames_keep_what_is_above_white(bright: Capture) -> None:
+def test_frames_keep_light_above_white(bright: Capture) -> None:
     view = bright.views[3]
     light = bright.frame(view).pixels
     assert light.max() > 3
@@ -107,7 +108,7 @@ def test_frames_keep_what_is_above_white(bright: Capture) -> None:
     assert picture.display(5.0).max() == 5.0
 
 
-def test_light_that_adds_is_clipped_at_white() -> None:
+def test_added_light_is_clipped_at_white() -> None:
     scene = torch.full((1, 1, 3), 0.5, requires_grad=True)
     light = torch.full((1, 1, 3), 2.0, requires_grad=True)
     flare = Splats(light, torch.ones(1, 1))
@@ -120,13 +121,13 @@ def test_light_that_adds_is_clipped_at_white() -> None:
     torch.testing.assert_close(light.grad, numeric.expand(1, 1, 3), rtol=1e-3, atol=0)
 
 
-def test_layers_of_a_scene_above_white_keep_it() -> None:
+def test_layers_keep_a_scene_above_white() -> None:
     scene = encode(torch.tensor([0.5, 3.0, 100.0])).expand(1, 1, 3)
-    white = float(encode(torch.tensor(WHITEST)))
+    white = float(encode(torch.tensor(MAX_WHITE)))
     for blend in ("add", "over"):
-        parts = layers(scene, {}, blend, white)
-        torch.testing.assert_close(parts.scene[0, 0], torch.tensor([0.5, 3.0, WHITEST]))
-        assert float(layers(scene, {}, blend).scene.max()) == pytest.approx(1)
+        parts = linear_layers(scene, {}, blend, white)
+        torch.testing.assert_close(parts.scene[0, 0], torch.tensor([0.5, 3.0, MAX_WHITE]))
+        assert float(linear_layers(scene, {}, blend).scene.max()) == pytest.approx(1)
 
 
 def light_s_pixel(targets: Targets, capture: Capture) -> tuple[int, int]:
@@ -134,22 +135,22 @@ def light_s_pixel(targets: Targets, capture: Capture) -> tuple[int, int]:
     return int(y), int(x)
 
 
-def test_above_white_a_light_s_disc_is_the_scene_s_where_the_frames_tell_so(bright: Capture) -> None:
-    trainer = Trainer(bright, replace(quick(), white=WHITEST))
+def test_a_light_disc_above_white_is_kept_where_frames_differ(bright: Capture) -> None:
+    trainer = Trainer(bright, replace(quick(), white=MAX_WHITE))
     targets = trainer.frames.targets(trainer.views[0])
-    assert targets.removed is not None
+    assert targets.clean is not None
     at = light_s_pixel(targets, bright)
     picture = torch.full_like(targets.frame, 0.5)
-    told = targets._replace(removed=targets.removed.clone(), frame=targets.frame.clone())
-    assert told.removed is not None
-    told.removed[at], told.frame[at] = 2.0, 2.4
-    sources = trainer._sources(told)
+    told = targets._replace(clean=targets.clean.clone(), frame=targets.frame.clone())
+    assert told.clean is not None
+    told.clean[at], told.frame[at] = 2.0, 2.4
+    sources = trainer._light_disc_mask(told)
     assert sources is not None and not sources.any(), "the flare is what the frame has more"
     assert torch.equal(trainer._joint_target(told, picture, sources), told.frame)
     told.frame[at] = 2.0
-    sources = trainer._sources(told)
+    sources = trainer._light_disc_mask(told)
     assert sources is not None and sources[at] and sources.sum() == 1
-    assert not trainer._behind_flare(told, torch.ones_like(picture), sources)[at].any()
+    assert not trainer._flare_background(told, torch.ones_like(picture), sources)[at].any()
     for drawn, wanted in ((0.5, 1.0), (3.0, 3.0)):  # at least white, and as bright as what is round it makes it
         target = trainer._joint_target(told, torch.full_like(picture, drawn), sources)
         assert (target[at] == wanted).all()
@@ -157,21 +158,21 @@ def test_above_white_a_light_s_disc_is_the_scene_s_where_the_frames_tell_so(brig
         assert torch.equal(target, told.frame)
 
 
-def test_behind_a_flare_what_is_above_white_is_the_clean_frame_s_to_the_end(bright: Capture) -> None:
-    trainer = Trainer(bright, replace(quick(), white=WHITEST))
+def test_the_flare_background_above_white_is_the_clean_frame_to_the_end(bright: Capture) -> None:
+    trainer = Trainer(bright, replace(quick(), white=MAX_WHITE))
     targets = trainer.frames.targets(trainer.views[0])
-    assert targets.removed is not None
-    scene, hot = torch.full_like(targets.frame, 0.25), targets.removed > 1
+    assert targets.clean is not None
+    scene, hot = torch.full_like(targets.frame, 0.25), targets.clean > 1
     assert hot.any() and not hot.all()
     trainer.iteration = trainer.settings.iterations
-    behind = trainer._behind_flare(targets, scene, None)
-    assert torch.equal(behind[hot], targets.removed[hot])
+    behind = trainer._flare_background(targets, scene, None)
+    assert torch.equal(behind[hot], targets.clean[hot])
     assert (behind[~hot] == 0.25).all()
 
 
-def test_colours_of_bright_scenes_have_a_longer_way(bright: Capture) -> None:
+def test_scenes_above_white_have_a_higher_colour_rate(bright: Capture) -> None:
     rates = [trainer.optimisers.scene.rates["sh"] for trainer in
-             (Trainer(bright, replace(quick(), white=white)) for white in (None, 1.0, WHITEST))]
+             (Trainer(bright, replace(quick(), white=white)) for white in (None, 1.0, MAX_WHITE))]
     assert all(isinstance(rate, torch.Tensor) for rate in rates)
     plain, clipped, far = (torch.as_tensor(rate) for rate in rates)
     assert torch.equal(plain, clipped) and (far[0] > 2 * plain[0]).all() and torch.equal(far[1:], plain[1:])
@@ -184,10 +185,10 @@ def truth(capture: Capture, view: View) -> tuple[NDArray[np.float32], NDArray[np
 
 
 def test_a_flare_above_white_is_fitted_as_bright_as_it_is(bright: Capture, tmp_path: Path) -> None:
-    heard = Heard()
+    heard = RecordingProgress()
     run = fit(bright, quick(), tmp_path / "run", heard)
     assert any("up to 64" in text for text in heard.texts)
-    assert Run.open(run.folder).settings.white == WHITEST
+    assert Run.open(run.folder).settings.white == MAX_WHITE
     clipped = fit(bright, replace(quick(), white=1.0), tmp_path / "clipped")
     _, views = bright.split(4)
     ratios, errors = [], {"run": [], "clipped": []}
@@ -210,7 +211,7 @@ def test_a_flare_above_white_is_fitted_as_bright_as_it_is(bright: Capture, tmp_p
     np.testing.assert_allclose(shot.render(shot.shot.frames[0], view.camera).scene, found, atol=1e-4)
 
 
-def test_a_run_of_an_earlier_version_is_shown_as_it_was_fitted(bright: Capture, tmp_path: Path) -> None:
+def test_a_run_without_white_is_clipped_at_1(bright: Capture, tmp_path: Path) -> None:
     run = fit(bright, replace(quick(12), white=1.0), tmp_path / "run")
     config = run.folder / "config.toml"
     text = config.read_text(encoding="utf-8")
@@ -222,24 +223,24 @@ def test_a_run_of_an_earlier_version_is_shown_as_it_was_fitted(bright: Capture, 
     np.testing.assert_array_equal(again.render(camera).scene, run.render(camera).scene)
 
 
-def test_a_sky_above_white_is_white_at_first(bright: Capture) -> None:
-    skies = (with_sky(bright, bright.views, Frames(bright, display_white=white)) for white in (SHOWN, 1.0))
+def test_sky_points_are_clipped_at_white(bright: Capture) -> None:
+    skies = (add_sky_points(bright, bright.views, Frames(bright, display_white=white)) for white in (SHOWN, 1.0))
     found, plain = (sky.rgb[len(bright.points):].astype(int) for sky in skies)
     assert (found >= plain).all(), "it is drawn up, and no colour begins anew from black"
     assert found.max() == 255
 
 
 @pytest.mark.parametrize("white", [0.5, 0.0, -1.0, 1e6])
-def test_a_white_that_is_none_is_refused(white: float) -> None:
+def test_an_invalid_white_is_refused(white: float) -> None:
     with pytest.raises(SettingsError, match="white must lie"):
-        replace(quick(), white=white).checked()
+        replace(quick(), white=white).validated()
 
 
-def test_clean_frames_that_end_at_white_are_told(tmp_path: Path) -> None:
+def test_clean_frames_clipped_at_white_give_a_warning(tmp_path: Path) -> None:
     folder = flared_capture(tmp_path / "c", 5, float_gain=GAIN)
     for path in sorted((folder / "removed").glob("*.exr")):
         write_png(path.with_suffix(".png"), np.full((40, 64, 3), 0.5))
         path.unlink()
-    heard = Heard()
+    heard = RecordingProgress()
     fit(Capture.open(folder), quick(2), tmp_path / "run", heard)
     assert any("EXR files for all" in text for text in heard.texts)

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from core.capture import Camera
 from core.colour.srgb_torch import decode, encode
-from core.conventions.pixel_grid import Sampling
+from core.conventions.pixel_grid import PixelGrid
 from core.errors import FlareFileError
 from core.flare import file as flare_file
 from core.flare import placement
-from core.flare.compositing import composite, joined, layers, splat_flare
+from core.flare.compositing import composite, concatenate, linear_layers, splat_flare
 from core.flare.deformation import QueryRange
 from core.flare.density import DensitySettings, clone_and_prune
 from core.flare.encoding import HashGrid, frequency_encoding
@@ -29,7 +29,7 @@ from core.gaussians import Splats, rasterization
 from core.gaussians.optimiser import Adam
 from core.gaussians.rendering import arc_strengths
 from core.look import TrainedCamera
-from core.look.look import FlareForm
+from core.look.form import FlareForm
 from core.look.plane import PLANE_DEPTH
 from tests.core.flared import cameras
 
@@ -60,7 +60,7 @@ def pose(number: int = 0) -> Tensor:
 # ---- beginning ------------------------------------------------------------------------------------
 
 
-def test_rings_at_first_are_of_all_sizes_and_thin() -> None:
+def test_initial_rings_have_all_sizes_and_are_thin() -> None:
     """Of a lens's ghosts some are as wide as half the frame, and a ring is found only from near by."""
     flare = LightFlare(OURS, RANGE, 400, random_(2)).gaussians
     scales, r0 = flare["log_scales"].detach()[:, 0].exp(), flare["rings"].detach()[:, 0]
@@ -122,15 +122,15 @@ def test_an_ellipse_has_its_axes() -> None:
 def test_resolution_and_focal_length_move_the_flare_as_a_lens_would() -> None:
     gaussians = next(iter(some_flare(replace(OURS, arcs=True))(pose()).values()))
     small, large = (torch.tensor([[f, 0, f / 3], [0, f, f / 4], [0, 0, 1.0]]) for f in (100.0, 200.0))
-    centres, covariances = placement.pixels(gaussians, small, Sampling(100.0, 100.0))
-    twice, wide = placement.pixels(gaussians, large, Sampling(100.0, 100.0))
+    centres, covariances = placement.pixels(gaussians, small, PixelGrid(100.0, 100.0))
+    twice, wide = placement.pixels(gaussians, large, PixelGrid(100.0, 100.0))
     assert torch.allclose(twice, 2 * centres, atol=1e-4)
     assert torch.allclose(wide, 4 * covariances, rtol=1e-5)
-    slopes = [placement.slopes(gaussians.arcs, found, k) for found, k in ((covariances, small), (wide, large))]
+    slopes = [placement.pixel_arcs(gaussians.arcs, found, k) for found, k in ((covariances, small), (wide, large))]
     assert slopes[0].abs().max() > 0.01 and torch.allclose(2 * slopes[1], slopes[0], rtol=1e-4, atol=1e-5)
 
 
-def test_an_arc_goes_along_with_its_gaussian() -> None:
+def test_an_arc_scales_and_turns_with_its_gaussian() -> None:
     """|a| is the strength at every size and angle, and the bright side turns with the axes."""
     a, k = torch.tensor([[0.9, -1.2]]), torch.eye(3)
     found = []
@@ -139,14 +139,15 @@ def test_an_arc_goes_along_with_its_gaussian() -> None:
         axis = torch.tensor([[math.cos(angle), math.sin(angle)]])
         covariance = placement.covariance_of_ellipse(log_scales, axis)
         way = placement.arcs_of_ellipse(a, log_scales, axis)
-        assert arc_strengths(covariance, placement.slopes(way, covariance, k)).item() == pytest.approx(1.5, rel=1e-4)
+        strengths = arc_strengths(covariance, placement.pixel_arcs(way, covariance, k))
+        assert strengths.item() == pytest.approx(1.5, rel=1e-4)
         found.append(way[0])
     assert torch.allclose(found[1], 5 * found[0])
     c, s = math.cos(2.0), math.sin(2.0)
     assert torch.allclose(found[2], torch.tensor([[c, -s], [s, c]]) @ found[0])
 
 
-def test_a_pictures_sampling_leaves_the_shift_of_an_arc() -> None:
+def test_the_low_pass_keeps_the_shift_of_an_arc() -> None:
     """What the low-pass blurs moves no less far: the plain Gaussian of the shifted mean is the same picture."""
     means, covariances = torch.tensor([[0.01, 0.02]]), torch.tensor([[2e-4, 5e-5, 1e-4]])
     way = torch.tensor([[0.015, -0.01]])
@@ -179,9 +180,9 @@ def test_sets_with_and_without_arcs_are_joined() -> None:
     model = some_flare(replace(OURS, arcs=True), lights=2)
     first, second = model(pose()).values()
     plain = second._replace(arcs=None)
-    whole = joined({"a": first, "b": plain})
+    whole = concatenate({"a": first, "b": plain})
     assert whole is not None and torch.equal(whole.arcs[:40], first.arcs) and not whole.arcs[40:].any()
-    assert joined({"b": plain}).arcs is None
+    assert concatenate({"b": plain}).arcs is None
 
 
 # ---- lights ---------------------------------------------------------------------------------------
@@ -294,7 +295,7 @@ def test_encode_and_decode_are_inverse() -> None:
     assert torch.allclose(encode(decode(values)), values, atol=1e-5)
 
 
-def test_added_light_clips_but_can_come_down_again() -> None:
+def test_added_light_is_clipped_with_a_straight_through_gradient() -> None:
     scene = torch.full((2, 2, 3), 0.9)
     light = torch.full((2, 2, 3), 0.6, requires_grad=True)
     picture = composite(scene, Splats(light, torch.ones(2, 2)), "add")
@@ -313,8 +314,8 @@ def test_layers_add_up_in_linear_light(blend: Any) -> None:
         splats = {name: splat_flare(one, intrinsics, camera.width, camera.height, blend, kernels="torch")
                   for name, one in parts.items()}
         scene = torch.rand(camera.height, camera.width, 3, generator=random_(0))
-        out = layers(scene, splats, blend)
-        whole = joined(parts)
+        out = linear_layers(scene, splats, blend)
+        whole = concatenate(parts)
         assert whole is not None
         direct = composite(scene, splat_flare(whole, intrinsics, camera.width, camera.height, blend, kernels="torch"),
                            blend)
@@ -348,7 +349,7 @@ def test_cloning_and_pruning_follow_opacity() -> None:
     assert 0 < float(nearest.max()) < 0.1
     assert (optimiser.moments["positions"].first[900:] == 0).all()
     assert (optimiser.moments["positions"].first[:900] != 0).all()
-    clone_and_prune(light, optimiser, names, DensitySettings(most=light.count + 3), random_(0))
+    clone_and_prune(light, optimiser, names, DensitySettings(max_gaussians=light.count + 3), random_(0))
     assert light.count == 900 + clones + 3
 
 
@@ -358,7 +359,7 @@ CAMERA = TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5)
 
 
 @pytest.mark.parametrize("form", [PAPER, OURS, replace(PAPER, line=False)])
-def test_a_flare_comes_back_bit_by_bit(tmp_path: Path, form: FlareForm) -> None:
+def test_a_saved_flare_loads_bit_for_bit(tmp_path: Path, form: FlareForm) -> None:
     model = some_flare(replace(form, levels=5), lights=2)
     model.clear.copy_(torch.tensor([0.25, 1.0]))
     path = tmp_path / "look.flare"
@@ -373,7 +374,7 @@ def test_a_flare_comes_back_bit_by_bit(tmp_path: Path, form: FlareForm) -> None:
         assert a is b is None or torch.equal(a, b)
 
 
-def test_a_view_that_hides_the_light_teaches_its_flare_nothing() -> None:
+def test_a_hidden_light_gives_no_gradient_to_its_flare() -> None:
     model = some_flare(PAPER, lights=1)
     for value, taught in ((0.1, False), (0.9, True)):
         share = torch.tensor(value, requires_grad=True)

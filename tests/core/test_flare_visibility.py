@@ -6,7 +6,13 @@ import pytest
 import torch
 
 from core.flare.model import FlareModel
-from core.flare.visibility import VisibilitySettings, clear_shares, of_clear, visible_share, visible_shares
+from core.flare.visibility import (
+    VisibilitySettings,
+    clear_visibilities,
+    light_visibilities,
+    light_visibility,
+    relative_to_clear,
+)
 from core.gaussians.scene import SceneGaussians
 from tests.core.test_flare import some_flare
 from tests.core.test_look import SMALL
@@ -27,10 +33,10 @@ def wall(x: float = 0.0, z: float = 2.0, half_width: float = 0.5, opacity: float
 
 def share(scene: SceneGaussians, light: torch.Tensor = LIGHT) -> float:
     with torch.no_grad():
-        return float(visible_share(scene, CAMERA, light, VisibilitySettings(radius=0.02), kernels="torch"))
+        return float(light_visibility(scene, CAMERA, light, VisibilitySettings(radius=0.02), kernels="torch"))
 
 
-def test_a_free_light_is_whole_and_a_hidden_one_gone() -> None:
+def test_an_unobstructed_light_has_visibility_1_and_a_hidden_one_0() -> None:
     assert share(SceneGaussians.empty()) == 1
     assert share(wall()) < 0.01
     assert share(wall(x=1.5)) > 0.99
@@ -59,7 +65,7 @@ def test_a_light_that_is_near_is_hidden_by_what_is_nearer_still() -> None:
     assert share(wall(z=0.1), torch.tensor([0.0, 0.0, 0.15])) < 0.01
 
 
-def test_an_edge_through_the_light_hides_half_and_fades_smoothly() -> None:
+def test_an_edge_through_the_light_hides_half_of_it() -> None:
     reach = 0.022  # Gaussians of 0.008 and the rasterizer's low-pass go on so far past the last centre
     assert share(wall(x=0.5 + reach)) == pytest.approx(0.5, abs=0.08)
     shares = [share(wall(x=0.5 + reach + shift)) for shift in (-0.06, -0.03, 0.0, 0.03, 0.06)]
@@ -79,9 +85,9 @@ def test_the_light_need_not_be_in_any_frame() -> None:
         assert share(hidden, 4 * forward) < 0.01
 
 
-def test_it_is_differentiable_by_what_hides_the_light() -> None:
+def test_visibility_is_differentiable_by_the_occluder() -> None:
     scene = wall(opacity=0.3)
-    visible_share(scene, CAMERA, LIGHT, kernels="torch").backward()
+    light_visibility(scene, CAMERA, LIGHT, kernels="torch").backward()
     gradient = scene.opacity_logits.grad
     assert gradient is not None and float(gradient.min()) < 0 and float(gradient.max()) <= 1e-7
 
@@ -97,31 +103,31 @@ def test_what_always_stands_before_a_light_does_not_hide_it() -> None:
         poses.append(pose)
     settings = VisibilitySettings(radius=0.02)
     with torch.no_grad():
-        raw = [float(visible_share(haze, -pose[:3, 3], LIGHT, settings, kernels="torch")) for pose in poses]
+        raw = [float(light_visibility(haze, -pose[:3, 3], LIGHT, settings, kernels="torch")) for pose in poses]
         assert max(raw) < 0.7
-        model.clear.copy_(clear_shares(haze, model, poses, settings, kernels="torch"))
+        model.clear.copy_(clear_visibilities(haze, model, poses, settings, kernels="torch"))
         for pose in poses:
-            assert float(visible_shares(haze, model, pose, settings, "torch")["sun"]) == pytest.approx(1, abs=0.1)
-        assert float(visible_shares(wall(), model, torch.eye(4), settings, "torch")["sun"]) < 0.02
+            assert float(light_visibilities(haze, model, pose, settings, "torch")["sun"]) == pytest.approx(1, abs=0.1)
+        assert float(light_visibilities(wall(), model, torch.eye(4), settings, "torch")["sun"]) < 0.02
         walled = wall(half_width=3.0)
-        model.clear.copy_(clear_shares(walled, model, poses, settings, kernels="torch"))
+        model.clear.copy_(clear_visibilities(walled, model, poses, settings, kernels="torch"))
         assert float(model.clear) == 0
-        assert float(visible_shares(walled, model, torch.eye(4), settings, "torch")["sun"]) == 1
+        assert float(light_visibilities(walled, model, torch.eye(4), settings, "torch")["sun"]) == 1
 
 
-def test_a_light_that_most_views_do_not_see_is_as_clear_as_it_is_to_the_others() -> None:
+def test_clear_visibility_is_that_of_the_views_that_see_the_light() -> None:
     model = FlareModel(["sun"], LIGHT[None], [some_flare(SMALL, 4).lights[0]])
     poses = []
     for x in (*torch.linspace(-0.4, 0.4, 8).tolist(), 2.0, 3.0):
         pose = torch.eye(4)
         pose[0, 3] = -x
         poses.append(pose)
-    assert float(clear_shares(wall(), model, poses, VisibilitySettings(radius=0.02), "torch")) > 0.99
+    assert float(clear_visibilities(wall(), model, poses, VisibilitySettings(radius=0.02), "torch")) > 0.99
 
 
-def test_shares_are_taken_of_what_is_clear() -> None:
+def test_visibilities_are_relative_to_the_clear_one() -> None:
     half = torch.tensor(0.5)
-    assert float(of_clear(half, 1.0)) == 0.5
-    assert float(of_clear(half, 0.66)) == pytest.approx(0.5 / 0.66)
-    assert float(of_clear(half, 0.4)) == 1, "clearer than clear is clear"
-    assert float(of_clear(half, 0.0)) == 1, "a scene that hides a light from everywhere says nothing about it"
+    assert float(relative_to_clear(half, 1.0)) == 0.5
+    assert float(relative_to_clear(half, 0.66)) == pytest.approx(0.5 / 0.66)
+    assert float(relative_to_clear(half, 0.4)) == 1, "clearer than clear is clear"
+    assert float(relative_to_clear(half, 0.0)) == 1, "a scene that hides a light from everywhere says nothing about it"

@@ -12,7 +12,14 @@ import pytest
 from core.colour.srgb import srgb_from_linear
 from core.errors import SettingsError
 from core.images.picture import Picture
-from core.metrics.evaluation import clipped, out_of_range, score_view, summary, table, worse_than_none
+from core.metrics.evaluation import (
+    clipped_mask,
+    format_table,
+    is_worse_than_empty,
+    score_view,
+    summarise,
+    unscored_mask,
+)
 from core.metrics.pictures import flip, has_flip, psnr, relative_l2, ssim
 
 
@@ -31,7 +38,7 @@ def test_psnr_of_a_constant_error() -> None:
     assert psnr(np.ones((4, 4)), np.ones((4, 4))) == math.inf
 
 
-def test_psnr_looks_only_where_it_should() -> None:
+def test_psnr_scores_only_the_mask() -> None:
     image, target, keep = np.zeros((4, 4, 3)), np.zeros((4, 4, 3)), np.ones((4, 4), bool)
     image[0, 0], keep[0, 0] = 1, False
     assert psnr(image, target) < 20
@@ -39,7 +46,7 @@ def test_psnr_looks_only_where_it_should() -> None:
     assert math.isnan(psnr(image, target, np.zeros((4, 4), bool)))
 
 
-def test_relative_error_of_nothing_is_one() -> None:
+def test_relative_error_of_an_empty_picture_is_one() -> None:
     target = np.random.default_rng(0).random((4, 4, 3))
     assert relative_l2(np.zeros_like(target), target) == pytest.approx(1)
     assert relative_l2(target * 1.1, target) == pytest.approx(0.1)
@@ -102,7 +109,7 @@ def test_ssim_needs_a_window() -> None:
         ssim(np.zeros((10, 30)), np.zeros((10, 30)))
 
 
-def test_flip_is_a_number_or_honestly_absent(pair: tuple[np.ndarray, np.ndarray]) -> None:
+def test_flip_is_a_number_or_none_if_not_installed(pair: tuple[np.ndarray, np.ndarray]) -> None:
     if not has_flip():
         assert flip(*pair) is None
         return
@@ -133,7 +140,7 @@ def test_an_exact_fit_scores_as_exact() -> None:
     assert 5 < scores["flare_linear"]["empty_psnr"] < 25
 
 
-def test_lpips_is_that_of_the_layers_as_shown() -> None:
+def test_lpips_scores_the_displayed_layers() -> None:
     scene, flare = layers()
     frame, clean = (Picture(srgb_from_linear(light), "srgb") for light in (scene + flare, scene))
     scores = score_view(scene + flare, scene * np.float32(0.5), frame, clean,
@@ -160,14 +167,14 @@ def test_clipped_pixels_do_not_count_against_the_linear_flare() -> None:
     truth = flare.copy()
     truth[3, 4] = 50
     frame = Picture(np.clip(srgb_from_linear(scene + truth), 0, 1), "srgb")
-    assert clipped(frame).sum() == 1
-    assert clipped(frame, (frame.size[0] // 2, frame.size[1] // 2)).sum() == 1
-    assert not clipped(Picture(scene + truth, "linear")).any()
+    assert clipped_mask(frame).sum() == 1
+    assert clipped_mask(frame, (frame.size[0] // 2, frame.size[1] // 2)).sum() == 1
+    assert not clipped_mask(Picture(scene + truth, "linear")).any()
     scores = score_view(scene + flare, scene, frame, Picture(srgb_from_linear(scene), "srgb"), Picture(truth, "linear"))
     assert scores["flare_linear"]["relative_l2"] == pytest.approx(0, abs=1e-6)
 
 
-def test_the_exact_layers_tell_what_noise_hides_of_clipping() -> None:
+def test_exact_layers_reveal_clipping_hidden_by_noise() -> None:
     scene, flare = layers()
     truth = flare.copy()
     truth[3, 4] = 50
@@ -188,9 +195,9 @@ def test_the_exact_layers_tell_what_noise_hides_of_clipping() -> None:
         def truth_flare(self, *_: object) -> Picture | None:
             return None
 
-    assert not out_of_range(Unknown(), None).any()
-    assert np.argwhere(out_of_range(Known(), None)).tolist() == [[3, 4]]
-    assert out_of_range(Known(), None, (frame.shape[1] // 2, frame.shape[0] // 2)).sum() == 1
+    assert not unscored_mask(Unknown(), None).any()
+    assert np.argwhere(unscored_mask(Known(), None)).tolist() == [[3, 4]]
+    assert unscored_mask(Known(), None, (frame.shape[1] // 2, frame.shape[0] // 2)).sum() == 1
 
 
 def test_the_summary_is_the_mean_and_json() -> None:
@@ -200,26 +207,26 @@ def test_the_summary_is_the_mean_and_json() -> None:
     truth = Picture(flare, "linear")
     views = [(f"{gain}.png", score_view(scene + np.float32(gain) * flare, scene, frame, reference, truth))
              for gain in (0.5, 0.75, 1.0)]
-    scores = summary("truth", views, (20, 16))
+    scores = summarise("truth", views, (20, 16))
     text = json.dumps(scores, allow_nan=False)
     again = json.loads(text)
     assert again["reference"] == "truth"
     assert again["flare_linear"]["relative_l2"] == pytest.approx((0.5 + 0.25 + 0) / 3, abs=1e-5)
     assert [view["name"] for view in again["views"]] == ["0.5.png", "0.75.png", "1.0.png"]
     assert set(again["composite"]) == {"psnr", "ssim", "lpips", "flip"}
-    shown = table(again)
+    shown = format_table(again)
     assert "against the exact layers" in shown
     assert "in 0.5.png" in shown
 
 
 def test_infinite_scores_become_null() -> None:
     scores = {"composite": {"psnr": math.inf, "ssim": 1.0}, "scene": {"psnr": 20.0, "ssim": 0.5}}
-    made = summary("removed", [("a", {**scores, "flare": scores["scene"]})], (4, 4))
+    made = summarise("removed", [("a", {**scores, "flare": scores["scene"]})], (4, 4))
     assert made["composite"] == {"psnr": None, "ssim": 1.0}
-    assert "removed/" in table(made)
+    assert "removed/" in format_table(made)
 
 
-def test_a_flare_is_averaged_over_the_views_that_show_one() -> None:
+def test_flare_scores_average_the_views_with_a_flare() -> None:
     """Where there is none an empty flare is exact and has no mean: the fit's own score would stand alone there."""
     scene, flare = layers()
     flare[8:] = 0
@@ -228,23 +235,24 @@ def test_a_flare_is_averaged_over_the_views_that_show_one() -> None:
     black = Picture(0 * flare, "linear")
     views = [("lit.png", score_view(astray, scene, shown, reference, Picture(flare, "linear"))),
              ("dark.png", score_view(scene + np.float32(1e-4), scene, reference, reference, black))]
-    alone, both = summary("truth", views[:1], (20, 16)), summary("truth", views, (20, 16))
+    alone, both = summarise("truth", views[:1], (20, 16)), summarise("truth", views, (20, 16))
     for layer in ("flare", "flare_linear"):
         of_one_set = [key for key in ("psnr", "empty_psnr", "relative_l2") if key in alone[layer]]
         assert {key: both[layer][key] for key in of_one_set} == {key: alone[layer][key] for key in of_one_set}
-        assert f"1 of 2 views show no flare to be scored against: PSNR, empty and rel. L2 of {layer} " in table(both)
+        note = f"1 of 2 views show no flare to be scored against: PSNR, empty and rel. L2 of {layer} "
+        assert note in format_table(both)
     assert both["flare"]["ssim"] == pytest.approx(np.mean([scores["flare"]["ssim"] for _, scores in views]))
-    assert worse_than_none(both)
-    assert "show no flare" not in table(alone)
+    assert is_worse_than_empty(both)
+    assert "show no flare" not in format_table(alone)
 
 
 def test_a_pixel_that_is_clipped_in_one_channel_is_clipped() -> None:
     pixels = np.full((4, 4, 3), 0.5, np.float32)
     pixels[1, 2, 0] = 1.0
-    assert clipped(Picture(pixels, "srgb")).sum() == 1
+    assert clipped_mask(Picture(pixels, "srgb")).sum() == 1
     flare = np.full((4, 4, 3), 0.1, np.float32)
     flare[2, 3, 0] = 5.0
     capture = SimpleNamespace(frame=lambda _: Picture(np.full_like(flare, 0.5), "srgb"),
                               truth_scene=lambda _: Picture(np.full_like(flare, 0.1), "linear"),
                               truth_flare=lambda _: Picture(flare, "linear"))
-    assert out_of_range(capture, SimpleNamespace()).sum() == 1  # type: ignore[arg-type]
+    assert unscored_mask(capture, SimpleNamespace()).sum() == 1  # type: ignore[arg-type]

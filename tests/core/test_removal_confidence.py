@@ -16,7 +16,7 @@ from core.removal.inference.test_time_augmentation import shot_confidence
 from core.removal.jobs.batch import remove_all
 from core.removal.jobs.mattes import Mattes
 from core.removal.model.image_formation import flare_to_linear
-from tests.core.heard import Heard
+from tests.core.recording_progress import RecordingProgress
 from tests.core.removal_cases import with_no_glow, write_codes
 
 
@@ -90,13 +90,13 @@ def test_the_log_says_that_a_flare_may_be_a_grade(flare_everywhere: Path, tmp_pa
     for name, display in frames.items():
         write_codes(tmp_path / name / f"{name}.png", (display * 255 + 0.5).astype(np.uint8))
     plates = [tmp_path / name / f"{name}.png" for name in ("grade", "veil")]
-    heard = Heard()
+    heard = RecordingProgress()
     remove_all(plates, tmp_path / "clean", Remover(flare_everywhere), heard)
     assert [said for said in heard.texts if said.startswith("In 1 of them") and "all-white matte" in said]
     codes = [cv2.imread(str(path)) for path in (plates[0], tmp_path / "clean" / "grade.png")]
     np.testing.assert_array_equal(*codes)
 
-    heard = Heard()  # as the message says
+    heard = RecordingProgress()  # as the message says
     matte = Mattes(tmp_path / "white" / "white.png")
     remove_all(plates[:1], tmp_path / "clean", Remover(flare_everywhere), heard, mattes=matte)
     assert not [said for said in heard.texts if "its grade" in said]

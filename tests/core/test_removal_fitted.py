@@ -24,7 +24,7 @@ from core.removal.jobs.fitted import _fit_flare_gains, remove_fitted_flare, subt
 from core.removal.jobs.manifest import MANIFEST
 from core.system.progress import Progress
 from tests.core.flared import LIGHT, flare, flared_capture
-from tests.core.heard import Heard
+from tests.core.recording_progress import RecordingProgress
 
 
 @dataclass
@@ -125,7 +125,7 @@ def test_a_light_that_is_off_leaves_no_dark_flare(capture: Capture, tmp_path: Pa
         light = scene_of(capture, view.camera) + np.float32(share) * flare(view.camera)
         write_png(capture.frame_path(view), srgb_from_linear(light).clip(0, 1))
     dimmed = Capture.open(capture.folder)
-    told = Heard()
+    told = RecordingProgress()
     remove_fitted_flare(Exact(capture), dimmed, dimmed.views, tmp_path / "clean", told)
     assert [text for text in told.texts if "1 of 3 frames show less than half of the flare that 'a'" in text]
     for view in dimmed.views:

@@ -17,7 +17,7 @@ from core.removal.jobs.batch import remove_all
 from core.removal.jobs.manifest import MANIFEST, Manifest, digest_inputs
 from core.removal.jobs.mattes import Mattes
 from core.system.progress import Progress
-from tests.core.heard import Heard
+from tests.core.recording_progress import RecordingProgress
 from tests.core.removal_cases import picture, write_codes
 
 
@@ -186,7 +186,7 @@ def test_an_edited_clean_plate_is_kept(tmp_path: Path, flare_everywhere: Path) -
     plates, out = [tmp_path / "in"], tmp_path / "out"
     remove_all(plates, out, one, Progress(), flare_folder=tmp_path / "flares")
     retouched = write_codes(out / "a.png", picture()[:, ::-1]).read_bytes()
-    heard = Heard()
+    heard = RecordingProgress()
     found = remove_all(plates, out, other, heard, flare_folder=tmp_path / "flares")
     assert (found["made"], found["kept"]) == (1, 1) and any("were edited" in text for text in heard.texts)
     assert (out / "a.png").read_bytes() == retouched

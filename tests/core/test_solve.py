@@ -37,7 +37,7 @@ from core.system.files import atomic_path
 from core.system.folder_lock import folder_lock
 from core.system.progress import Progress
 from tests.core.captures import look_at, make_capture, orbit
-from tests.core.heard import Heard
+from tests.core.recording_progress import RecordingProgress
 from tests.core.test_video import with_pixels
 
 SIZE = (320, 240)
@@ -229,7 +229,7 @@ def test_two_solves_cannot_write_to_one_folder(stopped: Path, tmp_path: Path) ->
 @pytest.mark.parametrize("damaged", ["request.json", "stills.json", "mapped.json", "database.db",
                                      "models/0/points3D.bin"])
 def test_damaged_intermediate_files_are_made_again(stopped: Path, tmp_path: Path, damaged: str) -> None:
-    out, heard = tmp_path / "out", Heard()
+    out, heard = tmp_path / "out", RecordingProgress()
     shutil.copytree(stopped / "out", out)
     file = out / ".solve" / damaged
     file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
@@ -366,7 +366,7 @@ def test_a_video_is_solved(tmp_path: Path) -> None:
 
 def test_a_truncated_video_is_reported(tmp_path: Path) -> None:
     """An AVI has its frames before its index: what there is of it can be read."""
-    video, heard = tmp_path / "shot.avi", Heard()
+    video, heard = tmp_path / "shot.avi", RecordingProgress()
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 25, SIZE)
     for camera in orbit(12, size=SIZE, arc=0.3):
         writer.write(render(camera))
@@ -547,7 +547,7 @@ def test_interlaced_footage_raises_a_warning(apart: int, told: int, as_video: bo
         source.mkdir()
         for number, frame in enumerate(frames):
             cv2.imwrite(str(source / f"{number:03d}.png"), frame)
-    heard = Heard()
+    heard = RecordingProgress()
     prepare_frames(source, tmp_path / "work", 6, 480, heard)
     assert sum("interlaced" in text for text in heard.texts) == told
 

@@ -16,7 +16,7 @@ from core.removal.jobs.video_frames import expand_videos, extract_frames
 from core.removal.training import flare_bank
 from core.removal.training.flare_bank import UserFlares
 from core.system.progress import Progress
-from tests.core.heard import Heard
+from tests.core.recording_progress import RecordingProgress
 
 PATCHES = np.array([(200, 60, 40), (40, 180, 60), (50, 70, 210), (128, 128, 128), (230, 200, 40), (240, 240, 240)])
 """Red, green, blue."""
@@ -191,7 +191,7 @@ def test_missing_frames_of_a_video_are_reported(tmp_path: Path) -> None:
         writer.write(np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8))
     writer.release()
     whole = (tmp_path / "clip.avi").read_bytes()
-    told = Heard()
+    told = RecordingProgress()
     extract_frames(tmp_path / "clip.avi", tmp_path / "whole", told)
     assert not told.texts
     (tmp_path / "clip.avi").write_bytes(whole[:len(whole) * 6 // 10])

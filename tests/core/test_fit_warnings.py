@@ -13,29 +13,30 @@ from core.capture import Capture
 from core.errors import Cancelled, CaptureError
 from core.fit import fit, preset
 from core.fit.frames import Frames
-from core.fit.warnings import doubts, unlike
+from core.fit.warnings import footage_warnings, outlier_warnings
 from core.images.write import write_png
-from core.metrics.evaluation import worse_than_none
+from core.metrics.evaluation import is_worse_than_empty
 from tests.core.flared import HEIGHT, WIDTH, flared_capture
-from tests.core.heard import Heard
+from tests.core.recording_progress import RecordingProgress
 from tests.core.test_fit import StopAt, quick
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return Capture.open(flared_capture(tmp_path_factory.mktemp("doubts") / "capture"))
+    return Capture.open(flared_capture(tmp_path_factory.mktemp("warnings") / "capture"))
 
 
-def told(capture: Capture, mode: str = "split", count: int = 12) -> list[str]:
+def warnings_on(capture: Capture, mode: str = "split", count: int = 12) -> list[str]:
     frames = Frames(capture, display_white=4.0)
-    return [text.split(":")[0] for text in doubts(capture, preset("draft", mode=mode), capture.views[:count], frames)]
+    warnings = footage_warnings(capture, preset("draft", mode=mode), capture.views[:count], frames)
+    return [text.split(":")[0] for text in warnings]
 
 
-def test_nothing_is_told_of_footage_as_it_should_be(capture: Capture) -> None:
-    assert told(capture) == told(capture, "default") == []
+def test_good_footage_gives_no_warning(capture: Capture) -> None:
+    assert warnings_on(capture) == warnings_on(capture, "default") == []
 
 
-def test_a_camera_that_only_turns_is_told_where_parallax_has_to_tell(capture: Capture) -> None:
+def test_a_rotating_camera_gives_a_warning_in_parallax_modes(capture: Capture) -> None:
     views = []
     for view in capture.views:
         pose = view.camera.world_to_camera.copy()
@@ -43,12 +44,12 @@ def test_a_camera_that_only_turns_is_told_where_parallax_has_to_tell(capture: Ca
         views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
     frames = {view.name: capture.frame_path(view) for view in capture.views}
     tripod = Capture(capture.folder, views, capture.points, capture.lights, frames=frames)
-    assert told(tripod) == ["The camera only turns"]
-    assert told(tripod, "default") == []
+    assert warnings_on(tripod) == ["The camera only turns"]
+    assert warnings_on(tripod, "default") == []
 
 
-@pytest.mark.parametrize(("away", "doubted"), [(5.4e6, True), (1e3, False)])
-def test_a_world_far_from_its_origin_is_told(capture: Capture, away: float, doubted: bool) -> None:
+@pytest.mark.parametrize(("away", "warned"), [(5.4e6, True), (1e3, False)])
+def test_a_capture_far_from_the_origin_gives_a_warning(capture: Capture, away: float, warned: bool) -> None:
     views = []
     for view in capture.views:
         pose = view.camera.world_to_camera.copy()
@@ -57,23 +58,23 @@ def test_a_world_far_from_its_origin_is_told(capture: Capture, away: float, doub
     frames = {view.name: capture.frame_path(view) for view in capture.views}
     points = replace(capture.points, xyz=capture.points.xyz + np.float32((away, away, 0)))
     moved = Capture(capture.folder, views, points, capture.lights, frames=frames)
-    assert told(moved, "3dgs") == ["The world's origin is far away"] * doubted
+    assert warnings_on(moved, "3dgs") == ["The world's origin is far away"] * warned
 
 
-def test_few_frames_are_told(capture: Capture) -> None:
-    assert [text.split(",")[0] for text in told(capture, count=11)] == ["11 frames are few to learn a flare from"]
-    assert told(capture, "3dgs", count=11) == []
+def test_few_frames_give_a_warning(capture: Capture) -> None:
+    assert [text.split(",")[0] for text in warnings_on(capture, count=11)] == ["11 frames are few to learn a flare from"]
+    assert warnings_on(capture, "3dgs", count=11) == []
 
 
-@pytest.mark.parametrize(("gain", "doubted"), [(0.01, True), (1.0, False), (3.0, False), (40.0, True)])
-def test_float_frames_far_from_middle_grey_are_told(gain: float, doubted: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("gain", "warned"), [(0.01, True), (1.0, False), (3.0, False), (40.0, True)])
+def test_float_frames_far_from_middle_grey_give_a_warning(gain: float, warned: bool, tmp_path: Path) -> None:
     capture = Capture.open(flared_capture(tmp_path / "capture", dots=400, float_gain=gain))
     frames = Frames(capture, display_white=20.0)
-    found = doubts(capture, preset("draft", mode="split"), capture.views, frames)
-    assert [text.startswith("The frames' light is ") for text in found] == [True] * doubted
+    found = footage_warnings(capture, preset("draft", mode="split"), capture.views, frames)
+    assert [text.startswith("The frames' median light is ") for text in found] == [True] * warned
 
 
-def test_mode_split_goes_by_the_frames_alone(capture: Capture, tmp_path: Path) -> None:
+def test_mode_split_uses_the_frames_only(capture: Capture, tmp_path: Path) -> None:
     """Whatever flare-free frames and exact layers lie beside them."""
     bare = tmp_path / "bare"
     shutil.copytree(capture.folder, bare, ignore=shutil.ignore_patterns("removed", "truth"))
@@ -82,7 +83,7 @@ def test_mode_split_goes_by_the_frames_alone(capture: Capture, tmp_path: Path) -
     assert with_them.fingerprint == without.fingerprint
 
 
-def test_estimates_are_flare_free_frames_that_were_made_not_exact_layers(capture: Capture, tmp_path: Path) -> None:
+def test_mode_estimated_uses_removed_frames_and_not_exact_layers(capture: Capture, tmp_path: Path) -> None:
     """Which would make a fit of a known scene look better than one of footage."""
     folder = tmp_path / "known"
     shutil.copytree(capture.folder, folder, ignore=shutil.ignore_patterns("removed"))
@@ -94,28 +95,28 @@ def test_estimates_are_flare_free_frames_that_were_made_not_exact_layers(capture
 
 def test_a_frame_of_another_scene_is_named(tmp_path: Path) -> None:
     folder = flared_capture(tmp_path / "capture")
-    heard = Heard()
+    heard = RecordingProgress()
     fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "sound", heard)
-    assert not any("does not look like it" in text for text in heard.texts)
+    assert not any("does not reproduce the shot" in text for text in heard.texts)
     tiles = np.random.default_rng(5).random((4, 8, 3)).repeat(HEIGHT // 4, 0).repeat(WIDTH // 8, 1)
     write_png(folder / "images" / "0005.png", tiles)
     with pytest.raises(Cancelled):
         fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "odd", StopAt(118))
     fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "odd", heard, resume=True)
-    assert [text.split(":")[0] for text in heard.texts if "does not look like it" in text] == ["0005.png"]
+    assert [text.split(":")[0] for text in heard.texts if "does not reproduce the shot" in text] == ["0005.png"]
 
 
-def test_where_many_frames_are_bad_none_is_blamed() -> None:
+def test_many_bad_frames_are_no_outliers() -> None:
     losses = {f"{number}.png": 0.1 for number in range(40)}
-    assert unlike(losses) == unlike({}) == ()
-    assert unlike({**losses, "a": 0.39, "b": 0.41})[0].startswith("b: ")
+    assert outlier_warnings(losses) == outlier_warnings({}) == ()
+    assert outlier_warnings({**losses, "a": 0.39, "b": 0.41})[0].startswith("b: ")
     few = {f"odd {number}": 1.0 for number in range(4)}
-    assert "odd 0, odd 1, odd 2, odd 3: " in unlike({**losses, **few})[0]
-    assert unlike({**losses, **few, "odd 4": 1.0}) == ()
-    assert unlike({"a": 0.0, "b": 0.0, "c": 1e-4}) == (), "nothing that can be seen"
+    assert "odd 0, odd 1, odd 2, odd 3: " in outlier_warnings({**losses, **few})[0]
+    assert outlier_warnings({**losses, **few, "odd 4": 1.0}) == ()
+    assert outlier_warnings({"a": 0.0, "b": 0.0, "c": 1e-4}) == (), "nothing that can be seen"
 
 
 @pytest.mark.parametrize(("found", "empty", "worse"), [(20.0, 24.0, True), (25.0, 24.0, False), (None, 24.0, False)])
-def test_a_flare_that_is_worse_than_none_is_known(found: float | None, empty: float, worse: bool) -> None:
-    assert worse_than_none({"flare": {"psnr": found, "empty_psnr": empty}}) == worse
-    assert not worse_than_none({"composite": {"psnr": 20.0}})
+def test_a_flare_that_scores_below_an_empty_one_is_recognised(found: float | None, empty: float, worse: bool) -> None:
+    assert is_worse_than_empty({"flare": {"psnr": found, "empty_psnr": empty}}) == worse
+    assert not is_worse_than_empty({"composite": {"psnr": 20.0}})

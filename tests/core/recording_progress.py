@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A progress that remembers what it was told to say."""
+"""A progress that records the sentences reported to the user."""
 from __future__ import annotations
 
 from core.system.progress import Progress
 
 
-class Heard(Progress):
-    """texts: everything that was said, in order."""
+class RecordingProgress(Progress):
+    """texts: everything that was reported, in order."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -42,6 +42,10 @@ class Cancelled(FitFlareError):
     """The user or the system stopped a long job; what is on disk is whole."""
 
 
+class SpecialFileError(OSError):
+    """A named pipe, a socket or a device in the place of a file; `strerror` says which."""
+
+
 MAX_SPELLED_OUT = 20
 """Number of failures that a joint message spells out."""
 
@@ -70,6 +74,8 @@ def os_error_message(problem: OSError) -> str:
     where = f" ({problem.filename})" if problem.filename else ""
     if problem.errno in DISK_FULL:
         return f"The disk is full{where}; make room and start it again, what is finished is kept."
+    if isinstance(problem, SpecialFileError):
+        return f"A file cannot be used: {problem.strerror}{where}; put a file in its place or choose another path."
     if isinstance(problem, IsADirectoryError):
         return f"The path of a file to write is a folder{where}; choose another name."
     if isinstance(problem, FileExistsError | NotADirectoryError):

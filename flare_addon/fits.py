@@ -13,6 +13,7 @@ from ..core.conventions import exposures
 from ..core.conventions.run_files import CONFIG, FLARE, SMALL_PREVIEW
 from ..core.errors import CaptureError, FitFlareError, RunError
 from ..core.look import Look, read
+from ..core.system.reading import MAX_PATH_BYTES, read_text
 from . import engine, jobs, lights, looks
 from .capture.importer import set_exposures
 from .images import reload_images
@@ -191,7 +192,7 @@ def _capture_has_moved(folder: Path, capture: Path | None) -> bool:
 def _capture_of_run(folder: Path) -> Path | None:
     """Return the capture of a run; None where its folder does not store it."""
     try:
-        return Path((folder / "capture.txt").read_text(encoding="utf-8").removesuffix("\n"))
+        return Path(read_text(folder / "capture.txt", MAX_PATH_BYTES).removesuffix("\n"))
     except (OSError, UnicodeDecodeError):
         return None
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from ..errors import CaptureError
 from ..images.size import MAX_PIXELS
-from ..system.files import UTF8_SIG, atomic_path
+from ..system.files import atomic_path
+from ..system.reading import MAX_MODEL_BYTES, UTF8_SIG, read_bytes, read_text
 from .camera import Floats, quaternion_from_rotation, rotation_from_quaternion
 from .lens import MODEL_NAMES, MODELS, Lens
 
@@ -170,7 +171,7 @@ def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Any:
     try:
         if path.suffix == ".bin":
             return binary(_ByteReader(path))
-        return text(path, path.read_text(encoding=UTF8_SIG).splitlines())
+        return text(path, read_text(path, MAX_MODEL_BYTES, UTF8_SIG).splitlines())
     except OSError as problem:
         raise CaptureError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except UnicodeDecodeError as problem:
@@ -182,7 +183,7 @@ class _ByteReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.data = path.read_bytes()
+        self.data = read_bytes(path, MAX_MODEL_BYTES)
         self.at = 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
@@ -239,6 +240,9 @@ def _read_cameras_txt(path: Path, lines: list[str]) -> dict[int, Lens]:
         if model not in MODELS:
             raise CaptureError(f"{path}, line {number}: {model!r} is no camera model this program knows; solve the "
                                "cameras again with another (OPENCV, for instance).")
+        if len(words) < 4:
+            raise CaptureError(f"{path}, line {number}: a camera takes at least four values (number, model, width, "
+                               f"height), not {len(words)}; export the model again.")
         camera, width, height, *params = _parse_numbers(path, number, [words[0], *words[2:]], "iii")
         if len(params) != len(MODELS[model][1]):
             raise CaptureError(f"{path}, line {number}: {model} takes {len(MODELS[model][1])} parameters "

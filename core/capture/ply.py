@@ -8,13 +8,14 @@ import numpy as np
 
 from .. import ply
 from ..errors import CaptureError
+from ..system.reading import MAX_MODEL_BYTES, read_bytes
 from .colmap import PointCloud
 
 
 def read_points(path: Path) -> PointCloud:
     """Read a point cloud; grey where it has no colours. Raises CaptureError where the file is no point cloud."""
     try:
-        data = path.read_bytes()
+        data = read_bytes(path, MAX_MODEL_BYTES)
     except OSError as problem:
         raise CaptureError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     header = ply.read_header(data)

@@ -111,7 +111,7 @@ def _parse_matrix(value: Any, where: str, what: str) -> Floats:
     """Parse (4, 4) from nested lists of 3 or 4 rows of 4 numbers. Raises CaptureError."""
     try:
         matrix = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)) or not (np.abs(matrix) < MAX_MAGNITUDE).all():
         raise CaptureError(f"{where} {what} should be 4 rows of 4 finite numbers of a sensible size; export the file "

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import EngineError, SettingsError
+from ..system.reading import check_regular
 from .spaces import REC_709, ColourSpace, colour_space, linear_space
 from .spaces import built_in_names as built_in_names
 
@@ -42,6 +43,7 @@ def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
     """
     library = _library()
     where = str(config or os.environ.get("OCIO") or _BUILT_IN)
+    check_regular(where)
     try:
         opened = library.Config.CreateFromFile(where)
     except Exception as problem:  # its own class, which exists only where it is installed

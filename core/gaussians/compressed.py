@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from .. import ply
 from ..errors import FlareFileError
+from ..system.reading import open_regular, read_bytes
 from .scene import COEFFICIENTS, SceneGaussians
 from .spherical_harmonics import dc_from_colour
 
@@ -34,7 +35,7 @@ Floats = NDArray[np.float32]
 
 def is_compressed(path: Path) -> bool:
     """Return whether the header is that of a compressed PLY. Raises OSError for an unreadable file."""
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         head = file.read(_MAX_HEADER_BYTES).split(b"end_header")[0]
     return head.startswith(b"ply") and b" packed_position\n" in head.replace(b"\r", b"")
 
@@ -42,7 +43,7 @@ def is_compressed(path: Path) -> bool:
 def read_compressed(path: Path) -> SceneGaussians:
     """Read a compressed PLY. Raises FlareFileError for a damaged file."""
     try:
-        elements = _read_elements(path.read_bytes())
+        elements = _read_elements(read_bytes(path))
         chunks, vertices = elements["chunk"], elements["vertex"]
         n = len(vertices)
         if len(chunks) * CHUNK < n:

@@ -20,6 +20,7 @@ from .. import ply
 from ..conventions.pixel_grid import PixelGrid
 from ..errors import FlareFileError
 from ..system.files import atomic_path
+from ..system.reading import open_regular
 from .compressed import is_compressed, read_compressed
 from .rendering import NEAR
 from .scene import COEFFICIENTS, SceneGaussians
@@ -85,7 +86,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
     try:
         if is_compressed(path):
             return read_compressed(path)
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             header = _header(path, file.read(MAX_HEADER_BYTES))
             n, row = header.vertices, header.row
             if path.stat().st_size - header.start < n * row.itemsize:

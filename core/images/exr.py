@@ -17,6 +17,7 @@ from ..colour import Chromaticities, space_of_chromaticities
 from ..colour.spaces import built_in_names as space_names
 from ..colour.srgb import Pixels
 from ..errors import FrameError, SettingsError
+from ..system.reading import check_regular, open_regular
 from .formats import exr_header
 from .size import checked_size, picture_size
 from .window import DataWindow
@@ -26,7 +27,7 @@ def channel_names(path: Path | str) -> list[str]:
     """The channels of an EXR's first part by its header alone. Raises FrameError where the header is no EXR's."""
     path = Path(path)
     try:
-        with open(path, "rb") as stream:
+        with open_regular(path) as stream:
             names = list(exr_header.channel_kinds(stream)) if stream.read(4) == exr_header.MAGIC else []
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
@@ -40,7 +41,7 @@ def exr_colour_space(path: Path | str) -> str:
 
     Without chromaticities it is "linear", Rec. 709, as the format defines. Raises OSError where the file is missing.
     """
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         chromaticities = exr_header.chromaticities(stream)
     if chromaticities is None:
         return "linear"
@@ -53,14 +54,14 @@ def exr_colour_space(path: Path | str) -> str:
 
 def exr_pixel_aspect(path: Path | str) -> float:
     """Return the pixel aspect ratio (width / height) of an EXR. Raises OSError where the file is missing."""
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         return exr_header.pixel_aspect(stream)
 
 
 def is_exr_truncated(path: Path | str) -> bool:
     """True if an EXR ends before its last lines, by its table of line offsets. Raises OSError where the file is
     missing."""
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         return stream.read(4) == exr_header.MAGIC and exr_header.is_truncated(stream)
 
 
@@ -75,6 +76,7 @@ def read_exr_header(path: Path | str) -> dict[str, Any]:
 def _exr_headers(path: Path | str) -> list[dict[str, Any]]:
     import OpenEXR
 
+    check_regular(path)
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             headers = [dict(part.header) for part in file.parts]
@@ -92,6 +94,7 @@ def read_exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[A
     """
     import OpenEXR
 
+    check_regular(path)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [(dict(part.header), {name: channel.pixels for name, channel in part.channels.items()})

@@ -22,6 +22,7 @@ from ..colour import ColourSpace, colour_space, space_of_chromaticities
 from ..colour.srgb import LUMINANCE, srgb_from_linear
 from ..errors import FrameError, is_out_of_memory
 from ..system.files import atomic_path
+from ..system.reading import open_regular, read_bytes
 from .borders import PictureArea, find_picture_area
 from .exr import missing_rgb, read_exr_parts
 from .formats import jpeg, png, tiff
@@ -136,7 +137,7 @@ def read_plate(path: Path | str) -> Plate:
 
 
 def _read_codes(path: Path) -> Plate:
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         pages = tiff.page_count(stream)
     if pages > 1:
         raise FrameError(f"{path} has {pages} pages; export the plate as a file of its own.")
@@ -156,7 +157,7 @@ def _read_codes(path: Path) -> Plate:
 
 def _is_grey_with_alpha(path: Path) -> bool:
     """True for a PNG of colour type 4 (PNG specification, 11.2.1), which OpenCV reads as colour."""
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         header = stream.read(26)
     return header[:4] == b"\x89PNG" and header[25:] == b"\x04"
 
@@ -164,7 +165,7 @@ def _is_grey_with_alpha(path: Path) -> bool:
 def _is_animated(path: Path) -> bool:
     """True for a PNG of several frames (PNG specification, third edition, 11.3.6.1), of which OpenCV reads the first.
     """
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         return any(int.from_bytes(content[:4], "big") > 1 for _, content in png.chunks(stream, (b"acTL",)))
 
 
@@ -173,7 +174,7 @@ def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
 
     OpenCV reads such files without it.
     """
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         depth = stream.read(25)[24:]
         key = next((content for _, content in png.chunks(stream, (b"tRNS",)) if len(content) == 2), None)
     if key is None:
@@ -256,14 +257,14 @@ def _copy_tags(encoded: bytes, suffix: str, plate: Plate) -> bytes:
     if suffix in _JPEGS and source in _JPEGS:
         return encoded[:2] + b"".join(_jpeg_tags(plate.path)) + encoded[2:]
     if suffix == source == ".png":
-        data = plate.path.read_bytes()
+        data = read_bytes(plate.path)
         was_grey, is_grey = (not header[25] & 2 for header in (data, encoded))
         left_out = (b"iCCP",) if was_grey != is_grey else ()
         chunks = b"".join(png.make_chunk(name, content) for name, content in png.chunks(io.BytesIO(data), _KEPT_CHUNKS)
                         if name not in left_out)
         return encoded[:33] + chunks + encoded[33:]  # behind the header chunk
     if suffix in _TIFFS and source in _TIFFS:
-        tags = tiff.read_tags(io.BytesIO(plate.path.read_bytes()), _KEPT_TAGS)
+        tags = tiff.read_tags(io.BytesIO(read_bytes(plate.path)), _KEPT_TAGS)
         if plate.alpha is None:
             tags.pop(tiff.EXTRA_SAMPLES, None)
         return tiff.with_tags(encoded, tags)
@@ -289,7 +290,7 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
 
 def _jpeg_tags(path: Path) -> Iterator[bytes]:
     """Yield the source's EXIF, XMP and colour profile segments."""
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         for marker, content in jpeg.segments(stream):
             if (marker, content[:4]) in _KEPT_SEGMENTS:
                 yield jpeg.make_segment(marker, content)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError
+from ..system.reading import open_regular, read_bytes
 from .exr import main_part, read_exr_parts, rec709_pixels, rgb_channels, window_from_header
 from .formats import exr_header, png, tiff
 from .listing import SUFFIXES
@@ -66,7 +67,7 @@ def has_half_pixels(path: Path) -> bool:
     """True if a picture is stored in 16 bit floats, which only EXRs can be. Raises FrameError."""
     if path.suffix.lower() != ".exr":
         return False
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         kinds = exr_header.channel_kinds(stream)
     return all(kinds.get(name, exr_header.HALF) == exr_header.HALF for name in "RGBY")
 
@@ -95,10 +96,10 @@ def decode(path: Path, flags: int) -> NDArray[Any] | None:
     """
     import cv2
 
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         if png.is_truncated(stream):
             return None
-    data = np.fromfile(path, np.uint8)
+    data = np.frombuffer(read_bytes(path), np.uint8)
     if data[:4].tobytes() in (b"II*\0", b"MM\0*"):
         data = np.frombuffer(tiff.without_reader_changes(data.tobytes()), np.uint8)
     try:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import FrameError
+from ..system.reading import open_regular
 from .formats import exr_header, jpeg, png, tiff
 
 MAX_PIXELS = 500_000_000
@@ -21,7 +22,7 @@ def picture_size(path: Path | str) -> tuple[int, int]:
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     try:
-        with open(path, "rb") as stream:
+        with open_regular(path) as stream:
             if stream.read(4) in tiff.BIG_TIFF:
                 raise FrameError(f"{path} is a BigTIFF; save it as a plain TIFF, of less than 4 GB.")
             stream.seek(0)

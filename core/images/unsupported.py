@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import FrameError
+from ..system.reading import open_regular
 from .formats import jpeg, tiff
 from .video import is_video
 
@@ -22,7 +23,7 @@ def unsupported_file(path: Path) -> FrameError:
 
 def compression_reason(path: Path) -> str:
     """Name a TIFF's compression that OpenCV cannot read, and what to do; "" for one that it can."""
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         tags = tiff.integer_values(tiff.read_tags(stream, (tiff.COMPRESSION,)))
     name = tiff.UNSUPPORTED_COMPRESSIONS.get(tags.get(tiff.COMPRESSION, 0))
     return f"is compressed by {name}, which this program does not read; save it with LZW, ZIP or none" if name else ""
@@ -34,7 +35,7 @@ _CMYK = "is CMYK, for print; convert it to RGB"
 def unsupported_reason(path: Path) -> str:
     """Say what OpenCV would decode wrongly, or not at all though the file is intact, and what to do; "" for a good
     file."""
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         magic = stream.read(4)
         stream.seek(0)
         if magic[:2] == b"\xff\xd8":  # whatever it is named

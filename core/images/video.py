@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError
+from ..system.reading import check_regular, open_regular
 
 VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv"})
 """Suffixes of video files."""
@@ -58,6 +59,7 @@ class Video:
     def __init__(self, path: Path) -> None:
         import cv2
 
+        check_regular(path)
         self._reader = cv2.VideoCapture(str(path))
         if not self._reader.isOpened():
             raise FrameError(f"{path} cannot be decoded: it is cut off, or not a video that this program knows; copy "
@@ -136,7 +138,7 @@ def _read_moov_box(path: Path) -> bytes:
 
     Cameras write it after the pictures, which are skipped.
     """
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         at, end = 0, stream.seek(0, 2)
         while at + 8 <= end:
             stream.seek(at)

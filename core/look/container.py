@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import FlareFileError
 from ..system.files import atomic_path
+from ..system.reading import parse_json, read_bytes
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -30,12 +31,12 @@ def read_tensors(path: Path | str) -> tuple[Arrays, dict[str, str]]:
     if not path.is_file():
         raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.")
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
         return _parse(data)
     except OSError as problem:
         raise FlareFileError(f"{path} cannot be read ({problem.strerror or problem}); copy it again, or choose "
                              "another.") from problem
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as problem:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as problem:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
 
 
@@ -43,7 +44,7 @@ def _parse(data: bytes) -> tuple[Arrays, dict[str, str]]:
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(len(data) - 8, MAX_HEADER_BYTES):
         raise ValueError("it ends inside its header")
-    header = json.loads(data[8:8 + length].decode("utf-8"))
+    header = parse_json(data[8:8 + length])
     metadata = header.pop("__metadata__", {}) or {}
     body = memoryview(data)[8 + length:]
     arrays: Arrays = {}
@@ -61,9 +62,9 @@ def _parse(data: bytes) -> tuple[Arrays, dict[str, str]]:
 def rewrite_metadata(source: Path | str, target: Path | str, metadata: dict[str, str]) -> None:
     """Copy a safetensors file with other metadata and the same tensors, byte for byte. Raises FlareFileError."""
     read_tensors(source)  # raises for an invalid file
-    data = Path(source).read_bytes()
+    data = read_bytes(source)
     length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8:8 + length].decode("utf-8"))
+    header = parse_json(data[8:8 + length])
     text = json.dumps({**header, "__metadata__": metadata}).encode("utf-8")
     text += b" " * (-len(text) % 8)  # the tensors stay aligned
     with atomic_path(target) as temporary:

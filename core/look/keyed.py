@@ -9,14 +9,14 @@ keyframes, and constant before the first and after the last.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..errors import SettingsError
-from ..system.files import UTF8_SIG, read_json, write_json
+from ..system.files import read_json, write_json
+from ..system.reading import MAX_TOML_BYTES, UTF8_SIG, parse_toml, read_text
 from .edits import LookEdits
 
 
@@ -73,7 +73,7 @@ class KeyedEdits:
 
 def _read_toml(path: Path) -> Any:
     try:
-        return tomllib.loads(path.read_text(encoding=UTF8_SIG))
+        return parse_toml(read_text(path, MAX_TOML_BYTES, UTF8_SIG))
     except OSError as problem:
         raise SettingsError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except ValueError as problem:

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..choices import Blend
 from ..conventions.pixel_grid import PixelGrid
 from ..errors import FlareFileError
+from ..system.reading import parse_json
 from ..typed import parse_table
 from . import container, elements
 from .edits import LookEdits, apply_edits
@@ -300,8 +301,8 @@ def _parse_json(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     if METADATA_KEY not in metadata:
         raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.")
     try:
-        description = json.loads(metadata[METADATA_KEY])
-    except (ValueError, RecursionError) as problem:
+        description = parse_json(metadata[METADATA_KEY])
+    except ValueError as problem:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
     version = description.get("version") if isinstance(description, dict) else None
     if not isinstance(version, int) or version > VERSION:

@@ -26,6 +26,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..errors import SettingsError
 from ..system.files import avoid_device_name, read_json, write_json
+from ..system.reading import read_bytes
 from .look import PlacedLight, Query
 
 VERSION = 1
@@ -89,7 +90,7 @@ class Shot:
     def fingerprint(self, run: str = "") -> str:
         """Return a hash that changes whenever all pictures would; `ShotFrame.cache_key` covers the single frames. run:
         fingerprint of the fit whose scene is behind the flare."""
-        digest = hashlib.sha256(self.flare.read_bytes())
+        digest = hashlib.sha256(read_bytes(self.flare))
         digest.update(repr((self.query, self.live, self.lights)).encode())
         digest.update(run.encode())
         return digest.hexdigest()[:16]

@@ -2,7 +2,8 @@
 """Safe writing and naming of files: results are whole or absent, names stay inside their folder, sources are not
 overwritten.
 
-Every module that touches the disk goes through here. `folder_lock.py` locks a folder for the length of a job.
+Every module that writes goes through here; `reading.py` opens and parses what is there. `folder_lock.py` locks a folder
+for the length of a job.
 """
 from __future__ import annotations
 
@@ -24,10 +25,8 @@ from typing import Any
 
 from ..errors import FitFlareError, SettingsError
 from .processes import WINDOWS, is_running, machine_id
+from .reading import UTF8_SIG, check_regular, open_regular, parse_json, read_bytes, read_text
 
-UTF8_SIG = "utf-8-sig"
-"""Encoding for reading text that people write: UTF-8, with the byte order mark that Windows' editors put first or
-without."""
 _PARTIAL, _TRASH = ".partial-", ".old-"
 """Parts of the names of temporary files and of folders on their way out."""
 _MAX_REFUSALS = 100
@@ -57,6 +56,7 @@ def atomic_path(target: Path | str,
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
+    check_regular(target)  # a pipe or device of that name is somebody's
     remove_partials_of(target)
     temporary = target
     try:
@@ -224,7 +224,11 @@ def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
     try:
         yield
     finally:
-        retry_while_locked(_remove_lock, lock, created_ns)
+        try:
+            retry_while_locked(_remove_lock, lock, created_ns)
+        except OSError:  # the work is done; an old lock is taken over at once
+            with contextlib.suppress(OSError):
+                os.utime(lock, (0, 0))
 
 
 def _remove_lock(lock: Path, created_ns: int) -> None:
@@ -281,20 +285,11 @@ def read_json(path: Path | str, error: type[FitFlareError]) -> Any:
     """Read a JSON file; raises `error` with one sentence if it cannot be read."""
     path = Path(path)
     try:
-        return json.loads(path.read_text(encoding=UTF8_SIG), object_pairs_hook=_reject_duplicate_keys)
+        return parse_json(read_text(path, encoding=UTF8_SIG))
     except OSError as problem:
         raise error(f"{path} cannot be read: {problem.strerror or problem}.") from problem
-    except (ValueError, RecursionError) as problem:
+    except ValueError as problem:
         raise error(f"{path} is not valid JSON ({problem}); correct it or make it again.") from problem
-
-
-def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Raise ValueError for a key that occurs twice, of which json would keep the last."""
-    unique = dict(pairs)
-    if len(unique) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"it has {next(name for name in names if names.count(name) > 1)!r} twice")
-    return unique
 
 
 def avoid_device_name(name: str) -> str:
@@ -368,7 +363,7 @@ def hash_files(paths: Iterable[Path]) -> str:
     digest = hashlib.sha256()
     for path in paths:
         if path.is_file():
-            digest.update(path.read_bytes())
+            digest.update(read_bytes(path))
     return digest.hexdigest()[:16]
 
 
@@ -380,5 +375,5 @@ def content_hash(path: Path) -> str:
 
 @lru_cache(maxsize=64)
 def _cached_hash(path: Path, _size: int, _time: int) -> str:
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         return hashlib.file_digest(stream, "blake2b").hexdigest()[:16]

@@ -8,6 +8,7 @@ from pathlib import Path
 from torch import Tensor
 
 from .files import atomic_path
+from .reading import check_regular
 
 
 def write(path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
@@ -27,9 +28,10 @@ def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """
     from safetensors import SafetensorError, safe_open
 
+    check_regular(path)
     try:
         with safe_open(str(path), "pt") as file:
             return ({name: file.get_tensor(name).clone() for name in file.keys()},  # noqa: SIM118 - not a mapping
                     dict(file.metadata() or {}))
-    except SafetensorError as problem:
+    except (SafetensorError, UnicodeError) as problem:  # of a path that is not UTF-8, too
         raise ValueError(str(problem)) from problem

@@ -9,6 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ...system.reading import open_regular
 from . import jpeg, png, tiff
 
 EXIF, FOCAL_35MM = 0x8769, 0xA405
@@ -21,7 +22,7 @@ def read_exif(path: Path) -> tuple[int, float | None]:
 
     (1, None) for other files, and where the tags are missing.
     """
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         block = _exif_block(stream)
         first = tiff.integer_values(tiff.read_tags(block, (tiff.ORIENTATION, EXIF)))
         second = tiff.integer_values(tiff.read_tags(block, (FOCAL_35MM,), first[EXIF])) if EXIF in first else {}

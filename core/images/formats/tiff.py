@@ -11,6 +11,8 @@ from typing import BinaryIO, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...system.reading import open_regular
+
 SUBFILE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, ORIENTATION, SAMPLES = 254, 256, 257, 258, 259, 262, 274, 277
 PLANES, EXTRA_SAMPLES, SAMPLE_FORMAT = 284, 338, 339
 X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT, XMP, COLOUR_PROFILE = 282, 283, 296, 700, 34675
@@ -115,7 +117,7 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
 
 def is_premultiplied(path: Path) -> bool:
     """True if a file says that its colours are multiplied with its alpha."""
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         tags = read_tags(stream, (EXTRA_SAMPLES,))
     return EXTRA_SAMPLES in tags and bool(tags[EXTRA_SAMPLES].values[0] == ASSOCIATED)
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...colour.srgb import Pixels
 from ...errors import SettingsError
 from ...images.plates import Plate
+from ...system.reading import read_bytes
 from ..model.image_formation import flare_to_linear
 from ..model.network import SIZE_MULTIPLE, RemovalNetwork
 from ..model.weights import IN_THE_BOX, load
@@ -145,6 +146,6 @@ class Remover:
 def compute_cache_key(model: str, weights: Path | str, *settings: Any) -> str:
     """Return a short text that changes whenever results would: by the content of the weights file, not its name, the
     settings and `REVISION`."""
-    digest = hashlib.sha256(Path(weights).read_bytes())
+    digest = hashlib.sha256(read_bytes(weights))
     digest.update(repr((REVISION, model, *settings)).encode())
     return digest.hexdigest()[:16]

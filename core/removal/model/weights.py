@@ -5,20 +5,24 @@
 """
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from ...errors import RunError
 from ...system import tensor_files
+from ...system.reading import parse_json
 from .network import RemovalNetwork
 
 IN_THE_BOX = Path(__file__).parents[1] / "box" / "removal.safetensors"
 """The weights that come with the program."""
+
+_MAX_LEVELS, _MAX_SIZE = 16, 4096
+"""Bounds of the resolutions of a network, and of the channels or blocks at each."""
 
 RETIRED_NAMES = {"see": "input_convs", "enter": "encoder", "leave": "decoder", "between": "inner_attention",
                  "first": "conv1", "second": "conv2", "place": "pos_embed", "asked": "qkv", "told": "proj",
@@ -59,11 +63,19 @@ def read_architecture(path: Path | str, metadata: Mapping[str, str]) -> Architec
     """Return the architecture in the recipe of a file's header. It does not need the recipe's other settings, which may
     be those of another version. Raises RunError."""
     try:
-        recipe = json.loads(metadata["recipe"])
+        recipe = parse_json(metadata["recipe"])
+        if not all(_is_size_list(recipe.get(name, [0])) for name in Architecture._fields):
+            raise ValueError("sizes")
         # Without the setting a network has no attention between blocks.
         return Architecture(tuple(recipe["widths"]), tuple(recipe["blocks"]), tuple(recipe.get("attention", (0, 0))))
-    except (KeyError, ValueError, TypeError) as problem:
+    except (KeyError, ValueError, TypeError, AttributeError) as problem:
         raise _not_weights(path) from problem
+
+
+def _is_size_list(sizes: object) -> bool:
+    """True for a list of whole numbers as networks have them."""
+    return (isinstance(sizes, list) and 0 < len(sizes) <= _MAX_LEVELS
+            and all(type(size) is int and 0 <= size <= _MAX_SIZE for size in sizes))
 
 
 def _not_weights(path: Path | str) -> RunError:
@@ -78,6 +90,11 @@ def load(path: Path = IN_THE_BOX) -> RemovalNetwork:
         raise RunError(f"{path} holds weights that are no finite numbers; get it again, or train it anew.")
     architecture = read_architecture(path, metadata)
     try:
+        with torch.device("meta"):  # before memory is taken for a size that the tensors do not have
+            described = RemovalNetwork(*architecture).state_dict()
+        if {name: value.shape for name, value in described.items()} != {
+                name: value.shape for name, value in tensors.items()}:
+            raise _not_weights(path)
         network = RemovalNetwork(*architecture)
         network.load_state_dict({name: value.float() for name, value in tensors.items()})
     except (RuntimeError, TypeError, ValueError) as problem:

@@ -20,10 +20,11 @@ from ...system.files import write_text
 from ...system.folder_lock import folder_lock
 from ...system.processes import available_cores
 from ...system.progress import Progress
+from ...system.reading import is_finite_number, parse_json, read_text
 from ..model import weights
 from ..model.recipe import Recipe, as_dict, from_dict
 from ..synthesis.flare import FLARE_CLASSES
-from ..synthesis.prescription import Prescription
+from ...optics.prescription import Prescription
 from .backgrounds import Backgrounds
 from .batches import Batch, Batches
 from .flare_bank import SingleFlareBank, UserFlares
@@ -69,7 +70,7 @@ def read_recipe(folder: Path | str) -> Recipe | None:
         return None
     _, metadata = weights.read(path)
     weights.read_architecture(path, metadata)  # raises for a foreign file
-    return from_dict(json.loads(metadata["recipe"]))
+    return from_dict(parse_json(metadata["recipe"]))
 
 
 def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: Sequence[Prescription], *,
@@ -127,7 +128,7 @@ class TrainingSetup(NamedTuple):
                          attention=tuple(map(max, self.recipe.attention, form.attention)))
         iteration = 0
         if self.resumes:
-            recipe = replace(recipe, **form._asdict(), seed=json.loads(metadata["recipe"])["seed"])
+            recipe = replace(recipe, **form._asdict(), seed=parse_json(metadata["recipe"])["seed"])
             iteration = int(metadata["iteration"])
         trainer = RemovalTrainer(recipe, worker)
         trainer.load_state(state, iteration)
@@ -214,11 +215,12 @@ def _write_weights_if_better(trainer: RemovalTrainer, folder: Path, gain: float,
 def _read_log(path: Path, iteration: int) -> list[dict[str, Any]]:
     """Return the lines of a log up to an iteration; later ones are of a training that was killed after its last
     checkpoint and are logged again."""
-    lines: list[dict[str, Any]] = []
-    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+    lines: list[Any] = []
+    for text in read_text(path, errors="replace").splitlines() if path.is_file() else ():
         with contextlib.suppress(ValueError):  # truncated by an earlier program
-            lines.append(json.loads(text))
-    return [line for line in lines if line.get("iteration", math.inf) <= iteration]
+            lines.append(parse_json(text))
+    return [line for line in lines
+            if isinstance(line, dict) and is_finite_number(line.get("iteration")) and line["iteration"] <= iteration]
 
 
 def _best_gain(folder: Path) -> float | None:

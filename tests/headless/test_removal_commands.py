@@ -43,7 +43,7 @@ def test_training_stops_at_its_length_and_resumes(backgrounds: Path, tmp_path: P
     assert cli.main([*words, "--iterations", "3", "--resume"]) == 0
     made = tmp_path / "made"
     shorter = ["train-removal", "--backgrounds", str(backgrounds), "--out", str(made), "--resume", "--processes", "1"]
-    assert cli.main([*shorter, "--set", "clean=0.5"]) == 0
+    assert cli.main([*shorter, "--set", "clean_share=0.5"]) == 0
     recipe = read_recipe(made)  # with its own settings, not the default length and size
     assert recipe is not None and (recipe.iterations, recipe.bank_size, recipe.clean_share) == (3, 2, 0.5)
     weights = str(tmp_path / "made" / "removal.safetensors")

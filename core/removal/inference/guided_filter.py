@@ -22,6 +22,7 @@ from .plate_light import CLIPPING_LEVEL, STRIP_ROWS, to_display, to_linear
 RADIUS, EPSILON = 1, 1e-3
 """Of the guided filter: radius of its window at the working size, pixels, and regularisation."""
 MAX_GAIN = 4
+"""Bound of the gain on both sides."""
 REMAP_COLUMNS = 16384
 """Columns of a plate that are interpolated at a time; OpenCV counts coordinates in 16 bits."""
 

@@ -119,12 +119,12 @@ def _find_light_discs(observed: Pixels, clean: Pixels, flare: Pixels, glow: Pixe
                                    for brightness in (clean, observed))
     glow_fraction = _label_means(glow, surround, count) / np.maximum(_label_means(flare, surround, count), 1e-6)
     pixels = np.bincount(labels.ravel(), minlength=count)
-    is_small = np.interp(pixels / observed.size, DISC_AREA_RAMP, (1, 0))
-    is_small[pixels < MIN_DISC_PIXELS] = 0
-    is_small[0] = 0  # the label of what is outside
+    area_weight = np.interp(pixels / observed.size, DISC_AREA_RAMP, (1, 0))
+    area_weight[pixels < MIN_DISC_PIXELS] = 0
+    area_weight[0] = 0  # the label of what is outside
     return _LightDiscs(
-        labels, is_small * np.interp(contrast, CONTRAST_RAMP, (0, 1)),
-        is_small * np.interp(glow_fraction, SURROUND_GLOW_RAMP, (0, 1))
+        labels, area_weight * np.interp(contrast, CONTRAST_RAMP, (0, 1)),
+        area_weight * np.interp(glow_fraction, SURROUND_GLOW_RAMP, (0, 1))
         * np.interp(observed_contrast, OBSERVED_CONTRAST_RAMP, (0, 1)),
         _label_maxima(observed, core, count), _label_maxima(clean, core, count))
 

@@ -138,7 +138,7 @@ class FitInputs:
         before, after = dict(stored.get("views") or []), dict(current["views"])
         if before and (others := [name for name in {**before, **after} if before.get(name) != after.get(name)]):
             raise RunError(f"{self._capture.folder} has changed since the fit began ({len(others)} of {len(after)} "
-                           f"views have another frame, flare-free frame or camera, {others[0]} first); put the old "
+                           f"views have another frame, clean frame or camera, {others[0]} first); put the old "
                            "ones back, or begin the fit anew in another folder.")
 
     def _digest(self, view: View) -> str:

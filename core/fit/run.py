@@ -32,8 +32,9 @@ from ..system.files import hash_files, remove_file, write_json, write_text
 from ..system.progress import Progress
 from ..system.reading import MAX_PATH_BYTES, read_text
 from ..typed import is_utf8
+from .config import read_config, write_config
 from .rendering import RenderedView, render
-from .settings import FitSettings, read_config, write_config
+from .settings import FitSettings
 
 
 @dataclass(frozen=True)

@@ -1,34 +1,31 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Every setting of a fit, its presets, and the config.toml that a run keeps.
+"""Every setting of a fit, and its presets.
 
 Defaults are the paper's (appendix "Flare representation"); the presets change length and rates so that a fit ends in
-minutes on two CPU cores. `fit` of the commands takes a preset and overrides of it; `trainer` follows them.
+minutes on two CPU cores. `fit` of the commands takes a preset and overrides of it; `trainer` follows them, and `config`
+keeps them in a run.
 """
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from operator import attrgetter
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from ..choices import ITERATIONS, PARALLAX_LENGTH_FACTOR, PARALLAX_MODES, Blend, Kernels, Mode, Model, Preset
 from ..colour.srgb import srgb_from_linear
-from ..errors import RunError, SettingsError
+from ..errors import SettingsError
 from ..flare.density import DensitySettings
 from ..flare.model import OURS, PAPER
 from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
 from ..look.form import FORM_BOUNDS, FlareForm
 from ..look.look import MAX_GAUSSIANS
-from ..system.files import write_text
 from ..system.progress import Progress
-from ..system.reading import MAX_TOML_BYTES, UTF8_SIG, parse_toml, read_text
-from ..typed import MAX_INT_DIGITS, MAX_SEED, Bounds, parse_field, parse_table
+from ..typed import MAX_INT_DIGITS, MAX_SEED, Bounds, parse_field
 
 
 @dataclass(frozen=True)
@@ -370,8 +367,7 @@ def _shorten_schedule(settings: FitSettings, count: int, max_gaussians: int) -> 
     return replace(settings, preview_every=max(length // 8, 1), scene=scene, flare=flare)
 
 
-# ---- config.toml ----------------------------------------------------------------------------------
-
+# ---- changes by name -----------------------------------------------------------------------------
 
 RENAMED = {
     "apart": "separate_until", "flare.begin": "flare.scene_only_until", "flare.snap": "flare.snap_lights",
@@ -399,79 +395,6 @@ def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, 
         known = isinstance(value, str) and (present, value) in RENAMED_VALUES
         current[present] = RENAMED_VALUES[present, value] if known else value
     return current, renamed
-
-
-def _flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values of nested tables by dotted name; an empty table stays one."""
-    flat: dict[str, Any] = {}
-    for name, value in table.items():
-        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) and value else {prefix + name: value}
-    return flat
-
-
-def _nest(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Undo `_flatten`. Raises ValueError where a name is both a value and a table."""
-    tables: dict[str, Any] = {}
-    for name, value in flat.items():
-        *keys, last = name.split(".")
-        table = tables
-        for key in keys:
-            table = table.setdefault(key, {})
-            if not isinstance(table, dict):
-                raise ValueError(f"{key} is both a value and a table")
-        table[last] = value
-    return tables
-
-
-def write_config(path: Path, settings: FitSettings) -> None:
-    """Write every setting, resolved, as TOML."""
-    lines: list[str] = []
-    _write_table(lines, [], settings)
-    write_text(path, "\n".join(lines).lstrip("\n") + "\n")
-
-
-def _write_table(lines: list[str], keys: list[str], table: Any) -> None:
-    plain = [entry for entry in fields(table) if not is_dataclass(getattr(table, entry.name))]
-    if keys:
-        lines += ["", f"[{'.'.join(keys)}]"]
-    for entry in plain:
-        value = getattr(table, entry.name)
-        if value is not None:  # TOML has no null; what is absent has its default, None
-            lines.append(f"{entry.name} = {_to_toml(value)}")
-    for entry in fields(table):
-        if entry not in plain:
-            _write_table(lines, [*keys, entry.name], getattr(table, entry.name))
-
-
-def _to_toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        # JSON's text is TOML's, but that TOML wants one more control character escaped, and no pairs of surrogates.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return repr(value)
-
-
-def read_config(path: Path, progress: Progress | None = None) -> FitSettings:
-    """Read the settings of a run; with `progress`, old names are reported in one line.
-
-    Raises RunError if the file is missing, damaged, or has unknown names.
-    """
-    try:
-        data = parse_toml(read_text(path, MAX_TOML_BYTES, UTF8_SIG))
-        if "mode" not in data:  # what is cut off would pass for settings that are left as they come
-            raise ValueError("it has no mode")
-        values, renamed = current_names(_flatten(data))
-        values.pop("split.excess_unfound", None)  # of versions that fitted an unconverged scene alone
-        settings: FitSettings = parse_table(FitSettings, _nest(values)).validated()
-    except OSError as problem:
-        raise RunError(f"{path} cannot be read ({problem.strerror}); is this the folder of a run?") from problem
-    except (ValueError, TypeError, SettingsError) as problem:
-        raise RunError(f"{path} is not a fit's configuration ({problem}); start the fit anew.") from problem
-    if renamed and progress is not None:
-        names = ", ".join(f"{old} is now {new}" for old, new in renamed.items())
-        progress.say(f"{path} has old names of settings, which still work in this version: {names}.")
-    return settings
 
 
 def override_settings(settings: FitSettings, values: Mapping[str, Any],

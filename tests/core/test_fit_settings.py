@@ -13,7 +13,8 @@ import pytest
 
 from core.choices import Mode
 from core.errors import RunError, SettingsError
-from core.fit.settings import BOUNDS, RENAMED, FitSettings, override_settings, preset, read_config, write_config
+from core.fit.config import read_config, write_config
+from core.fit.settings import BOUNDS, RENAMED, FitSettings, override_settings, preset
 from tests.core.recording_progress import RecordingProgress
 
 

@@ -62,7 +62,8 @@ def test_a_capture_far_from_the_origin_gives_a_warning(capture: Capture, away: f
 
 
 def test_few_frames_give_a_warning(capture: Capture) -> None:
-    assert [text.split(",")[0] for text in warnings_on(capture, count=11)] == ["11 frames are few to learn a flare from"]
+    texts = warnings_on(capture, count=11)
+    assert [text.split(",")[0] for text in texts] == ["11 frames are few to learn a flare from"]
     assert warnings_on(capture, "3dgs", count=11) == []
 
 

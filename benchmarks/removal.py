@@ -187,7 +187,7 @@ def clean(folders: list[Path], weights: Path | None = None) -> None:
 
 def scenes(folders: list[Path], weights: Path | None = None, count: int = 300) -> None:
     """Measure the change of held-out scenes without flare."""
-    from core.removal.synthesis.prescription import built_in_lenses
+    from core.optics.prescription import built_in_lenses
     from core.removal.training.backgrounds import read_backgrounds
     from core.removal.training.flare_bank import SingleFlareBank
     from core.removal.training.pairs import make_pair
@@ -206,15 +206,15 @@ def scenes(folders: list[Path], weights: Path | None = None, count: int = 300) -
 
 def _held_out_lenses(lenses: Path | None) -> Any:
     """Return the lenses of a folder that training leaves out."""
+    from core.optics.prescription import read_lenses
     from core.removal.evaluation import held_out_lenses
-    from core.removal.synthesis.prescription import read_lenses
 
     return held_out_lenses(read_lenses(lenses) if lenses else [])
 
 
 def _training_lenses(lenses: Path | None) -> Any:
     """Return the lenses of a folder that training uses."""
-    from core.removal.synthesis.prescription import built_in_lenses, read_lenses
+    from core.optics.prescription import built_in_lenses, read_lenses
     from core.removal.training.backgrounds import is_held_out
 
     return [lens for lens in read_lenses(lenses) if not is_held_out(lens.name)] if lenses else built_in_lenses()
@@ -324,10 +324,10 @@ class _AsphericBank:
 
     def draw(self, random: np.random.Generator) -> Any:
         """Return the ghosts of another light and lens at every call."""
+        from core.optics.prescription import built_in_lenses
         from core.removal.evaluation import CANVAS_SIZE
         from core.removal.synthesis.aspheric import draw_ghosts
         from core.removal.synthesis.flare import synthesise_flare
-        from core.removal.synthesis.prescription import built_in_lenses
         from core.removal.training.pairs import FlareLayers
 
         seed = (*self._seed, int(random.integers(1 << 30)))
@@ -398,9 +398,9 @@ def _rough_matte(frame: Any, truth: Any) -> Any:
 
 def coverage(sheet: Path | None = None, count: int = 400) -> None:
     """Print a histogram of the coverage of synthesised flares, and draw a sheet of them."""
+    from core.optics.prescription import built_in_lenses
     from core.removal.model.image_formation import coverage as covered
     from core.removal.synthesis.flare import FLARE_CLASSES, add_aspheric_ghosts, synthesise_flare
-    from core.removal.synthesis.prescription import built_in_lenses
 
     lenses = built_in_lenses()
     shares = [covered(synthesise_flare((1, number), 160, lenses).whole) for number in range(count)]

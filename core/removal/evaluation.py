@@ -27,8 +27,8 @@ from ..images.picture import same_aspect
 from ..images.read import read_picture
 from ..metrics.evaluation import format_cell
 from ..metrics.pictures import Perceptual, flip, psnr, ssim
+from ..optics.prescription import Prescription, built_in_lenses
 from ..system.progress import Progress
-from .synthesis.prescription import Prescription, built_in_lenses
 from .training.backgrounds import Backgrounds, is_held_out
 
 INPUT_FOLDERS = ("input", "flare", "blend")

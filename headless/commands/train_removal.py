@@ -14,8 +14,8 @@ from .fit import parse_setting
 
 if TYPE_CHECKING:
     from ...core.colour.srgb import Pixels
+    from ...core.optics.prescription import Prescription
     from ...core.removal.model.recipe import Recipe
-    from ...core.removal.synthesis.prescription import Prescription
     from ...core.removal.training.backgrounds import Backgrounds
     from ...core.removal.training.flare_bank import UserFlares
 
@@ -61,10 +61,10 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Train the network or the LoRA. Raises SettingsError."""
     import torch
 
+    from ...core.optics.prescription import built_in_lenses, read_lenses
     from ...core.removal.evaluation import held_out_lenses
     from ...core.removal.model import recipe as recipes
     from ...core.removal.model import weights
-    from ...core.removal.synthesis.prescription import built_in_lenses, read_lenses
     from ...core.removal.training.backgrounds import (
         describe_unusable,
         is_held_out,

@@ -26,7 +26,7 @@ from core.look.shot import Shot
 from core.removal.inference.remover import Remover
 from core.removal.jobs.batch import remove_all
 from core.removal.model import weights
-from core.removal.synthesis.prescription import built_in_lenses
+from core.optics.prescription import built_in_lenses
 from core.removal.training import run as training_run
 from core.system.progress import Progress
 from tests.core.test_removal_training import backgrounds

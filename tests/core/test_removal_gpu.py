@@ -13,11 +13,11 @@ import pytest
 import torch
 
 from core.errors import RunError
+from core.optics.prescription import built_in_lenses
 from core.removal.model.image_formation import add_under_shoulder
 from core.removal.model.network import SIZE_MULTIPLE
 from core.removal.model.recipe import Recipe
 from core.removal.synthesis import flare
-from core.removal.synthesis.prescription import built_in_lenses
 from core.removal.training import pairs, random_cameras, run
 from core.removal.training.backgrounds import Backgrounds
 from core.removal.training.gpu import composition, cuda_graphs, jpeg, pools

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from core.colour.srgb import Pixels
 from core.errors import FrameError, SettingsError
 from core.images.write import write_png
+from core.optics import prescription as lenses
 from core.removal.model import image_formation
 from core.removal.model.recipe import Recipe
 from core.removal.synthesis import aspheric, shapes
-from core.removal.synthesis import prescription as lenses
 from core.removal.synthesis.canvas import canvas_grid
 from core.removal.synthesis.flare import FLARE_CLASSES, SynthesisedFlare, synthesise_flare
 from core.removal.training import background_augmentation, pairs, random_cameras

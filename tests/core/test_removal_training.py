@@ -20,11 +20,11 @@ from core.errors import Cancelled, EngineError, FrameError, RunError, SettingsEr
 from core.images.contact_sheet import GAP, LABEL_HEIGHT
 from core.images.write import write_png
 from core.metrics.lpips import Lpips
+from core.optics.prescription import built_in_lenses
 from core.removal import evaluation
 from core.removal.model import network, weights
 from core.removal.model.network import Attention, RemovalNetwork
 from core.removal.model.recipe import RETIRED, Recipe, as_dict, from_dict
-from core.removal.synthesis.prescription import built_in_lenses
 from core.removal.training import backgrounds as removal_backgrounds
 from core.removal.training import optimiser, run
 from core.removal.training.backgrounds import Backgrounds

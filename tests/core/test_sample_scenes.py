@@ -18,16 +18,17 @@ from core.capture import Capture
 from core.colour.srgb import srgb_from_linear
 from core.errors import SettingsError
 from core.images.read import read_picture
-from core.removal.synthesis.prescription import read_prescription
+from core.optics.aperture import Aperture
+from core.optics.flare import build_optics
+from core.optics.ghosts import GhostSettings, draw_ghosts
+from core.optics.lenses import LENS_FOLDER
+from core.optics.prescription import read_prescription
+from core.optics.starburst import Glow, Ring, Starburst, Streak, draw_ring, draw_streak, starburst_texture
+from core.optics.trace import FIELDS, SENSOR_X, reflectance, trace_ray
 from core.system.progress import Progress
 from sample_scenes.capture_files import expose, write_layer
 from sample_scenes.description import Pinhole, look_at
 from sample_scenes.flares import LENS_SETUPS, LensSetup, render_flare
-from sample_scenes.flares.aperture import Aperture
-from sample_scenes.flares.flare import LENS_FOLDER, build_optics
-from sample_scenes.flares.ghosts import GhostSettings, draw_ghosts
-from sample_scenes.flares.starburst import Glow, Ring, Starburst, Streak, draw_ring, draw_streak, starburst_texture
-from sample_scenes.flares.trace import FIELDS, SENSOR_X, reflectance, trace_ray
 from sample_scenes.over_photos import add_flares
 from sample_scenes.scenes import SCENES
 from tests.core.captures import make_capture

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ...optics.prescription import Prescription
 from . import aspheric, ghosts, scatter, shapes
 from .canvas import Array, Point, Random, canvas_grid, log_uniform, random_tint
-from .prescription import Prescription
 
 FLARE_CLASSES = ("scatter", "ghosts", "streak", "halo", "shimmer", "glow", "rings", "mixed")
 """Flare classes, in the order of their shares."""

@@ -9,8 +9,15 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ...optics.prescription import (
+    CHANNEL_WAVELENGTHS,
+    HALF_DIAGONAL,
+    GhostPath,
+    Prescription,
+    reflectance,
+    trace_ghost_pairs,
+)
 from .canvas import Array, Point, Random, draw_ghost, log_uniform, random_tint, spectral_colour
-from .prescription import CHANNEL_WAVELENGTHS, HALF_DIAGONAL, GhostPath, Prescription, reflectance, trace_ghost_pairs
 
 
 @lru_cache(maxsize=2048)

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...optics.prescription import Prescription
 from ..model.recipe import Recipe
-from ..synthesis.prescription import Prescription
 from .backgrounds import Backgrounds
 from .flare_bank import MixedBank, SynthesisBank, UserFlares
 from .pairs import FlareSource, Pair, make_pair, to_grey

@@ -26,8 +26,8 @@ from ...images.listing import SUFFIXES
 from ...images.plates import read_plate
 from ...images.read import read_picture
 from ...images.video import VIDEOS, Video, frame_to_display, is_video
+from ...optics.prescription import Prescription
 from ..synthesis.flare import add_aspheric_ghosts, synthesise_flare
-from ..synthesis.prescription import Prescription
 from .pairs import WHITE, FlareLayers, FlareSource
 
 Random = np.random.Generator

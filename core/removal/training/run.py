@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import Cancelled, RunError, SettingsError
+from ...optics.prescription import Prescription
 from ...system.files import write_text
 from ...system.folder_lock import folder_lock
 from ...system.processes import available_cores
@@ -24,7 +25,6 @@ from ...system.reading import is_finite_number, parse_json, read_text
 from ..model import weights
 from ..model.recipe import Recipe, as_dict, from_dict
 from ..synthesis.flare import FLARE_CLASSES
-from ...optics.prescription import Prescription
 from .backgrounds import Backgrounds
 from .batches import Batch, Batches
 from .flare_bank import SingleFlareBank, UserFlares

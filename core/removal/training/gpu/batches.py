@@ -8,9 +8,9 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
+from ....optics.prescription import Prescription
 from ...model.network import SIZE_MULTIPLE
 from ...model.recipe import Recipe
-from ...synthesis.prescription import Prescription
 from .. import random_cameras
 from ..backgrounds import Backgrounds
 from ..batches import Batch

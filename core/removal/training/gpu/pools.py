@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....errors import RunError
+from ....optics.prescription import Prescription
 from ...model.image_formation import GAMMA_RANGE
 from ...model.recipe import Recipe
-from ...synthesis.prescription import Prescription
 from ..backgrounds import Backgrounds
 from ..flare_bank import MixedBank, SynthesisBank, UserFlares
 from ..pairs import FlareSource

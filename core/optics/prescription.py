@@ -15,18 +15,19 @@ and then at surface i < j crosses the lens by a product of 2x2 matrices that act
 product leads to the stop, one to the sensor; both are linear in the ray's height at the entrance and in the slope of
 the beam, so a ghost is the stop's shape, scaled and moved along the line through the principal point.
 
-The sample scenes trace real rays through the same prescriptions.
+`trace` follows real rays through the same prescriptions; `core.removal.synthesis` uses the paraxial ghosts.
 """
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import SettingsError
+from ..errors import SettingsError
+from ..system.reading import read_text
 
 Array = NDArray[np.float64]
 
@@ -65,6 +66,20 @@ class Prescription:
         """Return the distance from the last surface to the paraxial focus, mm, at the d line."""
         system = self._system_matrix(self.indices(LINE_D))
         return float(-system[0, 0] / system[1, 0])
+
+    def widest_f_number(self) -> float:
+        """Return the f-number with the stop fully open: focal length / diameter of the entrance pupil, paraxially."""
+        system, before, index = np.eye(2), 1.0, self.indices(LINE_D)
+        for k in range(self.stop):
+            system = _transfer(self.thickness[k], index[k]) @ _refraction(before, index[k], self.curvature[k]) @ system
+            before = index[k]
+        entrance = float(self.semi_aperture[self.stop] / max(abs(system[0, 0]), 1e-9))
+        return self.focal_length() / (2 * min(entrance, float(self.semi_aperture[0])))
+
+    def scaled(self, factor: float) -> Prescription:
+        """Return the lens with all lengths multiplied by a factor."""
+        return replace(self, curvature=self.curvature / factor, thickness=self.thickness * factor,
+                       semi_aperture=self.semi_aperture * factor)
 
     @property
     def vertices(self) -> Array:
@@ -178,7 +193,7 @@ def read_prescription(path: Path | str) -> Prescription:
     """Read the text format of the module's head. Raises SettingsError where the file is no prescription."""
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8", errors="replace")
+        text = read_text(path, errors="replace")
     except OSError as problem:
         raise SettingsError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     return parse_prescription(text, path.stem, str(path))

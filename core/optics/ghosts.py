@@ -17,9 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.removal.synthesis.prescription import Prescription
-
 from .aperture import Aperture, edge_radius
+from .prescription import Prescription
 from .spectrum import responses, wavelengths
 from .trace import SENSOR_X, STOP_X, STRAY, WEIGHT, trace_grid
 

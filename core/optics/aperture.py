@@ -16,7 +16,7 @@ class Aperture:
 
     radius: of the circle through the corners, mm. turn: of the first corner from +x, degrees. curved: 0 for straight
     blades, 1 for a circle. uneven: standard deviation of the blades' distances from the centre, relative to the radius.
-    dust: number of specks. seed: of the unevenness.
+    dust: number of specks. seed: of the unevenness, dust and scratches. scratches: number of fine straight lines.
     """
 
     radius: float
@@ -26,6 +26,7 @@ class Aperture:
     uneven: float = 0.01
     dust: int = 30
     seed: int = 0
+    scratches: int = 0
 
 
 def edge_radius(aperture: Aperture, sectors: int) -> Array:
@@ -41,7 +42,8 @@ def edge_radius(aperture: Aperture, sectors: int) -> Array:
 
 
 def transmission(aperture: Aperture, size: int, fill: float) -> Array:
-    """Return the stop as a picture (size, size), 0..1, its radius `fill` of half the side, with dust on the glass."""
+    """Return the stop as a picture (size, size), 0..1, its radius `fill` of half the side, with dust and
+    scratches on the glass."""
     axis = (np.arange(size) + 0.5) / size * 2 - 1
     x, y = np.meshgrid(axis / fill, axis / fill)
     radius, angle = np.hypot(x, y), np.arctan2(y, x)
@@ -53,4 +55,10 @@ def transmission(aperture: Aperture, size: int, fill: float) -> Array:
         far, where, speck = np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi), rng.uniform(0.004, 0.02)
         away = np.hypot(x - far * np.cos(where), y - far * np.sin(where))
         mask *= 1 - 0.9 * np.clip((speck - away) * fill * size / 2 + 0.5, 0, 1)
+    for _ in range(aperture.scratches):
+        turn, offset, width = rng.uniform(0, np.pi), rng.uniform(-0.9, 0.9), rng.uniform(0.002, 0.006)
+        middle, half = rng.uniform(-0.6, 0.6), rng.uniform(0.1, 0.8)
+        along, across = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
+        away = np.maximum(np.abs(across - offset) - width, np.abs(along - middle) - half)
+        mask *= 1 - 0.9 * np.clip(0.5 - away * fill * size / 2, 0, 1)
     return mask

@@ -132,7 +132,7 @@ def set_up() -> Job:
     if is_set_up() and not (virtual_environment() / "pyvenv.cfg").is_file():  # damaged
         _remove_environment(virtual_environment())
     script = ROOT / "headless" / "set_up.py"
-    command_line = [sys.executable, *bpy.app.python_args, str(script), str(virtual_environment())]
+    command_line = [sys.executable, *bpy.app.python_args, "-I", str(script), str(virtual_environment())]
     return jobs.start("set up", set_up_folder(), command_line, child_environment())
 
 

@@ -34,6 +34,7 @@ from ..core.system import processes
 from ..core.system.files import remove_file, write_json
 from ..core.system.processes import STOPPED, WINDOWS, new_process_group
 from ..core.system.progress import STOP_FILE
+from ..core.system.reading import parse_json, read_text
 from .paths import is_file, is_folder
 
 State = Literal["running", "done", "failed", "stopped"]
@@ -296,7 +297,7 @@ def find(folder: Path | str | None) -> Job | None:
     if known is not None:
         return known
     try:
-        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        record = parse_json(read_text(folder / RECORD))
         pid, host = int(record["pid"]), str(record.get("host", HOST))  # an early version stored none,
         host = HOST if host == platform.node() else host  # and the next the name of a Mac
         started = float(record["started"])
@@ -304,7 +305,7 @@ def find(folder: Path | str | None) -> Job | None:
         origin = Origin(pid if is_running else 0, host, str(record.get("host_name", "")), started,
                         int(record.get("log_from", 0)))
         job = Job(str(record["kind"]), folder, origin, list(map(str, record.get("args", record.get("words", ())))))
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return None
     _jobs[_key(folder)] = job
     job.poll()

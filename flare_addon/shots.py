@@ -2,7 +2,6 @@
 """Bakes: writes the cameras, lights and sliders of a scene frame by frame as a shot, which the engine bakes."""
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from ..core.errors import CaptureError, FrameError, RunError, SettingsError
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
 from ..core.system.files import hash_files, remove_file, write_json
+from ..core.system.reading import parse_json, read_text
 from . import cameras, engine, fits, jobs, library, looks
 from .images import reload_images
 from .jobs import Job
@@ -111,7 +111,7 @@ def live_layers(state: Any, folder: Path) -> dict[str, int] | None:
     """
     folder = next((one for one in (folder, folder.parent) if (one / LIVE_FILE).is_file()), folder)
     try:
-        live = json.loads((folder / LIVE_FILE).read_text(encoding="utf-8"))
+        live = parse_json(read_text(folder / LIVE_FILE))
         baked = layer_names(live["lights"])
         identities = dict(zip(live["lights"], live.get("identities", live["lights"]), strict=True))
     except (OSError, ValueError, KeyError, TypeError):

@@ -88,7 +88,7 @@ def _has_torch(python: Path) -> bool:
     """Return whether a Python has torch, without loading it."""
     code = "import importlib.util, sys; sys.exit(importlib.util.find_spec('torch') is None)"
     try:
-        return subprocess.run([str(python), "-c", code], env=child_environment(), capture_output=True,
+        return subprocess.run([str(python), "-I", "-c", code], env=child_environment(), capture_output=True,
                               timeout=60, check=False).returncode == 0
     except (OSError, subprocess.TimeoutExpired):
         return False

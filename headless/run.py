@@ -96,6 +96,7 @@ if __name__ == "__mp_main__":  # a process spawned by multiprocessing, which imp
     register_package()
 if __name__ == "__main__":
     open_streams()
+    os.environ["PYTHONSAFEPATH"] = "1"  # no child imports a module from the folder in which it happens to start
     package = register_package()
     if importlib.util.find_spec("numpy") is None:
         exit_process(exec_engine(package, command_argv()))

@@ -3,7 +3,8 @@
 
 The add-on runs it with Blender's own Python, so it uses the standard library alone. The packages are the group
 "engine" of pyproject.toml, at the versions in constraints.txt. Events go to standard output, one JSON object per line
-(core/system/progress.py). An environment in FOLDER, also one that a stopped set-up left, is replaced.
+(core/system/progress.py). Every Python is started isolated (-I), so that none imports a module from the folder in
+which it happens to start. An environment in FOLDER, also one that a stopped set-up left, is replaced.
 """
 from __future__ import annotations
 
@@ -163,14 +164,14 @@ def discard_environment(folder: Path) -> None:
 
 def venv_step(base: str, folder: Path) -> Step:
     """Return the step that makes a virtual environment with the Python `base`."""
-    return Step("Making the virtual environment", [base, "-m", "venv", str(folder)],
+    return Step("Making the virtual environment", [base, "-I", "-m", "venv", str(folder)],
                 "The virtual environment for the engine could not be made ({why}); look at the log, check the free "
                 "disk space, and set up again.")
 
 
 def install_step(folder: Path, package: str) -> Step:
     """Return the step that installs a package, named by its name or the file of its wheel."""
-    pip = [str(environment_python(folder)), "-m", "pip", "install", "--disable-pip-version-check", "--no-input",
+    pip = [str(environment_python(folder)), "-I", "-m", "pip", "install", "--disable-pip-version-check", "--no-input",
            "--only-binary", ":all:"]  # building one needs a compiler
     constraints = ROOT / "constraints.txt"
     if constraints.is_file():
@@ -183,7 +184,7 @@ def install_step(folder: Path, package: str) -> Step:
 def test_step(folder: Path) -> Step:
     """Return the step that imports every package of the engine."""
     cure = "install the Microsoft Visual C++ Redistributable (vc_redist.x64)" if WINDOWS else "look at the log"
-    return Step("Testing the engine", [str(environment_python(folder)), "-c", IMPORT_TEST],
+    return Step("Testing the engine", [str(environment_python(folder)), "-I", "-c", IMPORT_TEST],
                 f"The engine was installed but cannot be loaded ({{why}}); {cure}, and set up again.")
 
 

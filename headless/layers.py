@@ -62,3 +62,8 @@ def report_layers(frames: Sequence[NumberedFrame], folder: Path, total: int, pro
     besides = "" if total == len(frames) else f", which holds {total}"
     progress.say(f"Layers of {len(frames)} frame{'s' * (len(frames) != 1)} are in {folder}{besides}.")
     return {"layers": str(folder), "frames": len(frames), "frames_in_folder": total}
+
+
+def report_nothing(folder: Path) -> dict[str, object]:
+    """Return the result of a task of a farm whose frames do not exist; the folder is not touched."""
+    return {"layers": str(folder), "frames": 0}

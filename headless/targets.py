@@ -38,6 +38,7 @@ class TargetOptions:
     to: tuple[Path, ...]
     out: Path
     frames: str | None = None
+    job_frames: str | None = None
     shot: Path | None = None
     query: Follows = "blend"
     use: tuple[str, ...] = ()
@@ -123,7 +124,7 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
     Raises SettingsError, CaptureError, FrameError and RunError.
     """
     from ..core.capture import Capture
-    from ..core.conventions.frame_numbers import NumberedFrame, select_frames
+    from ..core.conventions.frame_numbers import NumberedFrame, select_task_frames
     from ..core.conventions.run_files import SCENE
     from ..core.fit.run import Run
     from ..core.lights.detection import Detector
@@ -156,7 +157,8 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
         shot = Shot.read(path)
         numbers = [NumberedFrame("", number, "") for number in sorted({one.frame for one in shot.frames})]
         return shot_target(shot, look, sources, plates=options.plates, scene=options.scene,
-                           required_frames={frame.number for frame in select_frames(numbers, options.frames)})
+                           required_frames={frame.number for frame in
+                                            select_task_frames(numbers, options.frames, options.job_frames)})
     lights = Path(options.lights) if options.lights else None
     if kind == ".ply":
         if options.cameras is None:

@@ -3,7 +3,8 @@
 
 A view's frame number is the number its name ends with ("DSC_0123.JPG" is frame 123), so that layers line up with the
 footage; views without one come after the last that has one. Where no name of a folder has one, or two would share one,
-the views of that folder are counted from 1 in their order. Ten digits and more are a time, not a number.
+the number is the one in which the names differ ("sh_9_comp.png" and "sh_10_comp.png" are 9 and 10); where they differ
+otherwise, the views of that folder are counted from 1 in natural order. Ten digits and more are a time, not a number.
 """
 from __future__ import annotations
 
@@ -14,9 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath, PurePosixPath
 
 from ..errors import SettingsError
+from ..system.file_names import natural_key
 
 _LAST_NUMBER = re.compile(r"(?<!\d)(\d{1,9})$")
 _BELOW_0 = re.compile(r"[._]-\d+$")
+_MAX_DIGITS = 9
+"""Digits of a frame number; a longer number is a time."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +47,10 @@ def number_views(views: Iterable[str]) -> list[NumberedFrame]:
         folders.setdefault(PurePosixPath(view).parent, []).append(view)
     frames: list[NumberedFrame] = []
     for folder, names in sorted(folders.items()):
-        parsed = {name: _parse_number(PurePosixPath(name)) for name in sorted(names)}
+        parsed = {name: _parse_number(PurePosixPath(name)) for name in sorted(names, key=natural_key)}
         numbers = {name: number for name, number in parsed.items() if number is not None}
-        if len(set(numbers.values())) < len(numbers):
-            numbers = {}
+        if not numbers or len(set(numbers.values())) < len(numbers):
+            numbers = _differing_numbers(list(parsed))
         after = max(numbers.values(), default=0) + 1
         numbers.update(zip((name for name in parsed if name not in numbers), itertools.count(after)))
         pairs = sorted((number, name) for name, number in numbers.items())
@@ -63,11 +67,49 @@ def _parse_number(name: PurePath) -> int | None:
     return int(match[1]) if match else None
 
 
+def _differing_numbers(names: Sequence[str]) -> dict[str, int]:
+    """Return the number of each name where all are equal but for one number; empty where they are not."""
+    pieces = {name: re.split(r"(\d+)", PurePosixPath(name).stem) for name in names}
+    if len(pieces) < 2 or len({len(each) for each in pieces.values()}) > 1:
+        return {}
+    differing = [column for column, values in enumerate(zip(*pieces.values(), strict=True)) if len(set(values)) > 1]
+    if len(differing) != 1 or differing[0] % 2 == 0:  # texts stand at the even places, numbers at the odd ones
+        return {}
+    numbers = {name: each[differing[0]] for name, each in pieces.items()}
+    if any(len(number) > _MAX_DIGITS for number in numbers.values()):
+        return {}
+    found = {name: int(number) for name, number in numbers.items()}
+    return found if len(set(found.values())) == len(found) else {}
+
+
+def number_sequences(paths: Iterable[Path]) -> dict[Path, int]:
+    """Return the frame number of each plate, counted in each sequence by itself.
+
+    The plates of a folder are one sequence, as for `number_views`; where two of them have one number, the names before
+    the number tell the sequences apart, so sh010.1001.png and sh020.1001.png are both frame 1001.
+    """
+    folders: dict[Path, list[Path]] = {}
+    for path in dict.fromkeys(paths):
+        folders.setdefault(path.parent, []).append(path)
+    numbers: dict[Path, int] = {}
+    for inside in folders.values():
+        ends = [number for path in inside if (number := _parse_number(path)) is not None]
+        groups: dict[tuple[str, str], list[Path]] = {}
+        for path in inside:
+            match = _LAST_NUMBER.search(path.stem)
+            key = ((path.stem[:match.start()], path.suffix.lower()) if match else ("", ""))
+            groups.setdefault(key if len(set(ends)) < len(ends) else ("", ""), []).append(path)
+        for group in groups.values():
+            by_name = {path.name: path for path in group}
+            numbers |= {by_name[frame.view]: frame.number for frame in number_views(by_name)}
+    return numbers
+
+
 def plates_by_number(pictures: Sequence[Path]) -> dict[int, Path]:
     """Map plates by the number that each name ends with; plates without one are left out.
 
-    Where no plate has a number, they are counted from 1 in their order. Raises SettingsError where two share a number,
-    or one has a number below 0.
+    Where no plate has a number, they have the number in which their names differ, else they are counted from 1 in
+    natural order. Raises SettingsError where two share a number, or one has a number below 0.
     """
     plates: dict[int, Path] = {}
     for path in pictures:
@@ -77,7 +119,10 @@ def plates_by_number(pictures: Sequence[Path]) -> dict[int, Path]:
         if number in plates:
             raise SettingsError(f"{plates[number]} and {path} have one number; keep one sequence in a folder.")
         plates[number] = path
-    return plates or dict(enumerate(sorted(pictures), 1))
+    if plates:
+        return plates
+    by_name = {path.name: path for path in pictures}
+    return {frame.number: by_name[frame.view] for frame in number_views(by_name)}
 
 
 def select_frames(frames: Sequence[NumberedFrame], text: str | None) -> list[NumberedFrame]:
@@ -91,9 +136,39 @@ def select_frames(frames: Sequence[NumberedFrame], text: str | None) -> list[Num
     ranges = _parse_ranges(text)
     selected = [frame for frame in frames if any(frame.number in numbers for numbers in ranges)]
     if not selected:
-        existing = f"there are {frames[0].number} to {frames[-1].number}" if frames else "there are none"
-        raise SettingsError(f"None of the frames {text!r} exists; {existing}.")
+        raise _no_frames(frames, text)
     return selected
+
+
+def select_task_frames(frames: Sequence[NumberedFrame], text: str | None,
+                       job_text: str | None = None) -> list[NumberedFrame]:
+    """Return the frames of one task of a job, as `select_frames` does; empty where the task has nothing to do.
+
+    job_text: the frames of the whole job. A task has nothing to do where its frames do not exist and others of the job
+    do; without `job_text`, where its frames lie between existing ones. Raises SettingsError where none of the job's
+    frames exists.
+    """
+    if text is None:
+        return list(frames)
+    ranges, job_ranges = _parse_ranges(text), _parse_ranges(job_text) if job_text is not None else []
+    numbers = sorted(frame.number for frame in frames)
+    if any(number in each for number in numbers for each in ranges):
+        return select_frames(frames, text)
+    has_others = any(number in each for number in numbers for each in job_ranges)
+    if not has_others and (job_text is not None or not _is_between(numbers, ranges)):
+        raise _no_frames(frames, job_text or text)
+    return []
+
+
+def _is_between(numbers: Sequence[int], ranges: Sequence[range]) -> bool:
+    """Return whether a range begins after the first and ends before the last of sorted numbers."""
+    return bool(numbers) and any(numbers[0] < each[0] and each[-1] < numbers[-1] for each in ranges)
+
+
+def _no_frames(frames: Sequence[NumberedFrame], text: str) -> SettingsError:
+    numbers = [frame.number for frame in frames]
+    existing = f"there are {min(numbers)} to {max(numbers)}" if frames else "there are none"
+    return SettingsError(f"None of the frames {text!r} exists; {existing}.")
 
 
 def missing_numbers(frames: Sequence[NumberedFrame], text: str | None) -> str:

@@ -21,6 +21,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "(core/look/shot.py)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for layers.####.exr")
     frames.add_option(parser)
+    frames.add_job_option(parser)
     parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the frames')")
     layers.add_options(
         parser, half="depth always 32", producer="bake",
@@ -55,7 +56,9 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise RunError(f"{args.run} is not finished; resume it with `fit --resume` first.")
     capture = run_.capture(args.capture, need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
-    selected = frames.select(number_views(cameras), args.frames, progress)
+    selected = frames.select_task(number_views(cameras), args, progress)
+    if not selected:
+        return layers.report_nothing(args.out)
     if args.jobs != 1:
         jobs.run_jobs(args, "bake", [frame.number for frame in selected], progress)
     settings = layers.bake_settings(args, *layers.parse_size(args.size))
@@ -93,8 +96,8 @@ def _target_options(args: argparse.Namespace) -> targets.TargetOptions:
     """Return the options of the target of a .flare. Raises SettingsError if two options name cameras."""
     if args.blend is not None and args.capture is not None:
         raise SettingsError("--capture and --blend each name cameras for the flare; give one of them.")
-    return targets.TargetOptions((args.blend or args.capture,), args.out, args.frames, args.shot, lights=args.lights,
-                                 scene=args.scene)
+    return targets.TargetOptions((args.blend or args.capture,), args.out, args.frames, args.job_frames, args.shot,
+                                 lights=args.lights, scene=args.scene)
 
 
 def run_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -110,7 +113,9 @@ def run_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             raise SettingsError(f"--{name} does not apply to a shot, which has its own cameras and lights; leave it "
                                 "out.")
     shot = Shot.read(args.run).resized(*layers.parse_size(args.size))
-    selected = frames.select([NumberedFrame("", one.frame, "") for one in shot.frames], args.frames, progress)
+    selected = frames.select_task([NumberedFrame("", one.frame, "") for one in shot.frames], args, progress)
+    if not selected:
+        return layers.report_nothing(args.out)
     if args.jobs != 1:
         jobs.run_jobs(args, "bake", [frame.number for frame in selected], progress)
     record = bake_shot(shot, args.out, half=not args.float, overwrite=args.overwrite, progress=progress,

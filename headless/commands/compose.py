@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.errors import SettingsError
 from ...core.look import LookEdits
@@ -13,6 +14,9 @@ from ...core.system.files import retry_while_locked
 from ...core.system.progress import Progress
 from .. import frames
 from ..command import Command, Step
+
+if TYPE_CHECKING:
+    from ...core.bake.folder import LayerFolder
 
 BLEND = "compositor.blend"
 
@@ -22,6 +26,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("layers", type=Path, metavar="LAYERS", help="folder that `bake` wrote")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for the frames and {BLEND}")
     frames.add_option(parser)
+    frames.add_job_option(parser)
     parser.add_argument("--intensity", type=float, default=1.0, metavar="X", help="factor on the flare (default 1)")
     parser.add_argument("--tint", default="1,1,1", metavar="R,G,B",
                         help="colour on the flare, linear factors or #rrggbb (default 1,1,1)")
@@ -29,30 +34,38 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Compose the layers as the arguments say."""
-    done = compose_frames(args.layers, args.out, progress, wanted=args.frames, intensity=args.intensity,
-                     tint=args.tint)
-    progress.say(f"The frames are in {done['frames']}; {done['blend']} opens in Blender.")
+    from ...core.bake.folder import LayerFolder
+    from ...core.conventions.frame_numbers import NumberedFrame
+
+    layers = LayerFolder.open(args.layers)
+    known = [NumberedFrame("", number, str(path)) for number, path in layers.files.items()]
+    selected = frames.select_task(known, args, progress)
+    if not selected:
+        return {"frames": str(args.out)}
+    done = compose_frames(layers, args.out, progress, numbers=[frame.number for frame in selected],
+                          intensity=args.intensity, tint=args.tint)
+    progress.say(f"{len(selected)} frame{'s' * (len(selected) != 1)} composed, in {done['frames']}; {done['blend']} "
+                 "opens in Blender.")
     return done
 
 
-def compose_frames(folder: Path, out: Path, progress: Progress, *, wanted: str | None = None, intensity: float = 1.0,
-              tint: str = "1,1,1") -> dict[str, Any]:
-    """Build the compositor for the layers in `folder`, save it as a .blend in `out`, and render the frames there."""
+def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, numbers: Sequence[int] | None = None,
+                   intensity: float = 1.0, tint: str = "1,1,1") -> dict[str, Any]:
+    """Build the compositor for the layers, save it as a .blend in `out`, and render the frames `numbers` there.
+
+    numbers: None for all.
+    """
     import bpy
 
-    from ...core.bake.folder import LayerFolder
-    from ...core.conventions.frame_numbers import NumberedFrame
     from ...flare_addon import cameras, render_settings
     from ...flare_addon.compositor import setup
 
-    if out.resolve() == folder.resolve():
+    if out.resolve() == layers.folder.resolve():
         raise SettingsError(f"{out} holds the layers; choose another folder for the frames.")
-    layers = LayerFolder.open(folder)
     if not 0 <= intensity < float("inf"):
         raise SettingsError(f"The intensity {intensity} is not a number of 0 or more.")
     colour = LookEdits.parse([f"flare.tint={tint}"], ["flare"]).light_edit("flare").tint
-    known = [NumberedFrame("", number, str(path)) for number, path in layers.files.items()]
-    numbers = [frame.number for frame in frames.select(known, wanted, progress)]
+    numbers = list(layers.files) if numbers is None else numbers
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene

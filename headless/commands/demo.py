@@ -135,7 +135,9 @@ def _write_sheet(capture: Capture, holdout: str | int | None, out: Path) -> None
 
 def composite_frames(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Blender step: composite the baked layers."""
-    done = compose.compose_frames(args.out / "layers", args.out / "frames", progress)
+    from ...core.bake.folder import LayerFolder
+
+    done = compose.compose_frames(LayerFolder.open(args.out / "layers"), args.out / "frames", progress)
     progress.say(f"Blender {done['blender']} composited the frames in {done['frames']}; {done['blend']} opens there.")
     return done
 

@@ -26,8 +26,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="the run's capture, if it was moved")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",
                         help="folder for the clean plates; they keep the names of the plates")
-    frames.add_option(parser, "numbers of frames, as in the names of the plates, such as 1-20,31 or 1-99:2 (default: "
-                               "all)")
+    frames.add_option(parser, "numbers of frames, as in the names of the plates, such as 1-20,31 or 1-99:2; of "
+                               "several sequences, in each (default: all)")
+    frames.add_job_option(parser)
     parser.add_argument("--flare", type=Path, metavar="DIR", help="also write the flares, as EXR in linear light")
     parser.add_argument("--matte", type=Path, metavar="PICTURE_OR_DIR",
                         help="where the flares are, white on black: one picture for all plates, or a folder with one "
@@ -51,7 +52,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Clean the plates, in `--jobs` processes. Raises FrameError for plates that failed, after the others are done."""
-    from ...core.conventions.frame_numbers import number_views
+    from ...core.conventions.frame_numbers import NumberedFrame, number_sequences
     from ...core.removal.jobs.batch import collect_plates, remove_all
     from ...core.removal.jobs.mattes import Mattes
     from ...core.removal.jobs.video_frames import expand_videos
@@ -67,9 +68,12 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     failed = left_out if args.frames is None else []  # a video without frames fails the whole command only
     wanted = None
     if args.frames is not None or args.jobs != 1:
-        names = [name.as_posix() for _, name in collect_plates(inputs, [args.out, args.flare, args.matte])]
-        chosen = frames.select(number_views(names), args.frames, progress)
-        wanted = {Path(frame.view) for frame in chosen}
+        plates = dict(collect_plates(inputs, [args.out, args.flare, args.matte]))
+        known = [NumberedFrame(str(path), number, "") for path, number in number_sequences(plates).items()]
+        chosen = frames.select_task(known, args, progress)
+        if not chosen:
+            return {"plates": str(args.out), "made": 0, "kept": 0}
+        wanted = {plates[Path(frame.view)] for frame in chosen}
         if args.jobs != 1:
             jobs.run_jobs(args, "remove", [frame.number for frame in chosen], progress, continue_on_failure=True)
             if failed:
@@ -95,7 +99,9 @@ def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[s
     if fitted.settings.mode == "3dgs":
         raise RunError(fitted.missing_flare_message)
     capture = fitted.capture(args.capture)
-    chosen = frames.select(number_views([view.name for view in capture.views]), args.frames, progress)
+    chosen = frames.select_task(number_views([view.name for view in capture.views]), args, progress)
+    if not chosen:
+        return {"plates": str(args.out), "made": 0, "kept": 0}
     wanted = {frame.view for frame in chosen}
     views = [view for view in capture.views if view.name in wanted]
     return remove_fitted_flare(fitted, capture, views, args.out, progress, flare_folder=args.flare,

@@ -34,6 +34,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "target: the target's view. blend: the target's view, clamped to the range of the "
                              "training views (default)")
     frames.add_option(parser)
+    frames.add_job_option(parser)
     parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the target's)")
     lights = parser.add_argument_group("lights")
     lights.add_argument("--light", action="append", default=[], metavar="[NAME=]X,Y",
@@ -84,7 +85,7 @@ def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, pr
     """Write the cameras, the lights and their visibility of the target, a .blend, as a shot.
 
     args: of the command, with --size and --jobs. flare: a .flare, or the folder of a run."""
-    from ...core.conventions.frame_numbers import NumberedFrame, select_frames
+    from ...core.conventions.frame_numbers import NumberedFrame, select_task_frames
     from ...core.conventions.run_files import FLARE
     from ...core.look import read
     from ...flare_addon.capture.blend_shot import open_blend, read_shot
@@ -101,12 +102,12 @@ def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, pr
     scene = open_blend(options.to[0])
     every = range(scene.frame_start, scene.frame_end + 1)
     # Neighbours too: visibility is smoothed over them, and a chunk of frames must give the result of the whole range.
-    selected = {frame.number for frame in select_frames([NumberedFrame("", number, "") for number in every],
-                                                         options.frames)}
+    selected = {frame.number for frame in select_task_frames([NumberedFrame("", number, "") for number in every],
+                                                             options.frames, options.job_frames)}
     around = range(-2 * options.smooth, 2 * options.smooth + 1)
     numbers = [number for number in every if any(number + step in selected for step in around)]
-    if options.query == "source":
-        numbers = list(every)  # the middle one selects the training view
+    if options.query == "source" or not selected:
+        numbers = list(every)  # the middle one selects the training view; without any, the engine step reports it
     names = [name.strip() for name in (options.lights or "").split(",") if name.strip()]
     progress.stage("read the .blend", len(numbers))
     shot = read_shot(scene, flare, names, numbers, radius=options.radius, done=progress.advance)
@@ -151,7 +152,9 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
                      "size than is rendered, or lens distortion.")
     settings = TransferSettings(options.query, options.scale, options.smooth, options.plate_space)
     transfer = Transfer(flare, target, settings, training, args.ocio)
-    selected = frames.select([one.frame for one in target.frames], args.frames, progress)
+    selected = frames.select_task([one.frame for one in target.frames], args, progress)
+    if not selected:
+        return layers.report_nothing(args.out)
     if args.jobs != 1:
         extra = ["--shot", str(targets.shot_path(options))] if targets.is_blend(options) else []
         jobs.run_jobs(args, step, [frame.number for frame in selected], progress, extra)

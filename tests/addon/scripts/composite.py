@@ -136,7 +136,7 @@ except FrameError as problem:
     facts["cropped"] = [str(problem), flare_node.find_node(scene) is None]
 
 # ---- the command, of layers of wide pixels in ACEScg ----------------------------------------------
-compose.compose_frames(aces, out / "aces", Progress())
+compose.compose_frames(LayerFolder.open(aces), out / "aces", Progress())
 scene = bpy.context.scene
 facts["aces"] = [setup.colour_space_warning(scene), scene.render.pixel_aspect_x, scene.render.pixel_aspect_y]
 

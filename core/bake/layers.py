@@ -7,7 +7,8 @@ linear scene. The layers of the lights sum to the flare. So plain addition compo
 Nuke), any number of them.
 
 A flare layer is premultiplied, with alpha = max(R, G, B) in 0..1: over black it is the flare, and the alpha serves as
-its matte. The root's alpha is 1.
+its matte. The root's alpha is 1, or, of a plate with alpha, the plate's, where the flare shines at least max(R, G, B);
+the scene layer shows such a plate over black.
 """
 from __future__ import annotations
 
@@ -34,13 +35,15 @@ _MAX_NAME = 40  # Blender cuts a layer's name at 63 bytes
 class FrameLayers:
     """Scene (h, w, 3), one flare layer (h, w, 3) for each light, by the light's name, and depth (h, w).
 
-    window: position of these pixels on the frame, for a plate with overscan or a crop; None if they are the frame.
+    window: position of these pixels on the frame, for a plate with overscan; None if they are the frame. alpha: of the
+    composite (h, w), 0..1; None for an opaque one.
     """
 
     scene: Pixels
     flares: Mapping[str, Pixels]
     depth: Pixels
     window: DataWindow | None = None
+    alpha: Pixels | None = None
 
     @property
     def flare(self) -> Pixels:
@@ -67,8 +70,8 @@ class FrameLayers:
         with the light's name made safe by `layer_names`.
         """
         channels: dict[str, Pixels] = {}
-        opaque, flare = np.ones_like(self.scene[..., 0]), self.flare
-        _add_channels(channels, "", self.scene + flare, opaque)
+        alpha, flare = np.ones_like(self.scene[..., 0]) if self.alpha is None else self.alpha, self.flare
+        _add_channels(channels, "", self.scene + flare, alpha)
         _add_channels(channels, "scene.", self.scene)
         _add_channels(channels, "flare.", flare, flare_alpha(flare))
         for light, layer in layer_names(self.flares).items():

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -84,8 +84,8 @@ class Plate:
 
     @property
     def straight_alpha(self) -> NDArray[np.float32] | None:
-        """(height, width), 0..1: alpha that integer codes are not multiplied with; None where there is none such."""
-        if self.alpha is None or self.encoding != "srgb" or tiff.is_premultiplied(self.path):
+        """(height, width), 0..1: alpha that the codes are not multiplied with; None where there is none such."""
+        if self.alpha is None or tiff.is_premultiplied(self.path):
             return None
         return self.alpha.astype(np.float32) / np.float32(self.max_code)
 
@@ -200,17 +200,23 @@ def _read_exr(path: Path) -> Plate:
     return Plate(path, codes, "linear", len(names) == 1, None, {"header": header, "channels": channels})
 
 
-def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any]) -> None:
-    """Write `codes` in the format and depth of `plate`, with its alpha, channels and tags, to a path of its suffix."""
+def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDArray[Any] | None = None) -> None:
+    """Write `codes` in the format and depth of `plate`, with its alpha, channels and tags, to a path of its suffix.
+
+    alpha: as stored, in place of the plate's.
+    """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix == plate.path.suffix.lower() and np.array_equal(codes, plate.codes, equal_nan=True):
+    is_same_alpha = alpha is None or plate.alpha is None or np.array_equal(alpha, plate.alpha)
+    if is_same_alpha and suffix == plate.path.suffix.lower() and np.array_equal(codes, plate.codes, equal_nan=True):
         with atomic_path(path) as temporary:
             shutil.copyfile(plate.path, temporary)
         return
     if "channels" in plate.extras:
         _write_exr(path, plate, codes)
         return
+    if alpha is not None:
+        plate = replace(plate, alpha=alpha)
     if codes.dtype not in _DEPTHS.get(suffix, (codes.dtype,)) or (suffix in _JPEGS and plate.alpha is not None):
         raise FrameError(f"{plate.path} holds what no {suffix[1:].upper()} can hold ({codes.dtype} pixels"
                          f"{', alpha' if plate.alpha is not None else ''}): it has the suffix of another kind of file; "

@@ -2,12 +2,16 @@
 """Data and display windows: where the stored pixels of a file lie on its frame."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..colour.srgb import Pixels
+
+TRANSPOSED = 5
+"""First Exif orientation whose sides change places."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,13 @@ class DataWindow:
         """True if the stored pixels are exactly the frame."""
         return self.size == self.frame and self.origin == (0, 0)
 
+    def oriented(self, orientation: int) -> DataWindow:
+        """Return the window of a picture as viewers show it, by its Exif orientation; only whole frames have one."""
+        if orientation < TRANSPOSED:
+            return self
+        return replace(self, size=self.size[::-1], origin=self.origin[::-1], frame=self.frame[::-1],
+                       aspect=1 / self.aspect)
+
     def header(self) -> dict[str, Any]:
         """Return the EXR attributes of these windows, for a frame that begins at 0."""
         (x, y), (width, height) = self.origin, self.size
@@ -36,14 +47,33 @@ class DataWindow:
         return {name: tuple(np.array(corner, np.int32) for corner in box) for name, box in boxes.items()}
 
 
+def union_window(windows: Iterable[DataWindow]) -> DataWindow:
+    """Return the window that holds the frame and all `windows`, which are of one frame."""
+    known = list(windows)
+    width, height = known[0].frame
+    left, top = (min(0, *(window.origin[axis] for window in known)) for axis in (0, 1))
+    right, bottom = (max((width, height)[axis], *(window.origin[axis] + window.size[axis] for window in known))
+                     for axis in (0, 1))
+    return DataWindow((right - left, bottom - top), (left, top), (width, height), known[0].aspect)
+
+
+def move_to_window(pixels: Pixels, source: DataWindow, target: DataWindow) -> Pixels:
+    """Return pixels (height, width, ...) of one data window as those of another on the same frame, 0 where there are
+    none."""
+    if (source.size, source.origin) == (target.size, target.origin):
+        return pixels
+    left, top = (source.origin[axis] - target.origin[axis] for axis in (0, 1))
+    return crop_to_display_window(pixels, DataWindow(source.size, (left, top), target.size))
+
+
 def crop_to_display_window(pixels: Pixels, window: DataWindow) -> Pixels:
-    """Return the frame of pixels (height, width, ...) that lie in a data window, 0 where there are none."""
+    """Return the display window of a file's pixels (height, width, ...), 0 outside their data window."""
     if window.is_frame:
         return pixels
     (width, height), (x, y) = window.frame, window.origin
-    whole = np.zeros((height, width, *pixels.shape[2:]), np.float32)
+    frame = np.zeros((height, width, *pixels.shape[2:]), np.float32)
     left, top = max(x, 0), max(y, 0)
     right, bottom = min(x + window.size[0], width), min(y + window.size[1], height)
     if right > left and bottom > top:
-        whole[top:bottom, left:right] = pixels[top - y:bottom - y, left - x:right - x]
-    return whole
+        frame[top:bottom, left:right] = pixels[top - y:bottom - y, left - x:right - x]
+    return frame

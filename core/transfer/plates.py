@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Plates with their colour space, and adding flares to them.
+"""Plates with their colour space, alpha and orientation, and adding flares to them.
 
-Pixels that the flare does not reach keep the exact numbers of their file.
+Pixels that the flare does not reach keep the exact numbers of their file. `transfer` reads and writes plates here.
 """
 from __future__ import annotations
 
@@ -13,65 +13,128 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..colour import ColourSpace, colour_space
-from ..colour.srgb import Pixels
+from ..colour.srgb import Pixels, srgb_from_linear
+from ..images.formats.exif import apply_orientation, undo_orientation
+from ..images.formats.tiff import UPRIGHT
+from ..images.picture import Picture
 from ..images.plates import Plate, read_plate, write_plate
+from ..images.read import read_picture
 
 AUTO = "auto"
+_OPAQUE = (".jpg", ".jpeg", ".exr")
+"""Suffixes of files without alpha, or with premultiplied colours."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColouredPlate:
-    """A plate and its colour space."""
+    """A plate, its colour space and its Exif orientation; all pixels are as viewers show them."""
 
     plate: Plate
     space: ColourSpace
+    orientation: int = UPRIGHT
 
     @classmethod
-    def read(cls, path: Path, space: str = AUTO, config: str | None = None) -> ColouredPlate:
-        """Read a plate. space: a name, or "auto": for EXR by its chromaticities, linear Rec. 709 without them; sRGB for
-        other files.
+    def read(cls, path: Path, space: str = AUTO, config: str | None = None,
+             orientation: int = UPRIGHT) -> ColouredPlate:
+        """Read a plate. space: a name, or "auto" for that which its file declares.
 
         Raises FrameError for an unreadable file, SettingsError for an unknown space.
         """
         plate = read_plate(path)
-        return cls(plate, plate.space if space == AUTO else colour_space(space, config))
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height), px."""
-        return self.plate.codes.shape[1], self.plate.codes.shape[0]
+        return cls(plate, plate.space if space == AUTO else colour_space(space, config), orientation)
 
     @property
     def values(self) -> Pixels:
         """(height, width, 3) in its own space, codes as 0..1."""
-        return self.plate.values
+        return apply_orientation(self.plate.values, self.orientation)
+
+    @property
+    def alpha(self) -> Pixels | None:
+        """(height, width), 0..1; None where the plate is opaque."""
+        stored = self.plate.extras.get("channels", {}).get("A") if self.plate.alpha is None else self.plate.alpha
+        if stored is None:
+            return None
+        top = np.float32(np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1)
+        values = np.nan_to_num(stored.astype(np.float32) / top, nan=1.0)
+        return apply_orientation(np.clip(values, 0, 1), self.orientation)
+
+    @property
+    def has_own_alpha(self) -> bool:
+        """Return whether the colours are not light: they have to be combined with an alpha first.
+
+        An EXR's are, since it is premultiplied in linear light.
+        """
+        return self.plate.alpha is not None
 
     @property
     def linear(self) -> Pixels:
-        """Scene-linear Rec. 709."""
-        return self.space.to_linear(self.values)
+        """Scene-linear Rec. 709 over black; what alpha hides is black."""
+        alpha = self.alpha
+        if not self.has_own_alpha or alpha is None:
+            return self.space.to_linear(self.values)
+        return self.space.to_linear(self._straight_values(alpha)) * alpha[..., None]
 
     @property
     def is_full_float(self) -> bool:
         """Return whether the file has 32 bit floats, which 16 bit layers would round."""
         return bool(self.plate.codes.dtype == np.float32)
 
-    def with_light(self, light: Pixels) -> NDArray[Any]:
-        """Return the plate's codes with light (height, width, 3), scene-linear Rec. 709, added."""
+    def with_light(self, light: Pixels) -> tuple[NDArray[Any], NDArray[Any] | None]:
+        """Return codes and alpha as stored, of the plate with light (height, width, 3) in linear Rec. 709.
+
+        The light is added to the picture over black (premultiplied). Where it exceeds what an integer plate can show
+        at its alpha, the alpha grows as far as it must. An EXR's alpha stays, so the light covers nothing.
+        """
         light = self.plate.to_plate_channels(light)
-        if self.space.is_linear:
+        is_lit = undo_orientation((light != 0).any(-1, keepdims=True), self.orientation)
+        alpha, stored_alpha = self.alpha, self.plate.alpha
+        if stored_alpha is not None and alpha is not None:
+            lit = np.maximum(self.linear + light, 0)
+            grown = alpha_with_light(alpha, lit)
+            values = self.space.from_linear(lit / np.maximum(grown, 1e-6)[..., None])
+            if self.plate.straight_alpha is None:
+                values = values * grown[..., None]
+            top = np.iinfo(stored_alpha.dtype).max if stored_alpha.dtype.kind == "u" else 1
+            grown = undo_orientation(grown, self.orientation) * np.float32(top)
+            grown = np.ceil(grown - 1e-3) if stored_alpha.dtype.kind == "u" else grown
+            new_alpha = grown.astype(stored_alpha.dtype)
+            stored_alpha = np.where(is_lit[..., 0], np.maximum(new_alpha, stored_alpha), stored_alpha)
+        elif self.space.is_linear:
             values = self.values + self.space.from_linear(light)
         else:
             values = self.space.from_linear(self.linear + light)
-        codes = self.plate.codes
+        codes, values = self.plate.codes, undo_orientation(values, self.orientation)
         if codes.dtype.kind == "u":
             stored = np.clip(np.round(values * self.plate.max_code), 0, self.plate.max_code).astype(codes.dtype)
         else:
             limit = 65504 if codes.dtype == np.float16 else np.finfo(np.float32).max
             stored = np.clip(values, -limit, limit).astype(codes.dtype)
-        is_lit = (light != 0).any(-1, keepdims=True)
-        return np.where(is_lit, stored, codes)
+        return np.where(is_lit, stored, codes), stored_alpha
 
     def write(self, path: Path, light: Pixels) -> None:
-        """Write `with_light` in the plate's own file type, bit depth and colour space."""
-        write_plate(path, self.plate, self.with_light(light))
+        """Write `with_light` in the plate's own file type, bit depth, colour space and orientation."""
+        codes, alpha = self.with_light(light)
+        write_plate(path, self.plate, codes, alpha)
+
+    def _straight_values(self, alpha: Pixels) -> Pixels:
+        """Return `values`, not multiplied with alpha. Colours under alpha 0 are no light, and are multiplied by it."""
+        if self.plate.straight_alpha is not None:
+            return self.values
+        return np.asarray(np.clip(self.values / np.maximum(alpha, 1e-6)[..., None], 0, 1), np.float32)
+
+
+def alpha_with_light(alpha: Pixels, lit: Pixels) -> Pixels:
+    """Return the smallest alpha (height, width), 0..1, that a picture over black (height, width, 3) can have, at least
+    `alpha`: no channel of premultiplied colour exceeds it."""
+    return np.asarray(np.maximum(alpha, np.clip(lit.max(-1), 0, 1)), np.float32)
+
+
+def shown_picture(path: Path, orientation: int = UPRIGHT) -> Picture:
+    """Read a picture as viewers show it: upright, and black where its alpha hides it. Raises FrameError."""
+    picture = read_picture(path)
+    pixels = picture.pixels
+    alpha = read_plate(path).straight_alpha if path.suffix.lower() not in _OPAQUE else None
+    if alpha is not None and (alpha < 1).any():
+        light = picture.linear() * alpha[..., None]
+        pixels = srgb_from_linear(light) if picture.encoding == "srgb" else light
+    return Picture(apply_orientation(pixels, orientation), picture.encoding)

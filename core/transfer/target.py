@@ -17,21 +17,27 @@ from numpy.typing import NDArray
 from ..capture import Camera, Capture, Light, View, read_lights
 from ..colour import ColourSpace
 from ..conventions.frame_numbers import NumberedFrame, layers_file, number_views, plates_by_number
-from ..errors import CaptureError, SettingsError
+from ..errors import CaptureError, FrameError, SettingsError
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..images.exr import read_data_window
+from ..images.formats.exif import read_exif
+from ..images.formats.tiff import UPRIGHT
 from ..images.listing import pictures_in
 from ..images.picture import Picture, same_aspect
-from ..images.read import read_picture
+from ..images.views import read_header_and_names, stereo_views
+from ..images.window import DataWindow, union_window
 from ..lights.detection import Detector
 from ..look import Look, PlacedLight
 from ..look.shot import Shot, ShotFrame
 from ..system.files import content_hash
+from .plates import shown_picture
 from .query import TrainingViews
 from .sources import assign_sources
 
 SourceNames = Mapping[str, str]
+_WITH_ALPHA = (".png", ".tif", ".tiff")
+"""Suffixes of files whose colours may not be multiplied with their alpha."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,20 +46,23 @@ class TargetFrame:
     or None.
 
     undistorted: reads the plate's undistorted picture, if the file is distorted; its argument is True for the file's
-    own numbers, without conversion from the file's colour space.
+    own numbers, without conversion from the file's colour space. window: where the layers lie on the plate's frame,
+    which they hold all of; None if the camera has another size than the plate. orientation: the plate's in Exif, by
+    which the camera and the layers are upright.
     """
 
     frame: NumberedFrame
     shot: ShotFrame
     plate: Path | None = None
     undistorted: Callable[[bool], Picture] | None = None
+    window: DataWindow | None = None
+    orientation: int = UPRIGHT
 
     def plate_with_flare_path(self, folder: Path) -> Path | None:
         """Return the path below `folder` of the plate with its flare: in the layers' subfolder, with the plate's name.
 
         None if it is not written: without a plate, or if the frame's size or distortion differs from the file's."""
-        if self.plate is None or self.undistorted is not None\
-                or read_data_window(self.plate).size != self.shot.camera.size:
+        if self.plate is None or self.undistorted is not None or self.window is None:
             return None
         return folder / Path(self.frame.file).parent / self.plate.name
 
@@ -62,7 +71,12 @@ class TargetFrame:
         plate = (self.plate.name, content_hash(self.plate)) if self.plate else None
         view, number, file = self.frame.view, self.frame.number, self.frame.file
         # Written out, not the repr of the class: a change would invalidate the layers of earlier transfers.
-        return f"(Frame(view={view!r}, number={number!r}, file={file!r}), {plate!r})" + self.shot.cache_key()
+        text = f"(Frame(view={view!r}, number={number!r}, file={file!r}), {plate!r})" + self.shot.cache_key()
+        if self.orientation != UPRIGHT:
+            text += f"orientation {self.orientation}"
+        if self.plate is not None and self.plate.suffix.lower() in _WITH_ALPHA:
+            text += "over black"  # layers of an earlier version show the colours under alpha
+        return text
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +93,7 @@ class Target:
     @property
     def lights(self) -> tuple[str, ...]:
         """Names of the target's lights, in order of appearance."""
-        return tuple(dict.fromkeys(light.name for one in self.frames for light in one.shot.lights))
+        return tuple(dict.fromkeys(light.name for frame in self.frames for light in frame.shot.lights))
 
     def fingerprint(self) -> str:
         """Return a hash of the scene; "" without one."""
@@ -112,41 +126,44 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
     frames, unlit = [], []
     for frame in number_views(by_name):
         path = by_name[frame.view]
-        window = read_data_window(path)
+        orientation = read_exif(path)[0]
+        window = plate_window(path, orientation)
         width, height = window.frame
         larger = look.camera.pixel_ratio(width, height)
         fx = focal or look.camera.fx * larger
         fy = (focal or look.camera.fy * larger) * window.aspect
         cx, cy = centre or (width / 2, height / 2)
-        camera = plate_camera(Camera(width, height, fx, fy, cx, cy, np.eye(4)), path)
-        found = dict(lights) or _detected(path, detector)
-        if not found:
+        camera = Camera(width, height, fx, fy, cx, cy, np.eye(4))
+        positions = dict(lights) or _detected(path, detector, orientation)
+        if not positions:
             unlit.append(path.name)
-        sources_by_light = {name: source for name, source in requested.items() if name in found}
+        sources_by_light = {name: source for name, source in requested.items() if name in positions}
         if not lights:
-            places = {name: ((x - cx) / fx, (y - cy) / fy) for name, (x, y) in found.items()}
-            sources_by_light = {**_most_similar_sources(places, training or {}), **sources_by_light}
-        sources = assign_sources(list(found), look.names, sources_by_light)
+            plane_positions = {name: ((x - cx) / fx, (y - cy) / fy) for name, (x, y) in positions.items()}
+            sources_by_light = {**_most_similar_sources(plane_positions, training or {}), **sources_by_light}
+        sources = assign_sources(list(positions), look.names, sources_by_light)
         placed = []
-        for name, (x, y) in found.items():
+        for name, (x, y) in positions.items():
             ray = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
             placed.append(PlacedLight(name, sources[name], ray / np.linalg.norm(ray) * distances[sources[name]]))
-        frames.append(TargetFrame(frame, ShotFrame(frame.number, frame.view, camera, tuple(placed)), path))
+        frames.append(TargetFrame(frame, ShotFrame(frame.number, frame.view, camera, tuple(placed)), path,
+                                  window=window, orientation=orientation))
     if len(unlit) == len(frames):
         raise SettingsError(f"No light was found in {paths[0]}; say where it is with --light X,Y.")
     names = f"{', '.join(unlit[:12])}{', …' if len(unlit) > 12 else ''}"
     warning = f"{len(unlit)} of {len(frames)} pictures show no light, and get no flare: {names}."
-    target = Target(tuple(frames), warnings=(warning,) if unlit else ())
+    target = Target(_share_windows(frames), warnings=(warning,) if unlit else ())
     if missing := set(requested) - set(target.lights):
         raise SettingsError(f"The pictures have no light {min(missing)!r}; they have {', '.join(target.lights)}.")
     return target
 
 
-def _detected(path: Path, detector: Detector | None) -> dict[str, tuple[float, float]]:
+def _detected(path: Path, detector: Detector | None, orientation: int) -> dict[str, tuple[float, float]]:
     if detector is None:
         return {}
-    found = detector.detect(read_picture(path))
-    return {f"found{number + 1}": (float(one.xy[0]), float(one.xy[1])) for number, one in enumerate(found)}
+    detections = detector.detect(shown_picture(path, orientation))
+    return {f"found{number}": (float(detection.xy[0]), float(detection.xy[1]))
+            for number, detection in enumerate(detections, 1)}
 
 
 def _most_similar_sources(
@@ -188,10 +205,10 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
         view = views[frame.view]
         path = None if shown else capture.frame_path(view)
         undistorted = None if view.lens is None or path is None else _undistorted(capture, view)
-        camera = plate_camera(view.camera, path) if undistorted is None and path is not None else view.camera
-        shot = ShotFrame(frame.number, str(Path(frame.view).parent), camera, placed)
-        frames.append(TargetFrame(frame, shot, path, undistorted))
-    return Target(tuple(frames), read_ply(scene) if scene else None, shown)
+        window = camera_window(view.camera, path) if undistorted is None and path is not None else None
+        shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)
+        frames.append(TargetFrame(frame, shot, path, undistorted, window))
+    return Target(_share_windows(frames), read_ply(scene) if scene else None, shown)
 
 
 def _placed(lights: Sequence[Light], look: Look, requested: SourceNames) -> tuple[PlacedLight, ...]:
@@ -226,45 +243,80 @@ def shot_target(shot: Shot, look: Look, requested: SourceNames, *, plates: Path 
     """
     plates_by_frame = _plates_by_number(plates) if plates else {}
     # The shot's own sources are used, unless others are requested or this look lacks them.
-    sources_by_light = {light.name: light.source for one in shot.frames for light in one.lights}
+    sources_by_light = {light.name: light.source for shot_frame in shot.frames for light in shot_frame.lights}
     known = {name: source for name, source in sources_by_light.items() if source in look.names}
     sources = assign_sources(list(sources_by_light), look.names, {**known, **requested})
     frames, folders = [], shot.folders
-    for one in sorted(shot.frames, key=lambda each: (each.name, each.frame)):
-        if plates and one.frame not in plates_by_frame and (required_frames is None or one.frame in required_frames):
-            raise SettingsError(f"{plates} has no picture for frame {one.frame}.")
-        lights = tuple(replace(light, source=sources[light.name]) for light in one.lights)
-        frame = NumberedFrame(f"{one.name}/{one.frame}", one.frame, layers_file(folders[one.name], one.frame))
-        plate = plates_by_frame.get(one.frame)
-        camera = plate_camera(one.camera, plate) if plate is not None else one.camera
+    for shot_frame in sorted(shot.frames, key=lambda each: (each.name, each.frame)):
+        name, number = shot_frame.name, shot_frame.frame
+        is_required = required_frames is None or number in required_frames
+        if plates and is_required and number not in plates_by_frame:
+            raise SettingsError(f"{plates} has no picture for frame {number}.")
+        lights = tuple(replace(light, source=sources[light.name]) for light in shot_frame.lights)
+        frame = NumberedFrame(f"{name}/{number}", number, layers_file(folders[name], number))
+        plate = plates_by_frame.get(number)
+        window = None
         if plate is not None:
-            _check_shape(plate, camera)
-        frames.append(TargetFrame(frame, replace(one, camera=camera, lights=lights), plate))
+            window = camera_window(shot_frame.camera, plate)
+            _check_shape(plate, shot_frame.camera)
+        frames.append(TargetFrame(frame, replace(shot_frame, lights=lights), plate, window=window))
     if not frames:
         raise SettingsError("The shot has no frames; export it again.")
-    return Target(tuple(frames), read_ply(scene) if scene else None)
+    return Target(_share_windows(frames), read_ply(scene) if scene else None)
 
 
 def _check_shape(plate: Path, camera: Camera) -> None:
     """Raise SettingsError for a plate of another aspect ratio than the frame, which would be stretched."""
-    width, height = read_data_window(plate).size
+    width, height = read_data_window(plate).frame
     if not same_aspect((width, height), camera.size):
         raise SettingsError(f"{plate} is {width} x {height} pixels and the shot {camera.width} x {camera.height}, "
                             "which is another shape; give the plates of this shot.")
 
 
-def plate_camera(camera: Camera, plate: Path) -> Camera:
-    """Return the camera of a plate's data window, which in an EXR may be larger (overscan) or smaller than the frame.
+def plate_window(plate: Path, orientation: int = UPRIGHT) -> DataWindow:
+    """Return where a plate's pixels lie on its frame, as viewers show it.
 
-    Raises SettingsError if it is, and the frame does not have the camera's size."""
+    Raises FrameError for a stereo picture: one flare fits one eye.
+    """
     window = read_data_window(plate)
+    if plate.suffix.lower() == ".exr" and (views := stereo_views(*read_header_and_names(plate))):
+        raise FrameError(f"{plate} holds the views {' and '.join(view.name for view in views)}, and a flare lies "
+                         "elsewhere in each; export each view as a file of its own, and transfer to one at a time.")
+    return window.oriented(orientation)
+
+
+def camera_window(camera: Camera, plate: Path) -> DataWindow | None:
+    """Return the window of a plate whose frame has the camera's size; None for a plate of another size.
+
+    Raises SettingsError for a plate of another size that stores more or fewer pixels than its frame."""
+    window = plate_window(plate)
+    if window.frame == camera.size:
+        return window
     if window.is_frame:
-        return camera
-    if window.frame != camera.size:
-        raise SettingsError(f"{plate} has pixels beyond its frame, or lacks some of it, and its frame of "
-                            f"{window.frame[0]} x {window.frame[1]} is not the camera's {camera.width} x "
-                            f"{camera.height}; give plates of the camera's size, or cut them to the frame.")
-    return camera.cropped(*window.origin, *window.size)
+        return None
+    raise SettingsError(f"{plate} has pixels beyond its frame, or lacks some of it, and its frame of "
+                        f"{window.frame[0]} x {window.frame[1]} is not the camera's {camera.width} x "
+                        f"{camera.height}; give plates of the camera's size, or cut them to the frame.")
+
+
+def _share_windows(frames: Sequence[TargetFrame]) -> tuple[TargetFrame, ...]:
+    """Give all frames of a folder of layers one window that holds the frame and the pixels of every plate.
+
+    Compositors that know no data windows, as Blender's, show such layers in their place, and all alike.
+    """
+    windows: dict[tuple[str, tuple[int, int]], list[DataWindow]] = {}
+    for frame in frames:
+        if frame.window is not None:
+            windows.setdefault((str(Path(frame.frame.file).parent), frame.window.frame), []).append(frame.window)
+    shared = {key: union_window(group) for key, group in windows.items()}
+    return tuple(frame if frame.window is None else _with_window(
+        frame, shared[str(Path(frame.frame.file).parent), frame.window.frame]) for frame in frames)
+
+
+def _with_window(frame: TargetFrame, window: DataWindow) -> TargetFrame:
+    """Return a frame, whose camera is that of the whole frame, with the camera of a window."""
+    camera = frame.shot.camera.cropped(*window.origin, *window.size)
+    return replace(frame, shot=replace(frame.shot, camera=camera), window=window)
 
 
 def _plates_by_number(folder: Path) -> dict[int, Path]:
@@ -276,19 +328,25 @@ def _plates_by_number(folder: Path) -> dict[int, Path]:
 
 
 def resized(target: Target, width: int | None, height: int | None) -> Target:
-    """Return the target at another size, px; without a height the aspect ratio is preserved."""
+    """Return the target at another size of its frame, px; without a height the aspect ratio is preserved."""
     if not width:
         return target
-    return replace(target, frames=tuple(
-        replace(one, shot=replace(one.shot, camera=one.shot.camera.scaled(width, height))) for one in target.frames))
+    frames = []
+    for frame in target.frames:
+        camera = frame.shot.camera
+        if frame.window is not None:
+            (left, top), size = frame.window.origin, frame.window.frame
+            camera = camera.cropped(-left, -top, *size)
+        frames.append(replace(frame, shot=replace(frame.shot, camera=camera.scaled(width, height)), window=None))
+    return replace(target, frames=tuple(frames))
 
 
-def background(one: TargetFrame, size: tuple[int, int], space: ColourSpace | None) -> NDArray[np.float32] | None:
+def background(frame: TargetFrame, size: tuple[int, int], space: ColourSpace | None) -> NDArray[np.float32] | None:
     """Return the undistorted plate in linear Rec. 709 at `size`; None if the plate's file is not distorted. space: the
     plate's colour space, None to use that of its file."""
-    if one.undistorted is None:
+    if frame.undistorted is None:
         return None
-    picture = one.undistorted(space is not None)
+    picture = frame.undistorted(space is not None)
     if space is not None:
         picture = Picture(space.to_linear(picture.pixels), "linear")
     return np.asarray(picture.resized(*size).linear(), np.float32)

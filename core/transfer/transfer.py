@@ -31,15 +31,15 @@ from ..fit.run import ViewLayers
 from ..flare.compositing import linear_layers as linear_layers
 from ..flare.visibility import VisibilitySettings, visibility_from
 from ..gaussians import Splats
-from ..images.exr import read_data_window
 from ..images.picture import Picture
+from ..images.window import crop_to_display_window, move_to_window
 from ..look import LookEdits, PlacedLight, ViewOfLight, read
 from ..system.files import check_no_overwrite
 from ..system.progress import Progress
 from ..system.reading import read_bytes
 from . import query as queries
-from .plates import AUTO, ColouredPlate
-from .target import Target, TargetFrame, background
+from .plates import AUTO, ColouredPlate, alpha_with_light
+from .target import Target, TargetFrame, background, plate_window
 from .visibility import smooth_visibility
 
 VISIBILITY_MARGIN = 0.02
@@ -77,7 +77,7 @@ class Transfer:
         self.training_views = queries.training_views(flare, self.look.lights, training)
         self._visibilities: dict[tuple[int, str], float] = {}
         self._fixed = self._fixed_views() if self.settings.query == "source" else {}
-        self._index = {one.frame.view: index for index, one in enumerate(target.frames)}
+        self._index = {frame.frame.view: index for index, frame in enumerate(target.frames)}
 
     # ---- the interface of `core.bake` -------------------------------------------------------------
 
@@ -94,9 +94,9 @@ class Transfer:
     def fingerprint_of(self, index: int) -> str:
         """Return a hash of a frame and of the neighbours that the visibility of its lights depends on."""
         radius = 2 * self.settings.smooth
-        near = self.target.frames[max(index - radius, 0):index + radius + 1]
+        neighbours = self.target.frames[max(index - radius, 0):index + radius + 1]
         fixed = [(name, view.camera.tolist(), view.light.tolist()) for name, view in self._fixed.items()]
-        key_text = "".join(one.cache_key() for one in near) + repr(fixed)
+        key_text = "".join(frame.cache_key() for frame in neighbours) + repr(fixed)
         return hashlib.sha256(key_text.encode()).hexdigest()[:16]
 
     @property
@@ -108,7 +108,7 @@ class Transfer:
     def elements(self) -> dict[str, list[str]]:
         """Names of each light's elements: those of its source."""
         names = self.look.element_names
-        return {light.name: names.get(light.source, []) for one in self.target.frames for light in one.shot.lights}
+        return {light.name: names.get(light.source, []) for frame in self.target.frames for light in frame.shot.lights}
 
     # ---- flares -----------------------------------------------------------------------------------
 
@@ -127,7 +127,7 @@ class Transfer:
 
     def visibility(self, index: int, light: str) -> float:
         """Return the visibility of a light in a frame, 0..1, smoothed along the path."""
-        frames = [one.shot for one in self.target.frames]
+        frames = [frame.shot for frame in self.target.frames]
         return smooth_visibility(frames, index, light, self.settings.smooth,
                                  lambda neighbour: self._frame_visibility(neighbour, light))
 
@@ -136,14 +136,15 @@ class Transfer:
         key = (index, light)
         if key not in self._visibilities:
             shot = self.target.frames[index].shot
-            placed = next((one for one in shot.lights if one.name == light), None)
+            placed = next((item for item in shot.lights if item.name == light), None)
             visibility = placed.visibility if placed is not None else 0.0
             if placed is not None and visibility > 0 and self.target.scene is not None:
                 source = self.sources[placed.source]
                 is_own_scene = np.allclose(placed.xyz, source.xyz, rtol=1e-6, atol=1e-9)  # the scene of the fit
-                seen = visibility_from(self.target.scene, shot.camera.position, placed.xyz, self.settings.visibility,
-                                  source.clear_visibility if is_own_scene else 1.0)
-                visibility *= min(max((seen - VISIBILITY_MARGIN) / (1 - 2 * VISIBILITY_MARGIN), 0.0), 1.0)
+                visible_share = visibility_from(self.target.scene, shot.camera.position, placed.xyz,
+                                                self.settings.visibility,
+                                                source.clear_visibility if is_own_scene else 1.0)
+                visibility *= min(max((visible_share - VISIBILITY_MARGIN) / (1 - 2 * VISIBILITY_MARGIN), 0.0), 1.0)
             self._visibilities[key] = visibility
         return self._visibilities[key]
 
@@ -152,14 +153,14 @@ class Transfer:
         fixed = {}
         for name in self.lights:
             placed: list[tuple[ViewOfLight, float, PlacedLight]] = []
-            for one in self.target.frames:
-                for light in one.shot.lights:
+            for frame in self.target.frames:
+                for light in frame.shot.lights:
                     if light.name == name:
-                        distance = float(np.linalg.norm(one.shot.camera.position - light.xyz)) / self.settings.scale
-                        placed.append((ViewOfLight.of(one.shot.camera.world_to_camera, light.xyz), distance, light))
+                        distance = float(np.linalg.norm(frame.shot.camera.position - light.xyz)) / self.settings.scale
+                        placed.append((ViewOfLight.of(frame.shot.camera.world_to_camera, light.xyz), distance, light))
             source = placed[0][2].source
-            view = queries.fixed_view(self.sources[source], [each[0] for each in placed],
-                                      [each[1] for each in placed], self.training_views.get(source))
+            view = queries.fixed_view(self.sources[source], [entry[0] for entry in placed],
+                                      [entry[1] for entry in placed], self.training_views.get(source))
             if view is not None:
                 fixed[name] = view
         return fixed
@@ -181,8 +182,9 @@ class Transfer:
         """
         settings = settings or BakeSettings()
         space = colour_space(settings.space, settings.config)
-        frames = list(requested) if requested is not None else [one.frame for one in self.target.frames]
-        cameras = {one.frame.view: one.shot.camera for one in self.target.frames}
+        targets = self.target.frames
+        frames = list(requested) if requested is not None else [target.frame for target in targets]
+        cameras = {target.frame.view: target.shot.camera for target in targets}
         if settings.half and self._has_full_float():
             settings = replace(settings, half=False)
         self._check_no_overwrite(Path(out))
@@ -193,9 +195,9 @@ class Transfer:
     def _check_no_overwrite(self, out: Path) -> None:
         """Raise SettingsError if results would overwrite plates, or lie in their folder, where the next transfer would
         read layers as plates."""
-        plates = [one.plate for one in self.target.frames if one.plate is not None]
-        results = [out / one.frame.file for one in self.target.frames]
-        results += [path for one in self.target.frames if (path := one.plate_with_flare_path(out / PLATES_FOLDER))]
+        plates = [frame.plate for frame in self.target.frames if frame.plate is not None]
+        results = [out / frame.frame.file for frame in self.target.frames]
+        results += [path for frame in self.target.frames if (path := frame.plate_with_flare_path(out / PLATES_FOLDER))]
         check_no_overwrite(plates, results)
         if out.resolve() in {path.resolve().parent for path in plates}:
             raise SettingsError(f"The layers would lie among the plates, in {out}; choose another folder for them.")
@@ -203,15 +205,15 @@ class Transfer:
     def _has_full_float(self) -> bool:
         """Return whether a plate has 32 bit floats, judged by the first plate of each file type."""
         by_suffix: dict[str, TargetFrame] = {}
-        for one in self.target.frames:
-            if one.plate is not None:
-                by_suffix.setdefault(one.plate.suffix.lower(), one)
-        return any(self.plate(one).is_full_float for one in by_suffix.values())
+        for frame in self.target.frames:
+            if frame.plate is not None:
+                by_suffix.setdefault(frame.plate.suffix.lower(), frame)
+        return any(self.plate(frame).is_full_float for frame in by_suffix.values())
 
-    def plate(self, one: TargetFrame) -> ColouredPlate:
+    def plate(self, frame: TargetFrame) -> ColouredPlate:
         """The frame's plate in its own space."""
-        assert one.plate is not None
-        return ColouredPlate.read(one.plate, self.settings.plate_space, self.config)
+        assert frame.plate is not None
+        return ColouredPlate.read(frame.plate, self.settings.plate_space, self.config, frame.orientation)
 
 
 class _FrameRenderer:
@@ -219,7 +221,7 @@ class _FrameRenderer:
 
     def __init__(self, transfer: Transfer, index: int, space: ColourSpace, out: Path | None) -> None:
         self._transfer, self._index, self._space, self._out = transfer, index, space, out
-        self._one = transfer.target.frames[index]
+        self._frame = transfer.target.frames[index]
         self._plate: ColouredPlate | None = None
 
     @property
@@ -230,12 +232,12 @@ class _FrameRenderer:
     @property
     def edit_texts(self) -> Sequence[str]:
         """Texts of the shot's own edits."""
-        return self._one.shot.edits
+        return self._frame.shot.edits
 
     @property
     def extra_files(self) -> Sequence[Path]:
         """Path of the plate with its flare, if one is written."""
-        target = self._one.plate_with_flare_path(self._out) if self._out is not None else None
+        target = self._frame.plate_with_flare_path(self._out) if self._out is not None else None
         return [] if target is None else [target]
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
@@ -251,34 +253,42 @@ class _FrameRenderer:
                                   for name in self._transfer.lights}, depth)
 
     def _background(self, camera: Camera) -> tuple[Pixels, Pixels]:
-        target, one = self._transfer.target, self._one
+        target, frame = self._transfer.target, self._frame
         no_depth = np.zeros((camera.height, camera.width), np.float32)
-        if one.plate is not None:
+        if frame.plate is not None:
             space = self._transfer.settings.plate_space
-            undistorted = background(one, camera.size,
+            undistorted = background(frame, camera.size,
                                      None if space == AUTO else colour_space(space, self._transfer.config))
             if undistorted is not None:
                 return undistorted, no_depth
-            plate = self._transfer.plate(one)
-            if plate.size == camera.size:
+            plate = self._transfer.plate(frame)
+            stored = plate_window(frame.plate, frame.orientation)
+            if frame.window is not None and frame.window.size == camera.size:
                 self._plate = plate
-                return plate.linear, no_depth
-            return np.asarray(Picture(plate.linear, "linear").resized(*camera.size).pixels, np.float32), no_depth
+                return move_to_window(plate.linear, stored, frame.window), no_depth
+            whole = Picture(crop_to_display_window(plate.linear, stored), "linear")
+            return np.asarray(whole.resized(*camera.size).pixels, np.float32), no_depth
         if target.scene is not None and target.shown:
             rendering = render_scene(target.scene, camera)
             return decode(rendering.colour.clamp(0, target.scene.display_white)).numpy(), rendering.depth.numpy()
         return np.zeros((camera.height, camera.width, 3), np.float32), no_depth
 
     def finish(self, layers: FrameLayers, camera: Camera) -> FrameLayers:
-        """Return the layers with the plate's data window, and with the plate's own numbers if the colour spaces are the
-        same; write the plate with its flare."""
-        if self._plate is None or self._plate.size != camera.size:
+        """Return the layers with their window, with the alpha of the plate, and with the plate's own numbers if the
+        colour spaces are the same; write the plate with its flare."""
+        frame, plate = self._frame, self._plate
+        if plate is None or frame.plate is None or frame.window is None or frame.window.size != camera.size:
             return layers
-        target = self._one.plate_with_flare_path(self._out) if self._out is not None else None
+        stored = plate_window(frame.plate, frame.orientation)
+        target = frame.plate_with_flare_path(self._out) if self._out is not None else None
         if target is not None:
-            self._plate.write(target, self._space.to_linear(layers.flare))
-        layers = replace(layers, window=read_data_window(self._plate.plate.path))
-        plate_matrix, matrix = self._plate.space.matrix, self._space.matrix
-        if plate_matrix is not None and matrix is not None and np.allclose(plate_matrix, matrix, atol=1e-9):
-            return replace(layers, scene=self._plate.values)
-        return layers
+            plate.write(target, move_to_window(self._space.to_linear(layers.flare), frame.window, stored))
+        layers = replace(layers, window=frame.window)
+        plate_matrix, matrix = plate.space.matrix, self._space.matrix
+        if plate_matrix is not None and matrix is not None and np.allclose(plate_matrix, matrix, atol=1e-9)\
+                and not plate.has_own_alpha:
+            layers = replace(layers, scene=move_to_window(plate.values, stored, frame.window))
+        if plate.alpha is None:
+            return layers
+        alpha = alpha_with_light(move_to_window(plate.alpha, stored, frame.window), layers.composite)
+        return replace(layers, alpha=alpha)

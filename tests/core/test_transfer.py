@@ -25,6 +25,7 @@ from core.gaussians import SceneGaussians
 from core.gaussians.ply import write_ply
 from core.images.exr import read_data_window, read_exr
 from core.images.plates import Plate
+from core.images.window import DataWindow, move_to_window, union_window
 from core.images.write import write_exr, write_png
 from core.look import KeyedEdits, Look, PlacedLight, TrainedCamera, ViewOfLight, read
 from core.look.shot import Shot, ShotFrame
@@ -417,20 +418,21 @@ def test_the_flare_lies_on_the_frame_for_any_data_window(flare: Path, look: Look
     light = plate_target(whole, look).frames[0].shot.lights[0]
     one = Shot(flare, (ShotFrame(1, "Camera", camera, (light,)),))
     by_shot = shot_target(one, look, {}, plates=tmp_path / "plates")
-    (x, y), (width, height) = origin, size
-    left, top, right, bottom = max(x, 0), max(y, 0), min(x + width, 100), min(y + height, 60)
+    frame_window = DataWindow((100, 60), (0, 0), (100, 60))
+    layers_window = union_window([DataWindow(size, origin, (100, 60))])
     for target in (plate_target(plate, look), by_shot):
         found = light_of(Transfer(flare, target))
-        assert found.shape == (height, width, 3)
-        np.testing.assert_allclose(found[top - y:bottom - y, left - x:right - x], expected[top:bottom, left:right],
-                                   atol=1e-4)
+        assert found.shape == (layers_window.size[1], layers_window.size[0], 3)
+        np.testing.assert_allclose(move_to_window(found, layers_window, frame_window), expected, atol=1e-4)
     Transfer(flare, by_shot).bake(tmp_path / "out")
     flared = tmp_path / "out" / "frames" / "plate.0001.exr"
     with OpenEXR.File(str(flared), header_only=True) as file:
         assert file.parts[0].header["dataWindow"][0].tolist() == list(origin)
-    np.testing.assert_allclose(read_exr(flared)["R"] - 0.1, found[..., 0], atol=1e-5)
+    np.testing.assert_allclose(read_exr(flared)["R"] - 0.1,
+                               move_to_window(found[..., 0], layers_window, read_data_window(plate)), atol=1e-5)
     layers = by_shot.frames[0].frame.file
-    assert lies_at(tmp_path / "out" / layers) == lies_at(plate) == (size, origin, (100, 60))
+    assert lies_at(plate) == (size, origin, (100, 60))
+    assert lies_at(tmp_path / "out" / layers) == (layers_window.size, layers_window.origin, (100, 60))
     np.testing.assert_allclose(read_exr(tmp_path / "out" / layers)["flare.R"], found[..., 0], atol=1e-5)
     Transfer(flare, resized(by_shot, 50, 30)).bake(tmp_path / "small")
     assert lies_at(tmp_path / "small" / layers) == ((50, 30), (0, 0), (50, 30))
@@ -668,6 +670,6 @@ def test_a_frame_is_rendered_again_when_a_smoothing_neighbour_changes(flare: Pat
 
 def test_a_half_float_plate_is_clamped_below_infinity() -> None:
     plate = ColouredPlate(Plate(Path("a.exr"), np.full((2, 2, 3), 60000, np.float16), "linear"), colour_space("linear"))
-    stored = plate.with_light(np.full((2, 2, 3), 30000, np.float32))
+    stored, _ = plate.with_light(np.full((2, 2, 3), 30000, np.float32))
     assert stored.dtype == np.float16
     assert (stored == 65504).all()

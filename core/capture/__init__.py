@@ -7,8 +7,9 @@ with the first one. `solve/` makes captures; fit, bake, transfer and removal rea
 from __future__ import annotations
 
 from .camera import Camera
-from .capture import LIGHTS, REMOVED, Capture, Light, PictureIndex, View, read_lights
+from .capture import LIGHTS, REMOVED, Capture, Light, View, read_lights
 from .colmap import PointCloud
+from .frame_files import PictureIndex
 from .lens import Lens
 
 __all__ = ["LIGHTS", "REMOVED", "Camera", "Capture", "Lens", "Light", "PictureIndex", "PointCloud", "View",

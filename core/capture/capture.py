@@ -2,9 +2,10 @@
 """A capture: frames, cameras, points and lights of one place, in one folder.
 
     images/           frames as filmed
-    sparse/0/         COLMAP model, binary or text (or transforms.json)
+    sparse/0/         COLMAP model, binary or text (or transforms.json); `layout` lists the other places
     lights.json       {"lights": [{"name": "lamp", "xyz": [x, y, z]}]}; optional
     removed/          clean frames, same names; optional
+    masks/            black where frames must not be learned from; optional
     split.json        {"test": ["0003.png", ...]}; optional
     truth/scene/, truth/flare/    exact layers where they are known; optional
 
@@ -13,33 +14,38 @@ pictures that belong to them, are undistorted to the pinhole camera of their vie
 """
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
+import unicodedata
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CaptureError, FrameError
-from ..images.listing import SUFFIXES, pictures_below
+from ..images.formats.exif import read_exif
+from ..images.listing import SUFFIXES
 from ..images.picture import Picture, same_aspect
 from ..images.read import read_picture
 from ..images.size import picture_size
 from ..images.unsupported import unsupported_file
 from ..images.video import is_video
+from ..system.file_names import canonical_name, find_entry
 from ..system.files import read_json, safe_join
 from .camera import Camera, Floats
-from .colmap import PointCloud, PosedFrame, find_model, read_model
-from .lens import PINHOLES, Lens, undistort_picture
-from .transforms import FILE as TRANSFORMS
-from .transforms import read_transforms
+from .camera_solve import check_geometry, match_frames, read_solve
+from .colmap import PointCloud, PosedFrame
+from .frame_files import mask_pictures, matching_pictures
+from .lens import PINHOLES, Lens
+from .orientation import SWAPS_SIDES, TurnedFrame, find_upright
+from .pictures import PictureCache
 
-LIGHTS, REMOVED = "lights.json", "removed"
-"""Names in a capture's folder: the file of its lights, and the folder of its clean frames."""
+LIGHTS, REMOVED, MASKS = "lights.json", "removed", "masks"
+"""Names in a capture's folder: the file of its lights, and the folders of its clean frames and of its masks."""
+MIN_MASK_VALUE = 0.99
+"""Mean of a mask from which a pixel counts."""
 HOLDOUT_INTERVAL = 8
 """Every 8th view is held out by default, as in 3DGS and mip-NeRF 360."""
 
@@ -49,13 +55,15 @@ class View:
     """One frame with its camera: name, pinhole camera of the undistorted picture, and lens of the file (None: no
     distortion).
 
-    points: indices (n,) of the capture's points that were observed in it, where the solve says.
+    points: indices (n,) of the capture's points that were observed in it, where the solve says. upright: the camera was
+    solved from the picture as shown, turned by the Exif orientation of its file.
     """
 
     name: str
     camera: Camera
     lens: Lens | None
     points: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    upright: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +86,18 @@ class Capture:
         self.lights = tuple(lights)
         self.cache_bytes = cache_bytes
         self._frames = frames or {}
-        self._pictures = _PictureCache(cache_bytes)
-        self._removed = _matching_pictures(folder / REMOVED, self.views)
-        self._truth_scene = _matching_pictures(folder / "truth" / "scene", self.views)
-        self._truth_flare = _matching_pictures(folder / "truth" / "flare", self.views)
+        self._pictures = PictureCache(cache_bytes)
+        names = [view.name for view in self.views]
+        self._removed = matching_pictures(folder / REMOVED, names)
+        self._truth_scene = matching_pictures(folder / "truth" / "scene", names)
+        self._truth_flare = matching_pictures(folder / "truth" / "flare", names)
+        self._masks = mask_pictures(folder / MASKS, names)
+        self._order = {name: number for number, name in enumerate(names)}
+        self._lists: tuple[set[str] | None, ...] = (None, None)
+        self.sentences: tuple[str, ...] = ()
+        """What the user should know of the capture before it is used."""
+        self.left_out: dict[str, tuple[str, ...]] = {}
+        """Names of frames that are not among the views, by reason."""
 
     @classmethod
     def open(cls, folder: Path | str, *, need_frames: bool = True, cache_bytes: int = 1 << 30) -> Capture:
@@ -99,24 +115,40 @@ class Capture:
                                "and name that.")
         if not folder.is_dir():
             raise CaptureError(f"{folder} is {'no folder' if folder.exists() else 'missing'}; name a capture's folder.")
-        posed, points, root = _read_poses(folder)
+        solve = read_solve(folder)
+        posed, root = solve.frames, solve.root
         names = [frame.name for frame in posed]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise CaptureError(f"{folder}: the frame {twice} has two poses; remove one of them.")
-        views, frames = [], {}
-        for frame in sorted(posed, key=lambda frame: frame.name):
-            path = safe_join(root, frame.name, CaptureError)
-            size = _checked_size(path, frame.lens) if need_frames else _size_or_model_size(path, frame.lens)
-            name = frame.name.removeprefix("images/") if root == folder else frame.name
+        matched = match_frames(solve)
+        turned = [found for frame in posed if (found := _to_turned(frame, matched.files.get(frame.name)))]
+        upright, sentences = find_upright(turned, solve.points)
+        turned_by_name = {frame.posed.name: frame for frame in turned if frame.posed.name in upright}
+        views, frames, order, names_of = [], {}, {}, {}
+        for number, frame in enumerate(posed):
+            path = matched.files.get(frame.name)
+            if path is None and need_frames and matched.files:
+                continue
+            path = path or safe_join(root, frame.name, CaptureError)
+            size_of = _checked_size if need_frames else _size_or_model_size
+            size = size_of(path, frame.lens, turned_by_name.get(frame.name))
+            name = _view_name(frame.name, root == folder)
             if name in frames:
                 raise CaptureError(f"{folder}: the frame {name} has two poses; remove one of them.")
-            views.append(_to_view(name, frame, size))
-            frames[name] = path
-        capture = cls(folder, views, points, read_lights(folder / LIGHTS), frames=frames,
-                      cache_bytes=cache_bytes)
+            views.append(_to_view(name, frame, size, frame.name in upright))
+            frames[name], order[name], names_of[frame.name] = path, number, name
+        capture = cls(folder, views, solve.points, read_lights(find_entry(folder, LIGHTS) or folder / LIGHTS),
+                      frames=frames, cache_bytes=cache_bytes)
+        capture._order = order
+        capture._lists = tuple(None if each is None else {names_of[name] for name in each if name in names_of}
+                               for each in (solve.training, solve.held_out))
+        capture._masks.update({names_of[name]: path for name, path in solve.masks.items() if name in names_of})
         if need_frames:
             capture._check_layer_sizes()
+            capture.sentences = (*solve.sentences, *matched.sentences, *sentences, *check_geometry(solve))
+            capture.left_out = {reason: tuple(each) for reason, each in (
+                ("no pose", matched.unposed), ("a pose without a frame", matched.missing)) if each}
         if (folder / "split.json").exists():
             capture.split(None)
         return capture
@@ -166,7 +198,7 @@ class Capture:
         """Return the view's frame, undistorted, at its file's size, without conversion to Rec. 709. Raises FrameError.
         """
         path = self.frame_path(view)
-        stored = read_picture(path, keep_primaries=True)
+        stored = self._pictures.upright(read_picture(path, keep_primaries=True), view, path)
         return self._pictures.undistorted(stored, view, path) if view.lens else stored
 
     def frame_path(self, view: View) -> Path:
@@ -180,6 +212,27 @@ class Capture:
     def removed_path(self, view: View) -> Path:
         """Return the file of the view in removed/, where `has_removed`."""
         return self._removed[view.name]
+
+    def mask(self, view: View, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
+        """Return (height, width) which pixels of the view count; None without a mask.
+
+        A mask is black where something moves or must not be learned from. Pixels that a black one reaches count as
+        black. Raises FrameError.
+        """
+        if view.name not in self._masks:
+            return None
+        path, size = self._masks[view.name], size or view.camera.size
+        picture = self._pictures.upright(read_picture(path), view, path)
+        codes = picture.display()
+        picture = Picture((codes / max(float(codes.max()), 1e-6) > 0.5).astype(np.float32), "linear")
+        if view.lens is not None:
+            picture = self._pictures.undistorted(picture, view, path)
+        return np.asarray(picture.resized(*size).pixels.min(axis=2) > MIN_MASK_VALUE)
+
+    @property
+    def has_masks(self) -> bool:
+        """True if some view has a mask."""
+        return bool(self._masks)
 
     def truth_scene(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
         """Return the exact scene layer; None where it is not known."""
@@ -235,27 +288,37 @@ class Capture:
 
     def view(self, name: str) -> View:
         """Return the view of that name. Raises CaptureError where there is none."""
-        for view in self.views:
-            if view.name == name:
-                return view
-        raise CaptureError(f"{self.folder} has no view {name!r}; its first is {self.views[0].name!r}.")
+        view = self._find_view(name)
+        if view is None:
+            raise CaptureError(f"{self.folder} has no view {name!r}; its first is {self.views[0].name!r}.")
+        return view
+
+    def _find_view(self, name: str) -> View | None:
+        """Return the view of a name in another form: separators, accents, case of the suffix, "images/" before it."""
+        for key in (lambda text: text, canonical_name, lambda text: canonical_name(_view_name(text, True))):
+            match = next((view for view in self.views if key(view.name) == key(name)), None)
+            if match is not None:
+                return match
+        return None
 
     def split(self, holdout: str | int | Path | None = None) -> tuple[tuple[View, ...], tuple[View, ...]]:
         """Return (training views, held-out views).
 
-        `holdout`: a JSON file like split.json; a number N (every Nth view, from the first; 0: none); None: the
-        capture's split.json, else every 8th. Raises CaptureError.
+        `holdout`: a JSON file like split.json; a number N (every Nth pose, from the first; 0: none); None: the
+        capture's split.json, else the lists of its transforms.json, else every 8th. Raises CaptureError.
         """
         if isinstance(holdout, str) and holdout.strip().lstrip("+-").isdigit():
             holdout = int(holdout)
         if holdout is None:
             default = self.folder / "split.json"
+            if not default.exists() and self._lists != (None, None):
+                return self._split_by_lists()
             holdout = default if default.exists() else HOLDOUT_INTERVAL
         if isinstance(holdout, int):
             if holdout < 0:
                 raise CaptureError(f"Every {holdout}th view cannot be held out; give a number from 0.")
-            train = tuple(view for i, view in enumerate(self.views) if not holdout or i % holdout)
-            test = tuple(view for i, view in enumerate(self.views) if holdout and not i % holdout)
+            train = tuple(view for view in self.views if not holdout or self._order[view.name] % holdout)
+            test = tuple(view for view in self.views if holdout and not self._order[view.name] % holdout)
             if not train:
                 raise CaptureError(f"{self.folder}: with every {holdout}th of {len(self.views)} views held out, "
                                    "none is left to train on; hold none out (--holdout 0).")
@@ -265,6 +328,20 @@ class Capture:
         if not train:
             raise CaptureError(f"{holdout} holds out every view, so that none is left to train on.")
         return train, tuple(view for view in self.views if view.name in names)
+
+    def _split_by_lists(self) -> tuple[tuple[View, ...], tuple[View, ...]]:
+        """Return (training views, held-out views) by the lists of transforms.json; views in neither are left out."""
+        training, held_out = self._lists
+        names = {view.name for view in self.views}
+        if training is None:
+            training = names - (held_out or set())
+        if held_out is None:
+            held_out = names - training
+        train = tuple(view for view in self.views if view.name in training)
+        if not train:
+            raise CaptureError(f"{self.folder}: the lists of transforms.json leave no view to train on; correct them, "
+                               "or choose with --holdout.")
+        return train, tuple(view for view in self.views if view.name in held_out and view.name not in training)
 
     # How the pictures are had.
 
@@ -279,12 +356,15 @@ class Capture:
         names = data.get("test") if isinstance(data, dict) else None
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise CaptureError(f'{path} should read {{"test": ["name of a frame", …]}}.')
-        unknown = set(names) - {view.name for view in self.views}
+        views = {name: self._find_view(name) for name in names}
+        without_frame = {canonical_name(_view_name(name, True)) for each in self.left_out.values() for name in each}
+        unknown = [name for name, view in views.items()
+                   if view is None and canonical_name(_view_name(name, True)) not in without_frame]
         if unknown:
             raise CaptureError(f"{path} names {min(unknown)!r}, which is not a frame of the capture.")
         if len(set(names)) < len(names):
             raise CaptureError(f"{path} names a frame twice; name each once.")
-        return set(names)
+        return {view.name for view in views.values() if view is not None}
 
     def _check_layer_sizes(self) -> None:
         """Check the sizes of removed/ and truth/, and that removed/ is complete: an incomplete one is an interrupted
@@ -293,69 +373,15 @@ class Capture:
             lacking = [view.name for view in self.views if view.name not in self._removed]
             raise CaptureError(f"{self.folder / 'removed'} lacks {len(lacking)} of {len(self.views)} frames, "
                                f"first {lacking[0]}; finish or remove it.")
-        for paths in (self._removed, self._truth_scene, self._truth_flare):
+        for paths in (self._removed, self._truth_scene, self._truth_flare, self._masks):
             for view in self.views:
                 if view.name in paths:
                     size = picture_size(paths[view.name])
+                    if view.upright and _orientation(paths[view.name]) in SWAPS_SIDES:
+                        size = size[::-1]
                     if not same_aspect(size, view.camera.size):
                         raise FrameError(f"{paths[view.name]} is {size[0]} x {size[1]} pixels and the frame "
                                          f"{view.camera.width} x {view.camera.height}; make them one shape.")
-
-
-class _PictureCache:
-    """Decoded, undistorted, resized pictures; evicts the least recently used above its capacity."""
-
-    def __init__(self, room: int) -> None:
-        self._capacity = room
-        self._used = 0
-        self._pictures: OrderedDict[tuple[Path, tuple[int, int]], Picture] = OrderedDict()
-        self._maps: OrderedDict[tuple[int, tuple[int, int], float], Any] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, path: Path, view: View, size: tuple[int, int]) -> Picture:
-        key = (path, size)
-        with self._lock:
-            if key in self._pictures:
-                self._pictures.move_to_end(key)
-                return self._pictures[key]
-        picture = read_picture(path)
-        if view.lens is not None:
-            picture = self.undistorted(picture, view, path)
-        elif not same_aspect(picture.size, view.camera.size):
-            raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "
-                             f"{view.camera.width} x {view.camera.height}.")
-        picture = picture.resized(*size)
-        picture.pixels.flags.writeable = False
-        self._store(key, picture)
-        return picture
-
-    def _store(self, key: tuple[Path, tuple[int, int]], picture: Picture) -> None:
-        with self._lock:
-            if key in self._pictures or picture.pixels.nbytes > self._capacity:
-                return
-            self._pictures[key] = picture
-            self._used += picture.pixels.nbytes
-            while self._used > self._capacity:
-                _, old = self._pictures.popitem(last=False)
-                self._used -= old.pixels.nbytes
-
-    def undistorted(self, picture: Picture, view: View, path: Path) -> Picture:
-        """Undistort a picture of a view's file, whose lens is distorted. Raises FrameError."""
-        assert view.lens is not None
-        if not same_aspect(picture.size, view.camera.size):
-            raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "
-                             f"{view.camera.width} x {view.camera.height}.")
-        camera = view.camera.scaled(*picture.size)
-        key = (id(view.lens), picture.size, camera.fx)
-        with self._lock:
-            maps = self._maps.get(key)
-        if maps is None:
-            maps = view.lens.maps(camera)
-            with self._lock:
-                self._maps[key] = maps
-                while len(self._maps) > 4:
-                    self._maps.popitem(last=False)
-        return undistort_picture(picture, maps)
 
 
 def read_lights(path: Path) -> tuple[Light, ...]:
@@ -389,20 +415,8 @@ def _is_finite(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e30
 
 
-def _read_poses(folder: Path) -> tuple[list[PosedFrame], PointCloud, Path]:
-    """Return frames with their poses, points, and the folder that the frames' names start from."""
-    model = find_model(folder)
-    if model is None and (folder / TRANSFORMS).exists():
-        return *read_transforms(folder), folder
-    model = model or find_model(folder, ("colmap/sparse/0",))
-    if model is None:
-        raise CaptureError(f"{folder} has no camera solve: neither sparse/0/cameras.bin (or .txt) nor "
-                           f"{TRANSFORMS}; run solve first.")
-    return *read_model(model), folder / "images"
-
-
-def _checked_size(path: Path, lens: Lens) -> tuple[int, int]:
-    size = picture_size(path)
+def _checked_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:
+    size = turned.shown_size if turned else picture_size(path)
     if not same_aspect(size, (lens.width, lens.height)):
         raise FrameError(f"{path} is {size[0]} x {size[1]} pixels and its camera {lens.width} x {lens.height}, "
                          "which is another shape; use the frames that were solved.")
@@ -411,54 +425,44 @@ def _checked_size(path: Path, lens: Lens) -> tuple[int, int]:
     return size
 
 
-def _size_or_model_size(path: Path, lens: Lens) -> tuple[int, int]:
+def _size_or_model_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:
     """Return the picture's size, or the model's where the picture is missing or unusable."""
     try:
-        return _checked_size(path, lens)
+        return _checked_size(path, lens, turned)
     except FrameError:
         return lens.width, lens.height
 
 
-def _to_view(name: str, frame: PosedFrame, size: tuple[int, int]) -> View:
+def _orientation(path: Path) -> int:
+    """Return the Exif orientation of a picture; 1 where it cannot be read, which the check of its size reports."""
+    try:
+        return read_exif(path)[0]
+    except OSError:
+        return 1
+
+
+def _to_turned(posed: PosedFrame, path: Path | None) -> TurnedFrame | None:
+    """Return a frame whose file has an Exif orientation; None for others."""
+    orientation = 1 if path is None else _orientation(path)
+    if path is None or orientation == 1:
+        return None
+    try:
+        return TurnedFrame(posed, path, orientation, picture_size(path))
+    except FrameError:  # the check of its size reports it
+        return None
+
+
+def _view_name(name: str, starts_at_capture: bool) -> str:
+    """Return a frame's name with forward slashes and composed accents, below images/ where it starts from there."""
+    text = unicodedata.normalize("NFC", name.replace("\\", "/"))
+    text = str(PurePosixPath(text))
+    return text[len("images/"):] if starts_at_capture and text.casefold().startswith("images/") else text
+
+
+def _to_view(name: str, frame: PosedFrame, size: tuple[int, int], upright: bool) -> View:
     lens = frame.lens
     fx, fy, cx, cy = lens.pinhole
     camera = Camera(lens.width, lens.height, fx, fy, cx, cy, frame.world_to_camera)
     straight = lens.model in PINHOLES
-    return View(name, camera if size == camera.size else camera.scaled(*size), None if straight else lens, frame.points)
-
-
-class PictureIndex:
-    """The pictures below a folder, found by the names of frames elsewhere, which may have another suffix."""
-
-    def __init__(self, folder: Path) -> None:
-        self.paths = pictures_below(folder)
-        self._names: dict[str, str] = {}
-        for path in self.paths:  # by the name with a lower-case suffix
-            name = path.relative_to(folder)
-            self._names.setdefault(name.with_suffix(name.suffix.lower()).as_posix(), name.as_posix())
-
-    def find(self, frame: Path | str) -> str | None:
-        """Return the name below the folder of a frame's picture, or None."""
-        name = Path(frame)
-        suffixes = (name.suffix.lower(), ".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
-        keys = (name.with_suffix(suffix).as_posix() for suffix in suffixes)
-        return next((self._names[key] for key in keys if key in self._names), None)
-
-
-def _matching_pictures(folder: Path, views: Sequence[View]) -> dict[str, Path]:
-    """Map the views to their pictures in `folder`."""
-    matches: dict[str, Path] = {}
-    if not folder.is_dir():
-        return matches
-    pictures = PictureIndex(folder)
-    for view in views:
-        safe_join(folder, view.name, CaptureError)
-        match = pictures.find(view.name)
-        if match is not None:
-            matches[view.name] = safe_join(folder, match, CaptureError)
-    if pictures.paths and views and not matches:
-        raise CaptureError(f"{folder} holds {len(pictures.paths)} pictures, the first {pictures.paths[0].name}, and "
-                           f"none has the name of a frame, such as {views[0].name}; give them the frames' names.")
-    return matches
-
-
+    return View(name, camera if size == camera.size else camera.scaled(*size), None if straight else lens, frame.points,
+                upright)

@@ -7,6 +7,7 @@ points3D. Counts in a file are checked against its length before anything is all
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..errors import CaptureError
 from ..images.size import MAX_PIXELS
+from ..system.file_names import find_entry
 from ..system.files import atomic_path
 from ..system.reading import MAX_MODEL_BYTES, UTF8_SIG, read_bytes, read_text
 from .camera import Floats, quaternion_from_rotation, rotation_from_quaternion
@@ -60,14 +62,6 @@ class PosedFrame:
     lens: Lens
     world_to_camera: Floats
     points: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-
-
-def find_model(folder: Path, places: tuple[str, ...] = ("sparse/0", "sparse")) -> Path | None:
-    """Return the folder of a capture's COLMAP model, the first of `places` that has one, or None."""
-    for name in places:
-        if any((folder / name / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return folder / name
-    return None
 
 
 def read_model(folder: Path) -> tuple[list[PosedFrame], PointCloud]:
@@ -158,8 +152,9 @@ def check_lens(lens: Lens, where: str) -> Lens:
 
 
 def _file_path(folder: Path, name: str) -> Path:
-    binary = folder / f"{name}.bin"
-    return binary if binary.is_file() else folder / f"{name}.txt"
+    """Return the path of a part of a model, in any case of letters; that of the text where there is none."""
+    found = (find_entry(folder, f"{name}{suffix}") for suffix in (".bin", ".txt"))
+    return next((path for path in found if path is not None and path.is_file()), folder / f"{name}.txt")
 
 
 def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Any:
@@ -169,7 +164,7 @@ def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Any:
             return None
         raise CaptureError(f"{folder} has no {name}.bin or {name}.txt; export the whole COLMAP model.")
     try:
-        if path.suffix == ".bin":
+        if path.suffix.lower() == ".bin":
             return binary(_ByteReader(path))
         return text(path, read_text(path, MAX_MODEL_BYTES, UTF8_SIG).splitlines())
     except OSError as problem:
@@ -259,6 +254,10 @@ def _add_lens(lenses: dict[int, Lens], path: Path, camera: int, lens: Lens) -> N
 
 Image = tuple[str, int, tuple[float, ...], tuple[float, ...], NDArray[np.int64]]
 """Name, camera, quaternion, translation, and the ids of the points observed in it."""
+_ANNOUNCED = re.compile(r"#\s*Number of images:\s*(\d{1,9})\b")
+"""Comment at the head of an images.txt."""
+_MAX_NAME_WORDS = 60
+"""Words of a picture's name; a line with more is one of 2D points."""
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
@@ -275,23 +274,59 @@ def _read_images_bin(file: _ByteReader) -> list[Image]:
 
 
 def _read_images_txt(path: Path, lines: list[str]) -> list[Image]:
-    """Read two lines an image; the second, of 2D points, may be empty."""
+    """Read an image's line and the line of its 2D points, which may be empty or missing."""
     images: list[Image] = []
-    rest = iter(enumerate(lines, 1))
-    for number, line in rest:
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
+    for number, line, points in image_lines(lines):
         words = line.split(maxsplit=9)
         if len(words) < 10:
             raise CaptureError(f"{path}, line {number}: an image takes ten values (number, quaternion, "
                                f"translation, camera, name), not {len(words)}; export the model again.")
         _, *pose, camera = _parse_numbers(path, number, words[:9], "iqqqqtttc")
-        second = next(rest, None)
-        if second is None:
-            raise CaptureError(f"{path} is truncated: the line of 2D points after {words[9].strip()} is missing; "
-                               "export the model again.")
-        images.append((words[9].strip(), camera, tuple(pose[:4]), tuple(pose[4:]), _parse_point_ids(second[1])))
+        images.append((words[9].strip(), camera, tuple(pose[:4]), tuple(pose[4:]), _parse_point_ids(points)))
+    announced = next((int(match[1]) for line in lines[:8] if (match := _ANNOUNCED.match(line))), len(images))
+    if len(images) < announced:
+        raise CaptureError(f"{path} is truncated: it announces {announced} images and has {len(images)}; export the "
+                           "model again.")
     return images
+
+
+def image_lines(lines: Sequence[str]) -> list[tuple[int, str, str]]:
+    """Return number, text, and line of 2D points ("" where there is none) of each image of an images.txt.
+
+    COLMAP writes a line of points after each image, which is empty where there are none. Other programs leave these
+    lines out; so does an editor that drops empty lines.
+    """
+    images: list[tuple[int, str, str]] = []
+    at = 0
+    while at < len(lines):
+        line = lines[at]
+        at += 1
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        number, points = at, ""
+        if at < len(lines) and len(lines[at].split()) % 3 == 0 and not _is_image(lines[at]):
+            points = lines[at]
+            at += 1
+        images.append((number, line, points))
+    return images
+
+
+def _is_image(line: str) -> bool:
+    """True for a line of ten fields of which the last is a name: 2D points are numbers in threes."""
+    words = line.split(maxsplit=9)
+    if len(words) < 10:
+        return False
+    name = words[9].split(maxsplit=_MAX_NAME_WORDS)
+    if not _are_numbers(words[:9]) or len(name) > _MAX_NAME_WORDS:
+        return False
+    return bool((len(name) + 9) % 3) or not _are_numbers(name)
+
+
+def _are_numbers(words: Sequence[str]) -> bool:
+    try:
+        return all(math.isfinite(float(word)) for word in words)
+    except ValueError:
+        return False
 
 
 def _parse_point_ids(line: str) -> NDArray[np.int64]:

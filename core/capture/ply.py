@@ -1,15 +1,26 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads point clouds in PLY, ASCII or binary: x y z and red green blue of the `vertex` element."""
+"""Reads point clouds in PLY, ASCII or binary: x y z and the colours of the `vertex` element, in all types that programs
+write."""
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import ply
 from ..errors import CaptureError
 from ..system.reading import MAX_MODEL_BYTES, read_bytes
 from .colmap import PointCloud
+
+HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
+COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"), HARMONICS)
+"""Names of the colours' properties, in the order in which they are looked for."""
+HARMONIC_0 = 0.28209479177387814
+"""The spherical harmonic of degree 0."""
+MAX_UNIT_COLOUR = 1.001
+"""Largest float colour of a cloud whose colours are 0..1."""
 
 
 def read_points(path: Path) -> PointCloud:
@@ -45,9 +56,24 @@ def read_points(path: Path) -> PointCloud:
         xyz = np.stack([table[name].astype(np.float32) for name in "xyz"], axis=1)
     if not np.isfinite(xyz).all():
         raise CaptureError(f"{path} has points that are not finite numbers; export it again.")
-    rgb = np.full((number, 3), 128, np.uint8)
-    if {"red", "green", "blue"} <= set(names):
-        colours = np.stack([table[name].astype(np.float64) for name in ("red", "green", "blue")], axis=1)
-        unit = 255.0 if dict(layout)["red"].startswith("f") else 1.0
-        rgb = np.clip(np.nan_to_num(colours) * unit + 0.5 * (unit > 1), 0, 255).astype(np.uint8)
-    return PointCloud(xyz, rgb, np.zeros(number, np.float32))
+    return PointCloud(xyz, _read_colours(table, dict(layout), number), np.zeros(number, np.float32))
+
+
+def _read_colours(table: NDArray[Any], kinds: dict[str, str], number: int) -> NDArray[np.uint8]:
+    """Return colours (n, 3) of 8 bits; grey where the file has none.
+
+    Whole numbers of 16 bits are divided by 257, of 32 bits by 257 * 65537. Where none is above 255 they are of 8 bits,
+    whatever their type. Floats are 0..1, or 0..255 where one is above 1. Gaussians have harmonics of degree 0.
+    """
+    names = next((names for names in COLOURS if set(names) <= set(kinds)), None)
+    if names is None or not number:
+        return np.full((number, 3), 128, np.uint8)
+    colours = np.nan_to_num(np.stack([table[name].astype(np.float64) for name in names], axis=1))
+    largest = float(colours.max(initial=0))
+    if names == HARMONICS:
+        colours = 255 * (0.5 + HARMONIC_0 * colours)
+    elif kinds[names[0]].startswith("f"):
+        colours = colours * (255 if largest <= MAX_UNIT_COLOUR else 1)
+    elif largest > 255:
+        colours = colours / (257 if largest <= 65535 else 257 * 65537)
+    return np.asarray(np.clip(colours + 0.5, 0, 255).astype(np.uint8))

@@ -1,52 +1,150 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads nerfstudio's and instant-ngp's `transforms.json`.
+"""Reads `transforms.json` as nerfstudio, instant-ngp, BlenderNeRF and Polycam's exporters write it, and the pairs
+`transforms_train.json`, `transforms_test.json` of NeRF's synthetic scenes.
 
-Poses are camera to world with OpenGL axes (x right, y up, z backward). `applied_transform` is already in the poses and
-in the point cloud of `ply_file_path`, so the world of the file is the world of the capture; points of a COLMAP model
-beside it still need it.
+Poses are camera to world with OpenGL axes (x right, y up, z backward). `applied_transform` and `applied_scale` are
+already in the poses, so the world of the file is the world of the capture. The point cloud of `ply_file_path` is in
+that world too; points of a COLMAP model beside it still need both.
 """
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import CaptureError
 from ..images.listing import SUFFIXES
 from ..images.size import picture_size
+from ..system.file_names import canonical_name, find_entry
 from ..system.files import read_json, safe_join
 from .camera import Floats, is_rotation
-from .colmap import MAX_MAGNITUDE, PointCloud, PosedFrame, check_lens, find_model, read_model
+from .colmap import MAX_MAGNITUDE, PointCloud, PosedFrame, check_lens, read_model
+from .layout import LATER_MODEL_PLACES, choose_model, find_models
 from .lens import Lens
 from .ply import read_points
 
 FILE = "transforms.json"
+PARTS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+"""Files of NeRF's synthetic scenes and of BlenderNeRF; all but the first list frames to hold out."""
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Names of a lens's coefficients, in the order of `distortion_params`."""
+OLD_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+"""What nerfstudio applied to poses before it wrote `applied_transform`."""
+MAX_MISMATCH = 0.01
+"""Distance between two places for one camera, relative to the cameras' extent, up to which they count as the same."""
+_EQUIVALENT_KEYS = ((("fl_x",), ("camera_angle_x",)), (("fl_y",), ("camera_angle_y",)),
+                    (DISTORTION, ("distortion_params",)))
+"""Keys that say one thing in two forms."""
 
 
-def read_transforms(folder: Path) -> tuple[list[PosedFrame], PointCloud]:
-    """Read poses and points of a capture; the names are paths below `folder`.
+@dataclass
+class Transforms:
+    """Poses and points of a capture with transforms.json; the names are paths below its folder.
+
+    masks: files of the frames' masks, by the frames' names. training, held_out: names in the file's lists of both, None
+    without a list. sentences: what the user should know.
+    """
+
+    frames: list[PosedFrame]
+    points: PointCloud
+    masks: dict[str, Path] = field(default_factory=dict)
+    training: set[str] | None = None
+    held_out: set[str] | None = None
+    sentences: list[str] = field(default_factory=list)
+
+
+def transforms_files(folder: Path) -> list[Path]:
+    """Return the transforms.json of a capture, else the files of its parts; none where it has neither."""
+    whole = find_entry(folder, FILE)
+    if whole is not None:
+        return [whole]
+    return [path for name in PARTS if (path := find_entry(folder, name)) is not None]
+
+
+def read_transforms(folder: Path) -> Transforms:
+    """Read poses, points, masks and lists of a capture.
 
     Raises CaptureError, naming the file and the frame, where something is missing or invalid.
     """
-    path = folder / FILE
-    meta = read_json(path, CaptureError)
-    frames = meta.get("frames") if isinstance(meta, dict) else None
-    if not isinstance(frames, list) or not frames:
-        raise CaptureError(f"{path} holds no frames; export it again.")
-    posed: list[PosedFrame] = []
+    result = Transforms([], PointCloud.empty())
     lenses: dict[tuple[object, ...], Lens] = {}  # one object for frames of one lens: its maps are shared
-    for number, frame in enumerate(frames):
-        name = frame.get("file_path") if isinstance(frame, dict) else None
-        if not isinstance(name, str):
-            raise CaptureError(f"{path}, frame {number}: file_path is missing; export it again.")
-        where = f"{path}, {name}:"
-        name = _with_suffix(folder, name)
-        lens = _read_lens({**meta, **frame}, folder, name, where)
-        lens = lenses.setdefault((lens.model, lens.params, lens.width, lens.height), lens)
-        posed.append(PosedFrame(name, lens, _read_pose(frame, where)))
-    return posed, _read_points(folder, meta)
+    files = transforms_files(folder)
+    for path in files:
+        meta = read_json(path, CaptureError)
+        frames = meta.get("frames") if isinstance(meta, dict) else None
+        if not isinstance(frames, list) or not (frames or len(files) > 1):
+            raise CaptureError(f"{path} holds no frames; export it again.")
+        names = [_read_frame(path, number, meta, frame, lenses, result) for number, frame in enumerate(frames)]
+        if len(files) > 1 and path.name.casefold() != PARTS[0]:
+            result.held_out = (result.held_out or set()) | set(names)
+        else:
+            _read_lists(path, meta, result)
+        if not len(result.points):
+            result.points = _read_points(path, meta, result)
+    if not result.frames:
+        raise CaptureError(f"{files[0]} holds no frames; export it again.")
+    return result
+
+
+def _read_frame(path: Path, number: int, meta: dict[str, Any], frame: Any, lenses: dict[tuple[object, ...], Lens],
+                result: Transforms) -> str:
+    """Read a frame's lens, pose and mask; return its name."""
+    name = frame.get("file_path") if isinstance(frame, dict) else None
+    if not isinstance(name, str):
+        raise CaptureError(f"{path}, frame {number}: file_path is missing; export it again.")
+    where = f"{path}, {name}:"
+    name = _with_suffix(path.parent, name)
+    lens = _read_lens(_own_first(meta, frame), path.parent, name, where)
+    lens = lenses.setdefault((lens.model, lens.params, lens.width, lens.height), lens)
+    result.frames.append(PosedFrame(name, lens, _read_pose(frame, where)))
+    mask = frame.get("mask_path")
+    if isinstance(mask, str):
+        file = safe_join(path.parent, mask, CaptureError)
+        found = find_entry(path.parent, file.relative_to(path.parent).as_posix())
+        if found is None or not found.is_file():
+            raise CaptureError(f"{where} its mask {file} is missing; put it there, or remove mask_path.")
+        result.masks[name] = found
+    return name
+
+
+def _own_first(meta: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of a frame's lens: its own, else those of the file.
+
+    What a frame says in one form replaces what the file says in another: an angle for a focal length, one list for
+    single coefficients.
+    """
+    shared = dict(meta)
+    for forms in _EQUIVALENT_KEYS:
+        if any(key in frame for form in forms for key in form):
+            shared = {key: value for key, value in shared.items() if not any(key in form for form in forms)}
+    return {**shared, **frame}
+
+
+def _read_lists(path: Path, meta: dict[str, Any], result: Transforms) -> None:
+    """Read nerfstudio's lists of training and held-out frames; its validation frames are held out too."""
+    lists: dict[str, set[str]] = {}
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        names = meta.get(key)
+        if names is None:
+            continue
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise CaptureError(f"{path}: {key} should be a list of names of frames; correct it or export the file "
+                               "again.")
+        lists[key] = {_with_suffix(path.parent, name) for name in names}
+    known = {canonical_name(frame.name): frame.name for frame in result.frames}
+    for key, names in lists.items():
+        if unknown := sorted(name for name in names if canonical_name(name) not in known):
+            raise CaptureError(f"{path}: {key} names {unknown[0]}, which is not a frame of the file; correct it or "
+                               "export the file again.")
+    found = {key: {known[canonical_name(name)] for name in names} for key, names in lists.items()}
+    result.training = found.get("train_filenames")
+    if "val_filenames" in found or "test_filenames" in found:
+        result.held_out = found.get("val_filenames", set()) | found.get("test_filenames", set())
 
 
 def _with_suffix(folder: Path, name: str) -> str:
@@ -83,7 +181,7 @@ def _read_lens(meta: dict[str, Any], folder: Path, name: str, where: str) -> Len
         has_angle = "camera_angle_y" in meta
         fy = _focal_length(_parse_number(meta, "camera_angle_y", where), height, where) if has_angle else fx
     cx, cy = _parse_number(meta, "cx", where, width / 2), _parse_number(meta, "cy", where, height / 2)
-    k1, k2, k3, k4, p1, p2 = (_parse_number(meta, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    k1, k2, k3, k4, p1, p2 = _read_distortion(meta, where)
     kind = meta.get("camera_model", "OPENCV")
     if kind in ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE") or meta.get("is_fisheye"):
         # The fisheye polynomial with every coefficient.
@@ -99,6 +197,18 @@ def _read_lens(meta: dict[str, Any], folder: Path, name: str, where: str) -> Len
         raise CaptureError(f"{where} the camera model {kind!r} is not one this program reads; use OPENCV, "
                            "OPENCV_FISHEYE or PINHOLE, or a COLMAP model.")
     return check_lens(lens, where)
+
+
+def _read_distortion(meta: dict[str, Any], where: str) -> list[float]:
+    """Return k1 k2 k3 k4 p1 p2, from one list in this order or from single values."""
+    values = meta.get("distortion_params")
+    if values is None:
+        return [_parse_number(meta, key, where, 0.0) for key in DISTORTION]
+    if not isinstance(values, list) or not len(values) <= len(DISTORTION):
+        raise CaptureError(f"{where} distortion_params should be the six numbers k1 k2 k3 k4 p1 p2; correct it or "
+                           "export the file again.")
+    values = [*values, *[0.0] * (len(DISTORTION) - len(values))]
+    return [_parse_number({"distortion_params": value}, "distortion_params", where) for value in values]
 
 
 def _focal_length(angle: float, size: int, where: str) -> float:
@@ -135,17 +245,71 @@ def _read_pose(frame: dict[str, Any], where: str) -> Floats:
     return inverse
 
 
-def _read_points(folder: Path, meta: dict[str, Any]) -> PointCloud:
-    name = meta.get("ply_file_path")
+def _read_points(path: Path, meta: dict[str, Any], result: Transforms) -> PointCloud:
+    folder, name = path.parent, meta.get("ply_file_path")
     if isinstance(name, str):
-        path = safe_join(folder, Path(name).as_posix(), CaptureError)
-        if not path.is_file():
-            raise CaptureError(f"{path} is missing, which {folder / FILE} names as its points.")
-        return read_points(path)
-    model = find_model(folder, ("colmap/sparse/0",))
+        file = safe_join(folder, Path(name).as_posix(), CaptureError)
+        found = find_entry(folder, file.relative_to(folder).as_posix())
+        if found is None or not found.is_file():
+            raise CaptureError(f"{file} is missing, which {path} names as its points.")
+        return read_points(found)
+    model, sentence = choose_model(find_models(folder, LATER_MODEL_PLACES), folder)
     if model is None:
         return PointCloud.empty()
-    _, points = read_model(model)
-    applied = _parse_matrix(meta.get("applied_transform", np.eye(4).tolist()), f"{folder / FILE}:", "applied_transform")
-    moved = points.xyz.astype(np.float64) @ applied[:3, :3].T + applied[:3, 3]
+    posed, points = read_model(model)
+    result.sentences += [sentence] if sentence else []
+    to_world = _applied(path, meta)
+    solved = _similarity(posed, result.frames)
+    if solved is not None and not _moves_alike(to_world, solved, points.xyz):
+        result.sentences.append(f"The points of {model} are moved as their cameras are in {path.name}: "
+                                + ("applied_transform and applied_scale say otherwise." if "applied_transform" in meta
+                                   else "it has no applied_transform."))
+        to_world = solved
+    moved = points.xyz.astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
     return PointCloud(moved.astype(np.float32), points.rgb, points.error)
+
+
+def _applied(path: Path, meta: dict[str, Any]) -> Floats:
+    """Return (4, 4): nerfstudio's motion and scale from the world of its COLMAP model to that of the file."""
+    applied = _parse_matrix(meta.get("applied_transform", OLD_APPLIED_TRANSFORM), f"{path}:", "applied_transform")
+    scale = _parse_number(meta, "applied_scale", f"{path}:", 1.0)
+    if scale <= 0:
+        raise CaptureError(f"{path}: applied_scale should be above 0, not {scale:g}; export the file again.")
+    return np.diag([scale, scale, scale, 1.0]) @ applied
+
+
+def _similarity(model: Sequence[PosedFrame], frames: Sequence[PosedFrame]) -> Floats | None:
+    """Return (4, 4), the similarity that takes the cameras of a COLMAP model to those of the same names in the file.
+
+    None where fewer than three share a name, lie in one place, or do not match within 1 % of their extent.
+    """
+    known = {PurePosixPath(canonical_name(frame.name)).name: frame for frame in model}
+    pairs = [(known[name], frame) for frame in frames
+             if (name := PurePosixPath(canonical_name(frame.name)).name) in known]
+    if len(pairs) < 3:
+        return None
+    rotations = np.array([there.world_to_camera[:3, :3].T @ here.world_to_camera[:3, :3] for here, there in pairs])
+    left, _, right = np.linalg.svd(rotations.mean(axis=0))
+    rotation = left @ right
+    here, there = (np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in (frame.world_to_camera for frame in side)])
+                   for side in zip(*pairs, strict=True))
+    middle, target = here.mean(axis=0), there.mean(axis=0)
+    spread, goal = (here - middle) @ rotation.T, there - target
+    extent, size = float(np.square(spread).sum()), float(np.square(goal).sum())
+    scale = float((spread * goal).sum()) / extent if extent > 0 else 0.0
+    if scale <= 0 or np.square(scale * spread - goal).sum() > MAX_MISMATCH**2 * size:
+        return None
+    similarity = np.eye(4)
+    similarity[:3, :3] = scale * rotation
+    similarity[:3, 3] = target - scale * rotation @ middle
+    return similarity
+
+
+def _moves_alike(first: Floats, second: Floats, xyz: NDArray[np.float32]) -> bool:
+    """True if two similarities take points (n, 3) to the same places, within 2 % of the points' extent."""
+    sample = xyz[::max(len(xyz) // 1000, 1)].astype(np.float64)
+    if not len(sample):
+        return True
+    ends = [sample @ motion[:3, :3].T + motion[:3, 3] for motion in (first, second)]
+    extent = float(np.median(np.linalg.norm(ends[1] - ends[1].mean(axis=0), axis=1)))
+    return float(np.median(np.linalg.norm(ends[0] - ends[1], axis=1))) <= 2 * MAX_MISMATCH * max(extent, 1e-12)

@@ -4,21 +4,49 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..system.file_names import natural_key
+
+_SYSTEM_FILES = frozenset({"thumbs.db", "desktop.ini"})
+"""Files that file managers leave, in lower case."""
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr"})
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """List the pictures of a folder by name, without hidden ones: macOS keeps "._0001.png" beside 0001.png on foreign
-    disks."""
-    return sorted(path for path in folder.iterdir()
-                  if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith("."))
+    """List the pictures of a folder in natural order, without hidden ones: macOS keeps "._0001.png" beside 0001.png on
+    foreign disks."""
+    return sorted((path for path in folder.iterdir()
+                   if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")),
+                  key=natural_key)
 
 
 def pictures_below(folder: Path) -> list[Path]:
-    """List the pictures in a folder and its subfolders by name, without hidden ones.
+    """List the pictures in a folder and its subfolders in natural order, without hidden ones.
 
     Broken links are included, for the reader to report: the disk that they lead to may be offline.
     """
-    return [path for path in sorted(folder.rglob("*"))
+    return [path for path in sorted(folder.rglob("*"), key=natural_key)
             if path.suffix.lower() in SUFFIXES and (path.is_file() or (path.is_symlink() and not path.exists()))
             and not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+
+
+def passed_over(folder: Path, *, subfolders: bool = True) -> list[tuple[str, list[str]]]:
+    """Return the reasons for which entries of a folder are not among `pictures_in`, with their names.
+
+    Hidden files and the systems' own (Thumbs.db, desktop.ini) are not mentioned. subfolders: mention those that hold
+    pictures or videos, with their number.
+    """
+    left_out: dict[str, list[str]] = {}
+    for path in sorted(folder.iterdir(), key=natural_key):
+        if path.name.startswith(".") or path.name.lower() in _SYSTEM_FILES:
+            continue
+        suffix = path.suffix.lower()
+        if path.is_dir():
+            count = len(pictures_below(path)) if subfolders else 0
+            reason = f"a subfolder with {count} picture{'' if count == 1 else 's'}" if count else ""
+        elif suffix in SUFFIXES:
+            reason = "" if path.is_file() else "a link to a missing file" if path.is_symlink() else "not a file"
+        else:
+            reason = f"{suffix[1:].upper()} is not read here" if suffix else "not a picture"
+        if reason:
+            left_out.setdefault(reason, []).append(path.name)
+    return list(left_out.items())

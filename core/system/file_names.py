@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from pathlib import PurePath, PurePosixPath
+from functools import lru_cache
+from pathlib import Path, PurePath, PurePosixPath
 
 _DIGITS = re.compile(r"(\d+)")
 _MAX_DIGITS = 4000
@@ -23,6 +24,7 @@ def natural_key(name: PurePath | str) -> list[tuple[tuple[int, int, str], ...]]:
     return [*(_part_key(part) for part in parts), ((2, 0, str(name)),)]
 
 
+@lru_cache(maxsize=1 << 14)
 def _part_key(part: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(piece), "") if piece.isascii() and piece.isdigit() and len(piece) < _MAX_DIGITS
                  else (1, 0, piece) for piece in _DIGITS.split(unicodedata.normalize("NFC", part)) if piece)
@@ -35,3 +37,21 @@ def canonical_name(name: PurePath | str) -> str:
     """
     path = PurePosixPath(unicodedata.normalize("NFC", str(name).replace("\\", "/")))
     return str(path.with_suffix(path.suffix.lower())) if path.suffix else str(path)
+
+
+def find_entry(folder: Path, name: str) -> Path | None:
+    """Return `folder / name` (forward slashes), in any case of letters where it does not exist as written; or None."""
+    path = folder / name
+    if path.exists():
+        return path
+    path = folder
+    for part in name.split("/"):
+        try:
+            entries = {entry.name.casefold(): entry for entry in sorted(path.iterdir(), reverse=True)}
+        except OSError:
+            return None
+        match = entries.get(part.casefold())
+        if match is None:
+            return None
+        path = match
+    return path

@@ -19,7 +19,7 @@ import bpy
 import numpy as np
 
 from ...core.capture.camera import is_rotation
-from ...core.capture.colmap import find_model
+from ...core.capture.layout import find_model
 from ...core.capture.transforms import FILE as TRANSFORMS
 from ...core.errors import CaptureError
 from ...core.images.picture import same_aspect

@@ -67,7 +67,7 @@ def is_blend(args: argparse.Namespace) -> bool:
 
 def import_blend(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Blender step: write a capture from the animated camera of a .blend."""
-    from ...core.capture.colmap import find_model
+    from ...core.capture.layout import find_model
     from ...core.capture.transforms import FILE as TRANSFORMS
     from ...core.conventions.frame_numbers import plates_by_number
     from ...core.images.listing import pictures_in

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reads the camera solve of a capture, of whatever program, and matches its poses with the pictures on disk.
+
+`Capture.open` calls `read_solve`, then `match_frames`; it makes its views of the result and passes the sentences on.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import CaptureError
+from ..system.file_names import canonical_name, natural_key
+from ..system.files import safe_join
+from .colmap import PointCloud, PosedFrame, read_model
+from .frame_files import PictureIndex
+from .layout import LATER_MODEL_PLACES, choose_model, find_models, frames_folder
+from .transforms import FILE as TRANSFORMS
+from .transforms import read_transforms, transforms_files
+
+MAX_NAMES = 3
+"""Number of names in a sentence."""
+SAMPLED_POINTS, SAMPLED_VIEWS = 4000, 40
+"""Approximate numbers of points and views by which the solve is checked."""
+MIN_SHARE_IN_VIEW = 0.5
+"""Share of the points before some camera below which points and cameras do not fit each other."""
+MIN_FIELD_OF_VIEW, MAX_FIELD_OF_VIEW = 0.5, 170.0
+"""Degrees along the longer side that lenses of frames have."""
+
+
+@dataclass
+class CameraSolve:
+    """Poses and points of a capture, before their pictures are looked at.
+
+    root: folder that the frames' names start from. masks: files by the frames' names. training, held_out: names in the
+    solve's own lists, None without. sentences: what the user should know.
+    """
+
+    frames: list[PosedFrame]
+    points: PointCloud
+    root: Path
+    masks: dict[str, Path] = field(default_factory=dict)
+    training: set[str] | None = None
+    held_out: set[str] | None = None
+    sentences: list[str] = field(default_factory=list)
+
+
+def read_solve(folder: Path) -> CameraSolve:
+    """Read a COLMAP model or a transforms.json, in natural order of the frames. Raises CaptureError where there is
+    none."""
+    models = find_models(folder)
+    if not models and transforms_files(folder):
+        read = read_transforms(folder)
+        solve = CameraSolve(read.frames, read.points, folder, read.masks, read.training, read.held_out, read.sentences)
+    else:
+        model, sentence = choose_model(models or find_models(folder, LATER_MODEL_PLACES), folder)
+        if model is None:
+            raise CaptureError(f"{folder} has no camera solve: neither sparse/0/cameras.bin (or .txt) nor "
+                               f"{TRANSFORMS}; run solve first.")
+        frames, points = read_model(model)
+        solve = CameraSolve(frames, points, frames_folder(folder, model))
+        solve.sentences += [sentence] if sentence else []
+    solve.frames.sort(key=lambda frame: natural_key(frame.name))
+    return solve
+
+
+@dataclass
+class MatchedFrames:
+    """The picture of each posed frame, by the frame's name in the solve, and what has no counterpart.
+
+    missing: names of poses without a picture; unposed: names of pictures without a pose, below the folder of the
+    frames. sentences: what the user should know.
+    """
+
+    files: dict[str, Path]
+    missing: list[str]
+    unposed: list[str]
+    sentences: list[str]
+
+
+def match_frames(solve: CameraSolve) -> MatchedFrames:
+    """Find the pictures of the posed frames, by other forms of their names too. Raises CaptureError for a name that
+    leads out of the capture."""
+    paths = {frame.name: safe_join(solve.root, frame.name, CaptureError) for frame in solve.frames}
+    files = {name: path for name, path in paths.items() if path.exists() or path.is_symlink()}
+    index = _index(solve.root, [path.parent for path in paths.values()])
+    used = {path.relative_to(solve.root).as_posix() for path in files.values()}
+    missing: list[str] = []
+    renamed: list[str] = []
+    for name in paths:
+        if name in files:
+            continue
+        found = index.find(name)
+        if found is None or found in used:
+            missing.append(name)
+            continue
+        used.add(found)
+        files[name] = safe_join(solve.root, found, CaptureError)
+        if canonical_name(found) != canonical_name(name):
+            renamed.append(f"{found} for {name}")
+    unposed = [name for name in index.names if name not in used]
+    return MatchedFrames(files, missing, unposed, _describe(solve, files, missing, unposed, renamed))
+
+
+def _index(root: Path, folders: list[Path]) -> PictureIndex:
+    """Index the pictures below the folder of the frames; where names start from the capture, those of the frames'
+    folders."""
+    if root.name.casefold() == "images":
+        return PictureIndex(root)
+    return PictureIndex(root, list(dict.fromkeys(folders)))
+
+
+def _describe(solve: CameraSolve, files: dict[str, Path], missing: list[str], unposed: list[str],
+              renamed: list[str]) -> list[str]:
+    sentences = []
+    if files and (missing or unposed):
+        text = f"{len(files)} of {len(files) + len(unposed)} frames in {solve.root} have a pose"
+        text += f", not {list_names(unposed)}" if unposed else ""
+        text += f"; {len(missing)} poses have no frame: {list_names(missing)}" if missing else ""
+        sentences.append(f"{text}. What has no counterpart is left out.")
+    if renamed:
+        sentences.append(f"{len(renamed)} frames have other names than in the camera solve: {list_names(renamed)}.")
+    return sentences
+
+
+def list_names(names: list[str]) -> str:
+    """Return the first names, and how many more there are."""
+    more = len(names) - MAX_NAMES
+    return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
+
+
+def check_geometry(solve: CameraSolve) -> list[str]:
+    """Return sentences on points that no camera has before it, and on lenses that cannot be."""
+    return [*_check_points(solve), *_check_lenses(solve)]
+
+
+def _check_points(solve: CameraSolve) -> list[str]:
+    points = solve.points.xyz[::max(len(solve.points) // SAMPLED_POINTS, 1)].astype(np.float64)
+    if not len(points):
+        return []
+    is_seen = np.zeros(len(points), bool)
+    shares = []
+    for frame in solve.frames[::max(len(solve.frames) // SAMPLED_VIEWS, 1)]:
+        local = points @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]
+        before = local[:, 2] > 0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            plane = np.abs(local[:, :2] / local[:, 2:])
+        reach = np.array([frame.lens.width, frame.lens.height]) / np.array(frame.lens.focal)
+        is_seen |= before & (plane <= reach).all(axis=1)
+        shares.append(before.mean())
+    share, before_share = float(is_seen.mean()), float(np.mean(shares))
+    if min(share, before_share) >= MIN_SHARE_IN_VIEW:
+        return []
+    return [f"Cameras and points do not fit each other: {100 * share:.0f} % of the points are in some view, and a "
+            f"camera has {100 * before_share:.0f} % of them before it. Export both in one coordinate system (scale, "
+            "axes, origin)."]
+
+
+def _check_lenses(solve: CameraSolve) -> list[str]:
+    wrong = []
+    for frame in solve.frames:
+        lens = frame.lens
+        long_side = max((lens.width, lens.focal[0]), (lens.height, lens.focal[1]))
+        angle = 2 * float(np.degrees(np.arctan(0.5 * long_side[0] / long_side[1])))
+        is_plain = lens.model != "EQUIRECTANGULAR" and "FISHEYE" not in lens.model
+        if is_plain and not MIN_FIELD_OF_VIEW <= angle <= MAX_FIELD_OF_VIEW:
+            wrong.append((frame.name, long_side[1], angle))
+    if not wrong:
+        return []
+    name, focal, angle = wrong[0]
+    return [f"The focal length of {len(wrong)} of {len(solve.frames)} frames cannot be: {name} has {focal:.4g} pixels, "
+            f"a field of view of {angle:.3g} degrees. Export it in pixels of the frames."]

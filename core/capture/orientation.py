@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Finds out whether cameras were solved from photographs as stored or as shown, where their Exif data turn them.
+
+Some programs solve the stored pixels, others apply the Exif orientation first, and neither says so. Where the
+orientation exchanges width and height, the size of the camera decides. Else the points decide: their colours match the
+picture that was solved. `Capture.open` calls it; most captures have no such photographs.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..colour.srgb import Pixels
+from ..errors import FrameError
+from ..images.formats.exif import apply_orientation
+from ..images.picture import same_aspect
+from ..images.read import read_picture
+from .colmap import PointCloud, PosedFrame
+
+SAMPLED_FRAMES = 6
+"""Number of frames whose colours are compared."""
+SAMPLED_POINTS = 4000
+"""Approximate number of points whose colours are compared."""
+MIN_POINTS = 30
+"""Number of points on a frame from which their colours count."""
+MAX_ERROR_RATIO = 0.9
+"""Ratio of the colour errors of the two readings below which the smaller one decides."""
+SWAPS_SIDES = frozenset({5, 6, 7, 8})
+"""Exif orientations that exchange width and height."""
+
+
+@dataclass(frozen=True)
+class TurnedFrame:
+    """A frame whose file has an Exif orientation (2 to 8), with the size of its stored pixels."""
+
+    posed: PosedFrame
+    path: Path
+    orientation: int
+    size: tuple[int, int]
+
+    @property
+    def shown_size(self) -> tuple[int, int]:
+        """(width, height) as viewers show it."""
+        return self.size[::-1] if self.orientation in SWAPS_SIDES else self.size
+
+
+def find_upright(frames: Sequence[TurnedFrame], points: PointCloud) -> tuple[set[str], list[str]]:
+    """Return the names of the frames that were solved as shown, and sentences for the user.
+
+    Frames that nothing decides count as solved from their stored pixels.
+    """
+    upright: set[str] = set()
+    undecided: dict[int, list[TurnedFrame]] = {}
+    for frame in frames:
+        lens = (frame.posed.lens.width, frame.posed.lens.height)
+        fits_stored, fits_shown = same_aspect(frame.size, lens), same_aspect(frame.shown_size, lens)
+        if fits_stored and fits_shown:
+            undecided.setdefault(frame.orientation, []).append(frame)
+        elif fits_shown:
+            upright.add(frame.posed.name)
+    sentences = [_describe(sorted(upright), "as shown, by the sizes of their cameras")] if upright else []
+    for orientation, group in sorted(undecided.items()):
+        names = [frame.posed.name for frame in group]
+        decision = _compare_colours(group, points)
+        if decision is None:
+            sentences.append(_describe(names, f"as stored, though their Exif orientation is {orientation}: no coloured "
+                                              "points show which. If the fit comes out turned, remove that tag"))
+        elif decision:
+            upright.update(names)
+            sentences.append(_describe(names, "as shown, by the colours of the points"))
+    return upright, sentences
+
+
+def _describe(names: Sequence[str], reading: str) -> str:
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    return f"Photographs with an Exif orientation ({names[0]}{more}) are read {reading}."
+
+
+def _compare_colours(frames: Sequence[TurnedFrame], points: PointCloud) -> bool | None:
+    """Return True if the points' colours match the frames as shown, False as stored, None where they do not decide."""
+    stored = shown = 0.0
+    number = 0
+    for frame in frames[::max(len(frames) // SAMPLED_FRAMES, 1)][:SAMPLED_FRAMES]:
+        try:
+            picture = read_picture(frame.path).display()
+        except (FrameError, ImportError):  # a damaged frame is reported by whoever decodes it; Blender has no OpenCV
+            continue
+        errors = [_colour_error(reading, frame.posed, points)
+                  for reading in (picture, apply_orientation(picture, frame.orientation))]
+        if None not in errors:
+            stored, shown, number = stored + (errors[0] or 0), shown + (errors[1] or 0), number + 1
+    if not number or min(stored, shown) > MAX_ERROR_RATIO * max(stored, shown):
+        return None
+    return shown < stored
+
+
+def _colour_error(picture: Pixels, posed: PosedFrame, points: PointCloud) -> float | None:
+    """Return the median difference between the points' colours and the picture at their images; None for few points."""
+    chosen = posed.points if len(posed.points) >= MIN_POINTS else np.arange(len(points))
+    chosen = chosen[::max(len(chosen) // SAMPLED_POINTS, 1)]
+    local = points.xyz[chosen] @ posed.world_to_camera[:3, :3].T + posed.world_to_camera[:3, 3]
+    is_before = local[:, 2] > 0
+    height, width = picture.shape[:2]
+    scale = np.array([width / posed.lens.width, height / posed.lens.height])
+    pixels = posed.lens.distort(local[is_before, :2] / local[is_before, 2:]) * scale
+    with np.errstate(invalid="ignore"):
+        is_inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+    if is_inside.sum() < MIN_POINTS:
+        return None
+    colours = points.rgb[chosen][is_before][is_inside] / np.float32(255)
+    x, y = pixels[is_inside].astype(int).T
+    return float(np.median(np.abs(picture[y, x] - colours).mean(axis=1)))

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Decodes the pictures of a capture's views, turned, undistorted and resized, and keeps the last ones in memory."""
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import FrameError
+from ..images.formats.exif import apply_orientation, read_exif
+from ..images.picture import Picture, same_aspect
+from ..images.read import read_picture
+from .lens import undistort_picture
+
+if TYPE_CHECKING:
+    from .capture import View
+
+
+class PictureCache:
+    """Decoded, undistorted, resized pictures; evicts the least recently used above its capacity."""
+
+    def __init__(self, room: int) -> None:
+        self._capacity = room
+        self._used = 0
+        self._pictures: OrderedDict[tuple[Path, tuple[int, int]], Picture] = OrderedDict()
+        self._maps: OrderedDict[tuple[int, tuple[int, int], float], Any] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, path: Path, view: View, size: tuple[int, int]) -> Picture:
+        key = (path, size)
+        with self._lock:
+            if key in self._pictures:
+                self._pictures.move_to_end(key)
+                return self._pictures[key]
+        picture = self.upright(read_picture(path), view, path)
+        if view.lens is not None:
+            picture = self.undistorted(picture, view, path)
+        elif not same_aspect(picture.size, view.camera.size):
+            raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "
+                             f"{view.camera.width} x {view.camera.height}.")
+        picture = picture.resized(*size)
+        picture.pixels.flags.writeable = False
+        self._store(key, picture)
+        return picture
+
+    def _store(self, key: tuple[Path, tuple[int, int]], picture: Picture) -> None:
+        with self._lock:
+            if key in self._pictures or picture.pixels.nbytes > self._capacity:
+                return
+            self._pictures[key] = picture
+            self._used += picture.pixels.nbytes
+            while self._used > self._capacity:
+                _, old = self._pictures.popitem(last=False)
+                self._used -= old.pixels.nbytes
+
+    def undistorted(self, picture: Picture, view: View, path: Path) -> Picture:
+        """Undistort a picture of a view's file, whose lens is distorted. Raises FrameError."""
+        assert view.lens is not None
+        if not same_aspect(picture.size, view.camera.size):
+            raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "
+                             f"{view.camera.width} x {view.camera.height}.")
+        camera = view.camera.scaled(*picture.size)
+        key = (id(view.lens), picture.size, camera.fx)
+        with self._lock:
+            maps = self._maps.get(key)
+        if maps is None:
+            maps = view.lens.maps(camera)
+            with self._lock:
+                self._maps[key] = maps
+                while len(self._maps) > 4:
+                    self._maps.popitem(last=False)
+        return undistort_picture(picture, maps)
+
+    def upright(self, picture: Picture, view: View, path: Path) -> Picture:
+        """Turn a picture of a view's file by its Exif orientation where the view was solved from pixels as shown."""
+        orientation = read_exif(path)[0] if view.upright else 1
+        return picture if orientation == 1 else replace(picture, pixels=apply_orientation(picture.pixels, orientation))

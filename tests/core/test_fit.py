@@ -300,7 +300,7 @@ def test_far_flare_light_falls_where_the_scene_has_not_converged(capture: Captur
             camera = view.camera
             black = torch.zeros(camera.height, camera.width, 3)
             alone = composite(black, render_flare(trainer.flare, settings.blend, camera), settings.blend).detach()
-            light += float((alone.mean(-1) * (1 - light_proximity(camera, lights, settings.split.reach))).sum())
+            light += float((alone.mean(-1) * (1 - light_proximity(camera, lights, settings.split.light_radius))).sum())
         return light
 
     assert away(found=1e9) < 0.5 * away(found=0.0)
@@ -309,7 +309,7 @@ def test_far_flare_light_falls_where_the_scene_has_not_converged(capture: Captur
 def test_the_far_flare_penalty_grows_with_light_and_distance(capture: Capture) -> None:
     camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
     added = torch.full((camera.height, camera.width, 3), 0.1, requires_grad=True)
-    settings = SplitSettings(haze=2.0, reach=0.05)
+    settings = SplitSettings(far_flare_penalty=2.0, light_radius=0.05)
     loss = far_flare_penalty(added, None, 0.0, camera, lights, settings)
     far = torch.from_numpy(1 - light_proximity(camera, lights, 0.05))
     assert float(loss.detach()) == pytest.approx(2 * 0.1 * float(far.mean()), rel=1e-4)
@@ -324,8 +324,8 @@ def test_the_far_flare_penalty_exempts_more_of_an_estimate_the_nearer_convergenc
     camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
     added = torch.full((camera.height, camera.width, 3), 0.1)
     told = torch.linspace(-0.1, 0.3, added.numel()).reshape(added.shape)
-    settings = SplitSettings(haze=2.0, lost=10.0, found=20.0)
-    far = torch.from_numpy(1 - light_proximity(camera, lights, settings.reach))
+    settings = SplitSettings(far_flare_penalty=2.0, diverged_ratio=10.0, converged_ratio=20.0)
+    far = torch.from_numpy(1 - light_proximity(camera, lights, settings.light_radius))
     expected = 2 * ((0.1 - believed * told.clamp(min=0)).clamp(min=0) * far[..., None]).mean()
     penalty = far_flare_penalty(added, told, found, camera, lights, settings)
     assert float(penalty) == pytest.approx(float(expected), rel=1e-4)
@@ -431,7 +431,7 @@ def test_a_diverging_fit_fails_and_writes_no_result(tmp_path: Path, capture: Cap
     assert not (tmp_path / "run" / "scene.ply").exists()
 
 
-@pytest.mark.parametrize(("end", "name"), [(end, name) for name in FORM_BOUNDS for end in ("least", "most")])
+@pytest.mark.parametrize(("end", "name"), [(end, name) for name in FORM_BOUNDS for end in ("minimum", "maximum")])
 def test_a_form_at_its_bounds_is_fitted_and_read(tmp_path: Path, capture: Capture, end: str, name: str) -> None:
     value = getattr(FORM_BOUNDS[name], end)
     run = fit(capture, quick(1, **{f"flare.form.{name}": value}), tmp_path / "run")
@@ -630,17 +630,20 @@ def test_a_scene_only_iteration_has_no_composite_loss(tmp_path: Path) -> None:
     assert told[-1]["loss"] > 0
 
 
-@pytest.mark.parametrize("found", [True, False])
-def test_checkpoints_of_older_formats_restore_the_excess_ratio(capture: Capture, found: bool) -> None:
-    """It says until when the scene was alone, for longer where it had not been found; a later one whether it was."""
+@pytest.mark.parametrize("converged", [True, False])
+def test_checkpoints_of_older_formats_restore_the_excess_ratio(capture: Capture, converged: bool) -> None:
+    """The oldest hold the last scene-only iteration, later ones whether the scene converged, then `times_found`."""
     settings = override_settings(quick(120), {"mode": "split", "split.scene_only_rounds": 1})
     earlier, trainer = (Trainer(capture, settings) for _ in range(2))
     state = earlier.state()
-    del state["times_found"]
-    for told in ({"alone_until": len(earlier.views) if found else settings.iterations // 3}, {"scene_is_found": found}):
+    del state["excess_ratio"]
+    alone_until = len(earlier.views) if converged else settings.iterations // 3
+    for entry in ({"alone_until": alone_until}, {"scene_is_found": converged}):
         trainer._excess_ratio = 13.5
-        trainer.load_state({**state, **told})
-        assert trainer._excess_ratio == (MAX_EXCESS_RATIO if found else 0)
+        trainer.load_state({**state, **entry})
+        assert trainer._excess_ratio == (MAX_EXCESS_RATIO if converged else 0)
+    trainer.load_state({**state, "times_found": 7.25})
+    assert trainer._excess_ratio == 7.25
 
 
 def test_a_checkpoint_restores_state_outside_the_optimisers(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def load(path: Path | str) -> FlareFile:
     description = parse_description(path, metadata)
     try:
         return _unpack(description, tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError) as problem:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError, RuntimeError) as problem:
         raise FlareFileError(f"{path} is damaged: its tensors do not fit its description ({problem}).") from problem
 
 

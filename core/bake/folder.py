@@ -9,7 +9,10 @@ from pathlib import Path
 
 from ..errors import FrameError
 from ..images.exr import channel_names, exr_pixel_aspect, is_exr_truncated
+from ..images.formats import exr_header
 from ..images.size import picture_size
+from ..images.window import DataWindow
+from ..system.reading import open_regular
 
 _NUMBERED = re.compile(r"(.*?)(\d+)\.exr", re.IGNORECASE)
 
@@ -26,8 +29,9 @@ class LayerFolder:
         """Open a folder. Raises FrameError without numbered EXR files, for more than one sequence, and for frames that
         differ in layers.
 
-        Blender takes the layers of the first frame, and would show the others without theirs. Also raised for a
-        truncated file, of which Blender would show the part that exists.
+        Blender takes the layers of the first frame, and would show the others without theirs. It ignores data windows:
+        frames with other ones, or with a part of the frame, would lie elsewhere. Also raised for a truncated file, of
+        which Blender would show the part that exists.
         """
         folder = Path(folder).resolve()
         sequences: dict[str, dict[int, Path]] = {}
@@ -53,7 +57,32 @@ class LayerFolder:
                                for one, two in ((first, path), (path, first)))
                 raise FrameError(f"{folder} holds frames of two bakes: beside the layers of both {first.name} has "
                                  f"{here}, {path.name} {there}; bake each into a folder of its own.")
-        return cls(folder, files)
+        found = cls(folder, files)
+        found._check_windows()
+        return found
+
+    def _check_windows(self) -> None:
+        """Raise FrameError for layers that the compositor cannot show in their place."""
+        windows = {path: self.window(number) for number, path in self.files.items()}
+        partial = next((path for path, window in windows.items() if not window.holds_frame), None)
+        if partial is not None:
+            raise FrameError(f"{partial} stores a part of its frame, which Blender shows in another place; bake or "
+                             "transfer it again.")
+        first = self.files[self.first]
+        other = next((path for path, window in windows.items() if window != windows[first]), None)
+        if other is not None and not all(window.is_frame for window in windows.values()):
+            raise FrameError(f"{self.folder} holds layers whose data windows differ ({first.name}, {other.name}), and "
+                             "Blender shows these in other places; bake or transfer them again.")
+
+    def window(self, number: int | None = None) -> DataWindow:
+        """Return where the pixels of a frame, of the first by default, lie, from its header."""
+        path = self.files[self.first if number is None else number]
+        with open_regular(path) as stream:
+            corners = exr_header.window_corners(stream)
+        if len(corners) < 2:
+            raise FrameError(f"{path} has a damaged header; bake it again.")
+        (x0, y0, x1, y1), (left, top, right, bottom) = corners["dataWindow"], corners["displayWindow"]
+        return DataWindow((x1 - x0 + 1, y1 - y0 + 1), (x0 - left, y0 - top), (right - left + 1, bottom - top + 1))
 
     @property
     def first(self) -> int:

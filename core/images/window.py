@@ -32,6 +32,12 @@ class DataWindow:
         """True if the stored pixels are exactly the frame."""
         return self.size == self.frame and self.origin == (0, 0)
 
+    @property
+    def holds_frame(self) -> bool:
+        """True if all of the frame is stored."""
+        return all(origin <= 0 and origin + size >= frame
+                   for origin, size, frame in zip(self.origin, self.size, self.frame, strict=True))
+
     def oriented(self, orientation: int) -> DataWindow:
         """Return the window of a picture as viewers show it, by its Exif orientation; only whole frames have one."""
         if orientation < TRANSPOSED:

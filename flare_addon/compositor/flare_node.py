@@ -14,6 +14,8 @@ from typing import Any
 
 import bpy
 
+from ...core.images.window import DataWindow
+
 GROUP = "Fit Flare"
 GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
 MISSING_IS_MAGENTA = bpy.app.version < (4, 4, 0)
@@ -124,6 +126,21 @@ def scale_to_render_size(tree: Any, socket: Any, column: float, row: float) -> A
                             ("Extension Y", "Extend")):
             if name in node.inputs:
                 node.inputs[name].default_value = value
+    tree.links.new(socket, node.inputs["Image"])
+    return node
+
+
+def crop_to_frame(tree: Any, socket: Any, window: DataWindow, column: float, row: float) -> Any:
+    """Add a node that cuts the overscan of a picture off, since Blender ignores data windows; return it."""
+    node = new_node(tree, "CompositorNodeCrop", column, row)
+    (left, top), (width, height), (_, stored) = window.origin, window.frame, window.size
+    bottom = stored + top - height  # rows of overscan below the frame; Blender counts from there
+    if "Width" in node.inputs:
+        for name, value in (("X", -left), ("Y", bottom), ("Width", width), ("Height", height), ("Alpha Crop", False)):
+            node.inputs[name].default_value = value
+    else:  # until 4.4
+        node.use_crop_size = True
+        node.min_x, node.max_x, node.min_y, node.max_y = -left, width - left, bottom + height, bottom
     tree.links.new(socket, node.inputs["Image"])
     return node
 

@@ -22,6 +22,7 @@ from . import drivers
 from .flare_node import (
     GROUP,
     GROUPS_ARE_TREES,
+    crop_to_frame,
     find_node,
     layer_of_gain,
     new_node,
@@ -35,6 +36,8 @@ PLATE = "Fit Flare Footage"
 VIEWER = "Fit Flare Viewer"
 RENDER = "Fit Flare Render"
 SIZE = "Fit Flare Size"
+CROP = "Fit Flare Crop"
+"""Start of the names of the nodes that cut the overscan of the layers off, one for each layer."""
 _OUR_NODES = (GROUP, LAYERS, PLATE, SIZE, VIEWER, RENDER)
 STATE_PROPERTY = "fit_flare_compositor"  # of the scene: the state before the set-up
 _MAX_FRAMES = 1048574  # the limit of Blender; frames without a file have no flare
@@ -55,7 +58,7 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
                          "switch Crop to Render Region off in its output properties.")
     original = tree_of(scene)
     own_tree = _own_tree(scene)
-    if STATE_PROPERTY in scene and (own_tree is None or not any(name in own_tree.nodes for name in _OUR_NODES)):
+    if STATE_PROPERTY in scene and (own_tree is None or not any(map(_is_ours, own_tree.nodes))):
         del scene[STATE_PROPERTY]  # our nodes were deleted by hand, so the stored state is of another compositor
     state = _scene_state(scene)
     tree = own_tree or _new_tree(scene, keep_image)
@@ -93,12 +96,18 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
             node.inputs[name].default_value = value
             if feeder is not None:
                 tree.links.new(feeder, node.inputs[name])
+    _remove_crops(tree)
+    window = layers.window()
+    if not window.is_frame:
+        for row, name in enumerate(names if plate is not None or keep_image else ("scene", *names)):
+            cropped = _set_name(crop_to_frame(tree, sockets[name], window, -3.2, -0.7 * row), f"{CROP} {name}")
+            sockets[name] = cropped.outputs[0]
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
     end = _output_input(tree)
     before = _feeding_socket(end)
     is_set_up = before is not None and _depends_on(before.node, node)  # set up earlier, perhaps with nodes after it
-    if is_set_up or before is None or before.node.name in _OUR_NODES:
+    if is_set_up or before is None or _is_ours(before.node):
         before = _image_under_flare(tree, node, scene[STATE_PROPERTY])
     if before is not None:
         scene[STATE_PROPERTY].update({"from": before.node.name, "socket": before.identifier})
@@ -109,7 +118,7 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
         scene_socket = before or _render_node(tree).outputs["Image"]
     if (size := tree.nodes.get(SIZE)) is not None:
         tree.nodes.remove(size)
-    if scene_socket is not None and scene_socket.node.name in (LAYERS, PLATE):
+    if scene_socket is not None and (scene_socket.node.name in (LAYERS, PLATE) or _is_crop(scene_socket.node)):
         scene_socket = _set_name(scale_to_render_size(tree, scene_socket, -3, 1), SIZE).outputs[0]
     tree.links.new(scene_socket, node.inputs["Scene"])
     if not is_set_up or end.links[0].from_node == node:
@@ -118,6 +127,22 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
         viewer = _set_name(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
         tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
     return node
+
+
+def _is_crop(node: Any) -> bool:
+    """Return whether a node is one of ours that cut overscan off."""
+    return bool(node.name.startswith(CROP))
+
+
+def _is_ours(node: Any) -> bool:
+    """Return whether a node was added by `set_up`."""
+    return node.name in _OUR_NODES or _is_crop(node)
+
+
+def _remove_crops(tree: Any) -> None:
+    """Remove our nodes that cut overscan off."""
+    for node in [node for node in tree.nodes if _is_crop(node)]:
+        tree.nodes.remove(node)
 
 
 def _own_tree(scene: Any) -> Any:
@@ -177,7 +202,7 @@ def _image_under_flare(tree: Any, node: Any, state: Any) -> Any:
     feeder = tree.nodes.get(state["from"])
     stored = next((one for one in feeder.outputs if one.identifier == state["socket"]), None) if feeder else None
     for socket in (_feeding_socket(node.inputs.get("Scene")), stored):
-        if socket is not None and socket.node.name not in _OUR_NODES and not _depends_on(socket.node, node):
+        if socket is not None and not _is_ours(socket.node) and not _depends_on(socket.node, node):
             return socket
     return None
 
@@ -256,6 +281,7 @@ def remove(scene: Any) -> None:
     drivers.disconnect(scene)
     if not state.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
         tree.animation_data_clear()
+    _remove_crops(tree)
     for name in _OUR_NODES:
         ours = tree.nodes.get(name)
         if ours is not None and not (name == RENDER and any(one.is_linked for one in ours.outputs)):

@@ -73,6 +73,9 @@ def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, number
     render_settings.match_scene(scene, layers, layers.size())
     render = scene.render
     render.pixel_aspect_x, render.pixel_aspect_y = cameras.pixel_aspect(1, layers.pixel_aspect())
+    if not (window := layers.window()).is_frame:
+        progress.say(f"The layers have overscan ({window.size[0]} x {window.size[1]} pixels for a frame of "
+                     f"{window.frame[0]} x {window.frame[1]}), which Blender cannot show; its nodes cut it off.")
     for note in (render_settings.set_plain_view(scene), setup.colour_space_warning(scene)):
         if note:
             progress.say(note)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from core.colour import colour_space
 from core.colour.srgb import srgb_from_linear
 from core.images.exr import read_exr
 from core.images.read import read_picture
+from core.images.window import DataWindow
 from core.images.write import write_exr
 
 SCRIPTS = Path(__file__).parent / "scripts"
@@ -53,8 +55,20 @@ def made(blender: Blender, tmp_path_factory: pytest.TempPathFactory) -> Made:
     aces = colour_space("acescg")
     write_layers(base / "aces" / "layers.0000.exr", random_layers(0).in_space(aces), half=False, pixel_aspect=2.0,
                  chromaticities=aces.chromaticities)
-    facts = blender.run(SCRIPTS / "composite.py", layers, base / "fewer", base / "none", base / "aces", out, user=user)
+    window = DataWindow((SIZE[1], SIZE[0]), (-7, -2), (20, 15))
+    write_layers(base / "overscan" / "layers.0000.exr", replace(random_layers(5), window=window))
+    facts = blender.run(SCRIPTS / "composite.py", layers, base / "fewer", base / "none", base / "aces",
+                        base / "overscan", out, user=user)
     return Made(facts, layers, out, user)
+
+
+def test_overscan_is_cut_off_where_the_frame_begins(made: Made) -> None:
+    """Block of composite.py: "overscan, in the command and beside an artist's nodes"."""
+    composite = random_layers(5).composite[2:17, 7:27]
+    found = rgb(made.out / "overscan" / "frame.0000.exr")
+    np.testing.assert_allclose(found, composite, rtol=3 * HALF, atol=1e-3)  # of a file of halfs, and a sum of halfs
+    assert len(made.facts["crops"]) == 3
+    assert made.facts["crops after"] == made.facts["crops removed"] == []
 
 
 def baked(made: Made, number: int) -> FrameLayers:

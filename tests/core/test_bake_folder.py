@@ -2,8 +2,10 @@
 """Which folders of layers are put together."""
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from core.bake.exr import write_layers
 from core.bake.folder import LayerFolder
 from core.bake.layers import FrameLayers
 from core.errors import FrameError
+from core.images.window import DataWindow
 
 
 def frame(folder: Path, number: int, lights: Sequence[str]) -> Path:
@@ -34,6 +37,24 @@ def test_frames_with_other_layers_are_refused(tmp_path: Path) -> None:
     frame(tmp_path, 3, ["sun", "lamp"])
     with pytest.raises(FrameError, match=r"two bakes.*layers\.0001\.exr has none of its own, layers\.0003\.exr .*lamp"):
         LayerFolder.open(tmp_path)
+
+
+@pytest.mark.parametrize(("windows", "message"), [
+    ([((6, 4), (-1, -1), (4, 2)), ((6, 4), (-2, -1), (4, 2))], "data windows differ"),
+    ([((6, 4), (0, 0), (6, 4)), ((6, 4), (0, -1), (6, 3))], "data windows differ"),
+    ([((6, 4), (1, 0), (8, 4))], "a part of its frame"),
+    ([((6, 4), (-1, -1), (4, 2)), ((6, 4), (-1, -1), (4, 2))], ""),
+    ([((6, 4), (0, 0), (6, 4)), ((3, 2), (0, 0), (3, 2))], ""),  # pictures of several sizes
+])
+def test_layers_that_blender_would_show_elsewhere_are_refused(tmp_path: Path, windows: Sequence[Any],
+                                                              message: str) -> None:
+    for number, window in enumerate(windows, 1):
+        (width, height), _, _ = window
+        black = np.zeros((height, width, 3), np.float32)
+        write_layers(tmp_path / f"layers.{number:04d}.exr",
+                     FrameLayers(black, {"sun": black}, np.ones((height, width), np.float32), DataWindow(*window)))
+    with pytest.raises(FrameError, match=message) if message else contextlib.nullcontext():
+        assert LayerFolder.open(tmp_path).window() == DataWindow(*windows[0])
 
 
 def test_layers_in_subfolders_are_named(tmp_path: Path) -> None:

@@ -23,9 +23,14 @@ _MAX_ATTRIBUTE_BYTES = 1 << 20
 
 def windows(stream: BinaryIO) -> dict[str, tuple[int, int]]:
     """Return (width, height) of the "dataWindow" (stored pixels) and the "displayWindow" (the frame), where present."""
+    return {name: (x1 - x0 + 1, y1 - y0 + 1) for name, (x0, y0, x1, y1) in window_corners(stream).items()}
+
+
+def window_corners(stream: BinaryIO) -> dict[str, tuple[int, int, int, int]]:
+    """Return the first and last (x, y) of the "dataWindow" and the "displayWindow", where present."""
     attributes = _read_attributes(stream, {b"dataWindow": b"box2i", b"displayWindow": b"box2i"})
-    corners = {name: np.frombuffer(value, "<i4").tolist() for name, value in attributes.items() if len(value) == 16}
-    return {name.decode(): (x1 - x0 + 1, y1 - y0 + 1) for name, (x0, y0, x1, y1) in corners.items()}
+    return {name.decode(): tuple(np.frombuffer(value, "<i4").tolist()) for name, value in attributes.items()
+            if len(value) == 16}
 
 
 HALF = 1

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Inside Blender: build, rebuild, render. Arguments: folders of layers, of layers of fewer lights, of a picture without
-layers, of wide pixels in ACEScg, and the folder to write."""
+layers, of wide pixels in ACEScg, of overscan, and the folder to write."""
 from __future__ import annotations
 
 import importlib.util
@@ -26,7 +26,7 @@ from fit_flare.headless.commands import compose  # noqa: E402
 
 INTENSITY, TINT = 1.7, (1.0, 0.5, 0.25, 1.0)
 
-folder, fewer, none, aces, out = map(Path, sys.argv[1:6])
+folder, fewer, none, aces, overscan, out = map(Path, sys.argv[1:7])
 layers = LayerFolder.open(folder)
 
 
@@ -139,6 +139,18 @@ except FrameError as problem:
 compose.compose_frames(LayerFolder.open(aces), out / "aces", Progress())
 scene = bpy.context.scene
 facts["aces"] = [setup.colour_space_warning(scene), scene.render.pixel_aspect_x, scene.render.pixel_aspect_y]
+
+# ---- overscan, in the command and beside an artist's nodes ------------------------------------------
+compose.compose_frames(LayerFolder.open(overscan), out / "overscan", Progress())
+scene = bpy.context.scene
+setup.set_up(scene, LayerFolder.open(overscan))
+facts["crops"] = sorted(node.name for node in flare_node.tree_of(scene).nodes if node.name.startswith(setup.CROP))
+setup.set_up(scene, layers)
+facts["crops after"] = [node.name for node in flare_node.tree_of(scene).nodes if node.name.startswith(setup.CROP)]
+setup.set_up(scene, LayerFolder.open(overscan))
+setup.remove(scene)
+tree = flare_node.tree_of(scene)
+facts["crops removed"] = [node.name for node in tree.nodes if node.name.startswith("Fit Flare")] if tree else []
 
 # ---- a disk that fills up -------------------------------------------------------------------------
 if sys.platform == "linux":

@@ -395,21 +395,21 @@ def _plot(lines: dict[str, dict[str, float]], picture: Path) -> None:
 
 
 def peer_section(checkout: Path, rounds: int) -> str:
-    """OpenSplat's rasterizer beside ours."""
+    """Return the table of OpenSplat's rasterizer beside ours."""
     module, rows = opensplat.build(checkout), []
     threads = torch.get_num_threads()
     for case in PEER_CASES:
-        ours = Raster(case, our_rasterizer("cpu"), "cpu", "cpu")
-        means, quats, scales, opacities, sh = (value.detach() for value in ours.inputs)
-        seen_colours = colours(means, sh, 3)
-        camera = (ours.camera[0], ours.camera[1])
-        theirs = opensplat.Rasterizer(
-            module, means, quats, scales, opacities, seen_colours, camera, case.width, case.height, ours.upstream
+        our_raster = Raster(case, our_rasterizer("cpu"), "cpu", "cpu")
+        means, quats, scales, opacities, sh = (value.detach() for value in our_raster.inputs)
+        view_colours = colours(means, sh, 3)
+        camera = (our_raster.camera[0], our_raster.camera[1])
+        opensplat_scene = opensplat.Rasterizer(
+            module, means, quats, scales, opacities, view_colours, camera, case.width, case.height, our_raster.upstream
         )
         with torch.no_grad():
-            difference = float((theirs.picture() - ours.picture()).abs().mean())
-        work = {"peer": theirs.forward_backward, "1": on_threads(1, ours.forward_backward),
-                "all": on_threads(threads, ours.forward_backward)}
+            difference = float((opensplat_scene.picture() - our_raster.picture()).abs().mean())
+        work = {"peer": opensplat_scene.forward_backward, "1": on_threads(1, our_raster.forward_backward),
+                "all": on_threads(threads, our_raster.forward_backward)}
         times = median_times(work, rounds)
         ratios = [_ratio(times["peer"], times[key]) for key in ("1", "all")]
         rows.append([str(case), *[milliseconds(times[key]) for key in work], *ratios, f"{difference:.1e}"])

@@ -34,7 +34,7 @@ from core.fit.run import Run
 from core.flare.compositing import composite, concatenate
 from core.flare.deformation import QueryRange
 from core.flare.model import OURS, PAPER, FlareModel, LightFlare
-from core.flare.placement import PlaneGaussians, pixel_arcs, pixels
+from core.flare.placement import PlaneGaussians, arcs_to_pixels, to_pixels
 from core.gaussians import SceneGaussians, kernels, splat
 from core.look.form import FlareForm
 
@@ -112,13 +112,13 @@ def stages(
         return scene.render(camera, kernels=kernel_set, depth=False).colour  # type: ignore[arg-type]
 
     flare = evaluate_flares()
-    pixel_gaussians = pixels(flare, intrinsics)
-    arcs = None if flare.arcs is None else pixel_arcs(flare.arcs, pixel_gaussians[1], intrinsics)
+    pixel_gaussians = to_pixels(flare, intrinsics)
+    arcs = None if flare.arcs is None else arcs_to_pixels(flare.arcs, pixel_gaussians[1], intrinsics)
     behind, front = render_scene(), splat(
         *pixel_gaussians, flare.opacities, flare.colours, width, height, blend=rendered.blend, kernels=kernel_set  # type: ignore[arg-type]
     )
     work: tuple[Callable[[], object], ...] = (
-        evaluate_flares, lambda: pixels(flare, intrinsics), raster("full"), raster("mixed"), render_scene,
+        evaluate_flares, lambda: to_pixels(flare, intrinsics), raster("full"), raster("mixed"), render_scene,
         lambda: composite(behind, front, rendered.blend),
     )  # fmt: skip
     return dict(zip(STAGES, work, strict=True))

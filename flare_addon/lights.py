@@ -114,8 +114,8 @@ def write_to_capture(scene: Any, folder: Path) -> int:
         raise CaptureError("There are no lights to fit a flare to; add one, or find them in the frames.")
     names = [light_name(item) for item in objects]
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise CaptureError(f"Two lights have the name {twice!r}; rename one in the panel Lights.")
+        duplicate = next(name for name in names if names.count(name) > 1)
+        raise CaptureError(f"Two lights have the name {duplicate!r}; rename one in the panel Lights.")
     path = folder / LIGHTS
     data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
     known = {entry.get("name"): entry for entry in data.get("lights", []) if isinstance(entry, dict)}

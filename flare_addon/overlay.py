@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FitFlareError
-from ..core.look import Look, PlaneGaussians, pixels
+from ..core.look import Look, PlaneGaussians, to_pixels
 from ..core.look.drawing import OPACITY_MAX, extent
-from ..core.look.plane import arc_log_peak, concatenate, pixel_arcs
+from ..core.look.plane import arc_log_peak, arcs_to_pixels, concatenate
 from . import cameras, looks
 
 LEVELS = (1, 2, 4, 8, 16)
@@ -158,8 +158,8 @@ def touch_region(centres: Floats, covariances: Floats, radii: Floats, width: int
 def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -> dict[int, Quads]:
     """Return the quads of Gaussians by level (the divisor of the size), in pixels of the level and drawing order."""
     blend = look.blend
-    centres, covariances = pixels(gaussians, window.intrinsics, look.pixel_grid)
-    radii, arcs = extent(gaussians, blend), pixel_arcs(gaussians, window.intrinsics)
+    centres, covariances = to_pixels(gaussians, window.intrinsics, look.pixel_grid)
+    radii, arcs = extent(gaussians, blend), arcs_to_pixels(gaussians, window.intrinsics)
     rows = np.flatnonzero(touch_region(centres, covariances, radii, window.width, window.height))
     opacities = gaussians.opacities if blend == "add" else np.minimum(gaussians.opacities, OPACITY_MAX)
     rings = gaussians.rings
@@ -230,39 +230,41 @@ def _sum_shader() -> Any:
     import gpu
 
     flow = gpu.types.GPUStageInterfaceInfo("fit_flare_sum")
-    flow.smooth("VEC2", "at")
+    flow.smooth("VEC2", "position")
     info = gpu.types.GPUShaderCreateInfo()
     info.push_constant("VEC4", "box")
     info.push_constant("VEC2", "extent")
-    info.push_constant("FLOAT", "covers")
+    info.push_constant("FLOAT", "is_display")
     for number in range(len(LEVELS)):
         info.sampler(number, "FLOAT_2D", f"level{number}")
     info.vertex_in(0, "VEC2", "corner")
     info.vertex_out(flow)
     info.fragment_out(0, "VEC4", "result")
     info.vertex_source("void main() {\n"
-                       "  at = corner;\n"
+                       "  position = corner;\n"
                        "  gl_Position = vec4(mix(box.xy, box.zw, corner) * 2.0 - 1.0, 0.0, 1.0);\n"
                        "}\n")
     # Texels are filtered here, so that the result does not depend on the settings of a texture. The size of a level is
     # rounded up, so its rows are counted from the top, where the picture begins.
-    picked = "".join(f"  sum += pick(level{number}, extent / {divisor}.0);\n" for number, divisor in enumerate(LEVELS))
-    info.fragment_source("vec3 pick(sampler2D picture, vec2 covered) {\n"
+    samples = "".join(f"  sum += bilinear(level{number}, extent / {divisor}.0);\n"
+                      for number, divisor in enumerate(LEVELS))
+    info.fragment_source("vec3 bilinear(sampler2D picture, vec2 covered) {\n"
                          "  ivec2 size = textureSize(picture, 0);\n"
-                         "  vec2 where = vec2(at.x * covered.x, float(size.y) - (1.0 - at.y) * covered.y) - 0.5;\n"
-                         "  ivec2 low = ivec2(floor(where));\n"
-                         "  vec2 share = where - vec2(low);\n"
-                         "  ivec2 most = size - 1;\n"
-                         "  vec3 a = texelFetch(picture, clamp(low, ivec2(0), most), 0).rgb;\n"
-                         "  vec3 b = texelFetch(picture, clamp(low + ivec2(1, 0), ivec2(0), most), 0).rgb;\n"
-                         "  vec3 c = texelFetch(picture, clamp(low + ivec2(0, 1), ivec2(0), most), 0).rgb;\n"
-                         "  vec3 d = texelFetch(picture, clamp(low + ivec2(1, 1), ivec2(0), most), 0).rgb;\n"
-                         "  return mix(mix(a, b, share.x), mix(c, d, share.x), share.y);\n"
+                         "  float y = float(size.y) - (1.0 - position.y) * covered.y;\n"
+                         "  vec2 texel = vec2(position.x * covered.x, y) - 0.5;\n"
+                         "  ivec2 low = ivec2(floor(texel));\n"
+                         "  vec2 weight = texel - vec2(low);\n"
+                         "  ivec2 last = size - 1;\n"
+                         "  vec3 a = texelFetch(picture, clamp(low, ivec2(0), last), 0).rgb;\n"
+                         "  vec3 b = texelFetch(picture, clamp(low + ivec2(1, 0), ivec2(0), last), 0).rgb;\n"
+                         "  vec3 c = texelFetch(picture, clamp(low + ivec2(0, 1), ivec2(0), last), 0).rgb;\n"
+                         "  vec3 d = texelFetch(picture, clamp(low + ivec2(1, 1), ivec2(0), last), 0).rgb;\n"
+                         "  return mix(mix(a, b, weight.x), mix(c, d, weight.x), weight.y);\n"
                          "}\n"
                          "void main() {\n"
-                         "  vec3 sum = vec3(0.0);\n" + picked +
+                         "  vec3 sum = vec3(0.0);\n" + samples +
                          "  sum = max(sum, vec3(0.0));\n"
-                         "  if (covers > 0.5) {\n"  # display values to linear light
+                         "  if (is_display > 0.5) {\n"  # display values to linear light
                          "    sum = mix(sum / 12.92, pow((sum + 0.055) / 1.055, vec3(2.4)), "
                          "step(vec3(0.04045), sum));\n"
                          "  }\n"
@@ -333,7 +335,7 @@ def composite(drawn: list[Any], box: tuple[float, float, float, float], blend: s
     shader.bind()
     shader.uniform_float("box", box)
     shader.uniform_float("extent", (window.width, window.height))
-    shader.uniform_float("covers", 1.0 if blend == "over" else 0.0)
+    shader.uniform_float("is_display", 1.0 if blend == "over" else 0.0)
     for number, offscreen in enumerate(drawn):
         shader.uniform_sampler(f"level{number}", offscreen.texture_color)
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)

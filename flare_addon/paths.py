@@ -55,16 +55,16 @@ def _relative(path: Path, blend: str) -> str:
 
 
 @bpy.app.handlers.persistent
-def _remap(blend: str, *_: object) -> None:
+def _update_relative_paths(blend: str, *_: object) -> None:
     """Before a save: make relative paths relative to the new file; on the first save make all paths relative."""
     _paths_before_save.clear()
-    first = not bpy.data.filepath
-    if not blend or (not first and Path(blend).parent == Path(bpy.data.filepath).parent):
+    is_first_save = not bpy.data.filepath
+    if not blend or (not is_first_save and Path(blend).parent == Path(bpy.data.filepath).parent):
         return
     for scene in (scene for scene in bpy.data.scenes if scene.library is None):
         for name in PATH_PROPERTIES:
             text = getattr(scene.fit_flare, name)
-            if text and text.startswith("//") != first:
+            if text and text.startswith("//") != is_first_save:
                 _paths_before_save[scene.name, name] = text
                 setattr(scene.fit_flare, name, _relative(absolute(text), blend))
 
@@ -79,7 +79,7 @@ def _restore(blend: str, *_: object) -> None:
 
 
 @bpy.app.handlers.persistent
-def _remap_appended(context: Any, *_: object) -> None:
+def _update_appended_paths(context: Any, *_: object) -> None:
     """After scenes of another .blend were appended: make their paths relative to this file."""
     for item in context.import_items:
         if item.id_type != "SCENE" or item.id is None or item.id.library is not None or item.source_library is None:
@@ -90,9 +90,9 @@ def _remap_appended(context: Any, *_: object) -> None:
                 setattr(item.id.fit_flare, name, blend_relative(absolute(text, item.source_library)))
 
 
-_HANDLERS = [("save_pre", _remap), ("save_post", _restore), ("save_post_fail", _restore)]
+_HANDLERS = [("save_pre", _update_relative_paths), ("save_post", _restore), ("save_post_fail", _restore)]
 if hasattr(bpy.app.handlers, "blend_import_post"):  # from 4.3 on
-    _HANDLERS.append(("blend_import_post", _remap_appended))
+    _HANDLERS.append(("blend_import_post", _update_appended_paths))
 
 
 def register() -> None:

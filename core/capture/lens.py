@@ -75,16 +75,16 @@ class Lens:
     @property
     def focal(self) -> tuple[float, float]:
         """(fx, fy) in pixels."""
-        named = self.parameters
+        parameters = self.parameters
         if self.model == "EQUIRECTANGULAR":
             return self.width / (2 * math.pi), self.height / math.pi
-        return named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
+        return parameters.get("fx", parameters.get("f", 0.0)), parameters.get("fy", parameters.get("f", 0.0))
 
     @property
     def centre(self) -> tuple[float, float]:
         """(cx, cy), the principal point in pixels."""
-        named = self.parameters
-        return named.get("cx", self.width / 2), named.get("cy", self.height / 2)
+        parameters = self.parameters
+        return parameters.get("cx", self.width / 2), parameters.get("cy", self.height / 2)
 
     def distort(self, plane: ArrayLike) -> Floats:
         """Map directions (n, 2) as X/Z and Y/Z to pixels (n, 2); NaN where the model has no image."""
@@ -187,8 +187,8 @@ class Lens:
         pixels = self.distort((steps * border).reshape(-1, 2)).reshape(16, -1, 2)
         reach = np.linalg.norm(pixels - self.distort(np.zeros((1, 2))), axis=2)
         inside = (pixels[-1] >= -1e-6) & (pixels[-1] <= np.array([self.width, self.height]) + 1e-6)
-        away = reach[-1] > 1e-9  # a border point on the principal point itself is not further out
-        return bool(inside.all() and (np.diff(reach, axis=0) > 0)[:, away].all())
+        is_outward = reach[-1] > 1e-9  # a border point on the principal point itself is not further out
+        return bool(inside.all() and (np.diff(reach, axis=0) > 0)[:, is_outward].all())
 
 
 def undistort_picture(picture: Picture, maps: tuple[NDArray[np.float32], NDArray[np.float32]]) -> Picture:

@@ -143,11 +143,13 @@ class FitInputs:
 
     def _digest(self, view: View) -> str:
         capture, camera = self._capture, view.camera
-        files = [capture.frame_path(view), *([capture.removed_path(view)] if self._removed else [])]
-        rotation, place = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-        numbers = [*np.round(rotation, 5).ravel() + 0.0, *place, camera.fx, camera.fy, camera.cx, camera.cy]
-        what = [*map(content_hash, files), *(f"{number:.5g}" for number in numbers), str(view.lens)]
-        return hashlib.blake2b(" ".join(what).encode(), digest_size=8).hexdigest()
+        mask = capture.mask_path(view)
+        files = [capture.frame_path(view), *([capture.removed_path(view)] if self._removed else []),
+                 *([] if mask is None else [mask])]
+        rotation, position = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        numbers = [*np.round(rotation, 5).ravel() + 0.0, *position, camera.fx, camera.fy, camera.cx, camera.cy]
+        inputs = [*map(content_hash, files), *(f"{number:.5g}" for number in numbers), str(view.lens)]
+        return hashlib.blake2b(" ".join(inputs).encode(), digest_size=8).hexdigest()
 
 
 def _describe_change(old: list[Any], new: list[Any], tolerance: float) -> str:
@@ -158,6 +160,6 @@ def _describe_change(old: list[Any], new: list[Any], tolerance: float) -> str:
     before, after = ([name for name, _ in lights] for lights in (old, new))
     if before != after:
         return f"its lights were {', '.join(map(repr, before))}, and are {', '.join(map(repr, after))} now"
-    return next((f"{name!r} was at {was}, and is at {now} now"
-                 for (name, was), (_, now) in zip(old, new, strict=True)
-                 if not np.allclose(was, now, rtol=1e-6, atol=tolerance)), "")
+    return next((f"{name!r} was at {old_position}, and is at {new_position} now"
+                 for (name, old_position), (_, new_position) in zip(old, new, strict=True)
+                 if not np.allclose(old_position, new_position, rtol=1e-6, atol=tolerance)), "")

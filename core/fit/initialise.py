@@ -52,6 +52,7 @@ def _load_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...]
         scene = read_ply(settings.scene.start)
         if not len(scene):
             raise CaptureError(f"{settings.scene.start} holds no Gaussians; export it again.")
+        _check_in_view(scene, views, settings.scene.start)
         for parameter in scene.parameters():
             parameter.requires_grad_(not settings.scene.frozen)
         if not settings.scene.frozen:
@@ -63,13 +64,24 @@ def _load_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...]
     return SceneGaussians.from_points(add_sky_points(capture, views, frames) if sky else capture.points)
 
 
+def _check_in_view(scene: SceneGaussians, views: tuple[View, ...], path: str) -> None:
+    """Raise CaptureError where no view has a Gaussian of the scene on its frame: it is of another world."""
+    means = scene.means.detach().numpy()
+    for points in (means[::max(len(means) // SAMPLED_POINTS, 1)], means):
+        if any(view.camera.contains(*view.camera.project(points)).any() for view in views):
+            return
+    raise CaptureError(f"{path}: none of its {len(scene)} Gaussians is in any view of the capture, so it is of another "
+                       "world; export it in the world of the cameras (for nerfstudio: --orientation-method none "
+                       "--center-method none --auto-scale-poses False).")
+
+
 def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings) -> FlareModel:
     """Return the flare model that a fit starts from. Raises CaptureError without lights, or if one is behind all
     cameras."""
     if not capture.lights:
-        there = (capture.folder / LIGHTS).exists()
+        is_listed = (capture.folder / LIGHTS).exists()
         raise CaptureError(f"{capture.folder / LIGHTS} lists no light; add one by hand, or fit with --mode 3dgs."
-                           if there else
+                           if is_listed else
                            f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
     generator = torch.Generator().manual_seed(settings.seed)
     positions = torch.tensor([list(map(float, light.xyz)) for light in capture.lights], dtype=torch.float64)
@@ -80,15 +92,16 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
     elif settings.flare.snap_lights and frames.reference:
         positions = torch.from_numpy(snap_lights(_snap_views(views, frames), positions.numpy()))
     poses = [torch.from_numpy(view.camera.world_to_camera) for view in views]
-    reach = max(view.camera.corner_radius for view in views)
+    corner_radius = max(view.camera.corner_radius for view in views)
     flares = []
     for light, xyz in zip(capture.lights, positions, strict=True):
-        in_front = [one for one in (ViewOfLight.of(pose, xyz) for pose in poses) if one.depth > 0]
+        light_views = [ViewOfLight.of(pose, xyz) for pose in poses]
+        in_front = [view for view in light_views if view.depth > 0]
         if not in_front:
             raise CaptureError(f"The light {light.name!r} is behind the camera in every view of {capture.folder}; "
                                "correct or remove it in lights.json.")
-        cameras, places = (torch.stack([getattr(one, name) for one in in_front]) for name in ("camera", "light"))
-        query = QueryRange.of(cameras, places, reach)
+        query = QueryRange.of(torch.stack([view.camera for view in in_front]),
+                              torch.stack([view.light for view in in_front]), corner_radius)
         flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator, settings.flare.opacity))
     return FlareModel([light.name for light in capture.lights], positions, flares)
 

@@ -62,7 +62,7 @@ def measure_exposures(capture: Capture, frames: Frames, progress: Progress | Non
         return {}
     filled = _fill_unmeasured(stops, [Path(view.name).parent for view in capture.views]) - np.nanmedian(stops)
     times = 2 ** filled.clip(math.log2(MIN_EXPOSURE), -math.log2(MIN_EXPOSURE))
-    return {view.name: round(float(one), 6) for view, one in zip(capture.views, times, strict=True)}
+    return {view.name: round(float(time), 6) for view, time in zip(capture.views, times, strict=True)}
 
 
 def _fill_unmeasured(stops: Floats, folders: Sequence[Path]) -> Floats:
@@ -70,10 +70,10 @@ def _fill_unmeasured(stops: Floats, folders: Sequence[Path]) -> Floats:
     one camera."""
     usable = np.flatnonzero(np.isfinite(stops))
 
-    def nearest(at: int) -> int:
-        return int(min(usable, key=lambda other: (folders[other] != folders[at], abs(other - at))))
+    def nearest(index: int) -> int:
+        return int(min(usable, key=lambda other: (folders[other] != folders[index], abs(other - index))))
 
-    return np.asarray(stops[[nearest(at) for at in range(len(stops))]])
+    return np.asarray(stops[[nearest(index) for index in range(len(stops))]])
 
 
 def spread(stops: Floats) -> float:
@@ -121,6 +121,8 @@ class PointObservations:
             camera, frame, clean = frames.targets(view)
             inside, observed = sample_colours(capture.points.xyz[chosen], camera, frame if clean is None else clean)
             usable = ((observed > MIN_LEVEL) & (observed < MAX_LEVEL)).all(-1)
+            if (mask := frames.mask(view)) is not None:
+                usable &= sample_colours(capture.points.xyz[chosen], camera, mask)[1]
             points = chosen[inside][usable]
             light = linear_from_srgb(observed[usable]).astype(np.float64) @ LUMINANCE
             parts.append((np.full(len(points), number), points, light))
@@ -142,11 +144,11 @@ class PointObservations:
     def _initial_luminances(self) -> Floats:
         """Estimate the luminance of each point in a view of the usual exposure, by index, without veils."""
         light, stops = np.log2(self.light), np.zeros(self.count)
-        most = int(self.points.max(initial=-1)) + 1
+        count = int(self.points.max(initial=-1)) + 1
         for _ in range(MAX_ROUNDS):
-            before, luminances = stops, _group_medians(light - stops[self.views], self.points, most)
+            previous, luminances = stops, _group_medians(light - stops[self.views], self.points, count)
             stops = _group_medians(light - luminances[self.points], self.views, self.count)
-            if np.allclose(before, stops, atol=TOLERANCE, equal_nan=True):
+            if np.allclose(previous, stops, atol=TOLERANCE, equal_nan=True):
                 break
         return np.asarray(2**luminances)
 

@@ -33,16 +33,16 @@ def write_preview(path: Path, rows: Sequence[NDArray[np.float32]]) -> None:
     """Write rows below each other as PNG; their widths may differ by a pixel or two of rounding."""
     if not rows:
         return
-    width = min(one.shape[1] for one in rows)
+    width = min(row.shape[1] for row in rows)
     gap = np.full((GAP, width, 3), 0.5, np.float32)
-    strips = [part for one in rows for part in (one[:, :width], gap)]
+    strips = [part for row in rows for part in (row[:, :width], gap)]
     write_png(path, np.concatenate(strips[:-1], axis=0))
 
 
 def write_small_preview(path: Path, strip: NDArray[np.float32]) -> None:
     """Write one view's composite above its flare, small enough for a panel that reads it again and again."""
     width = (strip.shape[1] - 3 * GAP) // 4
-    composite, flare = (strip[:, at * (width + GAP):at * (width + GAP) + width] for at in (1, 3))
+    composite, flare = (strip[:, index * (width + GAP):index * (width + GAP) + width] for index in (1, 3))
     both = np.ascontiguousarray(np.concatenate([composite, flare]), np.float32)
     share = min(MAX_SMALL_SIDE / max(both.shape[:2]), 1.0)
     picture = Picture(both, "srgb").resized(max(round(both.shape[1] * share), 1), max(round(both.shape[0] * share), 1))

@@ -128,8 +128,8 @@ def _evaluate_edited(look: Look, edits: LookEdits, camera: Camera,
             visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
     """Return each light's Gaussians under an artist's edits."""
     visible = {name: float(share) for name, share in (visibilities or {}).items()}
-    shown = look.evaluate(camera.world_to_camera, edits=edits, visibilities=visible)
-    return {name: as_tensors(gaussians) for name, gaussians in shown.items()}
+    gaussians_by_light = look.evaluate(camera.world_to_camera, edits=edits, visibilities=visible)
+    return {name: as_tensors(gaussians) for name, gaussians in gaussians_by_light.items()}
 
 
 def splat_look(look: Look, gaussians: LookGaussians, camera: Camera) -> Splats:

@@ -35,8 +35,8 @@ def add_sky_points(capture: Capture, views: tuple[View, ...], frames: Frames) ->
     view_colours = np.full((len(sampled), SKY_POINTS, 3), np.nan, np.float32)
     for row, view in zip(view_colours, sampled, strict=True):
         camera, frame, _ = frames.targets(view)
-        inside, shown = sample_colours(xyz, camera, frame)
-        row[inside] = expose(torch.from_numpy(shown), 1 / camera.exposure).numpy()
+        inside, observed = sample_colours(xyz, camera, frame)
+        row[inside] = expose(torch.from_numpy(observed), 1 / camera.exposure).numpy()
     is_seen = np.isfinite(view_colours[..., 0]).any(0)
     colours = np.nanquantile(view_colours[:, is_seen], COLOUR_QUANTILE, axis=0)
     rgb = np.concatenate([points.rgb, (colours.clip(0, 1) * 255 + 0.5).astype(np.uint8)])

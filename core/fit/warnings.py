@@ -76,7 +76,7 @@ def outlier_warnings(losses: Mapping[str, float]) -> tuple[str, ...]:
 
 def moved_light_warnings(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
     """Return a sentence for each light that the fit moved from its position in the capture."""
-    away = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
+    distances = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
             zip(capture.lights, flare.positions.numpy(), strict=True)]
     return tuple(f"The light {light.name!r} was moved to its flare, {distance:.3g} units from where lights.json has it."
-                 for light, distance in zip(capture.lights, away, strict=True) if distance > 0)
+                 for light, distance in zip(capture.lights, distances, strict=True) if distance > 0)

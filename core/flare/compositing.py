@@ -35,8 +35,8 @@ def splat_flare(gaussians: PlaneGaussians, intrinsics: Tensor, width: int, heigh
     The colour is in display space for `over` and scene-linear for `add`. pixel_grid: the grid at which the flare was
     fitted, so that it looks alike at every size. exposure: factor on the fitted light.
     """
-    centres, covariances = placement.pixels(gaussians, intrinsics, pixel_grid)
-    arcs = None if gaussians.arcs is None else placement.pixel_arcs(gaussians.arcs, covariances, intrinsics)
+    centres, covariances = placement.to_pixels(gaussians, intrinsics, pixel_grid)
+    arcs = None if gaussians.arcs is None else placement.arcs_to_pixels(gaussians.arcs, covariances, intrinsics)
     colours = gaussians.colours if exposure == 1 else colour_scale(exposure, blend) * gaussians.colours
     return splat(centres, covariances, gaussians.opacities, colours, width, height,
                  rings=gaussians.rings, arcs=arcs, blend=blend, kernels=kernels, resolution=resolution)

@@ -2,8 +2,8 @@
 """Places flare Gaussians in the picture (paper, section "Flare Representation").
 
 Everything is in normalised image coordinates (x/z, y/z, origin at the principal point p, y down), so a flare does not
-depend on resolution and a change of focal length moves it as a lens would. A camera's intrinsics enter in `pixels` and
-`pixel_arcs` only. `core.look.plane` has the same in numpy.
+depend on resolution and a change of focal length moves it as a lens would. A camera's intrinsics enter in `to_pixels`
+and `arcs_to_pixels` only. `core.look.plane` has the same in numpy.
 """
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ def arcs_of_ellipse(arcs: Tensor, log_scales: Tensor, directions: Tensor) -> Ten
     """Return arcs (n, 2) on the plane of arcs (n, 2) in deviations along the axes: R diag(s) a, so that |a| is the
     strength beta at every size."""
     axis = functional.normalize(directions, dim=-1, eps=1e-12)
-    along, aside = (arcs * log_scales.exp()).unbind(-1)
-    return along[:, None] * axis + aside[:, None] * torch.stack([-axis[:, 1], axis[:, 0]], -1)
+    along, across = (arcs * log_scales.exp()).unbind(-1)
+    return along[:, None] * axis + across[:, None] * torch.stack([-axis[:, 1], axis[:, 0]], -1)
 
 
 def opacity_gain(arcs: Tensor, rings: Tensor) -> Tensor:
@@ -94,20 +94,21 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
-def pixels(gaussians: PlaneGaussians, intrinsics: Tensor, pixel_grid: PixelGrid | None = None) -> tuple[Tensor, Tensor]:
-    """Return centres (n, 2) px and covariances (n, 3) px^2 under intrinsics (3, 3), with the low-pass added.
+def to_pixels(gaussians: PlaneGaussians, intrinsics: Tensor,
+              pixel_grid: PixelGrid | None = None) -> tuple[Tensor, Tensor]:
+    """Return centres (n, 2) px and covariances (n, 3) px^2 under intrinsics (3, 3), with the low-pass filter added.
 
-    The low-pass is that of the pixel grid at which they were fitted, where it is known.
+    pixel_grid: the one at which the Gaussians were fitted; None for the default low-pass filter.
     """
     focal, centre = intrinsics.diagonal()[:2], intrinsics[:2, 2]
     fx, fy = focal
     stretch = torch.stack([fx * fx, fx * fy, fy * fy])
-    wide = dilation(pixel_grid, math.sqrt(float(fx * fy)))
-    low_pass = torch.tensor([wide, 0.0, wide], dtype=stretch.dtype, device=stretch.device)
+    variance = dilation(pixel_grid, math.sqrt(float(fx * fy)))
+    low_pass = torch.tensor([variance, 0.0, variance], dtype=stretch.dtype, device=stretch.device)
     return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass
 
 
-def pixel_arcs(arcs: Tensor, covariances: Tensor, intrinsics: Tensor) -> Tensor:
+def arcs_to_pixels(arcs: Tensor, covariances: Tensor, intrinsics: Tensor) -> Tensor:
     """Return b (n, 2), px^-1, of arcs (n, 2) on the plane, for Gaussians of covariances (n, 3), px^2, under intrinsics.
 
     With the low-pass in the covariance it is exact for a plain Gaussian, whose mean an arc shifts: the shift stays. In

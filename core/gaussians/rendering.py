@@ -107,7 +107,8 @@ def extent(
 
 
 def record_gradient(centres: Tensor, index: Tensor, n: int) -> Tensor:
-    """Return (n, 2) zeros, to which backward adds the gradients by the centres (m, 2) of the Gaussians `index`."""
+    """Return (n, 2) zeros; the backward pass adds the gradients with respect to `centres` (m, 2) in the rows `index`.
+    """
     gradients = torch.zeros(n, 2, dtype=torch.float32, device=centres.device)
 
     def record(gradient: Tensor) -> None:

@@ -97,14 +97,14 @@ def write_findings(capture: Capture, findings: Findings, keep: bool = False) -> 
 
     views = [(view.name, view.camera) for view in capture.views]
     entries = write_lights(capture.folder / LIGHTS, findings.lights, views, keep)
-    named = [(str(entry["name"]), _light_of_entry(entry, findings.lights)) for entry in entries]
-    sheets = write_overlay_sheets(capture.folder / SHEETS, capture, findings.detections, named)
+    lights_by_name = [(str(entry["name"]), _light_of_entry(entry, findings.lights)) for entry in entries]
+    sheets = write_overlay_sheets(capture.folder / SHEETS, capture, findings.detections, lights_by_name)
     report = {
         "lights": entries, "says": findings.messages,
         "doubtful": [{"xyz": light.xyz.round(5).tolist(), "far": light.far, "support": list(light.support),
                       "residual_px": round(light.residual, 3), "uncertainty": _round_finite(light.uncertainty)}
                      for light in findings.doubtful],
-        "support": {name: list(light.support) for name, light in named},
+        "support": {name: list(light.support) for name, light in lights_by_name},
         "views": [{"name": view.name, "detections": [
             {"xy": detection.xy.round(3).tolist(), "radius": round(detection.radius, 2),
              "score": round(detection.score, 3), "cut": detection.is_cut} for detection in in_view]}

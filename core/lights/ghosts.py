@@ -66,8 +66,8 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
         window = 2 * max(1, round(radius)) + 1
         peak = (stands_out == cv2.dilate(stands_out, np.ones((window, window), np.uint8))) & (stands_out > 0.004)
         for y, x in np.argwhere(peak):
-            at = np.array([(x + 0.5) / size[0] * width, (y + 0.5) / size[1] * height])
-            candidates.append(Blob(at, float(radius / scale), float(stands_out[y, x])))
+            xy = np.array([(x + 0.5) / size[0] * width, (y + 0.5) / size[1] * height])
+            candidates.append(Blob(xy, float(radius / scale), float(stands_out[y, x])))
     strongest: list[Blob] = []
     for blob in sorted(candidates, key=lambda blob: -blob.strength):
         if all(np.linalg.norm(blob.xy - other.xy) > 0.7 * other.radius for other in strongest):

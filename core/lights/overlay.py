@@ -53,8 +53,8 @@ def _draw_tile(capture: Capture, number: int, detections: Sequence[Detection],
     size = (TILE_WIDTH, round(view.camera.height * scale))
     tile = np.ascontiguousarray(capture.frame(view).resized(*size).display())
     for detection in detections:
-        at = tuple(int(x) for x in detection.xy * scale)
-        cv2.circle(tile, at, max(4, round(detection.radius * scale) + 3), RING_COLOUR, 1, cv2.LINE_AA)
+        centre = tuple(int(x) for x in detection.xy * scale)
+        cv2.circle(tile, centre, max(4, round(detection.radius * scale) + 3), RING_COLOUR, 1, cv2.LINE_AA)
     for i, (name, light) in enumerate(lights):
         colour = PALETTE[i % len(PALETTE)]
         pixels, depth = view.camera.project(light.xyz[None])
@@ -67,9 +67,9 @@ def _draw_tile(capture: Capture, number: int, detections: Sequence[Detection],
             cv2.putText(tile, name, (int(x) + 9, int(y) - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
         else:
             middle = np.array(size) / 2
-            away = np.array([x, y]) - middle
-            tip = middle + away * min((middle - 6) / np.maximum(np.abs(away), 1e-9))
-            tail = tip - 16 * away / np.linalg.norm(away)
+            offset = np.array([x, y]) - middle
+            tip = middle + offset * min((middle - 6) / np.maximum(np.abs(offset), 1e-9))
+            tail = tip - 16 * offset / np.linalg.norm(offset)
             cv2.arrowedLine(tile, tuple(map(int, tail)), tuple(map(int, tip)), colour, 1, cv2.LINE_AA, tipLength=0.4)
     cv2.putText(tile, view.name, (4, size[1] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (1.0, 1.0, 1.0), 1, cv2.LINE_AA)
     return np.asarray(tile, np.float32)

@@ -51,10 +51,10 @@ def refine_until_stable(observations: Observations, place: Floats, remaining: ND
         if len(inliers) < 2:
             break
         place, covariance = _refine(observations, place, inliers, extent)
-        again = observations.inliers(place, remaining)
-        if np.array_equal(again, inliers):
+        new_inliers = observations.inliers(place, remaining)
+        if np.array_equal(new_inliers, inliers):
             break
-        inliers = again
+        inliers = new_inliers
     return place, inliers, covariance
 
 

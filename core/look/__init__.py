@@ -23,7 +23,7 @@ from .edits import Edit, LookEdits
 from .elements import Element
 from .keyed import KeyedEdits
 from .look import LightLook, Look, PlacedLight, TrainedCamera, ViewOfLight, read, store_elements
-from .plane import PlaneGaussians, pixels
+from .plane import PlaneGaussians, to_pixels
 
 __all__ = ["Edit", "Element", "KeyedEdits", "LightLook", "Look", "LookEdits", "PlacedLight", "PlaneGaussians",
-           "TrainedCamera", "ViewOfLight", "draw", "pixels", "read", "store_elements"]
+           "TrainedCamera", "ViewOfLight", "draw", "read", "store_elements", "to_pixels"]

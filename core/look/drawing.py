@@ -16,7 +16,7 @@ from ..choices import Blend
 from ..conventions.pixel_grid import PixelGrid
 from ..conventions.splatting import ALPHA_MIN, PROFILE_MIN
 from ..conventions.splatting import OPACITY_MAX as OPACITY_MAX
-from .plane import Floats, PlaneGaussians, arc_log_peak, arc_strengths, concatenate, pixel_arcs, pixels
+from .plane import Floats, PlaneGaussians, arc_log_peak, arc_strengths, arcs_to_pixels, concatenate, to_pixels
 
 
 def extent(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
@@ -43,8 +43,8 @@ def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, he
     if gaussians is None:
         return picture
     transmittance = np.ones((height, width), np.float32)
-    centres, covariances = pixels(gaussians, intrinsics, pixel_grid)
-    arcs = pixel_arcs(gaussians, intrinsics)
+    centres, covariances = to_pixels(gaussians, intrinsics, pixel_grid)
+    arcs = arcs_to_pixels(gaussians, intrinsics)
     radii = extent(gaussians, blend)
     for number in range(len(gaussians)):
         box = _box(centres[number], covariances[number], float(radii[number]), width, height)

@@ -211,11 +211,11 @@ def _parse_targets(text: str, whom: str, lights: Sequence[str],
     owners = list(lights) if owner == ALL else [owner]
     if elements is None:
         return [(light, part) for light in owners]
-    found = [(light, name) for light in owners for name in elements.get(light, ()) if part in (ALL, name)]
-    if not found:
+    pairs = [(light, name) for light in owners for name in elements.get(light, ()) if part in (ALL, name)]
+    if not pairs:
         known = ", ".join(dict.fromkeys(name for light in owners for name in elements.get(light, ()))) or "none at all"
         raise SettingsError(f"The edit {text!r} names the element {part!r}, but {owner} has {known}.")
-    return found
+    return pairs
 
 
 def _parse_change(text: str, property_name: str, value: str) -> Edit:
@@ -234,8 +234,8 @@ def _parse_change(text: str, property_name: str, value: str) -> Edit:
     signed = property_name == "rotation"
     if len(numbers) != expected or not all(abs(number) <= MAX_VALUE and (signed or number >= 0) for number in numbers):
         kind = "one number" if expected == 1 else "three numbers (or #rrggbb)"
-        least = -MAX_VALUE if signed else 0
-        raise SettingsError(f"The edit {text!r} needs {kind} from {least:g} to {MAX_VALUE:g} after the equals sign.")
+        minimum = -MAX_VALUE if signed else 0
+        raise SettingsError(f"The edit {text!r} needs {kind} from {minimum:g} to {MAX_VALUE:g} after the equals sign.")
     if property_name in _FLAGS and numbers[0] not in (0, 1):
         raise SettingsError(f"The edit {text!r} needs 0 or 1 after the equals sign.")
     parsed: Any = tuple(numbers) if expected == 3 else bool(numbers[0]) if property_name in _FLAGS else numbers[0]

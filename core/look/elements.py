@@ -140,12 +140,12 @@ def _split_at_valleys(mu: Floats, energy: Floats) -> list[NDArray[np.int64]]:
     offsets = np.arange(-12, 13) * (high - low) / bins
     density = np.convolve(density, np.exp(-0.5 * (offsets / DENSITY_SIGMA) ** 2))[12:-12]
     cuts: list[float] = []
-    peak, valley, at = density[0], density[0], 0
+    peak, valley, valley_index = density[0], density[0], 0
     for number, value in enumerate(density):
         if value < valley:
-            valley, at = value, number
+            valley, valley_index = value, number
         if valley < VALLEY_RATIO * peak and value > valley / VALLEY_RATIO:  # up again: a new peak began
-            cuts.append((edges[at] + edges[at + 1]) / 2)
+            cuts.append((edges[valley_index] + edges[valley_index + 1]) / 2)
             peak = valley = value
         elif value > peak:
             peak = valley = value

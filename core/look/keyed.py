@@ -64,11 +64,11 @@ class KeyedEdits:
         if not self.frames:
             return LookEdits.parse(self.always, lights, elements)
         numbers = sorted(self.frames)
-        before = max((number for number in numbers if number <= frame), default=numbers[0])
-        after = min((number for number in numbers if number >= frame), default=numbers[-1])
-        if before >= after:
-            return parsed(before if before in (frame, numbers[-1]) else after)
-        return parsed(before).interpolate(parsed(after), (frame - before) / (after - before))
+        previous = max((number for number in numbers if number <= frame), default=numbers[0])
+        following = min((number for number in numbers if number >= frame), default=numbers[-1])
+        if previous >= following:
+            return parsed(previous if previous in (frame, numbers[-1]) else following)
+        return parsed(previous).interpolate(parsed(following), (frame - previous) / (following - previous))
 
 
 def _read_toml(path: Path) -> Any:

@@ -336,7 +336,7 @@ def parse_description(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]
 
 def _check_light(path: Path, entry: Mapping[str, Any], listed: Any) -> str:
     """Validate the description of a light, and return its name."""
-    unknown = set(entry["form"]) - {one.name for one in fields(FlareForm)}
+    unknown = set(entry["form"]) - {field.name for field in fields(FlareForm)}
     if unknown:
         raise FlareFileError(f"{path} was written by a newer Fit Flare (its form has {', '.join(sorted(unknown))}); "
                              "update to open it.")

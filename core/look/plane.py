@@ -103,8 +103,8 @@ def covariance_of_ellipse(log_scales: Floats, directions: Floats) -> Floats:
 def arcs_of_ellipse(arcs: Floats, log_scales: Floats, directions: Floats) -> Floats:
     """Return (n, 2) arcs on the plane from arcs (n, 2) in standard deviations along the axes."""
     axis = directions / np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)
-    along, aside = (arcs * np.exp(log_scales)).T
-    return along[:, None] * axis + aside[:, None] * np.stack([-axis[:, 1], axis[:, 0]], -1)
+    along, across = (arcs * np.exp(log_scales)).T
+    return along[:, None] * axis + across[:, None] * np.stack([-axis[:, 1], axis[:, 0]], -1)
 
 
 def opacity_gain(arcs: Floats, rings: Floats) -> Floats:
@@ -140,7 +140,7 @@ def colours(rays: Floats, sh: Floats, degree: int) -> Floats:
     return np.maximum(sh_colours + np.float32(0.5), 0)
 
 
-def pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike,
+def to_pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike,
            pixel_grid: PixelGrid | None = None) -> tuple[Floats, Floats]:
     """Return centres (n, 2), px, and covariances (n, 3), px², for intrinsics (3, 3), with the low-pass filter of the
     fit's pixel grid, or the default one if it is unknown."""
@@ -152,8 +152,8 @@ def pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike,
     return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass
 
 
-def pixel_arcs(gaussians: PlaneGaussians, intrinsics: ArrayLike) -> Floats:
-    """Return (n, 2) arcs in pixels for intrinsics (3, 3), 0 without arcs: the inverse covariance (of `pixels`) times
+def arcs_to_pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike) -> Floats:
+    """Return (n, 2) arcs in pixels for intrinsics (3, 3), 0 without arcs: the inverse covariance (of `to_pixels`) times
     this is b, the slope of the profile's logarithm."""
     if gaussians.arcs is None:
         return np.zeros_like(gaussians.means)
@@ -173,13 +173,13 @@ def concatenate(sets: Sequence[PlaneGaussians]) -> PlaneGaussians | None:
         return None
 
     def extra(name: str, plain: Sequence[float]) -> Floats | None:
-        parts = [getattr(one, name) for one in sets]
+        parts = [getattr(gaussians, name) for gaussians in sets]
         if all(part is None for part in parts):
             return None
-        return np.concatenate([np.tile(np.array(plain, np.float32), (len(one), 1)) if part is None else part
-                               for one, part in zip(sets, parts, strict=True)])
+        return np.concatenate([np.tile(np.array(plain, np.float32), (len(gaussians), 1)) if part is None else part
+                               for gaussians, part in zip(sets, parts, strict=True)])
 
     means, covariances, opacities, sh_colours = (
-        np.concatenate([getattr(one, name) for one in sets])
+        np.concatenate([getattr(gaussians, name) for gaussians in sets])
         for name in ("means", "covariances", "opacities", "colours"))
     return PlaneGaussians(means, covariances, opacities, sh_colours, extra("rings", (0, 1)), extra("arcs", (0, 0)))

@@ -76,16 +76,16 @@ class Shot:
     @property
     def folders(self) -> dict[str, str]:
         """Folder of each camera's layers, "" for a single camera without `own_folder`; distinct on any file system."""
-        found: dict[str, str] = {}
+        folder_by_name: dict[str, str] = {}
         for name in dict.fromkeys(frame.name for frame in self.frames):
             plain = re.sub(r"[^\w-]+", "_", name).strip("_") or "camera"
             plain = avoid_device_name(plain)
-            used, folder, number = {other.casefold() for other in found.values()}, plain, 1
+            used, folder, number = {other.casefold() for other in folder_by_name.values()}, plain, 1
             while folder.casefold() in used:
                 number += 1
                 folder = f"{plain}_{number}"
-            found[name] = folder
-        return found if len(found) > 1 or self.own_folder else dict.fromkeys(found, "")
+            folder_by_name[name] = folder
+        return folder_by_name if len(folder_by_name) > 1 or self.own_folder else dict.fromkeys(folder_by_name, "")
 
     def fingerprint(self, run: str = "") -> str:
         """Return a hash that changes whenever all pictures would; `ShotFrame.cache_key` covers the single frames. run:
@@ -97,12 +97,12 @@ class Shot:
 
     def write(self, path: Path | str) -> None:
         """Write a JSON file for `read`."""
-        frames = [{"frame": one.frame, "name": one.name, "width": one.camera.width, "height": one.camera.height,
-                   "intrinsics": [one.camera.fx, one.camera.fy, one.camera.cx, one.camera.cy],
-                   "world_to_camera": one.camera.world_to_camera.tolist(), "exposure": one.camera.exposure,
-                   "edits": list(one.edits),
+        frames = [{"frame": frame.frame, "name": frame.name, "width": frame.camera.width, "height": frame.camera.height,
+                   "intrinsics": [frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy],
+                   "world_to_camera": frame.camera.world_to_camera.tolist(), "exposure": frame.camera.exposure,
+                   "edits": list(frame.edits),
                    "lights": [{"name": light.name, "source": light.source, "xyz": light.xyz.tolist(),
-                               "share": light.visibility} for light in one.lights]} for one in self.frames]
+                               "share": light.visibility} for light in frame.lights]} for frame in self.frames]
         write_json(path, {"version": VERSION, "flare": str(self.flare), "run": str(self.run) if self.run else None,
                           "query": self.query, "live": self.live, "apart": self.own_folder, "frames": frames})
 
@@ -118,9 +118,10 @@ class Shot:
             frames = tuple(_read_frame(entry, data) for entry in data["frames"])
             if not frames:
                 raise ValueError("it has no frames")
-            duplicates = [one for one, count in Counter((one.name, one.frame) for one in frames).items() if count > 1]
+            counts = Counter((frame.name, frame.frame) for frame in frames)
+            duplicates = [key for key, count in counts.items() if count > 1]
             if duplicates:
-                raise ValueError(f"frame {duplicates[0][1]} of {duplicates[0][0]!r} is listed duplicates")
+                raise ValueError(f"frame {duplicates[0][1]} of {duplicates[0][0]!r} is listed twice")
             folder_of_file = Path(path).parent
             run = folder_of_file / data["run"] if data.get("run") else None
             return cls(folder_of_file / data["flare"], frames, data.get("query", "target"), run, bool(data.get("live")),
@@ -133,8 +134,8 @@ class Shot:
         """Return the shot at another size, px; without a height the aspect ratio is preserved."""
         if not width:
             return self
-        return replace(self, frames=tuple(replace(one, camera=one.camera.scaled(width, height))
-                                          for one in self.frames))
+        return replace(self, frames=tuple(replace(frame, camera=frame.camera.scaled(width, height))
+                                          for frame in self.frames))
 
 
 def _read_frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
@@ -145,15 +146,15 @@ def _read_frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and fx > 0 and fy > 0 and pose.shape == (4, 4)
             and exposure > 0):
         raise ValueError(f"frame {entry['frame']} has no sensible camera")
-    lights = tuple(PlacedLight(str(one["name"]), str(one["source"]), np.array([_to_float(x) for x in one["xyz"]]),
-                               _to_float(one.get("share", 1.0))) for one in entry["lights"])
+    lights = tuple(PlacedLight(str(light["name"]), str(light["source"]), np.array([_to_float(x) for x in light["xyz"]]),
+                               _to_float(light.get("share", 1.0))) for light in entry["lights"])
     if len({light.name for light in lights}) < len(lights):
         raise ValueError(f"frame {entry['frame']} has two lights of one name")
     if any(light.xyz.shape != (3,) for light in lights):
         raise ValueError("a light has no place")
     if not all(0 <= light.visibility <= 1 for light in lights):
         raise ValueError("the share of a light lies between 0 and 1")
-    if not all(isinstance(word, str) for word in entry.get("edits", [])):
+    if not all(isinstance(text, str) for text in entry.get("edits", [])):
         raise ValueError("edits are a list of texts")
     number = _to_int(entry["frame"])
     if not 0 <= number < MAX_FRAME:

@@ -91,9 +91,9 @@ def _find_folder(root: Path, names: Sequence[str]) -> Path | None:
 def _index_by_key(folder: Path) -> dict[str, Path]:
     """Return a folder's pictures by name without prefix, or by the whole name if that is ambiguous."""
     paths = pictures_in(folder)
-    twice = [stem for stem, count in Counter(path.stem for path in paths).items() if count > 1]
-    if twice:
-        raise SettingsError(f"{folder} has {twice[0]} under two suffixes; remove one of them.")
+    duplicates = [stem for stem, count in Counter(path.stem for path in paths).items() if count > 1]
+    if duplicates:
+        raise SettingsError(f"{folder} has {duplicates[0]} under two suffixes; remove one of them.")
     plain = {re.sub(r"^(input|gt|target|clean|scene|flare|blend|mask)_?", "", path.stem): path for path in paths}
     return plain if len(plain) == len(paths) else {path.stem: path for path in paths}
 

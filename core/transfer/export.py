@@ -52,7 +52,7 @@ def flare_scene(
     rotations = np.zeros((n, 3, 3))
     rotations[:, :2, :2] = axes
     rotations[:, 2, 2] = np.linalg.det(axes)  # a rotation, not a mirror image
-    quaternions = np.array([quaternion_from_rotation(to_world @ one) for one in rotations]).reshape(n, 4)
+    quaternions = np.array([quaternion_from_rotation(to_world @ rotation) for rotation in rotations]).reshape(n, 4)
     # An opacity above the maximum of 3DGS is multiplied into the colour.
     gain = np.maximum(gaussians.opacities / OPACITY_MAX, 1)
     opacities = np.clip(gaussians.opacities / gain, 1e-6, OPACITY_MAX)

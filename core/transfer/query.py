@@ -94,9 +94,10 @@ def evaluate(light: LightLook, view: ViewOfLight, xyz: ArrayLike, query: Follows
     visibility *= extrapolation_fade(light, view)
     if visibility <= 0:
         return None
-    queries = _weighted_queries(light, view, np.asarray(xyz, np.float64), query, training, scale, fixed)
-    parts = [light.evaluate(view, query=one, edits=edits, visibility=visibility, name=name) for _, one in queries]
-    return _average([part for part in parts if part is not None], [weight for weight, _ in queries])
+    weighted = _weighted_queries(light, view, np.asarray(xyz, np.float64), query, training, scale, fixed)
+    parts = [light.evaluate(view, query=query_view, edits=edits, visibility=visibility, name=name)
+             for _, query_view in weighted]
+    return _average([part for part in parts if part is not None], [weight for weight, _ in weighted])
 
 
 def fixed_view(light: LightLook, views: Sequence[ViewOfLight], distances: Sequence[float],

@@ -22,17 +22,17 @@ def assign_sources(
             raise SettingsError(f"The target has no light {target!r}; it has {', '.join(targets) or 'none'}.")
         if source not in sources:
             raise SettingsError(f"The flare has no light {source!r}; it has {', '.join(sources)}.")
-    chosen: dict[str, str] = {}
-    turn = 0
+    source_by_target: dict[str, str] = {}
+    next_source = 0
     for target in targets:
         if target in requested:
-            chosen[target] = requested[target]
+            source_by_target[target] = requested[target]
         elif target in sources:
-            chosen[target] = target
+            source_by_target[target] = target
         else:
-            chosen[target] = sources[turn % len(sources)]
-            turn += 1
-    return chosen
+            source_by_target[target] = sources[next_source % len(sources)]
+            next_source += 1
+    return source_by_target
 
 
 def parse_assignments(texts: Sequence[str]) -> dict[str, str]:

@@ -16,13 +16,14 @@ MAX_STEP = 0.05
 """Largest motion of the camera between two frames of one path, relative to the distance of the light."""
 
 
-def are_consecutive(frame: ShotFrame, after: ShotFrame, light: str) -> bool:
+def are_consecutive(frame: ShotFrame, next_frame: ShotFrame, light: str) -> bool:
     """Return whether two frames are consecutive on one path, so that the light's visibility is continuous."""
-    places = [next((one.xyz for one in each.lights if one.name == light), None) for each in (frame, after)]
-    if after.frame - frame.frame != 1 or frame.name != after.name or places[0] is None or places[1] is None:
+    xyz, next_xyz = (next((item.xyz for item in each.lights if item.name == light), None)
+                     for each in (frame, next_frame))
+    if next_frame.frame - frame.frame != 1 or frame.name != next_frame.name or xyz is None or next_xyz is None:
         return False
-    motion = np.linalg.norm((after.camera.position - places[1]) - (frame.camera.position - places[0]))
-    return bool(motion <= MAX_STEP * np.linalg.norm(frame.camera.position - places[0]))
+    motion = np.linalg.norm((next_frame.camera.position - next_xyz) - (frame.camera.position - xyz))
+    return bool(motion <= MAX_STEP * np.linalg.norm(frame.camera.position - xyz))
 
 
 def smooth_visibility(frames: Sequence[ShotFrame], index: int, light: str, radius: int,

@@ -83,18 +83,18 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         progress.say(f"{count} runs are in {args.out}.")
         return {"runs": str(args.out), "count": count}
     folder, out = resolve_folders(args)
-    goes_on = args.resume and (out / CONFIG).is_file()
-    if not goes_on:
+    is_resumed = args.resume and (out / CONFIG).is_file()
+    if not is_resumed:
         Run.check_free(out)
     # The fit has its own cache, of smaller pictures.
     capture = Capture.open(folder, cache_bytes=DECODED_CACHE_BYTES)
-    settings = Run.open(out).settings if goes_on else fit_settings(args, capture, progress)
+    settings = Run.open(out).settings if is_resumed else fit_settings(args, capture, progress)
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
     capture = with_supervision(capture, settings, progress)
-    done = fit(capture, settings, out, progress, resume=args.resume)
-    progress.say(f"The run is in {done.folder}: look at preview.png there, then run `eval` and `bake`.")
-    return {"run": str(done.folder)}
+    result = fit(capture, settings, out, progress, resume=args.resume)
+    progress.say(f"The run is in {result.folder}: look at preview.png there, then run `eval` and `bake`.")
+    return {"run": str(result.folder)}
 
 
 def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress) -> FitSettings:

@@ -58,7 +58,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Train the network or the LoRA. Raises SettingsError."""
+    """Train the network, or the LoRA of the diffusion model. Raises SettingsError."""
     import torch
 
     from ...core.optics.prescription import built_in_lenses, read_lenses

@@ -122,11 +122,11 @@ def test_an_ellipse_has_its_axes() -> None:
 def test_resolution_and_focal_length_move_the_flare_as_a_lens_would() -> None:
     gaussians = next(iter(some_flare(replace(OURS, arcs=True))(pose()).values()))
     small, large = (torch.tensor([[f, 0, f / 3], [0, f, f / 4], [0, 0, 1.0]]) for f in (100.0, 200.0))
-    centres, covariances = placement.pixels(gaussians, small, PixelGrid(100.0, 100.0))
-    twice, wide = placement.pixels(gaussians, large, PixelGrid(100.0, 100.0))
+    centres, covariances = placement.to_pixels(gaussians, small, PixelGrid(100.0, 100.0))
+    twice, wide = placement.to_pixels(gaussians, large, PixelGrid(100.0, 100.0))
     assert torch.allclose(twice, 2 * centres, atol=1e-4)
     assert torch.allclose(wide, 4 * covariances, rtol=1e-5)
-    slopes = [placement.pixel_arcs(gaussians.arcs, found, k) for found, k in ((covariances, small), (wide, large))]
+    slopes = [placement.arcs_to_pixels(gaussians.arcs, found, k) for found, k in ((covariances, small), (wide, large))]
     assert slopes[0].abs().max() > 0.01 and torch.allclose(2 * slopes[1], slopes[0], rtol=1e-4, atol=1e-5)
 
 
@@ -139,7 +139,7 @@ def test_an_arc_scales_and_turns_with_its_gaussian() -> None:
         axis = torch.tensor([[math.cos(angle), math.sin(angle)]])
         covariance = placement.covariance_of_ellipse(log_scales, axis)
         way = placement.arcs_of_ellipse(a, log_scales, axis)
-        strengths = arc_strengths(covariance, placement.pixel_arcs(way, covariance, k))
+        strengths = arc_strengths(covariance, placement.arcs_to_pixels(way, covariance, k))
         assert strengths.item() == pytest.approx(1.5, rel=1e-4)
         found.append(way[0])
     assert torch.allclose(found[1], 5 * found[0])

@@ -26,7 +26,7 @@ from core.flare.compositing import splat_flare
 from core.flare.placement import PlaneGaussians
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import read_ply, write_ply
-from core.look import PlacedLight, draw, pixels, read
+from core.look import PlacedLight, draw, read, to_pixels
 from core.look import PlaneGaussians as LookGaussians
 from core.look.container import read_tensors, rewrite_metadata
 from core.look.shot import Shot, ShotFrame
@@ -133,7 +133,7 @@ def test_numpy_and_torch_filter_alike(times: float) -> None:
     twin = LookGaussians(*(None if part is None else part.numpy() for part in some))  # type: ignore[arg-type]
     theirs = flare_at(camera, GRID).numpy()
     assert np.abs(draw([twin], camera.intrinsics, *camera.size, "add", GRID) - theirs).max() < 1e-3 * theirs.max()
-    assert pixels(twin, camera.intrinsics, GRID)[1][0, 2] == pytest.approx(
+    assert to_pixels(twin, camera.intrinsics, GRID)[1][0, 2] == pytest.approx(
         1e-6 * camera.fy**2 + max(0.3 * times**2, 1 / 12), rel=1e-4)
 
 

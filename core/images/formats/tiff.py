@@ -94,7 +94,7 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
     order, entries = next(_directories(io.BytesIO(data)), _NO_DIRECTORY)
     if not entries or not tags:
         return data
-    whole = bytearray(data)
+    result = bytearray(data)
     new_entries = [entry for entry in entries if struct.unpack(order + "H", entry[:2])[0] not in tags]
     for number, (kind, values) in tags.items():
         raw = values.astype(values.dtype.newbyteorder(order)).tobytes()
@@ -102,17 +102,17 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
         if len(raw) <= 4:
             place = raw.ljust(4, b"\0")
         else:
-            whole += b"\0" * (len(whole) % 2)
-            place = struct.pack(order + "I", len(whole))
-            whole += raw
+            result += b"\0" * (len(result) % 2)
+            place = struct.pack(order + "I", len(result))
+            result += raw
         new_entries.append(struct.pack(order + "HHI", number, kind, count) + place)
-    whole += b"\0" * (len(whole) % 2)
+    result += b"\0" * (len(result) % 2)
     at = struct.unpack(order + "I", data[4:8])[0]
     following = data[at + 2 + 12 * len(entries):][:4].ljust(4, b"\0")
     new_entries.sort(key=lambda entry: struct.unpack(order + "H", entry[:2])[0])
-    whole[4:8] = struct.pack(order + "I", len(whole))
-    whole += struct.pack(order + "H", len(new_entries)) + b"".join(new_entries) + following
-    return bytes(whole)
+    result[4:8] = struct.pack(order + "I", len(result))
+    result += struct.pack(order + "H", len(new_entries)) + b"".join(new_entries) + following
+    return bytes(result)
 
 
 def is_premultiplied(path: Path) -> bool:

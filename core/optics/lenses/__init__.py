@@ -20,8 +20,8 @@ def find_lens(name: str) -> Prescription:
     """Return a lens by its name in `lens_names`, or read the file of that name. Raises SettingsError."""
     compact = name.replace(" ", "")
     if compact in lens_names():
-        own = {lens.name.replace(" ", ""): lens for lens in built_in_lenses()}
-        return own[compact] if compact in own else read_prescription(LENS_FOLDER / f"{compact}.lens")
+        built_in = {lens.name.replace(" ", ""): lens for lens in built_in_lenses()}
+        return built_in[compact] if compact in built_in else read_prescription(LENS_FOLDER / f"{compact}.lens")
     if not Path(name).is_file():
         raise SettingsError(f"There is no lens {name!r}; give a .lens file, or one of {', '.join(lens_names())}.")
     return read_prescription(name)

@@ -240,15 +240,15 @@ def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[
             first = int(json.loads(model.load(path).get("iteration", "0")))
         trainer = DiffusionTrainer(model, perceptual=perceptual)
         progress.stage("train", iterations, min(first, iterations))
-        done = first
+        iteration = first
         try:
             for number in range(first, iterations):
                 metrics = trainer.step(*draw(number))
-                done = number + 1
-                if done % SAVE_EVERY == 0:
-                    model.save(path, {"iteration": str(done)})
+                iteration = number + 1
+                if iteration % SAVE_EVERY == 0:
+                    model.save(path, {"iteration": str(iteration)})
                 progress.advance(1, **metrics)
         finally:
-            if done > first:
-                model.save(path, {"iteration": str(done)})
+            if iteration > first:
+                model.save(path, {"iteration": str(iteration)})
     return path

@@ -45,5 +45,5 @@ class FlarePrediction(NamedTuple):
 
 def single_prediction(flare: Pixels) -> TtaPrediction:
     """Return the prediction of a model that ran once, without test-time augmentation; none of it is glow."""
-    none = np.zeros_like(flare)
-    return TtaPrediction(flare, none, np.float32(0), none)
+    zeros = np.zeros_like(flare)
+    return TtaPrediction(flare, zeros, np.float32(0), zeros)

@@ -104,8 +104,8 @@ def filter_in_time(frame: FramePrediction, neighbours: Sequence[Neighbour]) -> F
                                                        for neighbour in neighbours)])
     flare = np.minimum(merge_flare(prediction), display)
     if neighbours:
-        own = _clean_estimate(frame)
-        residual = _residual_flare(own, [_warped_neighbour(own, neighbour) for neighbour in neighbours])
+        estimate = _clean_estimate(frame)
+        residual = _residual_flare(estimate, [_warped_neighbour(estimate, neighbour) for neighbour in neighbours])
         flare = np.clip(flare + upsample(residual, display), 0, display)
     return FlarePrediction(display, flare, confidence, prediction.glow_fraction)
 

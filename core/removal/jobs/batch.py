@@ -147,7 +147,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         if not is_plate_error(error):
             raise error
         if isinstance(error, OSError) and error.errno in DISK_FULL:
-            raise error  # none of the others would fit either
+            raise error  # no later frame would fit either
         if isinstance(error, OSError) and manifest.is_write_error(error):
             raise FrameError(f"{folder} cannot be written to ({error.strerror}); choose another folder for the clean "
                              "frames, or get write permission for this one.") from error

@@ -52,9 +52,9 @@ class Batches:
         count, width, height = self.recipe.draw_batch_shape(random, iteration)
         pairs = [self.draw_pair(iteration, number, width, height)
                  for number in range(self._worker.rank, count, self._worker.count)]
-        none = np.zeros((0, height, width, 3), np.float32)
+        empty = np.zeros((0, height, width, 3), np.float32)
         frame, scene, scene_with_glow = (
-            torch.from_numpy(np.stack([getattr(pair, part) for pair in pairs]) if pairs else none).permute(0, 3, 1, 2)
+            torch.from_numpy(np.stack([getattr(pair, part) for pair in pairs]) if pairs else empty).permute(0, 3, 1, 2)
             for part in ("frame", "scene", "scene_with_glow"))
         return Batch(frame, scene, scene_with_glow, len(pairs) / count)
 

@@ -125,10 +125,10 @@ def draw_flare_placements(random: Random, count: int, canvas: int, width: int, h
     """Draw the placements of `count` flares, the first or the second of their frames, float32."""
     shining = [random_cameras.draw_appearance(random, random_cameras.draw_second_strength(random) if second else 1.0)
                for _ in range(count)]
-    blurs, colours, gains, mosts = (np.array(part) for part in zip(*shining, strict=True))
+    blurs, colours, gains, max_means = (np.array(part) for part in zip(*shining, strict=True))
     matrices = random_cameras.draw_placement(random, canvas, width, height, (count, random_cameras.PLACEMENTS))
     return FlarePlacements(matrices=matrices, blur=blurs,
-                           colour=colours[..., None, None], gain=_per_frame(gains), max_mean=_per_frame(mosts))
+                           colour=colours[..., None, None], gain=_per_frame(gains), max_mean=_per_frame(max_means))
 
 
 def compose(scene: Tensor, gamma: Tensor, frames: FrameParameters,

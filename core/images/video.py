@@ -1,36 +1,64 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads the frames of a video, upright and in the colours that players show.
+"""Reads the frames of a video by PyAV (FFmpeg): upright, in the colours that players show, or as scene-linear light.
 
-OpenCV (4.11) converts luma and colour differences by the matrix of standard definition (ITU-R BT.601), whatever the
-file says, so that the colours of high definition are up to a tenth off. Frames are converted from there to the matrix
-that the file names or, where it names none, to the usual one of its size. Motion JPEG is BT.601 at any size, and some
-files hold RGB: those are left unchanged.
+    with Video(path) as video:
+        for frame in video:
+            picture = frame.picture()
+
+Matrix, range, transfer and primaries are those that the stream names or, where it names none, its container. `solve`,
+`remove` and the flare bank of a training read videos here; `video_colour.py` converts the colours, `video_writer.py`
+writes videos. PyAV is imported where it is used, because Blender's own Python has none.
 """
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FrameError
-from ..system.reading import check_regular, open_regular
+from ..errors import EngineError, FrameError
+from ..system.files import atomic_path
+from ..system.reading import check_regular
+from .picture import Encoding, Picture
+from .video_colour import (
+    LUMA_WEIGHTS,
+    RGB,
+    TRANSFERS,
+    UNSPECIFIED,
+    UNSUPPORTED_MATRICES,
+    UNSUPPORTED_TRANSFERS,
+    WIDE_PRIMARIES,
+    YCGCO,
+    VideoColour,
+    usual_matrix,
+)
+from .video_planes import (
+    Orientation,
+    PlaneFormat,
+    display_matrix,
+    nearest_planar_name,
+    orientation_from_matrix,
+    plane_arrays,
+    plane_format,
+    stack_planes,
+    to_planar,
+)
+from .write import write_exr
 
-VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv"})
+VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv", ".mxf",
+                    ".ts", ".m2t", ".vob", ".3gp", ".flv", ".ogv", ".dv"})
 """Suffixes of video files."""
-MIN_709_WIDTH, MAX_601_HEIGHT = 1280, 576
-"""A video without colour tags is BT.709 from this long side, or above this short side, px."""
-LUMA_WEIGHTS = {"BT.601": (0.299, 0.114), "BT.709": (0.2126, 0.0722), "BT.2020": (0.2627, 0.0593)}
-"""Weights of red and blue in the luma."""
-MATRICES = {1: "BT.709", 5: "BT.601", 6: "BT.601", 9: "BT.2020"}
-"""Names by the numbers of ITU-T H.273: matrix coefficients, transfer characteristics."""
-HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
-"""Names by the numbers of ITU-T H.273: matrix coefficients, transfer characteristics."""
-UNSPECIFIED = 2
-MAX_MOOV_BYTES = 1 << 24
-"""Bytes of a file's description that are searched."""
+MAX_VIDEO_PIXELS = 100_000_000
+"""Largest frame that is decoded; a header that claims more is damaged or hostile."""
+MAX_NAMED_FRAMES = 8
+"""Number of damaged frames that a sentence names."""
+_LIMITED, _FULL = 1, 2
 
 
 def is_video(path: Path) -> bool:
@@ -38,129 +66,339 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEOS
 
 
-def truncated_message(path: Path, length: int, read: int) -> str:
-    """Sentence for a video of which fewer frames could be read than its header promises."""
-    return f"The header of {path} promises {length} frames, and {read} could be read; if it is cut off, copy it again."
+def import_av() -> ModuleType:
+    """Import PyAV, which passes on none of FFmpeg's messages. Raises EngineError where it is not installed.
+
+    No level is set: that would install a callback in Python, on which decoding threads wait while a file is closed.
+    """
+    try:
+        import av
+    except ImportError as problem:
+        raise EngineError("Videos need PyAV: install the Python package av in the engine's environment.") from problem
+    return av
 
 
-def frame_to_display(frame: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Convert a video's frame to display values 0..1, R G B."""
-    return frame[..., ::-1].astype(np.float32) / np.float32(255)
+@dataclass(frozen=True)
+class VideoFrame:
+    """One decoded frame; pixels are converted when they are read.
+
+    number: from 0, in the order of display. raw: PyAV's frame as stored, before it is turned upright.
+    """
+
+    number: int
+    raw: Any
+    colour: VideoColour
+    orientation: Orientation
+
+    @property
+    def encoding(self) -> Encoding:
+        """What the pixels are: display values, or light for PQ, HLG and linear videos."""
+        return "linear" if self.colour.is_light else "srgb"
+
+    @property
+    def is_damaged(self) -> bool:
+        """True if the decoder filled in parts of the frame."""
+        return bool(self.raw.is_corrupt)
+
+    @property
+    def time(self) -> tuple[int, Fraction] | None:
+        """When the frame is shown, as ticks and seconds to a tick; None where the file does not say."""
+        return None if self.raw.pts is None else (int(self.raw.pts), Fraction(self.raw.time_base))
+
+    @cached_property
+    def _planes(self) -> tuple[list[NDArray[Any]], PlaneFormat]:
+        frame, planar = to_planar(self.raw, self.colour.limited)
+        return plane_arrays(frame, planar), planar
+
+    @cached_property
+    def _signal(self) -> NDArray[Any]:
+        arrays, planar = self._planes
+        return self.colour.to_signal(stack_planes(arrays, planar))
+
+    def pixels(self) -> NDArray[Any]:
+        """(height, width, 3): R G B as uint8 or uint16 codes of display values, or float32 linear light."""
+        return self.orientation.upright(self.colour.to_pixels(self._signal))
+
+    def alpha(self) -> NDArray[Any] | None:
+        """(height, width) alpha, of the type of integer `pixels` or float32 0..1; None where the video has none."""
+        arrays, planar = self._planes
+        if not planar.has_alpha:
+            return None
+        alpha, top = arrays[-1].astype(np.float32), float((1 << planar.bits) - 1)
+        if self.colour.is_light:
+            return self.orientation.upright(alpha / np.float32(top))
+        kind = np.uint8 if planar.bits == 8 and not self.colour.is_wide else np.uint16
+        return self.orientation.upright((alpha * np.float32(np.iinfo(kind).max / top) + np.float32(0.5)).astype(kind))
+
+    def straight_alpha(self) -> NDArray[np.float32] | None:
+        """(height, width) alpha at 0..1, with which the pixels are not multiplied; None where the video has none."""
+        alpha = self.alpha()
+        if alpha is None or alpha.dtype.kind == "f":
+            return alpha
+        return alpha.astype(np.float32) / np.float32(np.iinfo(alpha.dtype).max)
+
+    def picture(self) -> Picture:
+        """Return the frame as display values 0..1, or as linear light."""
+        pixels = self.pixels()
+        if pixels.dtype.kind == "u":
+            pixels = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+        return Picture(pixels, self.encoding)
+
+    def grey(self) -> NDArray[np.float32]:
+        """(height, width) mean of the signal R G B at 0..255, upright, for measures of detail; PQ and HLG as coded."""
+        import cv2
+
+        signal = self._signal
+        scale = np.float32(255 / np.iinfo(signal.dtype).max)
+        return self.orientation.upright(np.asarray(cv2.cvtColor(signal, cv2.COLOR_RGB2GRAY)).astype(np.float32) * scale)
 
 
 class Video:
-    """The frames of a video, (h, w, 3) uint8 B G R, in order. Raises FrameError where it cannot be decoded."""
+    """The frames of a video, `VideoFrame`s in the order of display. Raises FrameError where none can be decoded."""
 
     length: int
     """Number of frames by the file's header, which may be too large; 0 where unknown."""
     aspect: float
-    """Pixel aspect ratio (width / height); 1 where unknown."""
+    """Pixel aspect ratio (width / height) of upright frames; 1 where unknown."""
 
     def __init__(self, path: Path) -> None:
-        import cv2
-
         check_regular(path)
-        self._reader = cv2.VideoCapture(str(path))
-        if not self._reader.isOpened():
-            raise FrameError(f"{path} cannot be decoded: it is cut off, or not a video that this program knows; copy "
-                               "it again, or convert it to MP4 (H.264).")
-        self._reader.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)  # upright phone footage
-        self.length = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-        self.aspect = self._aspect()
-        transfer, matrix = _read_colour_tags(path)
-        standard = MATRICES.get(matrix) or self._usual_standard()
-        self._colours = None if self._is_as_read() else _matrix_from_601(standard)
-        self.warnings = () if transfer not in HDR_TRANSFERS else (
-            f"{path} has high dynamic range ({HDR_TRANSFERS[transfer]}), which is read as standard range: a flare "
-            "fitted to it is not that of the lens; convert it to EXR frames, or to standard range, first.",)
-        """Sentences for the user."""
+        self.path = Path(path)
+        self._start = 0
+        self._container: Any = None
+        self.problems: list[str] = []
+        """Sentences about frames that the last iteration did not get or got damaged."""
+        try:
+            self._open()
+            first = next(self._decode(), None)
+        except FrameError:
+            self.close()
+            raise
+        if first is None:
+            self.close()
+            raise self._unreadable()
+        self.colour = _colour_of(self.path, first, self._stream)
+        """What the codes of the first frame mean."""
+        self.matrix = display_matrix(first)
+        self.orientation = orientation_from_matrix(self.matrix)
+        self.stored_size = int(first.width), int(first.height)
+        """(width, height) of frames before they are turned upright."""
+        self.length = self._promised_length()
+        ratio = Fraction(self._stream.sample_aspect_ratio or 0)
+        aspect = float(ratio) if ratio > 0 else 1.0
+        self.aspect = 1 / aspect if self.orientation.transposed else aspect
+        self.has_alpha = _has_alpha(first)
+        self.rate = Fraction(self._stream.average_rate or self._stream.guessed_rate or 25)
+        """Frames a second, on average."""
+        self.estimated_length = self.length or self._length_by_duration()
+        """About how many frames there are, for progress; 0 where even the duration is unknown."""
 
     def __enter__(self) -> Video:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._reader.release()
+        self.close()
 
-    def __iter__(self) -> Iterator[Any]:
-        import cv2
+    def close(self) -> None:
+        """Close the file."""
+        if self._container is not None:
+            self._container.close()
+            self._container = None
 
-        while True:
-            good, frame = self._reader.read()
-            if not good:
+    def __iter__(self) -> Iterator[VideoFrame]:
+        """Yield the frames from that of `seek`, else from the first one; then `problems` is complete."""
+        number, start = self._start, self._start
+        self._start, self.problems = 0, []
+        damaged, colours = list[int](), dict[tuple[int, ...], VideoColour]()
+        for raw in self._frames_from(start):
+            if (raw.width, raw.height) != self.stored_size:
+                self.problems.append(f"{self.path} changes its size to {raw.width} x {raw.height} at frame {number + 1}"
+                                     "; the frames from there on are left out, split the video there.")
                 return
-            yield frame if self._colours is None else cv2.transform(frame, self._colours)
+            tags = (raw.colorspace, raw.color_range, raw.color_trc, raw.color_primaries)
+            if tags not in colours:
+                colours[tags] = _colour_of(self.path, raw, self._stream)
+            frame = VideoFrame(number, raw, colours[tags], self.orientation)
+            if frame.is_damaged:
+                damaged.append(number + 1)
+            yield frame
+            number += 1
+        if damaged:
+            names = ", ".join(map(str, damaged[:MAX_NAMED_FRAMES])) + (", …" if damaged[MAX_NAMED_FRAMES:] else "")
+            self.problems.append(f"{len(damaged)} of {number - start} frames of {self.path} are damaged ({names}); "
+                                 "copy it again.")
+        if number < self.length and start == 0:
+            self.problems.append(f"The header of {self.path} promises {self.length} frames, and {number} could be read"
+                                 "; if it is cut off, copy it again.")
 
     def seek(self, number: int) -> None:
-        """Continue from frame `number`, counted from 0."""
-        import cv2
+        """Let the next iteration begin at frame `number`, counted from 0."""
+        self._start = max(number, 0)
 
-        self._reader.set(cv2.CAP_PROP_POS_FRAMES, number)
+    def _open(self) -> None:
+        """Open the file anew, at its start."""
+        av = import_av()
+        self.close()
+        try:
+            self._container = av.open(str(self.path), metadata_errors="replace")
+            streams = [stream for stream in self._container.streams.video
+                       if not stream.disposition & av.stream.Disposition.attached_pic]  # cover art of music
+            if not streams:
+                raise FrameError(f"{self.path} holds no video; give the file with the picture.")
+            best = self._container.streams.best("video")
+            self._stream = best if best in streams else streams[0]
+            self._stream.codec_context.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
+            self._stream.thread_type = "AUTO"
+        except (av.error.FFmpegError, OSError, ValueError, MemoryError) as problem:
+            raise self._unreadable() from problem
 
-    def _aspect(self) -> float:
-        """Return the aspect of upright frames; the file's value is of frames as recorded."""
-        import cv2
+    def _unreadable(self) -> FrameError:
+        if not self.path.exists():
+            return FrameError(f"{self.path} is missing.")
+        return FrameError(f"{self.path} cannot be decoded: it is cut off, or not a video that this program knows; copy "
+                          "it again, or convert it to MP4 (H.264).")
 
-        wide, high, turned = (self._reader.get(name) for name in (
-            cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN, cv2.CAP_PROP_ORIENTATION_META))
-        if wide <= 0 or high <= 0:
-            return 1.0
-        return high / wide if turned % 180 else wide / high
+    def _decode(self) -> Iterator[Any]:
+        """Yield PyAV's frames from the present position; what cannot be decoded is passed over, and missing then."""
+        av = import_av()
+        errors = (av.error.FFmpegError, OSError, ValueError, RuntimeError, MemoryError)
+        packets = self._container.demux(self._stream)
+        while True:
+            try:
+                packet = next(packets)
+            except (StopIteration, EOFError):
+                return
+            except errors:  # the container is damaged here; what the decoder still holds comes out
+                packet = None
+            try:
+                frames = self._stream.codec_context.decode(packet)
+            except errors:
+                frames = []
+            for frame in frames:
+                if frame.width and frame.height:
+                    yield frame
+            if packet is None:
+                return
 
-    def _is_as_read(self) -> bool:
-        """True if OpenCV's colours are those of the file: it holds RGB, or Motion JPEG."""
-        import cv2
+    def _frames_from(self, number: int) -> Iterator[Any]:
+        """Yield PyAV's frames from frame `number` on."""
+        self._open()
+        if number == 0:
+            yield from self._decode()
+            return
+        times = self._packet_times()
+        if times is not None and number >= len(times):
+            return
+        if times is not None and self._seek_time(times[number]):
+            frames = self._decode()
+            first = next((frame for frame in frames if frame.pts is None or frame.pts >= times[number]), None)
+            if first is not None and first.pts == times[number]:
+                yield first
+                yield from frames
+                return
+        self._open()
+        for index, frame in enumerate(self._decode()):
+            if index >= number:
+                yield frame
 
-        pixels, codec = (int(self._reader.get(name)).to_bytes(8, "little", signed=True).upper()
-                         for name in (cv2.CAP_PROP_CODEC_PIXEL_FORMAT, cv2.CAP_PROP_FOURCC))
-        return b"RGB" in pixels or b"BGR" in pixels or codec[:4] in (b"MJPG", b"JPEG", b"MJPA", b"MJPB")
+    def _seek_time(self, ticks: int) -> bool:
+        """Go to the key frame before a time; False where the file cannot be searched."""
+        av = import_av()
+        self._open()
+        try:
+            self._container.seek(ticks, stream=self._stream, backward=True)
+        except (av.error.FFmpegError, OSError, ValueError):
+            return False
+        return True
 
-    def _usual_standard(self) -> str:
-        """Return the usual standard of the video's size."""
-        import cv2
+    def _packet_times(self) -> list[int] | None:
+        """Return the time of every frame in the order of display, from the packets alone; None where it is unknown."""
+        av = import_av()
+        times = list[int]()
+        try:
+            for packet in self._container.demux(self._stream):
+                if packet.size == 0 or packet.is_discard:
+                    continue
+                if packet.pts is None:
+                    return None
+                times.append(packet.pts)
+        except (av.error.FFmpegError, OSError, ValueError):
+            return None
+        return sorted(times)
 
-        sides = [self._reader.get(name) for name in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
-        return "BT.709" if max(sides) >= MIN_709_WIDTH or min(sides) > MAX_601_HEIGHT else "BT.601"
+    def _promised_length(self) -> int:
+        """Return the number of frames by the header; those that an edit list hides do not count."""
+        stream = self._stream
+        if not stream.frames:
+            return 0
+        if "mov" not in self._container.format.name:
+            return int(stream.frames)
+        entries = stream.index_entries
+        return sum(not entry.is_discard for entry in entries) if len(entries) else int(stream.frames)
+
+    def _length_by_duration(self) -> int:
+        seconds = Fraction(self._container.duration or 0, 1_000_000)
+        return max(int(seconds * self.rate), 0)
 
 
-def _read_colour_tags(path: Path) -> tuple[int, int]:
-    """Read transfer characteristics and matrix coefficients from the `colr` box of an MP4 or QuickTime; UNSPECIFIED
-    without."""
-    movie = _read_moov_box(path) if path.suffix.lower() in (".mp4", ".mov", ".m4v") else b""
-    for kind in (b"colrnclx", b"colrnclc"):
-        at = movie.find(kind)
-        if 0 <= at <= len(movie) - 14:
-            return int.from_bytes(movie[at + 10:at + 12], "big"), int.from_bytes(movie[at + 12:at + 14], "big")
-    return UNSPECIFIED, UNSPECIFIED
+def write_frame(stem: Path, frame: VideoFrame) -> Path:
+    """Write a frame without loss as STEM.png of 8 or 16 bits, or light as STEM.exr of half floats; return its path.
 
-
-def _read_moov_box(path: Path) -> bytes:
-    """Read the start of the `moov` box, which describes the tracks; empty where there is none.
-
-    Cameras write it after the pictures, which are skipped.
+    Alpha is kept: beside straight colours in PNG, and with colours multiplied by it in EXR, as the formats define.
     """
-    with open_regular(path) as stream:
-        at, end = 0, stream.seek(0, 2)
-        while at + 8 <= end:
-            stream.seek(at)
-            size, kind = int.from_bytes(stream.read(4), "big"), stream.read(4)
-            if kind == b"moov":
-                return stream.read(min(size, MAX_MOOV_BYTES))
-            size = int.from_bytes(stream.read(8), "big") if size == 1 else size
-            if size < 8:  # 0 reaches to the end
-                break
-            at += size
-    return b""
+    import cv2
+
+    if frame.colour.is_light:
+        light, coverage, target = frame.pixels(), frame.straight_alpha(), stem.with_name(stem.name + ".exr")
+        if coverage is not None:
+            light = light * coverage[..., None]
+        channels = {name: light[..., index] for index, name in enumerate("RGB")}
+        write_exr(target, channels if coverage is None else {**channels, "A": coverage})
+        return target
+    target, alpha = stem.with_name(stem.name + ".png"), frame.alpha()
+    planes = [*cv2.split(frame.pixels())[::-1], *([] if alpha is None else [alpha])]
+    done, data = cv2.imencode(".png", cv2.merge(planes), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not done:
+        raise FrameError(f"{target} could not be encoded as PNG.")
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(data.tobytes())
+    return target
 
 
-def _matrix_from_601(standard: str) -> NDArray[np.float32] | None:
-    """(3, 3), B G R: corrects colours that were decoded by BT.601 to a standard; None where that is the same."""
-    if standard == "BT.601":
-        return None
+def _colour_of(path: Path, raw: Any, stream: Any) -> VideoColour:
+    """Return what a frame's codes mean by its tags. Raises FrameError for colours that cannot be converted."""
+    context = stream.codec_context
 
-    def differences(red: float, blue: float) -> NDArray[np.float64]:
-        luma = np.array([red, 1 - red - blue, blue])
-        return np.stack([luma, (np.array([0, 0, 1]) - luma) / (2 - 2 * blue),
-                         (np.array([1, 0, 0]) - luma) / (2 - 2 * red)])
+    def tag(of_frame: int, of_container: int) -> int:
+        return int(of_container if of_frame in (UNSPECIFIED, 0) and of_container else of_frame)
 
-    matrix = np.linalg.inv(differences(*LUMA_WEIGHTS[standard])) @ differences(*LUMA_WEIGHTS["BT.601"])
-    return matrix[::-1, ::-1].astype(np.float32)
+    matrix, transfer, primaries = (tag(*pair) for pair in (
+        (raw.colorspace, context.colorspace), (raw.color_trc, context.color_trc),
+        (raw.color_primaries, context.color_primaries)))
+    colour_range = int(raw.color_range or context.color_range)
+    planar = plane_format(raw.format.name) or plane_format(nearest_planar_name(raw))
+    assert planar is not None
+    if planar.is_rgb:
+        matrix, limited = RGB, False
+    elif planar.is_grey:
+        matrix, limited = 1, colour_range == _LIMITED
+    else:
+        limited = colour_range != _FULL and not planar.is_full_range and not raw.format.name.startswith("yuvj")
+        if matrix == 12:  # derived from the primaries
+            matrix = {1: 1, 9: 9}.get(primaries, UNSPECIFIED)
+        if matrix in UNSUPPORTED_MATRICES:
+            raise FrameError(f"{path} has the colour matrix {UNSUPPORTED_MATRICES[matrix]}, which this program does "
+                             "not read; convert the video to BT.709, BT.2020 or RGB.")
+        if matrix not in LUMA_WEIGHTS and matrix != YCGCO:
+            matrix = 9 if primaries == 9 else usual_matrix(raw.width, raw.height)
+    if transfer in UNSUPPORTED_TRANSFERS:
+        raise FrameError(f"{path} has a {UNSUPPORTED_TRANSFERS[transfer]} transfer curve, which this program does not "
+                         "read; convert the video to BT.709.")
+    if primaries in (UNSPECIFIED, 0) and (matrix == 9 or transfer in (16, 18)):
+        primaries = 9
+    return VideoColour(matrix, limited, planar.bits, TRANSFERS.get(transfer, "display"), WIDE_PRIMARIES.get(primaries))
+
+
+def _has_alpha(raw: Any) -> bool:
+    planar = plane_format(raw.format.name) or plane_format(nearest_planar_name(raw))
+    return planar is not None and planar.has_alpha

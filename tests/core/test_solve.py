@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -36,9 +37,9 @@ from core.images.write import write_exr
 from core.system.files import atomic_path
 from core.system.folder_lock import folder_lock
 from core.system.progress import Progress
+from tests.core import videos
 from tests.core.captures import look_at, make_capture, orbit
 from tests.core.recording_progress import RecordingProgress
-from tests.core.test_video import with_pixels
 
 SIZE = (320, 240)
 QUICK = SolveSettings(features=800)
@@ -288,6 +289,8 @@ def test_a_mapping_that_ends_with_a_failure_is_not_recorded(stopped: Path, tmp_p
     shutil.copytree(stopped / "out", out)
     (out / ".solve" / "mapped.json").unlink()
     monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+    monkeypatch.setattr("core.capture.solve.run_in_child",
+                        lambda function, *args, progress: function(*args, progress))  # where it is replaced
     with pytest.raises(OSError, match="nobody listens"):
         solve(stopped / "frames", out, QUICK, Failing("place cameras", 1))
     assert not (out / ".solve" / "mapped.json").exists()
@@ -380,7 +383,8 @@ def test_a_truncated_video_is_reported(tmp_path: Path) -> None:
 
 def test_the_small_frames_of_a_squeezed_video_are_not(tmp_path: Path) -> None:
     frames = [render(camera) for camera in orbit(4, size=SIZE, arc=0.3)]
-    video = with_pixels(write_video(tmp_path / "shot.mp4", frames), 4, 3)
+    video = videos.write_video(tmp_path / "shot.mp4", "libx264", "yuv420p", [frame / 255 for frame in frames],
+                               aspect=Fraction(4, 3))
     stills, _ = prepare_frames(video, tmp_path / "work", 0, 400, Progress())
     assert [(still.width, still.height) for still in stills] == [SIZE] * 4
     assert picture_size(tmp_path / "work" / "small" / stills[0].name) == (400, 225)

@@ -1,217 +1,302 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Videos: their colours are those that players show, they stand upright, and what cannot be read is told."""
+"""Videos: colours are those that players show or light, frames stand upright, and what cannot be read is said."""
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.colour.srgb import linear_from_srgb
-from core.errors import Cancelled, FrameError, SettingsError
-from core.images.video import Video
-from core.removal.jobs.video_frames import expand_videos, extract_frames
+from core.colour.spaces import P3_D65, REC_709, REC_2020, matrix_between
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
+from core.errors import FrameError
+from core.images.video import Video, write_frame
 from core.removal.training import flare_bank
 from core.removal.training.flare_bank import UserFlares
-from core.system.progress import Progress
-from tests.core.recording_progress import RecordingProgress
+from tests.core.videos import PATCHES, STRIPE, X265, middles, stripes, write_video
 
-PATCHES = np.array([(200, 60, 40), (40, 180, 60), (50, 70, 210), (128, 128, 128), (230, 200, 40), (240, 240, 240)])
-"""Red, green, blue."""
-STRIPE = 128
+LOSSLESS = {"qp": "0", "preset": "ultrafast"}
+VP9 = {"lossless": "1"}
+AV1 = {"preset": "10", "crf": "1", "svtav1-params": "tune=0"}
+HD, SD = (1280, 720), (192, 96)
 
 
-def patches(path: Path, height: int, weights: tuple[float, float], told: bytes = b"") -> Path:
-    """A video of upright stripes whose codes are those that luma of these weights, of red and blue, makes of PATCHES.
-    OpenCV writes by BT.601's. told: put into its description."""
-    def luma_and_differences(red: float, blue: float) -> NDArray[np.float64]:
-        green = 1 - red - blue
-        return np.array([[red, green, blue], [-red / 2 / (1 - blue), -green / 2 / (1 - blue), 0.5],
-                         [0.5, -green / 2 / (1 - red), -blue / 2 / (1 - red)]])
+def first_frame(path: Path) -> NDArray[Any]:
+    with Video(path) as video:
+        return next(iter(video)).pixels()
 
-    mixed = PATCHES @ (np.linalg.inv(luma_and_differences(0.299, 0.114)) @ luma_and_differences(*weights)).T
-    frame = np.repeat(np.repeat(mixed.clip(0, 255).round().astype(np.uint8)[None], STRIPE, 1), height, 0)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25, (frame.shape[1], height))
-    for _ in range(3):
-        writer.write(np.ascontiguousarray(frame[..., ::-1]))
-    writer.release()
-    data = bytearray(path.read_bytes())
-    at = data.find(b"moov") - 4
-    if told:
-        size = int.from_bytes(data[at:at + 4], "big")
-        assert at + size == len(data), "the last box"
-        data[at:at + 4] = (size + len(told)).to_bytes(4, "big")
-    path.write_bytes(data + told)
+
+def codes_of(path: Path) -> NDArray[Any]:
+    """The middles of the stripes of a video's first frame, as codes of 8 bits."""
+    pixels = first_frame(path)
+    return middles(pixels).astype(float) * 255 / np.iinfo(pixels.dtype).max
+
+
+@pytest.mark.parametrize(("name", "codec", "pixels", "matrix", "tags", "full", "size", "options"), [
+    ("full_8.mp4", "libx264", "yuv420p", 1, (1, 1, 1), True, SD, LOSSLESS),
+    ("full_10.mp4", "libx264", "yuv422p10le", 1, (1, 1, 1), True, SD, LOSSLESS),
+    ("full_10.mov", "libx265", "yuv420p10le", 1, (1, 1, 1), True, SD, X265),
+    ("full_10.mkv", "libx265", "yuv420p10le", 1, (1, 1, 1), True, SD, X265),
+    ("full_12.mkv", "libx265", "yuv444p12le", 1, (1, 1, 1), True, SD, X265),
+    ("full.webm", "libvpx-vp9", "yuv420p", 1, (1, 1, 1), True, SD, VP9),
+    ("full_ffv1.mkv", "ffv1", "yuv422p10le", 1, (1, 1, 1), True, SD, {}),
+    ("limited_10.webm", "libsvtav1", "yuv420p10le", 9, (9, 1, 1), False, SD, AV1),
+    ("limited_16.mkv", "ffv1", "yuv444p16le", 1, (1, 1, 1), False, SD, {}),
+    ("rgb.mkv", "ffv1", "gbrp10le", 0, None, False, SD, {}),
+    ("rgb_16.mkv", "ffv1", "gbrp16le", 0, None, False, SD, {}),
+    ("rgb.mp4", "libx264rgb", "gbrp", 0, None, False, SD, {**LOSSLESS, "x264-params": ""}),
+    ("601_hd.mp4", "libx264", "yuv444p", 6, (6, 6, 6), False, HD, LOSSLESS),
+    ("601_hd.mkv", "libx264", "yuv444p", 6, (6, 6, 6), False, HD, LOSSLESS),
+    ("601_hd.mkv", "ffv1", "yuv444p", 6, (6, 2, 2), False, HD, {}),
+    ("240m.mkv", "libx264", "yuv444p", 7, (7, 7, 7), False, SD, LOSSLESS),
+    ("untagged_hd.mp4", "libx264", "yuv444p", 1, None, False, HD, LOSSLESS),
+    ("untagged_sd.mp4", "libx264", "yuv444p", 6, None, False, SD, LOSSLESS),
+    ("untagged_sd.avi", "mpeg4", "yuv420p", 6, None, False, SD, {"qscale": "1", "flags": "+qscale"}),
+    ("709_sd.mp4", "libx264", "yuv420p", 1, (1, 1, 1), False, SD, LOSSLESS),
+    ("2020_sdr_matrix.mp4", "libx264", "yuv420p", 9, (9, 1, 1), False, SD, LOSSLESS),
+    ("dnxhr.mov", "dnxhd", "yuv422p10le", 1, (1, 1, 1), False, (1280, 720), {"profile": "dnxhr_hqx"}),
+    ("prores.mov", "prores_ks", "yuv422p10le", 1, (1, 1, 1), False, SD, {"profile": "hq", "qscale": "2"}),
+    ("v210.mov", "v210", "yuv422p10le", 1, (1, 1, 1), False, SD, {}),
+    ("mpeg2.mpg", "mpeg2video", "yuv420p", 6, None, False, SD, {"qscale": "1", "flags": "+qscale"}),
+    ("jpeg.mov", "mjpeg", "yuvj444p", 6, None, True, SD, {"qscale": "1", "flags": "+qscale"}),
+])
+def test_codes_are_those_that_players_show(name: str, codec: str, pixels: str, matrix: int,
+                                           tags: tuple[int, int, int] | None, full: bool, size: tuple[int, int],
+                                           options: dict[str, str], tmp_path: Path) -> None:
+    if codec == "libx264rgb":
+        pytest.importorskip("av")
+        path = _write_rgb264(tmp_path / name)
+    else:
+        path = write_video(tmp_path / name, codec, pixels, [stripes(size[1], size[0])] * 2, matrix=matrix, tags=tags,
+                           full=full, options={key: value for key, value in options.items() if value})
+    lossy = codec in ("mpeg4", "mpeg2video", "mjpeg", "dnxhd", "prores_ks", "libsvtav1")
+    assert np.abs(codes_of(path) - PATCHES).max() <= (2 if lossy else 1)
+    deep = any(depth in pixels for depth in ("10", "12", "16"))
+    assert first_frame(path).dtype == (np.uint16 if deep else np.uint8)
+
+
+def _write_rgb264(path: Path) -> Path:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264rgb", rate=25, options=LOSSLESS)
+        stream.width, stream.height, stream.pix_fmt = 192, 96, "rgb24"
+        shown = np.round(stripes(96) * 255).astype(np.uint8)
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(shown, "rgb24")))
+        container.mux(stream.encode())
     return path
 
 
-def box(transfer: int, matrix: int) -> bytes:
-    """A `colr` box in one that players pass over, for the end of a file's `moov`."""
-    colours = b"colrnclx" + b"".join(number.to_bytes(2, "big") for number in (1, transfer, matrix)) + b"\0"
-    inner = (len(colours) + 4).to_bytes(4, "big") + colours
-    return (len(inner) + 8).to_bytes(4, "big") + b"udta" + inner
+def test_a_container_names_the_colours_that_the_stream_does_not(tmp_path: Path) -> None:
+    """QuickTime's `colr` and Matroska's `Colour`, of codecs that have no tags of their own."""
+    for suffix in ("mov", "mkv"):
+        path = write_video(tmp_path / f"a.{suffix}", "v210" if suffix == "mov" else "rawvideo",
+                           "yuv422p10le" if suffix == "mov" else "yuv420p", [stripes(720, 1280)], matrix=6,
+                           tags=(6, 6, 6))
+        assert np.abs(codes_of(path) - PATCHES).max() <= 1
 
 
-@pytest.mark.parametrize(("height", "weights", "told"), [
-    (360, (0.299, 0.114), b""), (720, (0.2126, 0.0722), b""), (360, (0.2126, 0.0722), box(1, 1)),
-    (720, (0.299, 0.114), box(1, 6)), (720, (0.2627, 0.0593), box(1, 9))])
-def test_the_colours_of_a_video_are_those_that_players_show(height: int, weights: tuple[float, float], told: bytes,
-                                                            tmp_path: Path) -> None:
-    with Video(patches(tmp_path / "a.mp4", height, weights, told)) as video:
-        frames = list(video)
-        assert video.warnings == ()
-    assert len(frames) == 3
-    shown = frames[-1][height // 2, STRIPE // 2::STRIPE, ::-1].astype(int)
-    assert np.abs(shown - PATCHES).max() <= 5, "24 by the wrong matrix"
+NITS = np.array([(203.0, 203, 203), (1000, 100, 50), (10, 20, 40), (0.5, 0.5, 0.5), (4000, 3000, 100), (90, 80, 70)])
 
 
-@pytest.mark.parametrize(("suffix", "codec"), [("mkv", "FFV1"), ("avi", "MJPG"), ("mov", "png ")])
-def test_colours_of_rgb_and_motion_jpeg_are_unchanged(suffix: str, codec: str, tmp_path: Path) -> None:
-    """RGB itself, and JPEG, which is of BT.601 at any size."""
-    frame = np.repeat(np.repeat(PATCHES.astype(np.uint8)[None, :, ::-1], 256, 1), 720, 0)
-    path = tmp_path / f"a.{suffix}"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, (frame.shape[1], 720))
-    for _ in range(2):
-        writer.write(np.ascontiguousarray(frame))
-    writer.release()
-    with Video(path) as video:
-        shown = next(iter(video))[360, 128::256, ::-1].astype(int)
-    assert np.abs(shown - PATCHES).max() <= 5
+def pq(nits: NDArray[Any]) -> NDArray[Any]:
+    """SMPTE ST 2084, written out anew."""
+    power = (nits / 10000) ** 0.1593017578125
+    return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
 
 
-@pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])
-def test_high_dynamic_range_raises_a_warning(transfer: int, name: str, tmp_path: Path) -> None:
-    with Video(patches(tmp_path / "a.mp4", 64, (0.299, 0.114), box(transfer, 9))) as video:
-        assert len(video.warnings) == 1
-        assert name in video.warnings[0]
-
-
-def test_rotated_phone_footage_is_read_upright(tmp_path: Path) -> None:
-    path = patches(tmp_path / "a.mp4", 96, (0.299, 0.114))
-    data = bytearray(path.read_bytes())
-    at = data.find(b"tkhd") + 4 + 40
-    turned = (0, 1 << 16, 0, -(1 << 16), 0, 0, 96 << 16, 0, 1 << 30)
-    data[at:at + 36] = b"".join(number.to_bytes(4, "big", signed=True) for number in turned)
-    path.write_bytes(data)
+@pytest.mark.parametrize(("name", "codec", "pixels", "options"), [
+    ("pq.mp4", "libx265", "yuv420p10le", X265), ("pq.mkv", "libx265", "yuv420p10le", X265),
+    ("pq.webm", "libsvtav1", "yuv420p10le", AV1), ("pq.mov", "prores_ks", "yuv444p10le",
+                                                                 {"profile": "4444", "qscale": "1"}),
+    ("pq_ffv1.mkv", "ffv1", "yuv444p12le", {})])
+def test_pq_is_light_in_which_reference_white_is_1(name: str, codec: str, pixels: str, options: dict[str, str],
+                                                   tmp_path: Path) -> None:
+    path = write_video(tmp_path / name, codec, pixels, [stripes(64, colours=pq(NITS))], matrix=9, tags=(9, 16, 9),
+                       options=options)
     with Video(path) as video:
         frame = next(iter(video))
-    assert frame.shape == (6 * STRIPE, 96, 3)
-    assert np.abs(frame[STRIPE // 2, 48, ::-1].astype(int) - PATCHES[0]).max() <= 5
+    assert frame.encoding == "linear"
+    truth = NITS / 203 @ matrix_between(REC_2020, REC_709).T
+    seen = middles(frame.pixels())
+    back = pq(np.maximum(seen @ np.linalg.inv(matrix_between(REC_2020, REC_709).T) * 203, 0))
+    assert np.abs(back - pq(NITS)).max() < 1.6 / 1023, "codes of 10 bits"
+    assert np.abs(seen[0] - 1).max() < 0.02
+    assert np.abs(seen - truth).max() < 0.03 * truth.max()
+
+
+@pytest.mark.parametrize(("name", "codec", "options"), [
+    ("hlg.mp4", "libx265", X265), ("hlg.mkv", "ffv1", {}), ("hlg.webm", "libsvtav1", AV1)])
+def test_hlg_is_light_of_a_display_of_1000_nits(name: str, codec: str, options: dict[str, str], tmp_path: Path) -> None:
+    """75 % of the signal is reference white, 203 cd/m², and 100 % is the peak (ITU-R BT.2408, table 1)."""
+    signal = np.array([(0.75,) * 3, (1.0,) * 3, (0.5,) * 3, (0.0,) * 3, (0.75, 0.5, 0.5), (0.38,) * 3])
+    path = write_video(tmp_path / name, codec, "yuv420p10le", [stripes(64, colours=signal)], matrix=9, tags=(9, 18, 9),
+                       options=options)
+    seen = middles(first_frame(path))
+    assert seen[0] == pytest.approx(1, rel=0.02)
+    assert seen[1] == pytest.approx(1000 / 203, rel=0.01)
+    assert seen[2] == pytest.approx((1 / 12) ** 1.2 * 1000 / 203, rel=0.02)
+    assert np.abs(seen[3]).max() < 1e-4
+    assert seen[5] == pytest.approx(26 / 203, rel=0.05), "a grey card of 18 %, BT.2408"
+
+
+@pytest.mark.parametrize(("primaries", "chromaticities"), [(12, P3_D65), (9, REC_2020)])
+def test_wide_primaries_of_standard_range_become_rec_709(primaries: int, chromaticities: Any, tmp_path: Path) -> None:
+    light = linear_from_srgb(PATCHES / 255) @ matrix_between(REC_709, chromaticities).T
+    path = write_video(tmp_path / "a.mp4", "libx264", "yuv444p10le", [stripes(64, colours=srgb_from_linear(light))],
+                       tags=(1, 1, primaries), options=LOSSLESS)
+    assert np.abs(codes_of(path) - PATCHES).max() <= 1
+    assert first_frame(path).dtype == np.uint16
+
+
+def test_linear_video_is_light(tmp_path: Path) -> None:
+    light = PATCHES / 255
+    path = write_video(tmp_path / "a.mkv", "ffv1", "gbrp16le", [stripes(64)], tags=(0, 8, 1))
+    with Video(path) as video:
+        picture = next(iter(video)).picture()
+    assert picture.encoding == "linear"
+    assert np.abs(middles(picture.pixels) - light).max() < 1e-4
+
+
+@pytest.mark.parametrize(("name", "codec", "pixels", "options"), [
+    ("a.mov", "prores_ks", "yuva444p10le", {"profile": "4444", "alpha_bits": "16", "qscale": "1"}),
+    ("a.mkv", "ffv1", "yuva420p", {}), ("b.mkv", "ffv1", "gbrap12le", {})])
+def test_alpha_is_kept(name: str, codec: str, pixels: str, options: dict[str, str], tmp_path: Path) -> None:
+    alpha = np.repeat(np.linspace(0, 1, 96)[:, None], 192, 1)
+    path = write_video(tmp_path / name, codec, pixels, [stripes(96)], alpha=alpha, options=options)
+    with Video(path) as video:
+        frame = next(iter(video))
+        assert video.has_alpha
+    straight = frame.straight_alpha()
+    assert straight is not None and np.abs(straight - alpha).max() < 1 / 250
+    file = write_frame(tmp_path / "out", frame)
+    stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    assert stored.shape == (96, 192, 4) and stored.dtype == frame.pixels().dtype
+    assert np.array_equal(stored[..., 2::-1], frame.pixels())
+    assert np.array_equal(stored[..., 3], frame.alpha())
+
+
+@pytest.mark.parametrize("rotation", [90, 180, 270, -90])
+@pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv"])
+def test_rotated_phone_footage_is_read_upright(rotation: int, suffix: str, tmp_path: Path) -> None:
+    """Turned counterclockwise by the angle of the display matrix."""
+    signal = stripes(96) * np.linspace(1, 0.5, 96)[:, None, None]
+    path = write_video(tmp_path / f"a.{suffix}", "libx264", "yuv444p", [signal], options=LOSSLESS, rotation=rotation,
+                       aspect=Fraction(4, 3))
+    with Video(path) as video:
+        seen = next(iter(video)).picture().pixels
+        assert video.aspect == pytest.approx(4 / 3 if rotation == 180 else 3 / 4)
+    assert np.abs(seen - np.rot90(_stored(path), rotation // 90)).max() == 0
+
+
+def _stored(path: Path) -> NDArray[Any]:
+    with Video(path) as video:
+        frame = next(iter(video))
+        return frame.orientation.stored(frame.picture().pixels)
+
+
+def test_mirrored_footage_is_read_upright(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.mp4", "libx264", "yuv444p", [stripes(96)], options=LOSSLESS)
+    plain = first_frame(path)
+    data = bytearray(path.read_bytes())
+    at = data.find(b"tkhd") + 4 + 40
+    mirrored = (-(1 << 16), 0, 0, 0, 1 << 16, 0, 192 << 16, 0, 1 << 30)
+    data[at:at + 36] = b"".join(number.to_bytes(4, "big", signed=True) for number in mirrored)
+    path.write_bytes(data)
+    assert np.array_equal(first_frame(path), plain[:, ::-1])
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv", "mov"])
+def test_the_pixel_aspect_is_read(suffix: str, tmp_path: Path) -> None:
+    for number, aspect in enumerate((None, Fraction(4, 3), Fraction(16, 15))):
+        path = write_video(tmp_path / f"{number}.{suffix}", "libx264", "yuv420p", [stripes(96)], aspect=aspect)
+        with Video(path) as video:
+            assert video.aspect == pytest.approx(float(aspect or 1))
+
+
+@pytest.mark.parametrize(("name", "codec", "options"), [
+    ("a.mp4", "libx264", {"g": "7", "bf": "3"}), ("a.mkv", "libx265", {"x265-params": "log-level=none:keyint=6"}),
+    ("a.webm", "libvpx-vp9", {"g": "5"}), ("a.avi", "mpeg4", {"g": "6", "bf": "0"}), ("a.mov", "prores_ks", {}),
+    ("a.mpg", "mpeg2video", {"g": "6", "bf": "2", "qscale": "1", "flags": "+qscale"}), ("a.ts", "libx264", {"g": "8"})])
+def test_seeking_finds_the_frame_of_that_number(name: str, codec: str, options: dict[str, str], tmp_path: Path) -> None:
+    signals = [np.full((64, 64, 3), 0.1 + number * 0.035) for number in range(20)]
+    path = write_video(tmp_path / name, codec, "yuv422p10le" if codec == "prores_ks" else "yuv420p", signals,
+                       options=options)
+    with Video(path) as video:
+        levels = [frame.pixels().mean() for frame in video]
+        assert len(levels) == 20 and np.all(np.diff(levels) > 0)
+        for number in (0, 1, 7, 13, 19):
+            video.seek(number)
+            frame = next(iter(video))
+            assert frame.number == number and frame.pixels().mean() == levels[number]
+        video.seek(20)
+        assert list(video) == []
+
+
+def test_frames_hidden_by_an_edit_list_are_neither_shown_nor_missing(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.mp4", "libx264", "yuv420p", [np.full((64, 64, 3), n / 20) for n in range(10)],
+                       options={"bf": "0", **LOSSLESS})
+    data = bytearray(path.read_bytes())
+    at = data.find(b"elst")
+    start = at + 16  # of one entry: duration, media time
+    ticks = 12800 // 25
+    assert int.from_bytes(data[start:start + 4], "big") == 0
+    data[start:start + 4] = (4 * ticks).to_bytes(4, "big")
+    path.write_bytes(data)
+    with Video(path) as video:
+        assert video.length == 6
+        levels = [frame.picture().pixels.mean() for frame in video]
+    assert len(levels) == 6 and levels[0] == pytest.approx(4 / 20, abs=0.01) and video.problems == []
 
 
 @pytest.mark.parametrize("content", [b"", b"no video at all", None])
 def test_an_invalid_or_truncated_video_is_reported(content: bytes | None, tmp_path: Path) -> None:
-    path = patches(tmp_path / "a.mp4", 64, (0.299, 0.114))
+    path = write_video(tmp_path / "a.mp4", "libx264", "yuv420p", [stripes(64)])
     path.write_bytes(path.read_bytes()[:200] if content is None else content)
     with pytest.raises(FrameError, match=r"a\.mp4 cannot be decoded: it is cut off, or"):
         Video(path)
 
 
+def test_colours_that_cannot_be_converted_are_refused(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.mkv", "ffv1", "yuv444p10le", [stripes(64)], tags=(14, 16, 9))
+    with pytest.raises(FrameError, match=r"a\.mkv has the colour matrix ICtCp"):
+        Video(path)
+
+
+def test_sound_and_cover_art_are_no_video(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=48000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+        frame.sample_rate = 48000
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with pytest.raises(FrameError, match=r"a\.mp4 holds no video"):
+        Video(path)
+
+
 def test_a_flare_video_keeps_its_colours(tmp_path: Path) -> None:
-    """Of high definition."""
     path = tmp_path / "clips" / "flare.mp4"
     path.parent.mkdir()
-    patches(path, 720, (0.2126, 0.0722))
-    own = UserFlares(path.parent, 256)
-    layers = own.draw(np.random.default_rng(0))
+    write_video(path, "libx264", "yuv444p", [stripes(720, 1280)] * 3, options=LOSSLESS)
+    layers = UserFlares(path.parent, 256).draw(np.random.default_rng(0))
     high, wide = np.nonzero(layers.rest.sum(-1) > 0.01)
     shown = layers.rest[high.min():high.max() + 1, wide.min():wide.max() + 1]
     columns = ((np.arange(6) + 0.5) / 6 * shown.shape[1]).astype(int)
-    truth = linear_from_srgb(PATCHES / 255)
-    assert np.abs(shown[len(shown) // 2, columns] - truth).max() < 0.04
+    assert np.abs(shown[len(shown) // 2, columns] - linear_from_srgb(PATCHES / 255)).max() < 0.03
 
 
 def test_a_flare_video_that_claims_too_many_frames_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As one does whose sound is longer."""
     class Longer(Video):
         def __init__(self, path: Path) -> None:
             super().__init__(path)
-            self.length = 1000
+            self.estimated_length = 1000
 
     path = tmp_path / "clips" / "flare.mp4"
     path.parent.mkdir()
-    patches(path, 360, (0.299, 0.114))
+    write_video(path, "libx264", "yuv420p", [stripes(96, 6 * STRIPE)] * 3)
     monkeypatch.setattr(flare_bank, "Video", Longer)
     assert UserFlares(path.parent, 256).draw(np.random.default_rng(0)).rest.max() > 0.1
-
-
-def with_pixels(path: Path, wide: int, high: int) -> Path:
-    """A video of OpenCV's as one whose pixels are of that shape: the box `pasp`, in all boxes about it."""
-    data = bytearray(path.read_bytes())
-    entry = data.find(b"mp4v", data.find(b"stsd")) - 4
-    end = entry + int.from_bytes(data[entry:entry + 4], "big")
-    box = (16).to_bytes(4, "big") + b"pasp" + wide.to_bytes(4, "big") + high.to_bytes(4, "big")
-    at = data.find(b"moov")
-    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"mp4v"):
-        at = data.find(name, at) - 4
-        data[at:at + 4] = (int.from_bytes(data[at:at + 4], "big") + len(box)).to_bytes(4, "big")
-        at += 4
-    data[end:end] = box
-    path.write_bytes(data)
-    return path
-
-
-def test_the_pixel_aspect_is_read(tmp_path: Path) -> None:
-    path = patches(tmp_path / "a.mp4", 240, (0.299, 0.114))
-    with Video(path) as video:
-        assert video.aspect == 1
-    with Video(with_pixels(path, 4, 3)) as video:
-        assert video.aspect == pytest.approx(4 / 3) and len(list(video)) == 3
-
-
-def test_the_frames_of_a_video_are_extracted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clip, out = patches(tmp_path / "clip.mp4", 64, (0.299, 0.114)), tmp_path / "out"
-    frames = extract_frames(clip, out, Progress())
-    assert frames == out / "clip.mp4.frames"
-    assert sorted(path.name for path in frames.glob("*.png")) == [f"clip.{number:06d}.png" for number in (1, 2, 3)]
-    first = cv2.imread(str(frames / "clip.000001.png"))
-    assert np.abs(first[32, STRIPE // 2::STRIPE, ::-1].astype(int) - PATCHES).max() < 12
-    with Video(clip) as again:
-        assert np.array_equal(first, next(iter(again)))
-    with monkeypatch.context() as patch:
-        patch.setattr("core.removal.jobs.video_frames._decode_frames", lambda *_: pytest.fail("they are there"))
-        assert extract_frames(clip, out, Progress()) == frames
-    patches(clip, 96, (0.299, 0.114))
-    with pytest.raises(SettingsError, match=r"another video of that name"):
-        extract_frames(clip, out, Progress())
-
-
-def test_frames_that_another_task_has_extracted_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clip, out = patches(tmp_path / "clip.mp4", 64, (0.299, 0.114)), tmp_path / "out"
-    there = extract_frames(clip, tmp_path / "other", Progress())
-    monkeypatch.setattr("core.removal.jobs.video_frames._decode_frames", lambda *_: there.rename(out / there.name))
-    assert len(list(extract_frames(clip, out, Progress()).glob("*.png"))) == 3
-
-
-def test_missing_frames_of_a_video_are_reported(tmp_path: Path) -> None:
-    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25, (64, 48))
-    for _ in range(4):
-        writer.write(np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8))
-    writer.release()
-    whole = (tmp_path / "clip.avi").read_bytes()
-    told = RecordingProgress()
-    extract_frames(tmp_path / "clip.avi", tmp_path / "whole", told)
-    assert not told.texts
-    (tmp_path / "clip.avi").write_bytes(whole[:len(whole) * 6 // 10])
-    extract_frames(tmp_path / "clip.avi", tmp_path / "cut", told)
-    assert [sentence for sentence in told.texts if "promises 4 frames" in sentence]
-
-
-def test_an_unreadable_or_cancelled_video_leaves_no_frames(tmp_path: Path) -> None:
-    (tmp_path / "empty.mov").touch()
-    clip, out = patches(tmp_path / "clip.mp4", 64, (0.299, 0.114)), tmp_path / "out"
-    stopped = Progress()
-    stopped.request_stop()
-    with pytest.raises(Cancelled):
-        extract_frames(clip, out, stopped)
-    with pytest.raises(FrameError, match=r"empty\.mov cannot be decoded"):
-        extract_frames(tmp_path / "empty.mov", out, Progress())
-    assert list(out.iterdir()) == []
-    given = [tmp_path / "empty.mov", clip, tmp_path / "plate.png"]
-    plates, left_out = expand_videos(given, out, Progress())
-    assert plates == [out / "clip.mp4.frames", given[2]]
-    assert len(left_out) == 1 and left_out[0].startswith(f"{given[0]} cannot be decoded")
-    with pytest.raises(FrameError, match=r"^\S+empty\.mov cannot be decoded"):
-        expand_videos(given[:1], out, Progress())

@@ -22,7 +22,7 @@ from ...images.listing import pictures_in
 from ...images.picture import Picture
 from ...images.read import read_picture
 from ...images.size import picture_size
-from ...images.video import Video, frame_to_display, is_video, truncated_message
+from ...images.video import Video, is_video, write_frame
 from ...images.write import write_png
 from ...system.files import read_json, write_json
 from ...system.progress import Progress
@@ -171,31 +171,26 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
 def _from_video(source: Path, work: Path, number: int, size: int,
                 progress: Progress) -> tuple[list[SourceFrame], list[str]]:
     """Read the video twice: for the sharpness of every frame, then for the chosen ones."""
-    import cv2
-
     with Video(source) as video:
-        for sentence in video.warnings:
-            progress.say(sentence)
-        progress.stage("choose frames", video.length)
+        progress.stage("choose frames", video.estimated_length)
         scores = []
         for frame in video:
-            scores.append(sharpness(np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.float32)))
+            scores.append(sharpness(frame.grey()))
             progress.advance()
+        for sentence in video.problems:
+            progress.say(sentence)
     if not scores:
         raise CaptureError(f"{source} holds no frame that can be decoded; convert it to MP4 (H.264).")
-    if len(scores) < video.length:
-        progress.say(truncated_message(source, video.length, len(scores)))
     chosen = set(choose_sharpest(scores, number))
     progress.stage("read frames", len(chosen))
     frames, interlaced = list[SourceFrame](), list[bool]()
     with Video(source) as video:
-        for index, frame in enumerate(video):
-            if index in chosen:
-                picture = Picture(frame_to_display(frame), "srgb")
-                file = work / "full" / f"{index:06d}.png"
-                write_png(file, picture.pixels)
-                frames.append(SourceFrame(file.name, str(file.resolve()), *picture.size, None, 1))
-                _write_small(picture, video.aspect, work, file.name, size)
+        for frame in video:
+            if frame.number in chosen:
+                picture = frame.picture()
+                file = write_frame(work / "full" / f"{frame.number:06d}", frame)
+                frames.append(SourceFrame(f"{file.stem}.png", str(file.resolve()), *picture.size, None, 1))
+                _write_small(picture, video.aspect, work, frames[-1].name, size)
                 interlaced.append(is_interlaced(picture))
                 progress.advance()
     _warn_if_interlaced(interlaced, progress)

@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Extracts the frames of videos into folders, so that `remove` can clean them like any shot."""
+"""Extracts the frames of videos into folders, so that `remove` can clean them like any shot.
+
+`headless/commands/remove.py` calls `expand_videos`; `clean_video.py` writes a video of the clean frames.
+"""
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from ...errors import FrameError, SettingsError, join_failures
-from ...images.video import Video, frame_to_display, is_video, truncated_message
-from ...images.write import write_png
+from ...images.video import Video, is_video, write_frame
 from ...system.files import atomic_folder, content_hash, read_json, write_json
 from ...system.progress import Progress
 
 VIDEO_MANIFEST = "video.json"
-"""The file in the folder of a video's frames that says which video they are of."""
+"""The file in the folder of a video's frames that says which video they are of, and what is wrong with it."""
 
 
 def expand_videos(inputs: Iterable[Path], folder: Path, progress: Progress) -> tuple[list[Path], list[str]]:
@@ -30,8 +33,9 @@ def expand_videos(inputs: Iterable[Path], folder: Path, progress: Progress) -> t
 
 
 def extract_frames(video: Path, folder: Path, progress: Progress) -> Path:
-    """Return the folder NAME.frames below `folder` with a video's frames as 8 bit PNGs, STEM.000001.png and on, upright
-    and in the colours that players show. Frames that exist already are kept.
+    """Return the folder NAME.frames below `folder` with a video's frames, STEM.000001 and on: PNGs of 8 bits, or of 16
+    where it has more, in the colours that players show; EXRs of linear light for PQ and HLG. Alpha is kept. Frames that
+    exist already are kept.
 
     Raises FrameError for a video without a readable frame, SettingsError where the folder holds frames of another
     video.
@@ -40,27 +44,29 @@ def extract_frames(video: Path, folder: Path, progress: Progress) -> Path:
     if not frames.exists():
         try:
             with atomic_folder(frames) as temporary:
-                _decode_frames(video, temporary, progress)
-                write_json(temporary / VIDEO_MANIFEST, {"content": content})
+                problems = _decode_frames(video, temporary, progress)
+                write_json(temporary / VIDEO_MANIFEST, {"content": content, "problems": problems})
         except OSError:
             if not frames.exists():  # another task of a farm may have extracted them meanwhile
                 raise
-    if read_json(frames / VIDEO_MANIFEST, SettingsError).get("content") != content:
+    manifest: dict[str, Any] = read_json(frames / VIDEO_MANIFEST, SettingsError)
+    if manifest.get("content") != content:
         raise SettingsError(f"{frames} holds the frames of another video of that name; choose another folder for the "
                             "clean frames, or delete it.")
+    for sentence in manifest.get("problems", []):
+        progress.say(str(sentence))
     return frames
 
 
-def _decode_frames(video: Path, folder: Path, progress: Progress) -> None:
+def _decode_frames(video: Path, folder: Path, progress: Progress) -> list[str]:
+    """Write all frames, and return sentences about those that are missing or damaged."""
     with Video(video) as reader:
-        progress.stage(f"extract the frames of {video.name}", reader.length)
-        for sentence in reader.warnings:
-            progress.say(sentence)
-        number = 0
-        for number, frame in enumerate(reader, 1):
-            write_png(folder / f"{video.stem}.{number:06d}.png", frame_to_display(frame))
+        progress.stage(f"extract the frames of {video.name}", reader.estimated_length)
+        count = 0
+        for frame in reader:
+            write_frame(folder / f"{video.stem}.{frame.number + 1:06d}", frame)
+            count += 1
             progress.advance()
-    if number == 0:
+    if count == 0:
         raise FrameError(f"{video} has no frame that can be read; copy it again, or convert it to MP4 (H.264).")
-    if number < reader.length:
-        progress.say(truncated_message(video, reader.length, number))
+    return reader.problems

@@ -20,12 +20,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...colour.srgb import linear_from_srgb
 from ...errors import FrameError, SettingsError
 from ...images.listing import SUFFIXES
 from ...images.plates import read_plate
 from ...images.read import read_picture
-from ...images.video import VIDEOS, Video, frame_to_display, is_video
+from ...images.video import VIDEOS, Video, is_video
 from ...optics.prescription import Prescription
 from ..synthesis.flare import add_aspheric_ghosts, synthesise_flare
 from .pairs import WHITE, FlareLayers, FlareSource
@@ -75,6 +74,7 @@ class SynthesisBank:
                                light=_to_float32(layers.light))
 
     def _synthesise(self, serial: int) -> FlareLayers:
+        """Synthesise the flare of a serial number, in half precision, by chance coloured or with ghosts of aspheres."""
         synthesised = synthesise_flare((self._seed, serial), self._size, self._lenses)
         random = np.random.default_rng((self._seed, serial, 2))
         colour = draw_saturated_colour(random) if random.random() < self._coloured else WHITE
@@ -153,7 +153,8 @@ class UserFlares:
     def draw(self, random: Random) -> FlareLayers:
         """Return a random layer; the middle of its picture is taken as the principal point.
 
-        An unreadable one is skipped, so that a training of days does not end for it. Raises FrameError where many are.
+        Unreadable files are skipped, so that one does not end a long training. Raises FrameError after
+        MAX_UNREADABLE_DRAWS in succession.
         """
         for _ in range(MAX_UNREADABLE_DRAWS - 1):
             with contextlib.suppress(FrameError):
@@ -161,6 +162,7 @@ class UserFlares:
         return self._draw_layers(random)
 
     def _draw_layers(self, random: Random) -> FlareLayers:
+        """Return the layers of a random file; its light is placed where the picture of the light is brightest."""
         file = self._files[int(random.integers(len(self._files)))]
         flare, light = map(self._fit_to_canvas, self._read(file, random))
         light = np.minimum(light, flare)
@@ -203,14 +205,15 @@ def _read_random_frame(path: Path, random: Random) -> NDArray[np.float32]:
     if not is_video(path):
         return _read_linear(path)
     with Video(path) as clip:
-        clip.seek(int(random.integers(max(clip.length, 1))))
+        clip.seek(int(random.integers(max(clip.estimated_length, 1))))
         frame = next(iter(clip), None)
-    if frame is None:  # past the end: a file with longer sound claims more frames than it has
+    if frame is None:  # past the end: the header of a file with longer sound claims more frames than it has
         with Video(path) as clip:
             frame = next(iter(clip), None)
     if frame is None:
         raise FrameError(f"{path} cannot be read as a video; convert it to pictures.")
-    return np.asarray(linear_from_srgb(frame_to_display(frame)), np.float32)
+    light, alpha = frame.picture().linear(), frame.straight_alpha()
+    return np.maximum(light if alpha is None else light * alpha[..., None], 0)
 
 
 class MixedBank:

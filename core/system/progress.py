@@ -86,6 +86,11 @@ class Progress:
             raise Cancelled(f"Stopped during {self._stage or 'start-up'} as requested; what is done is kept.")
 
     @property
+    def stage_name(self) -> str:
+        """Name of the stage, "" before the first."""
+        return self._stage
+
+    @property
     def eta_s(self) -> float | None:
         """Estimated seconds to the end of this stage, by the recent pace; None until a second after the first step.
 
@@ -182,6 +187,7 @@ class TerminalProgress(Progress):
         self._reported = 0
 
     def _show_stage(self) -> None:
+        """Begin the bar of the current stage, by tqdm on a terminal that has it, else by lines."""
         self.close()
         self._reported = self._done
         # Blender's own Python has no tqdm.

@@ -22,6 +22,7 @@ from ...choices import Matching
 from ...errors import CaptureError, SettingsError
 from ...images.listing import pictures_in
 from ...images.video import is_video
+from ...system.child import ChildDied, run_in_child
 from ...system.files import read_json, remove_file, remove_partials_below, write_json
 from ...system.folder_lock import folder_lock
 from ...system.progress import Progress
@@ -100,13 +101,18 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
 
 def _solve(source: Path, out: Path, request: dict[str, Any], settings: SolveSettings,
            progress: Progress) -> dict[str, Any]:
+    """Carry out `solve` in the locked folder `out`; return the report."""
     from . import develop, mapping, report, source_frames, world
 
     began = time.monotonic()
     _prepare_output(source, out, request, progress)
     work = out / WORK_FOLDER
     chosen, left_out = source_frames.prepare_frames(source, work, settings.frames, settings.size, progress)
-    solved = mapping.solve(chosen, work, settings, is_video(source), progress)
+    try:
+        solved = run_in_child(mapping.solve, chosen, work, settings, is_video(source), progress=progress)
+    except ChildDied as problem:  # pycolmap aborts where its database cannot be written
+        raise CaptureError(f"COLMAP ended by itself ({problem}); mostly the disk of {work} is full or fails: make room "
+                           "and solve again, finished steps are kept.") from problem
     world.align(solved.model)
     missing = sorted(set(range(len(chosen))) - {frame.index for frame in solved.frames})
     if missing:

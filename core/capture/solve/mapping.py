@@ -293,6 +293,7 @@ def _run_mapper(pycolmap: Any, work: Path, database: Path, frames: int, settings
     for number, model in models.items():
         (folder / str(number)).mkdir(exist_ok=True)
         model.write(str(folder / str(number)))
+        read_model(folder / str(number))  # pycolmap does not report a write that fails
     write_json(work / MODELS_FILE, [str(number) for number in models])
     return list(models.values())
 

@@ -88,9 +88,9 @@ class Experiment:
     frames: Literal["filmed", "graded", "removed", "cleaned"] = "filmed"
 
     def key(self) -> str:
-        """The same for two experiments that are the same fit."""
-        made = {**asdict(self), "study": "", "name": ""}
-        return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()[:16]
+        """Return a key that is equal for two experiments that are the same fit."""
+        identity = {**asdict(self), "study": "", "name": ""}
+        return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _seeded(seed: int, name: Preset, **form: Any) -> FitSettings:
@@ -98,22 +98,22 @@ def _seeded(seed: int, name: Preset, **form: Any) -> FitSettings:
 
 
 def ours(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
-    """Our form at this length, with settings changed by dotted name (`__` for the dot)."""
+    """Return our form at this length, with settings changed by dotted name (`__` for the dot)."""
     return override_settings(length(mode=mode), {name.replace("__", "."): value for name, value in changes.items()})
 
 
 def papers(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
-    """The paper's form and loss at the same length, with the same rates."""
-    made = length(model="paper", mode=mode)
-    return override_settings(made, {name.replace("__", "."): value for name, value in changes.items()})
+    """Return the paper's form and loss at the same length, with the same rates."""
+    settings = length(model="paper", mode=mode)
+    return override_settings(settings, {name.replace("__", "."): value for name, value in changes.items()})
 
 
 def experiments(length: Length) -> list[Experiment]:
-    """All studies."""
-    def of(study: str, variants: dict[str, FitSettings]) -> list[Experiment]:
+    """Return the experiments of all studies."""
+    def variants_of(study: str, variants: dict[str, FitSettings]) -> list[Experiment]:
         return [Experiment(study, name, settings) for name, settings in variants.items()]
 
-    made = of("form", {
+    result = variants_of("form", {
         "ours": ours(length),
         "without rings": ours(length, flare__form__rings=False),
         "with arcs": ours(length, flare__form__arcs=True),
@@ -128,7 +128,7 @@ def experiments(length: Length) -> list[Experiment]:
         "fitted apart throughout": ours(length, separate_until=1.0),
         "the paper's": papers(length),
     })
-    made += of("comparison", {
+    result += variants_of("comparison", {
         "default": papers(length),
         "2d": papers(length, "2d"),
         "in-flare": papers(length, "in-flare"),
@@ -144,27 +144,27 @@ def experiments(length: Length) -> list[Experiment]:
             settings = form(length, flare__form__light_correction=light, flare__form__plane_offset=plane)
             if not light:  # as they are given, then
                 settings = override_settings(settings, {"flare.snap_lights": False})
-            made += [Experiment(study, f"{corrections}, sigma {sigma:g}", settings, sigma) for sigma in SIGMAS]
-    made += of("supervision", {"exact flare-free frames": ours(length), "none: split": ours(length, "split"),
+            result += [Experiment(study, f"{corrections}, sigma {sigma:g}", settings, sigma) for sigma in SIGMAS]
+    result += variants_of("supervision", {"exact flare-free frames": ours(length), "none: split": ours(length, "split"),
                                "none: unsup": ours(length, "unsup")})
-    made += [Experiment("supervision", "what remove makes, for exact", ours(length), frames="cleaned"),
+    result += [Experiment("supervision", "what remove makes, for exact", ours(length), frames="cleaned"),
              Experiment("supervision", "what remove makes: estimated", ours(length, "estimated"), frames="cleaned")]
     many = {"flare.count": 900, "flare.density.max_gaussians": 900}  # of each light, from the beginning to the end
     alone = override_settings(ours(length), {**many, "flare.occlusion": False})
-    made += [Experiment("known", "ours", alone, known_scene=True),
+    result += [Experiment("known", "ours", alone, known_scene=True),
              Experiment("known", "with arcs", override_settings(alone, {"flare.form.arcs": True}), known_scene=True),
              Experiment("known", "without rings", override_settings(alone, {"flare.form.rings": False}),
                         known_scene=True),
              Experiment("known", "the paper's", override_settings(papers(length), many), known_scene=True)]
-    made += [Experiment("extrapolation", "every n-th view", ours(length)),
+    result += [Experiment("extrapolation", "every n-th view", ours(length)),
              Experiment("extrapolation", "a stretch", ours(length), stretch=True),
              Experiment("extrapolation", "a stretch, the paper's", papers(length), stretch=True)]
     plain = papers(length, "3dgs")
-    made += [Experiment("reconstruction", "3dgs on the frames", plain),
+    result += [Experiment("reconstruction", "3dgs on the frames", plain),
              Experiment("reconstruction", "3dgs on the frames, bilateral grids", plain, frames="graded"),
              Experiment("reconstruction", "3dgs on flare-free frames", plain, frames="removed"),
              Experiment("reconstruction", "our joint fit", ours(length))]
-    return made
+    return result
 
 
 def displaced(capture: Capture, sigma: float, seed: int = 0) -> Capture:
@@ -184,11 +184,11 @@ def stretch(capture: Capture, share: float = 0.15) -> list[str]:
 
 
 def run(experiment: Experiment, folder: Path, capture: Path, width: int, progress: Progress) -> dict[str, Any]:
-    """Scores of one experiment, from its folder if it was done before."""
+    """Return the scores of one experiment, from its folder if it was done before."""
     file = folder / SCORES
     if file.exists():
-        found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        return found
+        stored: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        return stored
     opened = displaced(Capture.open(capture), experiment.displacement)
     settings = replace(experiment.settings, width=width)
     if experiment.stretch:
@@ -205,8 +205,8 @@ def run(experiment: Experiment, folder: Path, capture: Path, width: int, progres
             opened = _capture_of(folder / "capture", capture, images="removed")
         elif experiment.frames == "cleaned":
             opened = _cleaned(folder / "capture", capture, progress)
-        made = fit(opened, settings, folder / "run", progress, resume=True)
-        scores = _scores(made, capture, settings, progress)
+        fitted = fit(opened, settings, folder / "run", progress, resume=True)
+        scores = _scores(fitted, capture, settings, progress)
     scores["seconds"], scores["commit"] = round(time.monotonic() - began), _commit()
     write_json(file, scores)
     return scores
@@ -243,8 +243,10 @@ def _graded(capture: Capture, settings: FitSettings, progress: Progress) -> dict
 
 
 def _capture_of(folder: Path, capture: Path, **origins: str) -> Capture:
-    """A capture of another's frames, cameras and lights, without its flare-free frames; origins: what stands for one of
-    these instead."""
+    """Make a capture of links to another's frames, cameras and lights, without its clean frames.
+
+    origins: the file or folder of `capture` that a name links to instead.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("images", "sparse", "split.json", "lights.json"):
         link, origin = folder / name, capture / origins.get(name, name)
@@ -254,27 +256,27 @@ def _capture_of(folder: Path, capture: Path, **origins: str) -> Capture:
 
 
 def _cleaned(folder: Path, capture: Path, progress: Progress) -> Capture:
-    made = _capture_of(folder, capture)
-    if not made.has_removed:
-        clean_capture(made, Remover(glow="remove"), progress)
+    copy = _capture_of(folder, capture)
+    if not copy.has_removed:
+        clean_capture(copy, Remover(glow="remove"), progress)
     return Capture.open(folder)
 
 
-def _scores(made: Run | _SceneAlone, folder: Path, settings: FitSettings, progress: Progress) -> dict[str, Any]:
-    """Means over the held-out views, against the capture as it is: lights are displaced for the fit alone.
+def _scores(renderer: Run | _SceneAlone, folder: Path, settings: FitSettings, progress: Progress) -> dict[str, Any]:
+    """Return means over the held-out views of the unchanged capture: lights are displaced for the fit alone.
 
     `hidden`: see `hidden_lights`, over all views, since few of those held out hide a light.
     """
     capture = Capture.open(folder)
     held_out = capture.split(settings.holdout)[1]
     frames = Frames(capture, settings.width)
-    found = evaluate(made, capture, {view: frames.camera(view) for view in held_out}, progress,
+    evaluated = evaluate(renderer, capture, {view: frames.camera(view) for view in held_out}, progress,
                      frames.picture_area)
-    scores: dict[str, Any] = {layer: part for layer, part in found.items() if isinstance(part, dict)}
+    scores: dict[str, Any] = {layer: part for layer, part in evaluated.items() if isinstance(part, dict)}
     if settings.mode == "3dgs":  # what it calls a flare is nothing at all
         scores = {layer: part for layer, part in scores.items() if not layer.startswith("flare")}
     else:
-        hidden = hidden_flare(made, folder, {view: frames.camera(view) for view in capture.views})
+        hidden = hidden_flare(renderer, folder, {view: frames.camera(view) for view in capture.views})
         if hidden is not None:
             scores["hidden"] = hidden
     return scores
@@ -296,20 +298,20 @@ def _cell(values: Iterable[float | None], digits: int) -> str:
 
 
 def tables(results: Results) -> str:
-    """A table for each study; figures are means over the captures that all of its rows have."""
+    """Return a table for each study; figures are means over the captures that all of its rows have."""
     parts = []
     for study, rows in results.items():
         names = shared(rows)
         scores = {name: [row[capture] for capture in names] for name, row in rows.items()}
-        known = [one for row in scores.values() for one in row]
-        shown = [(layer, key, title) for layer, key, title in COLUMNS
-                 if any(one.get(layer, {}).get(key) is not None for one in known)]
+        all_scores = [scored for row in scores.values() for scored in row]
+        columns = [(layer, key, title) for layer, key, title in COLUMNS
+                 if any(scored.get(layer, {}).get(key) is not None for scored in all_scores)]
         lines = []
         for name, row in scores.items():
-            cells = [_cell((one.get(layer, {}).get(key) for one in row), 2 if key == "psnr" else 3)
-                     for layer, key, _ in shown]
-            lines.append([name, *cells, _cell((one.get("seconds") for one in row), 0)])
-        table = report.table([study, *[title for *_, title in shown], "s"], lines)
+            cells = [_cell((scored.get(layer, {}).get(key) for scored in row), 2 if key == "psnr" else 3)
+                     for layer, key, _ in columns]
+            lines.append([name, *cells, _cell((scored.get("seconds") for scored in row), 0)])
+        table = report.table([study, *[title for *_, title in columns], "s"], lines)
         parts.append(f"### {study}\n\nMeans over {', '.join(names)}.\n\n{table}")
     return "\n\n".join(parts)
 
@@ -321,7 +323,7 @@ def shared(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def by_capture(rows: Mapping[str, Mapping[str, dict[str, Any]]]) -> str:
-    """A table of one study, capture by capture: the flare in dB, and the linear flare's relative error."""
+    """Return a table of one study by capture: the flare in dB, and the linear flare's relative error."""
     names = shared(rows)
     lines = []
     for title, row in rows.items():
@@ -332,7 +334,7 @@ def by_capture(rows: Mapping[str, Mapping[str, dict[str, Any]]]) -> str:
 
 
 def plot(rows: Mapping[str, Mapping[str, dict[str, Any]]], picture: Path) -> None:
-    """The flare's PSNR against the displacement of its light."""
+    """Plot the flare's PSNR against the displacement of its light."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -341,7 +343,7 @@ def plot(rows: Mapping[str, Mapping[str, dict[str, Any]]], picture: Path) -> Non
     names = shared(rows)
     figure, axes = pyplot.subplots(figsize=(6, 3.6), layout="constrained")
     for corrections in dict.fromkeys(name.split(",")[0] for name in rows):
-        points = [(float(name.rsplit(" ", 1)[1]), np.mean([scores[one]["flare"]["psnr"] for one in names]))
+        points = [(float(name.rsplit(" ", 1)[1]), np.mean([scores[capture]["flare"]["psnr"] for capture in names]))
                   for name, scores in rows.items() if name.split(",")[0] == corrections]
         axes.plot(*zip(*points, strict=True), "o-", label=corrections)
     axes.set(xlabel="displacement of the lights, sigma in scene units", ylabel="flare, dB")
@@ -358,8 +360,8 @@ def _commit() -> str:
 
 
 def write(results: Results, section: str, length: str, document: Path) -> str:
-    """The tables, with what they were made of, into a section of the document; returns them."""
-    commits = {one["commit"]: None for rows in results.values() for row in rows.values() for one in row.values()}
+    """Write the tables, with commit and settings, into a section of the document; return them."""
+    commits = {result["commit"]: None for rows in results.values() for row in rows.values() for result in row.values()}
     head = f"Fitted at commit {', '.join(commits)}; times include other load on the machine. {report.conditions()}"
     text = f"## Figures: {length[0].lower()}{length[1:]}\n\n{head}\n\n{tables(results)}"
     for study in ("form", "known", "extrapolation"):

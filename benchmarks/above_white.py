@@ -52,7 +52,7 @@ def scores(run: Run, capture: Capture) -> list[float]:
         rendered = np.sum([*layers.flare_by_light.values()], axis=0)
         scene, flare = capture.truth_scene(view), capture.truth_flare(view)
         assert scene is not None and flare is not None
-        flare_bright, scene_bright = (_is_above_white(one.linear()) for one in (flare, scene))
+        flare_bright, scene_bright = (_is_above_white(layer.linear()) for layer in (flare, scene))
         exact = flare.linear()
         rows.append([relative_l2(rendered, exact, ~flare_bright), relative_l2(rendered, exact, flare_bright),
                      rendered.max(), exact.max(), rendered.sum() / exact.sum(),

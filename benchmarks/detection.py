@@ -141,6 +141,7 @@ def main() -> None:
 
 
 def _print(method: str, tallies: dict[float, Tally], number: int) -> None:
+    """Print precision, recall, F1 and IoU of each threshold."""
     print(f"{method}, {number} pictures, {next(iter(tallies.values())).lights} lights")
     print("          |        shape             |        glare             | by light")
     print("threshold |  P     R     F1    IoU   |  P     R     F1    IoU   | recall  precision  false a picture")

@@ -29,7 +29,7 @@ Pixels = NDArray[np.float32]
 
 def side_by_side(capture: Capture, name: str, runs: list[Run]) -> Pixels:
     """Return the picture, display values (h, w, 3). Raises CaptureError if the view or its layers are missing."""
-    view = next((one for one in capture.views if Path(one.name).stem == Path(name).stem), None)
+    view = next((each for each in capture.views if Path(each.name).stem == Path(name).stem), None)
     if view is None:
         raise CaptureError(f"{capture.folder} has no view {name}; give a frame's name.")
     camera = Frames(capture, runs[0].settings.width).camera(view)

@@ -18,7 +18,8 @@ SHARES = "truth/visible_share.json"
 
 
 def hidden_flare(renderer: Renderer, folder: Path, cameras: Mapping[View, Camera]) -> dict[str, Any] | None:
-    """Energies (means of the linear layer over pixels and channels) of the lights' flares, means over views and lights.
+    """Return energies of the lights' flares (means of the linear layer over pixels and channels), averaged over views
+    and lights.
 
     `hidden` where the visibility is 0, `partial` in between, `visible` where it is 1; `residual`: hidden / visible.
     `by_light`: the same by light, whose views differ in brightness less. None where the capture has no visibilities, or

@@ -191,15 +191,15 @@ def raster_section(rasterizers: dict[str, Rasterizer], thread_counts: list[int],
                 work[f"{case}|{name}|{count}|forward"] = on_threads(count, raster.forward)
                 work[f"{case}|{name}|{count}|both"] = on_threads(count, raster.forward_backward)
     times = median_times(work, rounds)
-    shown = [name for name in rasterizers if any(f"|{name}|" in key for key in times)]
+    names = [name for name in rasterizers if any(f"|{name}|" in key for key in times)]
     parts = []
     for kind, title in (("forward", "Forward, ms"), ("both", "Forward + backward, ms")):
-        head = [title, *[f"{name}, {_thread_label(c)}" for name in shown for c in thread_counts]]
+        head = [title, *[f"{name}, {_thread_label(c)}" for name in names for c in thread_counts]]
         few, many = thread_counts[0], thread_counts[-1]
         head += [f"cpu, {few} to {many} threads", f"tiles / cpu, {_thread_label(many)}"]
         rows = []
         for case in RASTER_CASES:
-            cells = {(n, c): times.get(f"{case}|{n}|{c}|{kind}") for n in shown for c in thread_counts}
+            cells = {(n, c): times.get(f"{case}|{n}|{c}|{kind}") for n in names for c in thread_counts}
             speedup = _ratio(cells.get(("cpu", few)), cells.get(("cpu", many)))
             relative_to_tiles = _ratio(cells.get(("tiles", many)), cells.get(("cpu", many)))
             rows.append([str(case), *[milliseconds(v) for v in cells.values()], speedup, relative_to_tiles])
@@ -211,7 +211,7 @@ GPU_CASES = (*RASTER_CASES, Case(1_000_000, 1920, 1080))
 
 
 def gpu_section(rounds: int) -> str:
-    """Forward, and forward + backward, on an NVIDIA GPU and beside it on all of the processor's threads."""
+    """Return a table of forward, and forward + backward, on an NVIDIA GPU and on all threads of the processor."""
     rasterizers = {"cuda": "cuda", "tiles": "cuda", "cpu": "cpu"}
     work: dict[str, Callable[[], object]] = {}
     for case in GPU_CASES:
@@ -242,12 +242,12 @@ def iteration_section(sets: list[str], thread_counts: list[int], rounds: int) ->
                 step = Iteration(case, name).step
                 work |= {f"{case}|{name}|{count}": on_threads(count, step) for count in thread_counts}
     times = median_times(work, rounds)
-    shown = [name for name in sets if any(f"|{name}|" in key for key in times)]
+    names = [name for name in sets if any(f"|{name}|" in key for key in times)]
     rows = [
-        [str(case), *[milliseconds(times.get(f"{case}|{name}|{c}")) for name in shown for c in thread_counts]]
+        [str(case), *[milliseconds(times.get(f"{case}|{name}|{c}")) for name in names for c in thread_counts]]
         for case in ITERATION_CASES
     ]
-    head = [f"{name}, {_thread_label(c)}" for name in shown for c in thread_counts]
+    head = [f"{name}, {_thread_label(c)}" for name in names for c in thread_counts]
     return table(["A training iteration, ms", *head], rows)
 
 
@@ -308,7 +308,7 @@ def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
 
 
 def flare_section(sets: list[str], rounds: int) -> str:
-    """2,000 flare Gaussians alone: both blends, plain and rings, at full and mixed resolution."""
+    """Return a table of 2,000 flare Gaussians alone: both blends, plain and rings, at full and mixed resolution."""
     rows, work = [], {}
     variants = [(b, r, m) for b in ("over", "add") for r in (False, True) for m in ("full", "mixed")]
     for width, height in ((480, 270), (960, 540)):
@@ -340,6 +340,7 @@ def flare_section(sets: list[str], rounds: int) -> str:
 def _splat_work(
     inputs: list[Tensor], width: int, height: int, rings: Tensor | None, blend: str, resolution: str, name: str
 ) -> Callable[[], object]:
+    """Return a function that splats the flare Gaussians, forward and backward."""
     upstream = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0))
 
     def run() -> None:
@@ -354,7 +355,7 @@ def _splat_work(
 
 
 def curve_section(rasterizers: dict[str, Rasterizer], rounds: int, device: str, picture: Path) -> str:
-    """Forward + backward against the count, as a table and as a picture."""
+    """Return a table of forward + backward by the number of Gaussians, and draw it as a picture."""
     rows, lines = [], {}
     fast = [name for name in rasterizers if name not in ("torch", "tiles")]
     for name in fast:
@@ -376,6 +377,7 @@ def curve_section(rasterizers: dict[str, Rasterizer], rounds: int, device: str, 
 
 
 def _plot(lines: dict[str, dict[str, float]], picture: Path) -> None:
+    """Draw times, ms, against the number of Gaussians, a line for each kernel set."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -124,7 +124,7 @@ def speed(weights: Path | None = None) -> None:
 def sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | None = None,
            sheet: Path | None = None) -> None:
     """Measure the PSNR of every frame against the exact scene, and flicker."""
-    before: Any = None
+    previous_errors: Any = None
     scores, flicker, rows = [], [], []
     paths = sorted((capture / "images").iterdir())
     results = _clean_by_network(paths, weights) if cleaned is None else _read_cleaned(paths, cleaned)
@@ -135,9 +135,10 @@ def sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | No
         if number % max(len(paths) // SHOWN_FRAMES, 1) == 5:
             rows.append(np.concatenate([frame, result, np.clip(truth, 0, 1)], 1))
         errors = (frame - truth, result - truth)
-        if before is not None:
-            flicker.append([float(np.abs(now - then).mean()) for now, then in zip(errors, before, strict=True)])
-        before = errors
+        if previous_errors is not None:
+            flicker.append([float(np.abs(current - previous).mean())
+                            for current, previous in zip(errors, previous_errors, strict=True)])
+        previous_errors = errors
     untouched, after = np.mean(scores, 0)
     gains = np.diff(scores, axis=1)[:, 0]
     print(f"scene PSNR {after:.2f} dB, untouched {untouched:.2f}, gain {gains.mean():+.2f} "
@@ -170,16 +171,16 @@ def clean(folders: list[Path], weights: Path | None = None) -> None:
     from core.removal.training.backgrounds import PHOTO_SUFFIXES, list_pictures
 
     remover = Remover(weights)
-    values, kept = [], 0
+    values, unchanged = [], 0
     for path in (path for folder in folders for path in list_pictures(folder, PHOTO_SUFFIXES, "all")):
-        found = read_plate(path)
-        codes = remover.remove(found)[0]
-        if np.array_equal(codes, found.codes):
-            kept += 1
+        plate = read_plate(path)
+        codes = remover.remove(plate)[0]
+        if np.array_equal(codes, plate.codes):
+            unchanged += 1
             values.append(100.0)
             continue
-        values.append(psnr(codes / found.max_code, found.codes / found.max_code))
-    print(f"{len(values)} pictures, {kept} kept to the last bit; PSNR against the input: median "
+        values.append(psnr(codes / plate.max_code, plate.codes / plate.max_code))
+    print(f"{len(values)} pictures, {unchanged} kept to the last bit; PSNR against the input: median "
           f"{np.median(values):.2f}, mean with 100 for the kept {np.mean(values):.2f}, 5 % below "
           f"{np.percentile(values, 5):.2f}, lowest {min(values):.2f} dB; {np.mean(np.array(values) >= 45):.0%} at 45 "
           "dB or more")
@@ -288,16 +289,16 @@ def _draw_features(remover: Remover, seed: int, count: int, backgrounds: Any, le
     features, gains = [], []
     for number in range(count):
         bare, kind = number % 3 > 0, FLARE_CLASSES[number // 3 % len(FLARE_CLASSES)]
-        one = make_pair(np.random.default_rng((seed, number)), SingleFlareBank((seed, number), 160, lenses, kind),
+        pair = make_pair(np.random.default_rng((seed, number)), SingleFlareBank((seed, number), 160, lenses, kind),
                         backgrounds, *SIZE, clean_share=float(bare), lifted_black_share=0.25, shoulder_share=0.3,
                         against_light_share=0.35)
-        prediction = remover.predict_with_tta(one.frame)
+        prediction = remover.predict_with_tta(pair.frame)
         if prediction.features is None:
             continue
-        left = psnr(np.maximum(one.frame - prediction.mean, 0), one.scene)
+        left = psnr(np.maximum(pair.frame - prediction.mean, 0), pair.scene)
         if not bare or left < 45:
             features.append(prediction.features)
-            gains.append(-5.0 if bare else left - psnr(one.frame, one.scene))
+            gains.append(-5.0 if bare else left - psnr(pair.frame, pair.scene))
     return np.array(features), np.array(gains)
 
 
@@ -307,13 +308,13 @@ def _logistic(features: Any, gains: Any) -> Any:
     middle, spread = features.mean(0), features.std(0)
     a = np.column_stack([(features - middle) / spread, np.ones(len(features))])
     counts, flares = np.minimum(np.abs(gains), 15) / 5, gains > 0
-    ridge, found = np.diag([1.0] * features.shape[1] + [0.0]), np.zeros(a.shape[1])
+    ridge, solution = np.diag([1.0] * features.shape[1] + [0.0]), np.zeros(a.shape[1])
     for _ in range(30):
-        p = 1 / (1 + np.exp(-a @ found))
-        step = a.T @ (counts * (p - flares)) + ridge @ found
-        found -= np.linalg.solve(a.T @ (a * (counts * p * (1 - p))[:, None]) + ridge, step)
-    by_sign = found[:-1] / spread
-    return np.append(by_sign, found[-1] - by_sign @ middle)
+        p = 1 / (1 + np.exp(-a @ solution))
+        step = a.T @ (counts * (p - flares)) + ridge @ solution
+        solution -= np.linalg.solve(a.T @ (a * (counts * p * (1 - p))[:, None]) + ridge, step)
+    by_sign = solution[:-1] / spread
+    return np.append(by_sign, solution[-1] - by_sign @ middle)
 
 
 class _AsphericBank:
@@ -360,9 +361,9 @@ def _gain(remover: Remover, seed: tuple[int, ...], bank: Any, backgrounds: Any,
     their lights against a bright scene."""
     from core.removal.training.pairs import make_pair
 
-    one = make_pair(np.random.default_rng(seed), bank, backgrounds, *SIZE, clean_share=0,
+    pair = make_pair(np.random.default_rng(seed), bank, backgrounds, *SIZE, clean_share=0,
                     against_light_share=against_light_share)
-    return psnr(remover.clean_display(one.frame), one.scene) - psnr(one.frame, one.scene)
+    return psnr(remover.clean_display(pair.frame), pair.scene) - psnr(pair.frame, pair.scene)
 
 
 def _print_gains(name: str, gains: Any) -> None:
@@ -378,8 +379,8 @@ def matte(folders: list[Path], lenses: Path | None = None, weights: Path | None 
     remover, gains = Remover(weights), []
     for case in synthetic_cases(1001, count, _held_out_backgrounds(folders), _held_out_lenses(lenses), SIZE):
         frame, truth, _ = case.read()
-        found = Plate(Path("frame.png"), (frame * 65535 + 0.5).astype(np.uint16), "srgb")
-        results = [remover.remove(found, marked)[0] / found.max_code for marked in (None, _rough_matte(frame, truth))]
+        plate = Plate(Path("frame.png"), (frame * 65535 + 0.5).astype(np.uint16), "srgb")
+        results = [remover.remove(plate, marked)[0] / plate.max_code for marked in (None, _rough_matte(frame, truth))]
         gains.append([psnr(result, truth) - psnr(frame, truth) for result in results])
     for name, values in zip(("without", "with a matte"), np.transpose(gains), strict=True):
         _print_gains(f"{name:13}", values)
@@ -413,7 +414,8 @@ def coverage(sheet: Path | None = None, count: int = 400) -> None:
         rows = [[synthesise_flare((5, number), 256, lenses, kind) for number in range(9)] for kind in FLARE_CLASSES]
         rows.append([add_aspheric_ghosts(synthesise_flare((5, number), 256, lenses, "glow"), (5, number, 3))
                      for number in range(9)])
-        tiles = [np.concatenate([np.clip(one.whole + one.light, 0, 1) ** (1 / 2.2) for one in row], 1) for row in rows]
+        tiles = [np.concatenate([np.clip(flare.whole + flare.light, 0, 1) ** (1 / 2.2) for flare in row], 1)
+                 for row in rows]
         import cv2
 
         picture = (np.concatenate(tiles)[::2, ::2, ::-1] * 255).astype(np.uint8)

@@ -125,7 +125,7 @@ def stages(
 
 
 def measure(rendered: RenderedScene, kernel_set: str, device: str, rounds: int) -> str:
-    """The table."""
+    """Return the table of the stages of a frame."""
     rows = []
     for width, height in SIZES:
         for lights in (1, 2, 3):
@@ -133,8 +133,8 @@ def measure(rendered: RenderedScene, kernel_set: str, device: str, rounds: int) 
             shared = sum(times[stage] for stage in ("deformation", "projection", "scene", "composite"))
             full, mixed = shared + times["flare raster"], shared + times["flare raster, mixed"]
             paper = (str(DEFORMATION[lights]), "10.79" if lights == 1 else "–") if width == 1920 else ("–", "–")
-            shown = [milliseconds(seconds) for seconds in (*times.values(), full, mixed)]
-            rows.append([f"{width}x{height}, {lights}", *shown, f"{1 / mixed:.1f}", *paper])
+            cells = [milliseconds(seconds) for seconds in (*times.values(), full, mixed)]
+            rows.append([f"{width}x{height}, {lights}", *cells, f"{1 / mixed:.1f}", *paper])
     head = ["ms; picture, lights", *STAGES, "frame", "frame, mixed", "frames/s, mixed"]
     return table([*head, "paper's deformation (RTX 4090)", "paper's frame"], rows)
 

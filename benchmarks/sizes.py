@@ -43,8 +43,8 @@ def scores(run: Run, capture: Capture, views: Sequence[View], width: int) -> tup
             raise CaptureError(f"{capture.folder} has no exact layers of {view.name}.")
         scene, flare = exact
         flare_sum = np.sum([*layers.flare_by_light.values()], axis=0)
-        display = [srgb_from_linear(np.clip(one, 0, 1)) for one in (layers.scene, scene, layers.scene + flare_sum,
-                                                                  scene + flare)]
+        display = [srgb_from_linear(np.clip(picture, 0, 1))
+                   for picture in (layers.scene, scene, layers.scene + flare_sum, scene + flare)]
         rows.append((psnr(display[0], display[1]), psnr(display[2], display[3]),
                      psnr(np.clip(flare_sum, 0, 1), np.clip(flare, 0, 1)), float(flare_sum.mean())))
     first, second, third, fourth = np.mean(np.array(rows, np.float64), 0).tolist()

@@ -27,13 +27,14 @@ NEAR = 0.012
 
 
 def errors(capture: Capture, places: ArrayLike) -> NDArray[np.float64]:
-    """(lights,) mean distance of these places (lights, 3) from the lights, over the views that have both in front."""
+    """Return (lights,), the mean distance in the frame, relative to its width, of these places (lights, 3) from the
+    lights."""
     distances = []
     for view in capture.views:
         pixels, depth = view.camera.project([light.xyz for light in capture.lights])
         others, behind = view.camera.project(places)
-        away = np.linalg.norm(pixels - others, axis=1) / view.camera.width
-        distances.append(np.where((depth > 0) & (behind > 0), away, np.nan))
+        distance = np.linalg.norm(pixels - others, axis=1) / view.camera.width
+        distances.append(np.where((depth > 0) & (behind > 0), distance, np.nan))
     return np.asarray(np.nanmean(distances, 0))
 
 
@@ -47,14 +48,14 @@ def main() -> None:
     for folder in args.captures:
         truth = Capture.open(folder)
         for sigma in SIGMAS:
-            before, after = [], []
+            errors_before, errors_after = [], []
             for seed in range(args.seeds if sigma else 1):
                 moved = displaced(Capture.open(folder), sigma, seed)
                 flare = Trainer(moved, preset("standard")).flare
                 assert flare is not None
-                before.append(errors(truth, [light.xyz for light in moved.lights]))
-                after.append(errors(truth, flare.positions.numpy()))
-            initial, snapped = np.concatenate(before), np.concatenate(after)
+                errors_before.append(errors(truth, [light.xyz for light in moved.lights]))
+                errors_after.append(errors(truth, flare.positions.numpy()))
+            initial, snapped = np.concatenate(errors_before), np.concatenate(errors_after)
             rows.append([folder.name, f"{sigma:g}", f"{initial.max():.1%}", f"{np.median(snapped):.2%}",
                          f"{(snapped < NEAR).sum()} of {len(snapped)}", str((snapped > initial + 1e-3).sum())])
             print(*rows[-1], sep="\t", file=sys.stderr, flush=True)

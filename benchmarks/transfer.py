@@ -75,7 +75,7 @@ def move_world(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Truth]:
-    """Frames with exact flares. Each light is hidden for some frames, and behind an edge for two beside them."""
+    """Return frames with exact flares. Each light is hidden for some frames, and behind an edge for two beside them."""
     sources = sources_of(look)
     width, height = size
     truths = []
@@ -174,11 +174,11 @@ def main() -> None:
         inside = all(is_inside(ranges[light.source], ViewOfLight.of(camera.world_to_camera, light.xyz),
                                float(np.linalg.norm(camera.position - light.xyz))) for light in truth.shot.lights)
         clipped = np.clip(scene + exact, 0, 1), np.clip(scene + ours, 0, 1)
-        shown = displayed_flare(scene + exact, scene)
+        displayed = displayed_flare(scene + exact, scene)
         rows.append({"frame": truth.shot.frame, "inside": inside,
                      "shares": [light.visibility for light in truth.shot.lights],
-                     "flare": psnr(shown, displayed_flare(scene + ours, scene)), "flare_linear": psnr(*clipped),
-                     "empty": psnr(shown, 0 * shown)})
+                     "flare": psnr(displayed, displayed_flare(scene + ours, scene)), "flare_linear": psnr(*clipped),
+                     "empty": psnr(displayed, 0 * displayed)})
         if index % max(len(truths) // 6, 1) == 0:
             pictures.append(np.concatenate([srgb_from_linear(part) for part in clipped], 1))
         print(f"frame {rows[-1]['frame']:3}  inside {inside!s:5}  shares "

@@ -67,9 +67,9 @@ def thumbnail(look: Look) -> NDArray[np.float32]:
     for light in look.lights:
         middle = (light.query_range.camera_low + light.query_range.camera_high) / 2
         _, place = light.query_range.clip(middle, np.array([-0.24, -0.2], np.float32))
-        found = light.evaluate(ViewOfLight(middle, np.eye(3, dtype=np.float32), place, 1.0))
-        if found is not None:
-            shown = draw([found], k, THUMBNAIL_SIZE, THUMBNAIL_SIZE, look.blend, look.pixel_grid)
+        gaussians = light.evaluate(ViewOfLight(middle, np.eye(3, dtype=np.float32), place, 1.0))
+        if gaussians is not None:
+            shown = draw([gaussians], k, THUMBNAIL_SIZE, THUMBNAIL_SIZE, look.blend, look.pixel_grid)
             total += shown if look.blend == "add" else linear_from_srgb(shown)
     return np.clip(srgb_from_linear(np.maximum(total, 0)), 0, 1)
 
@@ -105,7 +105,7 @@ def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, 
 
         _previews = previews.new()
     _previews.clear()
-    found = []
+    entries = []
     for name, _ in stamps:
         number = zlib.crc32(name.encode("utf-8", "surrogateescape")) & 0x7FFFFFFF  # does not depend on the other files
         path = Path(name)
@@ -117,8 +117,8 @@ def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, 
             notes = f"{len(look.lights)} lights, {look.count} Gaussians. {look.notes}".strip()
         except (FitFlareError, OSError) as problem:
             icon, notes = 0, str(problem)
-        found.append((name, path.stem, notes, icon, number))
-    _items, _stamps = found or [("", "Empty", "Save a flare to the library first", 0, 0)], tuple(stamps)
+        entries.append((name, path.stem, notes, icon, number))
+    _items, _stamps = entries or [("", "Empty", "Save a flare to the library first", 0, 0)], tuple(stamps)
     return _items
 
 

@@ -28,8 +28,8 @@ _names_cache: dict[Path, tuple[tuple[int, int], tuple[str, ...]]] = {}
 def scene_lights(scene: Any) -> list[Any]:
     """Return the light objects of the scene's capture, sorted by the name of the light."""
     root = scene.fit_flare.root
-    found = [item for item in scene.objects if item.fit_flare.is_light and not _belongs_to_other_capture(item, root)]
-    return sorted(found, key=lambda item: light_name(item).casefold())
+    objects = [item for item in scene.objects if item.fit_flare.is_light and not _belongs_to_other_capture(item, root)]
+    return sorted(objects, key=lambda item: light_name(item).casefold())
 
 
 def _belongs_to_other_capture(light: Any, root: Any) -> bool:
@@ -62,14 +62,14 @@ def light_position(light: Any, matrix: Any, eye: Any) -> Any:
     return matrix.translation.copy()
 
 
-def add_to_scene(scene: Any, where: Any, name: str = "") -> Any:
+def add_to_scene(scene: Any, position: Any, name: str = "") -> Any:
     """Add a light at a point (3,) of Blender's world; return its object. Raises CaptureError as `world_matrix` does."""
     state = scene.fit_flare
     root = state.root
-    taken = {light_name(item) for item in scene_lights(scene)}
-    name = free_name(name or "light1", taken)
+    used_names = {light_name(item) for item in scene_lights(scene)}
+    name = free_name(name or "light1", used_names)
     size = max((item.empty_display_size for item in scene_lights(scene) if item.type == "EMPTY"), default=0.2)
-    local = cameras.point_in_capture(where, root, depsgraph_of(scene))
+    local = cameras.point_in_capture(position, root, depsgraph_of(scene))
     return add_light(_collection_of(scene), root, name, local, size)
 
 
@@ -122,8 +122,8 @@ def write_to_capture(scene: Any, folder: Path) -> int:
     lights, depsgraph = [known[name] for name in new_names(scene, folder)], depsgraph_of(scene)
     eye = scene.camera.matrix_world.translation if scene.camera is not None else objects[0].matrix_world.translation
     for item, name in zip(objects, names, strict=True):
-        where = light_position(item, world_matrix(item, depsgraph), eye)
-        xyz = cameras.point_in_capture(where, scene.fit_flare.root, depsgraph)
+        position = light_position(item, world_matrix(item, depsgraph), eye)
+        xyz = cameras.point_in_capture(position, scene.fit_flare.root, depsgraph)
         lights.append({**known.get(name, {}), "name": name, "xyz": [round_for_text(float(value)) for value in xyz]})
     if lights != data.get("lights"):
         write_json(follow_link(path), {**data, "lights": lights})
@@ -149,9 +149,9 @@ def new_names(scene: Any, folder: Path) -> list[str]:
     """
     if not scene.fit_flare.is_property_set("known_lights"):
         return []
-    found = _names_in(folder / LIGHTS)
-    had = {*scene.fit_flare.known_lights.split("\n"), *map(light_name, scene_lights(scene))} if found else set()
-    return [name for name in found if name not in had]
+    names = _names_in(folder / LIGHTS)
+    had = {*scene.fit_flare.known_lights.split("\n"), *map(light_name, scene_lights(scene))} if names else set()
+    return [name for name in names if name not in had]
 
 
 def _names_in(path: Path) -> tuple[str, ...]:
@@ -173,13 +173,13 @@ def import_new(scene: Any, folder: Path) -> int:
     """
     existing = scene_lights(scene)
     names = set(new_names(scene, folder)) if existing else None
-    found = [light for light in read_lights(folder / LIGHTS) if names is None or light.name in names]
+    new_lights = [light for light in read_lights(folder / LIGHTS) if names is None or light.name in names]
     collection = _collection_of(scene)
     size = max((item.empty_display_size for item in existing if item.type == "EMPTY"), default=0.2)
-    for light in found:
+    for light in new_lights:
         add_light(collection, scene.fit_flare.root, light.name, light.xyz, size)
     remember_names(scene)
-    return len(found)
+    return len(new_lights)
 
 
 def _move_to(light: Any, xyz: ArrayLike) -> None:
@@ -204,9 +204,10 @@ def move_to_fit(scene: Any, fitted: Mapping[str, ArrayLike], capture: Path | Non
         is_still = item.parent == scene.fit_flare.root and item.animation_data is None
         if name in fitted and name in fitted_from and is_still:
             try:
-                where = capture_position(item, scene.fit_flare.root, depsgraph)
+                position = capture_position(item, scene.fit_flare.root, depsgraph)
             except CaptureError:  # it is disabled, and its position is unknown
                 continue
-            if np.allclose(where, fitted_from[name], atol=1e-4) and not np.allclose(where, fitted[name], atol=1e-4):
+            is_unmoved = np.allclose(position, fitted_from[name], atol=1e-4)
+            if is_unmoved and not np.allclose(position, fitted[name], atol=1e-4):
                 _move_to(item, fitted[name])
     view_layer_of(scene).update()

@@ -39,10 +39,10 @@ def look_of(scene: Any) -> Look:
     known = _cache.get(str(path))
     if known is None or known[0] != stamp:
         try:
-            found: Look | str = read(path)
+            result: Look | str = read(path)
         except FlareFileError as problem:
-            found = str(problem)
-        known = _cache[str(path)] = (stamp, found)
+            result = str(problem)
+        known = _cache[str(path)] = (stamp, result)
     if isinstance(known[1], str):
         raise FlareFileError(known[1])
     return known[1]
@@ -118,9 +118,9 @@ def add_flare(scene: Any, target: Any, source: str) -> Any:
     if light is None:
         raise FlareFileError(f"{look.path} has no light {source!r}; it has {', '.join(look.names)}.")
     state = scene.fit_flare
-    taken = {item.name for item in state.lights}
+    used_names = {item.name for item in state.lights}
     name, number = target.name, 2
-    while name in taken:
+    while name in used_names:
         name, number = f"{target.name} {number}", number + 1
     item = state.lights.add()
     item.name, item.source, item.target = name, source, target
@@ -131,13 +131,13 @@ def add_flare(scene: Any, target: Any, source: str) -> Any:
 
 def _sync_elements(item: Any, light: Any) -> None:
     """Update the elements of a flare to those of its look; elements that stay keep their sliders."""
-    wanted = {element.name: element.kind for element in light.elements}
+    kinds = {element.name: element.kind for element in light.elements}
     for index in reversed(range(len(item.elements))):
-        if item.elements[index].name not in wanted:
+        if item.elements[index].name not in kinds:
             fcurves.remove_item(item.elements, f"{item.path_from_id()}.elements", index)
-    there = {element.name for element in item.elements}
-    for name, kind in wanted.items():
-        if name not in there:
+    existing = {element.name for element in item.elements}
+    for name, kind in kinds.items():
+        if name not in existing:
             item.elements.add().name = name
         next(element for element in item.elements if element.name == name).kind = kind
 
@@ -174,9 +174,9 @@ def place_lights(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.fl
     for item in state.lights:
         if not is_placed(item, scene):
             continue
-        where = light_position(item.target, world_matrix(item.target, depsgraph), matrix.translation)
+        position = light_position(item.target, world_matrix(item.target, depsgraph), matrix.translation)
         visibility = occlusion.visibility(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0
-        xyz = (to_capture @ np.array([*where, 1.0]))[:3]
+        xyz = (to_capture @ np.array([*position, 1.0]))[:3]
         lights.append(PlacedLight(item.name, item.source, xyz, visibility))
     return cameras.pose_in_capture(matrix, state.root, depsgraph), lights
 
@@ -185,9 +185,9 @@ def evaluate_flares(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneG
     """Evaluate every flare of the scene for a camera at the current frame. Raises FlareFileError and CaptureError."""
     look = look_of(scene)
     pose, lights = place_lights(scene, depsgraph, camera)
-    found = look.evaluate_lights(pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
+    gaussians = look.evaluate_lights(pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
     exposure = camera.evaluated_get(depsgraph).fit_flare.exposure
-    return {name: one.with_exposure(exposure, look.blend) for name, one in found.items()}
+    return {name: light_gaussians.with_exposure(exposure, look.blend) for name, light_gaussians in gaussians.items()}
 
 
 def clear_cache() -> None:

@@ -38,17 +38,18 @@ def visibility(scene: Any, depsgraph: Any, eye: Any, item: Any) -> float:
     The lamp itself hides nothing: objects within `LIGHT_MARGIN` of the distance, the light object, its children, and
     the instances of these.
     """
-    where = light_position(item.target, world_matrix(item.target, depsgraph), eye)
+    position = light_position(item.target, world_matrix(item.target, depsgraph), eye)
     lamp = (item.target, *item.target.children_recursive)
     ignored = {obj.name for obj in lamp}
     instances = _instances_of(depsgraph, ignored) if any(obj.is_instancer for obj in lamp) else set()
-    return disc_visibility(scene, depsgraph, eye, where, ignored, item.radius, instances)
+    return disc_visibility(scene, depsgraph, eye, position, ignored, item.radius, instances)
 
 
 def _instances_of(depsgraph: Any, parents: set[str]) -> set[tuple[str, Any]]:
     """Return the instances of objects with these names, each as the object's name and its matrix_world."""
-    return {(one.object.original.name, one.matrix_world.copy().freeze()) for one in depsgraph.object_instances
-            if one.is_instance and one.parent.original.name in parents}
+    return {(instance.object.original.name, instance.matrix_world.copy().freeze())
+            for instance in depsgraph.object_instances
+            if instance.is_instance and instance.parent.original.name in parents}
 
 
 def disc_visibility(scene: Any, depsgraph: Any, eye: Any, light: Any, ignored: set[str], disc_radius: float = 0.0,

@@ -63,11 +63,11 @@ class FITFLARE_PT_lights(_SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, scene = self.layout, context.scene
-        found = lights.scene_lights(scene)
-        if not found:
+        objects = lights.scene_lights(scene)
+        if not objects:
             label_lines(layout, "No lights yet. The fit learns a flare for each light in the footage.", "INFO")
         column = layout.column(align=True)
-        for light in found:
+        for light in objects:
             row = column.row(align=True)
             row.prop(light.fit_flare, "light", text="", icon="LIGHT_POINT")
             row.operator("fit_flare.remove_light", text="", icon="X").object = light.name

@@ -59,8 +59,8 @@ def scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int],
             depsgraph = view_layer.depsgraph
             shot_frames += [shot_frame(scene, depsgraph, camera, frame) for camera in camera_objects]
             if not camera_objects:
-                one = shot_frame(scene, depsgraph, scene.camera, frame)
-                shot_frames.append(replace(one, name=shot_frames[0].name if shot_frames else one.name))
+                current = shot_frame(scene, depsgraph, scene.camera, frame)
+                shot_frames.append(replace(current, name=shot_frames[0].name if shot_frames else current.name))
             done(frame)
     finally:
         scene.frame_set(before, subframe=subframe)
@@ -109,7 +109,7 @@ def live_layers(state: Any, folder: Path) -> dict[str, int] | None:
 
     Layers of removed flares are left out. None where neither the folder nor its parent has a LIVE_FILE.
     """
-    folder = next((one for one in (folder, folder.parent) if (one / LIVE_FILE).is_file()), folder)
+    folder = next((place for place in (folder, folder.parent) if (place / LIVE_FILE).is_file()), folder)
     try:
         live = parse_json(read_text(folder / LIVE_FILE))
         baked = layer_names(live["lights"])

@@ -95,9 +95,10 @@ def _filter_points(reconstruction: Any) -> Any:
         observations = [(index, point.xy) for index, point in enumerate(image.points2D)
                         if point.has_point3D() and point.point3D_id in good_points]
         new_index.update({(number, index): at for at, (index, _) in enumerate(observations)})
-        kept = pycolmap.Image(name=image.name, keypoints=np.array([xy for _, xy in observations]).reshape(-1, 2),
-                              camera_id=image.camera_id, image_id=number)
-        filtered.add_image_with_trivial_frame(kept, image.cam_from_world())
+        keypoints = np.array([xy for _, xy in observations]).reshape(-1, 2)
+        filtered_image = pycolmap.Image(name=image.name, keypoints=keypoints, camera_id=image.camera_id,
+                                        image_id=number)
+        filtered.add_image_with_trivial_frame(filtered_image, image.cam_from_world())
     for _, point in sorted(good_points.items()):
         track = pycolmap.Track()
         for element in point.track.elements:

@@ -57,6 +57,7 @@ class Room:
             self._add_light("AREA", self._random_position(self.height * 0.97), math.exp(random.uniform(2, 6)))
 
     def _add_sky(self) -> None:
+        """Light the world by a random environment map, or evenly and dimly."""
         random = self.random
         if self.indoors and random.random() < 0.5:
             stage.uniform_world(random_colour(random, 0.3), 0.01 if self.dark else 0.2)
@@ -74,6 +75,7 @@ class Room:
         background.inputs["Strength"].default_value = random.uniform(0, 0.02) if self.dark else random.uniform(0.3, 1)
 
     def _add_walls(self) -> None:
+        """Add a floor, and indoors most of the walls and the ceiling."""
         random, middle = self.random, self.depth / 2 - 1
         polished = random.random() < 0.65
         reach = (self.width, self.depth + 2) if self.indoors else (60, 60)
@@ -93,6 +95,7 @@ class Room:
                         tilt=(180, 0))
 
     def _add_object(self) -> None:
+        """Add a random solid at a random place."""
         random, mesh = self.random, bpy.ops.mesh
         size = math.exp(random.uniform(-1.5, 0.6))
         kind = random.choice(["cube", "ball", "pillar", "ring", "monkey", "cone"])
@@ -120,6 +123,7 @@ class Room:
             metallic=float(random.random() < 0.2), glass=random.random() < 0.08))
 
     def _add_lamp(self) -> None:
+        """Add a visible lamp: a bulb, a screen, a tube or a spot."""
         random = self.random
         position = self._random_position(random.uniform(0.6, self.height * 0.95), min_distance=2)
         size = math.exp(random.uniform(-3.2, -0.9))
@@ -145,6 +149,7 @@ class Room:
                 self._add_light("SPOT", position, power * 8, colour)
 
     def _add_light(self, kind: str, position: Colour, power: float, colour: Colour | None = None) -> None:
+        """Add a light of Blender without a visible shape."""
         random = self.random
         bpy.ops.object.light_add(type=kind, location=position)
         light = bpy.context.object

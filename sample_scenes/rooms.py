@@ -41,10 +41,10 @@ def develop(random: np.random.Generator, light: Pixels) -> Pixels:
 
 def training_pictures(folder: Path, suffixes: Set[str]) -> list[Path]:
     """Return the pictures of a folder that trainings may see. Raises SettingsError where there are none."""
-    found = list_pictures(folder, suffixes, "train")
-    if not found:
+    existing = list_pictures(folder, suffixes, "train")
+    if not existing:
         raise SettingsError(f"{folder} holds none of {', '.join(sorted(suffixes))}; name a folder of clean pictures.")
-    return found
+    return existing
 
 
 def make_rooms(folder: Path, photos: Sequence[Path], maps: Sequence[Path], count: int, progress: Progress) -> None:

@@ -55,6 +55,7 @@ def plain_material(name: str, colour: Vec, roughness: float = 0.5, metallic: flo
 
 
 def _add(name: str, mesh: bmesh.types.BMesh, materials: Sequence[Any], smooth: bool = False) -> Any:
+    """Add a mesh with these materials to the scene; return its object."""
     data = bpy.data.meshes.new(name)
     for face in mesh.faces:
         face.smooth = smooth

@@ -225,7 +225,7 @@ def frames_to_delete(out: Path | str, fingerprint: Callable[[], str], lights: It
 
 
 def _claim_folder(out: Path, cache_key: dict[str, Any], names: dict[str, str], overwrite: bool) -> None:
-    """Prepare the folder for this bake: refuse, or delete, what was made differently."""
+    """Prepare the folder for this bake: refuse layers of another bake, or delete them with `overwrite`."""
     with file_lock(out / LOCK):
         manifest = read_manifest(out) if (out / MANIFEST).exists() else None
         if manifest is not None and (manifest["made_from"], manifest["layers"]) == (cache_key, names):

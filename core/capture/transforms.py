@@ -283,25 +283,27 @@ def _similarity(model: Sequence[PosedFrame], frames: Sequence[PosedFrame]) -> Fl
 
     None where fewer than three share a name, lie in one place, or do not match within 1 % of their extent.
     """
-    known = {PurePosixPath(canonical_name(frame.name)).name: frame for frame in model}
-    pairs = [(known[name], frame) for frame in frames
-             if (name := PurePosixPath(canonical_name(frame.name)).name) in known]
+    model_frames = {PurePosixPath(canonical_name(frame.name)).name: frame for frame in model}
+    pairs = [(model_frames[name], frame) for frame in frames
+             if (name := PurePosixPath(canonical_name(frame.name)).name) in model_frames]
     if len(pairs) < 3:
         return None
-    rotations = np.array([there.world_to_camera[:3, :3].T @ here.world_to_camera[:3, :3] for here, there in pairs])
+    rotations = np.array([in_file.world_to_camera[:3, :3].T @ in_model.world_to_camera[:3, :3]
+                          for in_model, in_file in pairs])
     left, _, right = np.linalg.svd(rotations.mean(axis=0))
     rotation = left @ right
-    here, there = (np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in (frame.world_to_camera for frame in side)])
-                   for side in zip(*pairs, strict=True))
-    middle, target = here.mean(axis=0), there.mean(axis=0)
-    spread, goal = (here - middle) @ rotation.T, there - target
-    extent, size = float(np.square(spread).sum()), float(np.square(goal).sum())
-    scale = float((spread * goal).sum()) / extent if extent > 0 else 0.0
-    if scale <= 0 or np.square(scale * spread - goal).sum() > MAX_MISMATCH**2 * size:
+    model_centres, file_centres = (
+        np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in (frame.world_to_camera for frame in side)])
+        for side in zip(*pairs, strict=True))
+    model_mean, file_mean = model_centres.mean(axis=0), file_centres.mean(axis=0)
+    centred, target_centred = (model_centres - model_mean) @ rotation.T, file_centres - file_mean
+    extent, size = float(np.square(centred).sum()), float(np.square(target_centred).sum())
+    scale = float((centred * target_centred).sum()) / extent if extent > 0 else 0.0
+    if scale <= 0 or np.square(scale * centred - target_centred).sum() > MAX_MISMATCH**2 * size:
         return None
     similarity = np.eye(4)
     similarity[:3, :3] = scale * rotation
-    similarity[:3, 3] = target - scale * rotation @ middle
+    similarity[:3, 3] = file_mean - scale * rotation @ model_mean
     return similarity
 
 

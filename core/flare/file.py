@@ -97,6 +97,8 @@ def _pack(model: FlareModel) -> dict[str, Tensor]:
 
 
 def _unpack(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> FlareFile:
+    """Make the model from description and tensors. Raises ValueError, KeyError or RuntimeError where they are
+    damaged."""
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise ValueError(f"{name} holds values that are not finite")

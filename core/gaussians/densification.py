@@ -92,9 +92,9 @@ class Classic:
         """Accumulate the gradients by the centres of the visible Gaussians."""
         height, width = rendering.alpha.shape
         norms = torch.hypot(*(rendering.centre_gradients * rendering.alpha.new_tensor([width / 2, height / 2])).T)
-        seen = rendering.radii > 0
-        self.gradients += norms * seen
-        self.views += seen
+        is_visible = rendering.radii > 0
+        self.gradients += norms * is_visible
+        self.views += is_visible
 
     @torch.no_grad()
     def update(self, iteration: int) -> bool:
@@ -114,6 +114,8 @@ class Classic:
         return changed
 
     def _refine(self, prune_large: bool) -> None:
+        """Clone small and split large Gaussians of high gradient, and prune faint ones; `prune_large` prunes large ones
+        too."""
         s, scene = self.settings, self.scene
         size = scene.scales.amax(-1)
         removed = scene.opacities < s.faint
@@ -212,6 +214,7 @@ class Mcmc:
         return changed
 
     def _relocate(self) -> None:
+        """Move dead Gaussians, whose opacity is at most `faint`, to others drawn by opacity."""
         dead = self.scene.opacities <= self.settings.faint
         targets = torch.nonzero(dead)[:, 0]
         alive = torch.nonzero(~dead)[:, 0]
@@ -224,6 +227,7 @@ class Mcmc:
             self.optimiser.reset_moments(name, torch.cat([sources, targets]))
 
     def _add(self) -> None:
+        """Add Gaussians as copies of others drawn by opacity, up to `growth` and `cap`."""
         n = len(self.scene)
         new = min(self.settings.cap, int(n * self.settings.growth)) - n
         if new <= 0:

@@ -119,6 +119,7 @@ def select_kernels(name: str, like: Tensor) -> KernelSet:
 
 
 def _fastest(like: Tensor) -> str:
+    """Return the name of the fastest kernel set that can be used for such tensors."""
     preferred = {"cuda": "cuda", "cpu": "cpu"}.get(like.device.type, "tiles")
     if like.dtype != torch.float32:
         return "tiles"

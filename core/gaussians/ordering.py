@@ -59,8 +59,8 @@ def nearest_distances(points: Tensor, neighbours: int = 3) -> Tensor:
         bound = _kth(block, around, k)[:, -1].amax()
         gaps = (lows - highs[block_number]).clamp(min=0) + (lows[block_number] - highs).clamp(min=0)
         near = torch.nonzero(torch.linalg.vector_norm(gaps, dim=-1) <= bound)[:, 0].tolist()
-        found = _kth(block, torch.cat([blocks[other] for other in near]), k)
-        result[order[start : start + BLOCK]] = found
+        distances = _kth(block, torch.cat([blocks[other] for other in near]), k)
+        result[order[start : start + BLOCK]] = distances
     return result
 
 

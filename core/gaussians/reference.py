@@ -102,9 +102,9 @@ def rasterize_scene(
 ) -> Rendering:  # fmt: skip
     """Render as `rasterization` of the package does."""
     scales, opacities = activate(scales, opacities, raw)
-    seen = project(means, quats, scales, world_to_camera, intrinsics, width, height, near, dilation)
-    order = torch.argsort(seen.depths, stable=True)
-    index, centres, covariances, depths = (part[order] for part in seen)
+    projected = project(means, quats, scales, world_to_camera, intrinsics, width, height, near, dilation)
+    order = torch.argsort(projected.depths, stable=True)
+    index, centres, covariances, depths = (part[order] for part in projected)
     colours = colours_of((means - camera_position(world_to_camera))[index], sh[index], sh_degree)
     values = torch.cat([colours, depths[:, None]], -1)
     opacities = opacities[index]

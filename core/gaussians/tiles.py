@@ -191,11 +191,12 @@ def _blend_weights(chunk: _Chunk, blend: Blend, before: Tensor) -> tuple[Tensor,
     return alpha.mul_(threshold(reaching, TRANSMITTANCE_MIN, 0.0)), after
 
 
-def _median_rows(before: Tensor, after: Tensor, index: Tensor) -> Tensor:
+def _median_rows(transmittance: Tensor, next_transmittance: Tensor, index: Tensor) -> Tensor:
     """Return (b, pixels) the row at which the transmittance falls below 1/2, -1 if at none of `index`."""
-    limit = torch.full_like(before, -0.5)
-    place = torch.searchsorted(after.neg(), limit, right=True)[..., 0]  # negated, since it needs ascending order
-    crosses = (place < index.shape[1]) & (before[..., 0] >= 0.5)
+    limit = torch.full_like(transmittance, -0.5)
+    # Negated, since searchsorted needs ascending order.
+    place = torch.searchsorted(next_transmittance.neg(), limit, right=True)[..., 0]
+    crosses = (place < index.shape[1]) & (transmittance[..., 0] >= 0.5)
     return torch.where(crosses, index.gather(1, place.clamp(max=index.shape[1] - 1)), -1)
 
 

@@ -207,6 +207,7 @@ def _as_warp_array(tensor: Tensor) -> Any:
 
 
 def _launch(kernel: Any, lists: TileLists, blend: Blend, parts: Any, more: list[Any]) -> None:
+    """Launch a kernel with one thread for each pixel of each tile; more: its last arguments."""
     places, values, rings, arcs = parts
     shapes = values.new_zeros(len(values), SHAPES)
     if rings is not None:

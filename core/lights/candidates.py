@@ -59,7 +59,7 @@ class Candidates:
 
 def _intersections(observations: Observations, index: NDArray[np.int64], rng: np.random.Generator,
                    max_candidates: int) -> Floats:
-    """(n, 4), at most `max_candidates`: places where the rays of two of the detections `index` meet."""
+    """Return (n, 4), at most `max_candidates`: places where the rays of two of the detections `index` meet."""
     first, second = _choose_pairs(observations, index, rng)
     places = np.concatenate([_triangulate(observations, first, second), _at_infinity(observations, first, second)])
     first, second = np.tile(first, 2), np.tile(second, 2)
@@ -105,7 +105,7 @@ def _draw_pairs(observations: Observations, index: NDArray[np.int64],
 
 
 def _triangulate(observations: Observations, first: NDArray[np.int64], second: NDArray[np.int64]) -> Floats:
-    """(n, 4) midpoint between the rays of two detections where they come nearest; zeros for parallel rays."""
+    """Return (n, 4), the midpoints of the shortest segments between two detections' rays; zeros for parallel rays."""
     a, b = observations.position[observations.view[first]], observations.position[observations.view[second]]
     d, e = observations.ray[first], observations.ray[second]
     cosine, base = (d * e).sum(axis=1), b - a
@@ -119,6 +119,6 @@ def _triangulate(observations: Observations, first: NDArray[np.int64], second: N
 
 
 def _at_infinity(observations: Observations, first: NDArray[np.int64], second: NDArray[np.int64]) -> Floats:
-    """(n, 4) mean direction of two rays, as a place at infinity."""
+    """Return (n, 4), the mean direction of two rays, as a place at infinity."""
     mean = observations.ray[first] + observations.ray[second]
     return np.concatenate([mean / np.linalg.norm(mean, axis=1, keepdims=True), np.zeros((len(mean), 1))], axis=1)

@@ -50,7 +50,7 @@ class Detector(Protocol):
 
 
 def union_mask(detections: Sequence[Detection], size: tuple[int, int]) -> Mask:
-    """(h, w) union of all masks in a picture of `size` (width, height)."""
+    """Return (h, w), the union of all masks in a picture of `size` (width, height)."""
     whole = np.zeros((size[1], size[0]), np.bool_)
     for detection in detections:
         left, top, right, bottom = detection.box

@@ -64,7 +64,9 @@ class ExposureDetector:
 
 
 def _neighbourhood_area(clipped: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """(h, w) number of clipped pixels in each pixel's group; regions nearer than 1.5 % of the diagonal form one group.
+    """Return (h, w), the number of clipped pixels in each pixel's group.
+
+    Regions nearer to each other than 1.5 % of the diagonal form one group.
 
     Groups are the panes of a window, the letters of a sign, the flecks of a bright cloth.
     """
@@ -116,7 +118,7 @@ def _open_by_disc(mask: NDArray[np.uint8], reach: int) -> NDArray[np.uint8]:
 
 
 def _attached_share(core: NDArray[np.bool_], whole: NDArray[np.bool_]) -> float:
-    """Share of a ring half the core's radius outside it where the clipped region continues.
+    """Return the share of a ring half the core's radius outside it where the clipped region continues.
 
     High for a patch cut out of a surface, low past the short spikes of a star or beside a bracket.
     """
@@ -137,7 +139,7 @@ def _smoothstep(value: float, low: float, high: float) -> float:
 
 
 def _shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:
-    """Score of a mask's shape, size, whiteness and surroundings."""
+    """Return the score of a mask's shape, size, whiteness and surroundings."""
     import cv2
 
     height, width = display.shape[:2]
@@ -155,7 +157,7 @@ def _shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDAr
 
 
 def _surrounding_level(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:
-    """Mean HSV value of the ring a radius away from the mask; 1 where the ring is out of frame."""
+    """Return the mean HSV value of the ring a radius away from the mask; 1 where the ring is out of frame."""
     import cv2
 
     height, width = display.shape[:2]

@@ -131,6 +131,6 @@ def keep_smallest(boxes: NDArray[np.float64], among: Sequence[int]) -> list[int]
 
 
 def _intersection_area(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Area of the intersection of two boxes."""
+    """Return the area of the intersection of two boxes."""
     width, height = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
     return float(max(width, 0.0) * max(height, 0.0))

@@ -71,14 +71,14 @@ def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) 
 def _is_same_light(light: FoundLight, other: FoundLight, views: Sequence[tuple[str, Camera]], extent: float) -> bool:
     """True if two lights fall on one spot: nearer than their radii in most frames that show both, or nearer in space
     than their uncertainties."""
-    near = 0.02 * extent + 2 * (light.uncertainty + other.uncertainty)
-    if not light.far and not other.far and np.linalg.norm(light.xyz - other.xyz) < min(near, 0.3 * extent):
+    max_distance = 0.02 * extent + 2 * (light.uncertainty + other.uncertainty)
+    if not light.far and not other.far and np.linalg.norm(light.xyz - other.xyz) < min(max_distance, 0.3 * extent):
         return True
-    together = separate = 0
+    same_views = other_views = 0
     for _, camera in views:
         (a, b), depth = camera.project([light.xyz, other.xyz])
         if (depth > 0).all() and camera.contains([a, b], depth).any():
-            reach = light.radius + other.radius + 0.004 * np.hypot(*camera.size)
-            together += bool(np.linalg.norm(a - b) < reach)
-            separate += bool(np.linalg.norm(a - b) >= reach)
-    return together > 2 * separate
+            joint_radius = light.radius + other.radius + 0.004 * np.hypot(*camera.size)
+            same_views += bool(np.linalg.norm(a - b) < joint_radius)
+            other_views += bool(np.linalg.norm(a - b) >= joint_radius)
+    return same_views > 2 * other_views

@@ -67,7 +67,7 @@ class Observations:
         return local[..., :2] / depth * self.focal + self.centre, front
 
     def is_inlier(self, places: Floats, index: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(n,) whether each place (n, 4) projects on to the detection of the same row of `index`, within tolerance."""
+        """Return (n,), whether each place (n, 4) projects within tolerance of the detection in its row of `index`."""
         view = self.view[index]
         local = np.einsum("nij,nj->ni", self.rotation[view], places[:, :3] - places[:, 3:] * self.position[view])
         front = local[:, 2] > MIN_DEPTH
@@ -89,8 +89,9 @@ class Observations:
         return np.array(sorted(nearest.values()), np.int64)
 
     def scores(self, places: Floats, index: NDArray[np.int64]) -> Floats:
-        """(n,) score of each place (n, 4): the sum of weights of the detections `index` near its projections.
+        """Return (n,), the score of each place (n, 4): the summed weights of the detections near its projections.
 
+        index: of the detections that count.
         The best detection of each view counts, more the nearer it is.
         """
         pixels, front = self.project(places)

@@ -46,6 +46,8 @@ def write_overlay_sheets(folder: Path, capture: Capture, detections: Sequence[Se
 
 def _draw_tile(capture: Capture, number: int, detections: Sequence[Detection],
           lights: Sequence[tuple[str, FoundLight]]) -> NDArray[np.float32]:
+    """Draw the frame of view `number` small, with its detections as rings and the lights as marks, or as arrows to
+    them."""
     import cv2
 
     view = capture.views[number]

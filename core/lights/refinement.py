@@ -91,7 +91,7 @@ def _refine(observations: Observations, place: Floats, inliers: NDArray[np.int64
 
 def _residuals(observations: Observations, inliers: NDArray[np.int64], place: InverseDistance,
                basis: Floats) -> tuple[Floats, Floats]:
-    """Residuals (n, 2) in pixels, and their derivatives (n, 2, 3) by two angles and inverse distance."""
+    """Return residuals (n, 2) in pixels, and their derivatives (n, 2, 3) by two angles and inverse distance."""
     view = observations.view[inliers]
     rotation, shift = observations.rotation[view], place.origin - observations.position[view]
     local = np.einsum("nij,nj->ni", rotation, place.direction + place.inverse * shift)
@@ -107,7 +107,7 @@ def _residuals(observations: Observations, inliers: NDArray[np.int64], place: In
 
 
 def _tangent_basis(direction: Floats) -> Floats:
-    """(3, 2) two unit vectors perpendicular to a direction and to each other."""
+    """Return (3, 2), two unit vectors perpendicular to a direction and to each other."""
     first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(direction, first)], axis=1)

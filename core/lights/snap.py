@@ -61,45 +61,47 @@ def snap_lights(views: Sequence[FlareView], lights: ArrayLike) -> Floats:
     """Return the positions of the lights (n, 3), world coordinates, on their flares; unchanged where there is no clear
     peak."""
     initial = np.array(lights, np.float64).reshape(-1, 3)
-    places, done = initial.copy(), _are_on_peaks(views, initial)
+    positions, is_on_peak = initial.copy(), _are_on_peaks(views, initial)
     for first in reversed(range(len(WINDOWS) - 2)):
-        if done.all():
+        if is_on_peak.all():
             break
-        moved = _mean_shift(views, places, ~done, WINDOWS[first:])
-        accepted = (~done & _are_on_peaks(views, moved) & ~_are_merged(views, moved)
+        moved = _mean_shift(views, positions, ~is_on_peak, WINDOWS[first:])
+        accepted = (~is_on_peak & _are_on_peaks(views, moved) & ~_are_merged(views, moved)
                     & _are_in_reach(views, initial, moved))
-        places[accepted], done = moved[accepted], done | accepted
-    return places
+        positions[accepted], is_on_peak = moved[accepted], is_on_peak | accepted
+    return positions
 
 
-def _mean_shift(views: Sequence[FlareView], places: Floats, free: NDArray[np.bool_],
+def _mean_shift(views: Sequence[FlareView], positions: Floats, free: NDArray[np.bool_],
                 windows: Sequence[float]) -> Floats:
-    """(n, 3) positions after mean shift of the lights that are `free` (n,); the others keep their share of the pixels.
+    """Return positions (n, 3) after mean shift of the lights that are `free` (n,).
+
+    The others stay, and keep their share of the pixels.
     """
-    places = places.copy()
+    positions = positions.copy()
     for window in windows:
         for _ in range(MAX_STEPS):
             farthest = 0.0
-            for light, observations in enumerate(_observe(views, places, window)):
+            for light, observations in enumerate(_observe(views, positions, window)):
                 if not free[light] or len(observations) < 2:
                     continue
                 step = _least_squares_step(observations)
-                places[light] += step
+                positions[light] += step
                 motions = (float(np.linalg.norm(observation.jacobian @ step)) for observation in observations)
                 farthest = max(farthest, *motions)
             if farthest < 0.05:
                 break
-    return places
+    return positions
 
 
-def _are_on_peaks(views: Sequence[FlareView], places: Floats) -> NDArray[np.bool_]:
-    """(n,) which lights sit on a peak of brightness."""
-    fine, wide = (_observe(views, places, window) for window in (PEAK_WINDOW, 2 * PEAK_WINDOW))
-    on_peak = np.zeros(len(places), bool)
-    for light, (near, wide_observations) in enumerate(zip(fine, wide, strict=True)):
-        if near:
-            brightness = np.array([observation.brightness for observation in near])
-            shifts = np.array([np.linalg.norm(observation.shift) for observation in near])
+def _are_on_peaks(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
+    """Return (n,), which lights sit on a peak of brightness."""
+    fine, wide = (_observe(views, positions, window) for window in (PEAK_WINDOW, 2 * PEAK_WINDOW))
+    on_peak = np.zeros(len(positions), bool)
+    for light, (fine_observations, wide_observations) in enumerate(zip(fine, wide, strict=True)):
+        if fine_observations:
+            brightness = np.array([observation.brightness for observation in fine_observations])
+            shifts = np.array([np.linalg.norm(observation.shift) for observation in fine_observations])
             shift = shifts @ brightness / brightness.sum()
             peak = brightness.mean() / np.mean([observation.brightness for observation in wide_observations])
             on_peak[light] = peak > MIN_PEAK_RATIO and shift < MAX_SHIFT * PEAK_WINDOW * views[0].camera.width
@@ -119,7 +121,7 @@ class _Observation(NamedTuple):
 
 
 def _least_squares_step(observations: Sequence[_Observation]) -> Floats:
-    """(3,) step in the world that best fits the views' mean shifts; dim views have less weight."""
+    """Return the step (3,), world units, that best fits the views' mean shifts; dim views have less weight."""
     brightness = np.array([observation.brightness for observation in observations])
     weights = np.minimum(brightness / np.quantile(brightness, 0.75), 1)
     jacobians = np.stack([observation.jacobian for observation in observations])
@@ -129,52 +131,56 @@ def _least_squares_step(observations: Sequence[_Observation]) -> Floats:
     return np.asarray(np.linalg.solve(curvature + DAMPING * np.trace(curvature) / 3 * np.eye(3), pull))
 
 
-def _observe(views: Sequence[FlareView], places: Floats, window: float) -> list[list[_Observation]]:
+def _observe(views: Sequence[FlareView], positions: Floats, window: float) -> list[list[_Observation]]:
     """Observe each light in the views that show flare under its window.
 
     window: standard deviation in frame widths. Returns the observations by light.
     """
-    by_light: list[list[_Observation]] = [[] for _ in places]
+    by_light: list[list[_Observation]] = [[] for _ in positions]
     for camera, flare in views:
         height, width = flare.shape
         deviation = window * width
         across, down = np.arange(width) + 0.5, np.arange(height) + 0.5
-        pixels, depth = camera.project(places)
-        at = {light: (np.exp(-0.5 * ((across - x) / deviation) ** 2), np.exp(-0.5 * ((down - y) / deviation) ** 2))
-              for light, (x, y) in enumerate(pixels) if depth[light] > 0}
-        windows = {light: row * column[:, None] for light, (row, column) in at.items()}
-        together = sum(windows.values(), np.full((height, width), 1e-12))
+        pixels, depth = camera.project(positions)
+        profiles = {
+            light: (np.exp(-0.5 * ((across - x) / deviation) ** 2), np.exp(-0.5 * ((down - y) / deviation) ** 2))
+            for light, (x, y) in enumerate(pixels) if depth[light] > 0}
+        windows = {light: row * column[:, None] for light, (row, column) in profiles.items()}
+        total_window = sum(windows.values(), np.full((height, width), 1e-12))
         for light, window_pixels in windows.items():
-            support = window_pixels * window_pixels / together
+            support = window_pixels * window_pixels / total_window
             weights = support * flare
-            whole, total = support.sum(), weights.sum()
-            if total <= 1e-12 * max(whole, 1e-12):
+            window_sum, weight_sum = support.sum(), weights.sum()
+            if weight_sum <= 1e-12 * max(window_sum, 1e-12):
                 continue
             # Relative to the window's mean, which the frame's edge and the other lights' windows displace.
-            shift = [(weights.sum(axis) @ where) / total - (support.sum(axis) @ where) / whole
-                     for axis, where in ((0, across), (1, down))]
-            by_light[light].append(_Observation(float(total) / (2 * np.pi * deviation**2), np.array(shift),
-                                             camera.jacobian(places[light])))
+            shift = [(weights.sum(axis) @ coordinates) / weight_sum - (support.sum(axis) @ coordinates) / window_sum
+                     for axis, coordinates in ((0, across), (1, down))]
+            by_light[light].append(_Observation(float(weight_sum) / (2 * np.pi * deviation**2), np.array(shift),
+                                             camera.jacobian(positions[light])))
     return by_light
 
 
-def _are_merged(views: Sequence[FlareView], places: Floats) -> NDArray[np.bool_]:
-    """(n,) which lights coincide with another in most views."""
-    near = np.zeros((len(places), len(places)))
+def _are_merged(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
+    """Return (n,), which lights coincide with another in most views."""
+    coincident_views = np.zeros((len(positions), len(positions)))
     for camera, _ in views:
-        pixels, _ = camera.project(places)
-        near += np.linalg.norm(pixels[:, None] - pixels, axis=-1) < PEAK_WINDOW * camera.width
-    near -= np.diag(np.diag(near))
-    return np.asarray((near > len(views) / 2).any(1))
+        pixels, _ = camera.project(positions)
+        coincident_views += np.linalg.norm(pixels[:, None] - pixels, axis=-1) < PEAK_WINDOW * camera.width
+    coincident_views -= np.diag(np.diag(coincident_views))
+    return np.asarray((coincident_views > len(views) / 2).any(1))
 
 
-def _are_in_reach(views: Sequence[FlareView], initial: Floats, places: Floats) -> NDArray[np.bool_]:
-    """(n,) which places are within MAX_OFFSET of the lights' initial ones; farther ones are ghosts of a light out of
-    frame."""
-    near = np.zeros(len(initial), bool)
-    pictures = [(camera.width, *camera.project(initial), *camera.project(places)) for camera, _ in views]
+def _are_in_reach(views: Sequence[FlareView], initial: Floats, positions: Floats) -> NDArray[np.bool_]:
+    """Return (n,), which positions are within MAX_OFFSET of the initial ones in the median view.
+
+    Farther ones are ghosts of a light out of frame.
+    """
+    in_reach = np.zeros(len(initial), bool)
+    projections = [(camera.width, *camera.project(initial), *camera.project(positions)) for camera, _ in views]
     for light in range(len(initial)):
-        moved = [float(np.linalg.norm(after[light] - before[light])) / width
-                 for width, before, front, after, still in pictures if front[light] > 0 and still[light] > 0]
-        near[light] = bool(moved) and float(np.median(moved)) < MAX_OFFSET * WINDOWS[0]
-    return near
+        offsets = [float(np.linalg.norm(moved_pixels[light] - initial_pixels[light])) / width
+                   for width, initial_pixels, initial_depth, moved_pixels, moved_depth in projections
+                   if initial_depth[light] > 0 and moved_depth[light] > 0]
+        in_reach[light] = bool(offsets) and float(np.median(offsets)) < MAX_OFFSET * WINDOWS[0]
+    return in_reach

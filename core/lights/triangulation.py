@@ -120,7 +120,7 @@ def _to_light(observations: Observations, place: Floats, inliers: NDArray[np.int
 
 
 def _nfa(observations: Observations, support: int, visible: int) -> float:
-    """Number of false alarms: how many places chance would give that `support` of `visible` views agree on.
+    """Return the number of false alarms: how many places chance would give that `support` of `visible` views agree on.
 
     Every pair of detections claims a place, and each other view has a detection within tolerance of it with a small
     probability.
@@ -132,7 +132,7 @@ def _nfa(observations: Observations, support: int, visible: int) -> float:
 
 
 def binomial_tail(successes: int, trials: int, probability: float) -> float:
-    """Probability of at least so many successes in independent trials.
+    """Return the probability of at least so many successes in independent trials.
 
     Computed in logarithms: from some 1030 trials on the binomial coefficients exceed floats.
     """

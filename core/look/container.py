@@ -41,6 +41,7 @@ def read_tensors(path: Path | str) -> tuple[Arrays, dict[str, str]]:
 
 
 def _parse(data: bytes) -> tuple[Arrays, dict[str, str]]:
+    """Parse a safetensors file to arrays and metadata. Raises ValueError where it is damaged."""
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(len(data) - 8, MAX_HEADER_BYTES):
         raise ValueError("it ends inside its header")
@@ -50,7 +51,7 @@ def _parse(data: bytes) -> tuple[Arrays, dict[str, str]]:
     arrays: Arrays = {}
     for name, entry in header.items():
         shape = [int(size) for size in entry["shape"]]
-        begin, end = (int(at) for at in entry["data_offsets"])
+        begin, end = (int(offset) for offset in entry["data_offsets"])
         kind = np.dtype(_DTYPES[entry["dtype"]])
         count = math.prod(shape)
         if min([0, *shape]) < 0 or not 0 <= begin <= end <= len(body) or end - begin != count * kind.itemsize:

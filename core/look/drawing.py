@@ -81,6 +81,7 @@ def _box(centre: Floats, covariance: Floats, radius: float, width: int,
 
 def _profile(centre: Floats, covariance: Floats, ring: NDArray[Any] | None, pixel_arc: Floats,
              box: tuple[int, int, int, int]) -> Floats:
+    """Return the profile (rows, columns) of a Gaussian in a box, 1 at its peak; ring (2,): r0 and w, or None."""
     xx, xy, yy = covariance
     dx = np.arange(box[0], box[2], dtype=np.float32) + 0.5 - centre[0]
     dy = (np.arange(box[1], box[3], dtype=np.float32) + 0.5 - centre[1])[:, None]

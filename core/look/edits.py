@@ -219,6 +219,7 @@ def _parse_targets(text: str, whom: str, lights: Sequence[str],
 
 
 def _parse_change(text: str, property_name: str, value: str) -> Edit:
+    """Return the edit of one `property=value`; text: the whole edit, for the SettingsError of an invalid one."""
     if property_name == "tint" and _HEX.fullmatch(value):
         channels = np.array([int(value[at:at + 2], 16) / 255 for at in (1, 3, 5)])
         red, green, blue = linear_from_srgb(channels).tolist()
@@ -243,6 +244,7 @@ def _parse_change(text: str, property_name: str, value: str) -> Edit:
 
 
 def _to_texts(edit: Edit) -> list[str]:
+    """Return the texts `property=value` of an edit's changed properties."""
     texts = []
     for entry in fields(Edit):
         value, default = getattr(edit, entry.name), getattr(NEUTRAL, entry.name)
@@ -289,6 +291,7 @@ def apply_edits(gaussians: PlaneGaussians, light: str, light_position: NDArray[A
 
 
 def _apply_colour(part: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:
+    """Return the Gaussians with the colours and opacities of an edit."""
     if not edit.changes_colour:
         return part
     if blend == "add":

@@ -175,9 +175,9 @@ def _merge_faint(parts: list[tuple[str, NDArray[np.int64]]], energy: Floats,
     return parts
 
 
-def _unique_name(name: str, taken: Sequence[Element]) -> str:
+def _unique_name(name: str, elements: Sequence[Element]) -> str:
     """Return `name`, with a number if an element has it already: ghost, ghost 2, ghost 3."""
-    names = {element.name for element in taken}
+    names = {element.name for element in elements}
     if name not in names:
         return name
     number = 2

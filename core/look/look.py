@@ -131,9 +131,9 @@ class LightLook:
             return self._listed
         along = self.query_range.light_high[2] * np.array([0.55, 0.35], np.float32)
         middle = (self.query_range.camera_low + self.query_range.camera_high) / 2
-        seen, _ = self._gaussians(ViewOfLight(middle, np.eye(3, dtype=np.float32), np.asarray(along, np.float32), 1.0),
-                                  None)
-        return elements.group_elements(seen, self._rows["positions"][:, 0] if self.form.line else None)
+        view = ViewOfLight(middle, np.eye(3, dtype=np.float32), np.asarray(along, np.float32), 1.0)
+        gaussians, _ = self._gaussians(view, None)
+        return elements.group_elements(gaussians, self._rows["positions"][:, 0] if self.form.line else None)
 
     def evaluate(self, view: ViewOfLight, *, query: ViewOfLight | None = None, edits: LookEdits | None = None,
                  visibility: float = 1.0, name: str | None = None) -> PlaneGaussians | None:
@@ -298,6 +298,7 @@ def write_annotated(source: Path | str, target: Path | str, *, notes: str, licen
 
 
 def _parse_json(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Parse JSON of a .flare's metadata. Raises FlareFileError."""
     if METADATA_KEY not in metadata:
         raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.")
     try:
@@ -373,6 +374,7 @@ def read(path: Path | str) -> Look:
 
 def _read_light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: Blend,
            listed: Any) -> LightLook:
+    """Make the look of light `index` of a file."""
     form, name, count = FlareForm(**entry["form"]), str(entry["name"]), int(entry["count"])
     xyz = np.array([float(value) for value in entry["xyz"]], np.float64)
     own_rows = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}

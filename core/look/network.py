@@ -59,9 +59,9 @@ class HashGrid:
     def _row_values(self, rows: NDArray[np.int64]) -> Floats:
         values = np.zeros((*rows.shape, self._values.shape[1]), np.float32)
         if len(self._rows):
-            at = np.minimum(np.searchsorted(self._rows, rows), len(self._rows) - 1)
-            is_stored = self._rows[at] == rows
-            values[is_stored] = self._values[at[is_stored]]
+            index = np.minimum(np.searchsorted(self._rows, rows), len(self._rows) - 1)
+            is_stored = self._rows[index] == rows
+            values[is_stored] = self._values[index[is_stored]]
         return values
 
 

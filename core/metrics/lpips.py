@@ -54,6 +54,7 @@ class Lpips:
         return total
 
     def _features(self, x: Tensor) -> list[Tensor]:
+        """Return the activations of the compared layers for x (n, 3, h, w), 0..1, normalised over channels."""
         shift, scale = (torch.tensor(values, device=x.device).reshape(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
         x = (x * 2 - 1 - shift) / scale
         features = []
@@ -67,6 +68,7 @@ class Lpips:
 
 
 def _read_weights(path: Path) -> dict[str, Tensor]:
+    """Read a file of weights; {} for a file of another kind. Raises SettingsError for pickled code."""
     if path.suffix == ".safetensors":
         from safetensors.torch import load_file
 

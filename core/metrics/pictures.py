@@ -82,8 +82,8 @@ def ssim(image: Array, target: Array, borders: Borders = "valid") -> float:
 
 def _blur(picture: NDArray[np.float64], borders: Borders) -> NDArray[np.float64]:
     """Convolve with the Gaussian window, one axis after the other."""
-    at = np.arange(WINDOW) - WINDOW // 2
-    window = np.exp(-at ** 2 / (2 * SIGMA ** 2))
+    offsets = np.arange(WINDOW) - WINDOW // 2
+    window = np.exp(-offsets ** 2 / (2 * SIGMA ** 2))
     window /= window.sum()
     for axis in (0, 1):
         if borders == "same":

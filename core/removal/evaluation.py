@@ -99,6 +99,7 @@ def _index_by_key(folder: Path) -> dict[str, Path]:
 
 
 def _case_reader(path: Path, truth: Path, mask: Path | None) -> Callable[[], tuple[Pixels, Pixels, Pixels | None]]:
+    """Return a function that reads frame, truth and mask of a case; it raises FrameError where their sizes differ."""
     def read() -> tuple[Pixels, Pixels, Pixels | None]:
         frame, clean = read_picture(path), read_picture(truth)
         if frame.size != clean.size:
@@ -152,6 +153,7 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
 
 def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
             lpips: Perceptual | None) -> Scores:
+    """Return the scores of a picture against the truth; None for one that is infinite or cannot be computed."""
     small = min(picture.shape[:2]) < 11
     scores: Scores = {"psnr": psnr(picture, truth), "ssim": None if small else ssim(picture, truth),
                       "lpips": lpips(picture, truth) if lpips else None, "flip": flip(picture, truth)}
@@ -162,6 +164,7 @@ def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return means over the cases, and the share that became worse by more than 0.5 dB."""
     gains = [row["gain_db"] for row in rows]
     summary: dict[str, Any] = {"count": len(rows), "gain_db": _mean(gains),
                                "made_worse": round(sum(gain < -0.5 for gain in gains) / max(len(gains), 1), 4)}

@@ -132,6 +132,7 @@ def _start_time(pid: int) -> float | None:
 
 
 def _start_time_windows(pid: int) -> float | None:
+    """Return the start time of a running process, seconds since 1970; None where there is none."""
     import ctypes
 
     kernel = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
@@ -149,6 +150,7 @@ def _start_time_windows(pid: int) -> float | None:
 
 
 def _start_time_proc(pid: int) -> float | None:
+    """Return the start time of a running process by /proc, seconds since 1970; None where there is none."""
     after_name = (PROC / str(pid) / "stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
     if after_name[0] in "ZX":  # ended, and its parent has not read its status
         return None

@@ -114,11 +114,11 @@ def preset(look: Look, views: Mapping[str, ViewOfLight], edits: LookEdits | None
         if gaussians is None:
             continue
         gaussians = gaussians.with_exposure(exposure, look.blend)
-        at = views[light.name].light.astype(np.float64)
+        light_position = views[light.name].light.astype(np.float64)
         elements = [{"name": element.name, "kind": element.kind,
-                     "parts": [_part(gaussians, row, at, width) for row in rows]}
+                     "parts": [_part(gaussians, row, light_position, width) for row in rows]}
                     for element, rows in _visible_elements(light, edits, len(gaussians))]
-        lights.append({"name": light.name, "at": (at / width).tolist(), "elements": elements})
+        lights.append({"name": light.name, "at": (light_position / width).tolist(), "elements": elements})
     return {"version": PRESET_VERSION, "made_by": "Fit Flare", "blend": look.blend, "unit": "picture width",
             "offset": "0 at the light, 1 at the principal point", "licence": look.licence, "notes": look.notes,
             "lights": lights}

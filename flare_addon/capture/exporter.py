@@ -211,14 +211,14 @@ def lens_distortion(camera: Any, path: Path) -> dict[str, float]:
     {} without distortion, and for other pictures, which count as undistorted. Raises CaptureError for a distortion
     model other than Polynomial, which transforms.json cannot represent.
     """
-    for back in camera.data.background_images:
-        clip = back.clip if back.source == "MOVIE_CLIP" else None
+    for background in camera.data.background_images:
+        clip = background.clip if background.source == "MOVIE_CLIP" else None
         if clip is None or absolute(clip.filepath, clip.library).parent.resolve() != path.parent.resolve():
             continue
         lens = clip.tracking.camera
         if lens.distortion_model == "POLYNOMIAL":
-            found = {name: float(getattr(lens, name)) for name in ("k1", "k2", "k3")}
-            return found if any(found.values()) else {}
+            coefficients = {name: float(getattr(lens, name)) for name in ("k1", "k2", "k3")}
+            return coefficients if any(coefficients.values()) else {}
         if any(getattr(lens, name, 0) for name in _UNSUPPORTED_DISTORTION.get(lens.distortion_model, ())):
             raise CaptureError(f"The lens of the clip {clip.name!r} is distorted by the model {lens.distortion_model}; "
                                "solve it with the model Polynomial, or give undistorted frames.")
@@ -232,25 +232,25 @@ def bundle_matrix(camera: Any) -> Any:
     and Set Scale change.
     """
     parent = camera.parent.matrix_world if camera.parent else None
-    if not any(one.type == "CAMERA_SOLVER" and not one.mute for one in camera.constraints):
+    if not any(constraint.type == "CAMERA_SOLVER" and not constraint.mute for constraint in camera.constraints):
         return parent
     return camera.matrix_basis if parent is None else parent @ camera.matrix_parent_inverse @ camera.matrix_basis
 
 
 def scene_points(scene: Any, camera: Any) -> np.ndarray[Any, Any]:
     """Return the points (n, 3) of the clip's solved tracks and of the scene's meshes, in Blender's world."""
-    found: list[np.ndarray[Any, Any]] = []
-    for back in camera.data.background_images:
-        if back.source == "MOVIE_CLIP" and back.clip is not None:
-            bundles = [list(track.bundle) for track in back.clip.tracking.tracks if track.has_bundle]
+    parts: list[np.ndarray[Any, Any]] = []
+    for background in camera.data.background_images:
+        if background.source == "MOVIE_CLIP" and background.clip is not None:
+            bundles = [list(track.bundle) for track in background.clip.tracking.tracks if track.has_bundle]
             if bundles:
-                found.append(_transform(np.array(bundles), bundle_matrix(camera)))
+                parts.append(_transform(np.array(bundles), bundle_matrix(camera)))
     for item in scene.objects:
         if item.type == "MESH" and len(item.data.vertices):
             flat = np.empty(3 * len(item.data.vertices), np.float32)
             item.data.vertices.foreach_get("co", flat)
-            found.append(_transform(flat.reshape(-1, 3), item.matrix_world))
-    every = np.concatenate(found) if found else np.zeros((0, 3))
+            parts.append(_transform(flat.reshape(-1, 3), item.matrix_world))
+    every = np.concatenate(parts) if parts else np.zeros((0, 3))
     return every[:: max(len(every) // MAX_POINTS, 1)]
 
 

@@ -251,9 +251,9 @@ def _show_sequence(camera: Any, capture: Capture, views: Sequence[View], numbers
     False."""
     paths = [capture.frame_path(view) for view in views]
     patterns = {(path.parent, _NUMBER.sub("#", path.name)) for path in paths}
-    found = [_NUMBER.search(path.stem) for path in paths]
+    matches = [_NUMBER.search(path.stem) for path in paths]
     in_order = len(patterns) == 1 and all(match is not None and int(match[1]) == number
-                                          for match, number in zip(found, numbers, strict=True))
+                                          for match, number in zip(matches, numbers, strict=True))
     if len(paths) == 1 or not in_order:
         _add_background(camera, load_image(paths[0]))
         return len(paths) == 1
@@ -295,7 +295,7 @@ def show_footage(scene: Any, which: str) -> int:
 def _background_images(root: Any) -> Iterator[Any]:
     """Yield the background images of the cameras of a capture."""
     for data in {item.data for item in root.children if item.type == "CAMERA"}:  # cameras may share their data
-        yield from (back for back in data.background_images if back.image is not None)
+        yield from (background for background in data.background_images if background.image is not None)
 
 
 def _own_image(image: Any, users: Sequence[Any]) -> Any:
@@ -310,9 +310,10 @@ def _own_image(image: Any, users: Sequence[Any]) -> Any:
 def _add_background(camera: Any, image: Any) -> Any:
     """Add a background image to a camera; return it."""
     camera.data.show_background_images = True
-    back = camera.data.background_images.new()
-    back.image, back.alpha, back.frame_method, back.display_depth = image, 1.0, "STRETCH", "BACK"
-    return back
+    background = camera.data.background_images.new()
+    background.image, background.alpha = image, 1.0
+    background.frame_method, background.display_depth = "STRETCH", "BACK"
+    return background
 
 
 # ---- points and objects -------------------------------------------------------------------------------------
@@ -336,7 +337,7 @@ def _add_points(collection: Any, root: Any, cloud: PointCloud) -> Any:
 
 def _add_object(collection: Any, name: str, data: Any, parent: Any) -> Any:
     """Add an object to a collection, as a child of `parent`; return it."""
-    made = bpy.data.objects.new(name, data)
-    collection.objects.link(made)
-    made.parent = parent
-    return made
+    obj = bpy.data.objects.new(name, data)
+    collection.objects.link(obj)
+    obj.parent = parent
+    return obj

@@ -60,10 +60,10 @@ class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
         """Return the selected cameras; [] for the scene's camera. Raises CaptureError where none is selected."""
         if not self.selected:
             return []
-        found = [item for item in context.selected_objects if item.type == "CAMERA"]
-        if not found:
+        cameras = [item for item in context.selected_objects if item.type == "CAMERA"]
+        if not cameras:
             raise CaptureError("No camera is selected; select those to bake from.")
-        return found
+        return cameras
 
 
 def _is_baking(scene: Any) -> bool:

@@ -61,12 +61,12 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         if not chosen.exists() and self.directory:
             chosen = Path(bpy.path.abspath(self.directory))
         settings = ImportSettings(self.cameras, self.up, self.scale, self.frames, self.points, self.match_scene)
-        made = import_capture(context.scene, chosen, settings)
+        imported = import_capture(context.scene, chosen, settings)
         fits.clear_other_run(context.scene)
         fits.expose_cameras(context.scene, fits.run_folder(context.scene))
-        for note in made.notes:
+        for note in imported.notes:
             self.report({"WARNING"}, note)
-        self.report({"INFO"}, f"{chosen.name}: cameras {len(made.cameras)}, lights {len(made.lights)}")
+        self.report({"INFO"}, f"{chosen.name}: cameras {len(imported.cameras)}, lights {len(imported.lights)}")
         _look_through_camera(context)
 
 

@@ -197,8 +197,8 @@ class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):
         scene.collection.objects.link(camera)
         camera.rotation_euler = (1.5707963, 0, 0)
         data.show_background_images = True
-        back = data.background_images.new()
-        back.image, back.alpha, back.frame_method = image, 1.0, "STRETCH"
+        background = data.background_images.new()
+        background.image, background.alpha, background.frame_method = image, 1.0, "STRETCH"
         scene.camera = camera
         scene.render.resolution_x, scene.render.resolution_y = image.size
         scene.render.resolution_percentage = 100

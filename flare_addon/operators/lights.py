@@ -44,9 +44,9 @@ class FITFLARE_OT_lights_from_selected(GuardedOperator, bpy.types.Operator):
         return ""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        taken = {lights.light_name(item) for item in lights.scene_lights(context.scene)}
-        made = lights.mark_as_lights(context.selected_objects, taken)
-        self.report({"INFO"}, f"{made} objects are lights now")
+        used_names = {lights.light_name(item) for item in lights.scene_lights(context.scene)}
+        count = lights.mark_as_lights(context.selected_objects, used_names)
+        self.report({"INFO"}, f"{count} objects are lights now")
         return {"FINISHED"}
 
 

@@ -76,8 +76,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     progress.stage("export", len(selected))
     for frame in selected:
         camera = cameras[frame.view]
-        flares = {light: one.with_exposure(camera.exposure, look.blend)
-                  for light, one in look.evaluate(camera.world_to_camera, edits=edits).items()}
+        flares = {light: gaussians.with_exposure(camera.exposure, look.blend)
+                  for light, gaussians in look.evaluate(camera.world_to_camera, edits=edits).items()}
         write_flare_ply(args.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"), flares, camera,
                         look.blend, look.pixel_grid)
         progress.advance()

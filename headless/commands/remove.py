@@ -102,8 +102,8 @@ def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[s
     chosen = frames.select_task(number_views([view.name for view in capture.views]), args, progress)
     if not chosen:
         return {"plates": str(args.out), "made": 0, "kept": 0}
-    wanted = {frame.view for frame in chosen}
-    views = [view for view in capture.views if view.name in wanted]
+    selected_names = {frame.view for frame in chosen}
+    views = [view for view in capture.views if view.name in selected_names]
     return remove_fitted_flare(fitted, capture, views, args.out, progress, flare_folder=args.flare,
                                overwrite=args.overwrite, fit_digest=fitted.fingerprint,
                                above_white=fitted.settings.display_white > 1)

@@ -141,8 +141,8 @@ def _train_diffusion(args: argparse.Namespace, recipe: Recipe, backgrounds: Back
     batches = Batches(recipe, backgrounds, lenses, user_flares)
 
     def draw(number: int) -> tuple[Pixels, Pixels]:
-        one = batches.draw_pair(number, 0, 512, 512)
-        return one.frame, one.scene_with_glow if args.keep_glow else one.scene
+        pair = batches.draw_pair(number, 0, 512, 512)
+        return pair.frame, pair.scene_with_glow if args.keep_glow else pair.scene
 
     path = diffusion.train_diffusion(diffusion.DiffusionRemoval(args.base), args.out, draw,
                                      args.iterations or diffusion.ITERATIONS, progress, resume=args.resume,

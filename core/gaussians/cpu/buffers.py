@@ -23,7 +23,7 @@ CACHE_LINE = 64
 MIN_POOLED_BYTES = 1 << 15
 """Size in bytes from which arrays come from the pool; smaller ones come from the system."""
 MAX_FREE_BYTES = 1 << 30
-"""Most bytes in the pool; the blocks that are unused for longest are freed first."""
+"""Bound of the bytes in the pool; the blocks that were unused for longest are freed first."""
 
 _free_blocks: OrderedDict[int, list[Array]] = OrderedDict()
 _references: dict[int, _BlockReference] = {}
@@ -38,6 +38,7 @@ class _BlockReference(weakref.ref[Array]):
 
 
 def _release(reference: weakref.ref[Array]) -> None:
+    """Return the block of a freed array to the pool, and free the oldest blocks above MAX_FREE_BYTES."""
     global _free_bytes
     assert isinstance(reference, _BlockReference)
     del _references[id(reference)]
@@ -66,6 +67,7 @@ def _allocate_aligned(size: int) -> Array:
 
 
 def _take_block(capacity: int) -> Array:
+    """Return a block of this capacity, bytes, from the pool, or a new one."""
     global _free_bytes
     blocks = _free_blocks.get(capacity)
     if not blocks:

@@ -255,6 +255,8 @@ def stream_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
 
 
 def _make_prefetch(write: bool, purpose: str) -> Any:
+    """Return the intrinsic that prefetches a cache line for writing (`write`) or reading."""
+
     def prefetch(typing_context, array, index):  # noqa: ARG001
         def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
             address = _address(context, builder, sig.args[0], *args)

@@ -118,6 +118,7 @@ class DiffusionRemoval(nn.Module):
         return (self._decode(clean, features) + 1) / 2
 
     def _encode(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return the latents of x (n, 3, h, w), -1..1, and the features for the skip convolutions."""
         encoder, features = self.vae.encoder, []
         x = encoder.conv_in(x)
         for block in encoder.down_blocks:

@@ -133,6 +133,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         return digest_inputs(remover.cache_key, [frame.source, *predictor.dependencies(frame.source), *matte])
 
     def clean(frame: CleanFrame) -> Callable[[], None]:
+        """Predict a plate's flare; return the function that writes its results."""
         plate, prediction = predictor.predict(frame.source)
         matte = mattes.read(frame.name, read_data_window(frame.source), read_exif(frame.source)[0]) if mattes else None
 
@@ -144,6 +145,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         return write
 
     def leave_out(frame: CleanFrame, error: Exception) -> None:
+        """Note a plate that cannot be cleaned; raise an error that concerns all plates."""
         if not is_plate_error(error):
             raise error
         if isinstance(error, OSError) and error.errno in DISK_FULL:

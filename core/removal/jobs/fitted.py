@@ -162,9 +162,9 @@ def _bounded_least_squares(product: Floats, target: Floats, start: Floats, low: 
     """Solve product x = target for x (n,) between bounds, by coordinate descent."""
     solution = start.copy()
     for _ in range(DESCENT_SWEEPS):
-        for at in range(len(solution)):
-            rest = target[at] - product[at] @ solution + product[at, at] * solution[at]
-            solution[at] = min(max(rest / product[at, at], low[at]), high[at])
+        for index in range(len(solution)):
+            residual = target[index] - product[index] @ solution + product[index, index] * solution[index]
+            solution[index] = min(max(residual / product[index, index], low[index]), high[index])
     return solution
 
 

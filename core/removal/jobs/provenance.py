@@ -13,8 +13,8 @@ from .manifest import Manifest
 def has_exact_clean_frames(capture: Capture) -> bool:
     """Return whether a capture has clean frames that a fit may take as exact.
 
-    Someone's own are exact, and those that `remove` made if all were edited since; without removed/, the layers of a
-    rendered scene. Unedited results of `remove` are estimates.
+    Files that `remove` made and nobody has edited since are estimates, all others in removed/ are exact. Without
+    removed/, the exact layers of a rendered scene count.
     """
     if not capture.has_removed:
         return capture.has_truth

@@ -81,9 +81,10 @@ def _draw_ghost(random: Random, centre: Array, radius: float, texture: Array, si
     light = np.zeros((size, size, 3), np.float32)
     for channel in range(3):
         x, y = aberrations.to_sensor(channel, u, v)
-        at = (np.stack([x * math.cos(azimuth) - y * math.sin(azimuth), x * math.sin(azimuth) + y * math.cos(azimuth)])
-              * radius + centre[:, None, None] + 1) * size / 2 - 0.5
-        light[..., channel] = _splat(at, pupil, size) * (radius * size / count) ** 2
+        rotated = np.stack([x * math.cos(azimuth) - y * math.sin(azimuth),
+                            x * math.sin(azimuth) + y * math.cos(azimuth)])
+        positions = (rotated * radius + centre[:, None, None] + 1) * size / 2 - 0.5
+        light[..., channel] = _splat(positions, pupil, size) * (radius * size / count) ** 2
     blur = max(0.6, radius * size * log_uniform(random, 0.003, 0.06))
     return np.asarray(np.minimum(cv2.GaussianBlur(light, (0, 0), blur), MAX_CAUSTIC), np.float32)
 
@@ -114,15 +115,16 @@ def _draw_pupil(random: Random, u: Array, v: Array) -> Array:
     return pupil
 
 
-def _splat(at: Array, weights: Array, size: int) -> Array:
-    """Return (size, size): the weights at positions (2, n, n) in pixels, each shared bilinearly among four pixels."""
-    low = np.floor(at)
-    part, low = at - low, low.astype(np.int64)
+def _splat(positions: Array, weights: Array, size: int) -> Array:
+    """Return the picture (size, size) of weights (n, n) at positions (2, n, n), px, each split bilinearly on 4 pixels.
+    """
+    low = np.floor(positions)
+    fraction, low = positions - low, low.astype(np.int64)
     total = np.zeros(size * size)
     for right in (0, 1):
         for down in (0, 1):
             x, y = low[0] + right, low[1] + down
-            share = weights * np.abs(1 - right - part[0]) * np.abs(1 - down - part[1])
+            share = weights * np.abs(1 - right - fraction[0]) * np.abs(1 - down - fraction[1])
             inside = (x >= 0) & (x < size) & (y >= 0) & (y < size)
             total += np.bincount((y * size + x)[inside], share[inside], size * size)
     return total.reshape(size, size).astype(np.float32)

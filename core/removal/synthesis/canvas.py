@@ -16,8 +16,8 @@ Random = np.random.Generator
 
 def canvas_grid(size: int) -> tuple[Array, Array]:
     """Return x and y of the pixel centres of a square canvas, each (size, size), -1..1, x to the right, y down."""
-    at = ((np.arange(size) + 0.5) / size * 2 - 1).astype(np.float32)
-    x, y = np.meshgrid(at, at)
+    coordinates = ((np.arange(size) + 0.5) / size * 2 - 1).astype(np.float32)
+    x, y = np.meshgrid(coordinates, coordinates)
     return x, y
 
 
@@ -69,8 +69,8 @@ def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, c
         y0 = max(int((cy - reach + 1) * n / 2), 0)
         y1 = min(int((cy + reach + 1) * n / 2) + 2, n)
         edge = max(soft / r, 2.5 / (n * r))
-        away = math.sqrt(cx * cx + cy * cy) + 1e-6
-        ux, uy = cx / away, cy / away
+        distance = math.sqrt(cx * cx + cy * cy) + 1e-6
+        ux, uy = cx / distance, cy / distance
         for row in range(y0, y1):
             y = (row + 0.5) * 2 / n - 1
             for column in range(x0, x1):

@@ -176,8 +176,8 @@ def draw_arc(random: Random, light: Point, size: int, x: Array, y: Array) -> Arr
     layer = np.zeros((size, size, 3), np.float32)
     spread = random.uniform(-0.6, 0.6)
     for wave, colour in zip(waves, colours / colours.sum(0), strict=True):
-        at = radius * (1 + spread * (wave - 0.55))
-        layer += np.exp(-((r - at) / width) ** 2)[..., None] * colour.astype(np.float32)
+        radius_of_wave = radius * (1 + spread * (wave - 0.55))
+        layer += np.exp(-((r - radius_of_wave) / width) ** 2)[..., None] * colour.astype(np.float32)
     return layer * window[..., None] * log_uniform(random, 0.1, 1.0)
 
 

@@ -47,8 +47,8 @@ def _draw_stop(random: Random, dirt: float) -> Array:
     """
     import cv2
 
-    at = np.linspace(-1, 1, STOP_SAMPLES)
-    x, y = np.meshgrid(at, at)
+    axis = np.linspace(-1, 1, STOP_SAMPLES)
+    x, y = np.meshgrid(axis, axis)
     blades = int(random.integers(5, 10))
     if random.random() < 0.2:
         blades = 18
@@ -86,8 +86,8 @@ def _draw_phase(random: Random) -> Array:
     """Return the phase, radians, of defocus and of smooth grease."""
     import cv2
 
-    at = np.linspace(-1, 1, STOP_SAMPLES)
-    x, y = np.meshgrid(at, at)
+    axis = np.linspace(-1, 1, STOP_SAMPLES)
+    x, y = np.meshgrid(axis, axis)
     phase = np.zeros((STOP_SAMPLES, STOP_SAMPLES))
     if random.random() < 0.5:
         phase += random.normal(0, 12) * (x**2 + y**2)
@@ -108,16 +108,16 @@ def shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
         number, width = int(random.integers(4, 30)), log_uniform(random, 0.002, 0.03)
     else:  # a curtain of them
         number, width = int(random.integers(40, 300)), log_uniform(random, 0.001, 0.01)
-    at = np.arange(count) / count
+    positions = np.arange(count) / count
     for _ in range(number):
         centre = random.random()
-        gap = np.abs(at - centre)
+        gap = np.abs(positions - centre)
         strength += random.exponential(1) * np.exp(-(np.minimum(gap, 1 - gap) / (width * random.uniform(0.5, 2))) ** 2)
     strength = strength / strength.max() + random.uniform(0, 0.3)
     reach = log_uniform(random, 0.08, 0.8) * (0.5 + 0.5 * np.roll(strength, int(random.integers(20))))
-    turn = ((angle / (2 * math.pi)) % 1) * count
-    low = turn.astype(int) % count
-    part = (turn - np.floor(turn)).astype(np.float32)
+    position = ((angle / (2 * math.pi)) % 1) * count
+    low = position.astype(int) % count
+    part = (position - np.floor(position)).astype(np.float32)
     near = strength[low] * (1 - part) + strength[(low + 1) % count] * part
     far = reach[low] * (1 - part) + reach[(low + 1) % count] * part
     inner = random.uniform(0, 0.15)

@@ -19,14 +19,14 @@ def streak(random: Random, light: Point, x: Array, y: Array) -> Array:
         dx, dy = x - light[0], y - light[1]
         along = dx * math.cos(angle) + dy * math.sin(angle)
         across = dy * math.cos(angle) - dx * math.sin(angle) - offset
-        reach, width = log_uniform(random, 0.1, 2.5), log_uniform(random, 0.003, 0.05)
-        cross = np.exp(-(across / width) ** 2) if random.random() < 0.5 else 1 / (1 + (across / width) ** 2) ** 1.5
-        fall = np.exp(-np.abs(along) / reach) if random.random() < 0.5 else 1 / (1 + (along / reach * 2) ** 2)
+        length, width = log_uniform(random, 0.1, 2.5), log_uniform(random, 0.003, 0.05)
+        profile = np.exp(-(across / width) ** 2) if random.random() < 0.5 else 1 / (1 + (across / width) ** 2) ** 1.5
+        falloff = np.exp(-np.abs(along) / length) if random.random() < 0.5 else 1 / (1 + (along / length * 2) ** 2)
         if random.random() < 0.3:  # uneven along its length
-            fall *= 1 + 0.4 * np.sin(along * random.uniform(4, 60) + random.uniform(0, 7))
+            falloff *= 1 + 0.4 * np.sin(along * random.uniform(4, 60) + random.uniform(0, 7))
         colour = blue * random_tint(random, 0.2) if random.random() < 0.6 else random_tint(random, 0.6)
-        core = np.exp(-np.abs(along) / (0.3 * reach))[..., None]
-        layer += (cross * fall * width ** -0.2 * random.uniform(0.3, 1))[..., None] * (
+        core = np.exp(-np.abs(along) / (0.3 * length))[..., None]
+        layer += (profile * falloff * width ** -0.2 * random.uniform(0.3, 1))[..., None] * (
             colour * (1 - 0.6 * core) + 0.6 * core).astype(np.float32)
     return layer / max(float(layer.max()), 1e-9)
 
@@ -53,26 +53,26 @@ def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Arra
     form, level = random.random(), log_uniform(random, 0.1, 1) if fainter else 1.0
     rays = _draw_ray_profile(random) if random.random() < 0.5 else None
     colour = random_tint(random, 0.15) + (random_tint(random, 0.5) - 1) * np.clip(r / end, 0, 1)[..., None]
-    fall = (1 + (0.25 / reach) ** power) / (1 + (r / reach) ** power) * np.exp(-((r / end) ** 2))
+    falloff = (1 + (0.25 / reach) ** power) / (1 + (r / reach) ** power) * np.exp(-((r / end) ** 2))
     spread = np.sqrt(width**2 + (opening * r) ** 2)
     light = np.zeros_like(r)
-    for turn, strength in ((0.0, level), (math.pi, level * other_side)):
-        deviation = angle - direction - turn - bend * r
+    for rotation, strength in ((0.0, level), (math.pi, level * other_side)):
+        deviation = angle - direction - rotation - bend * r
         deviation = np.arctan2(np.sin(deviation), np.cos(deviation))
         u = np.minimum(np.abs(deviation), 1.5) * r / spread
-        cross = np.exp(-(u**2)) if form < 0.4 else 1 / (1 + u**2) ** 1.5 if form < 0.7 else np.exp(-(u**4))
+        profile = np.exp(-(u**2)) if form < 0.4 else 1 / (1 + u**2) ** 1.5 if form < 0.7 else np.exp(-(u**4))
         if rays is not None:
-            cross = cross * rays(deviation / max(opening, 0.01))
-        light += np.minimum(strength * cross * fall, 30)
+            profile = profile * rays(deviation / max(opening, 0.01))
+        light += np.minimum(strength * profile * falloff, 30)
     return np.asarray(light[..., None] * np.maximum(colour, 0.05), np.float32)
 
 
 def _draw_ray_profile(random: Random) -> Callable[[Array], Array]:
     """Return a function of direction: random brightness of rays, mean about 1, one opening's width to either side."""
     count = int(random.integers(6, 60))
-    at, values = np.linspace(-2.5, 2.5, count), random.exponential(1, count) + random.uniform(0, 1)
+    angles, values = np.linspace(-2.5, 2.5, count), random.exponential(1, count) + random.uniform(0, 1)
     values /= values.mean()
-    return lambda direction: np.interp(direction, at, values).astype(np.float32)
+    return lambda direction: np.interp(direction, angles, values).astype(np.float32)
 
 
 def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
@@ -90,13 +90,13 @@ def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
         spread = random.uniform(-1, 1) if random.random() < 0.7 else 0.0
         ring = np.zeros_like(layer)
         for wave, colour in zip(waves, colours.astype(np.float32), strict=True):
-            at = radius * (1 + spread * (wave - 0.55))
-            side = np.where(r < at, random.uniform(0.7, 1.3), 1.0)
-            ring += np.exp(-((r - at) / (width * side)) ** 2)[..., None] * colour
+            radius_of_wave = radius * (1 + spread * (wave - 0.55))
+            side = np.where(r < radius_of_wave, random.uniform(0.7, 1.3), 1.0)
+            ring += np.exp(-((r - radius_of_wave) / (width * side)) ** 2)[..., None] * colour
         if random.random() < 0.4:
             direction, opening_angle = random.uniform(-math.pi, math.pi), random.uniform(0.3, 2)
-            away = np.arctan2(np.sin(angle - direction), np.cos(angle - direction))
-            ring *= np.exp(-((away / opening_angle) ** 2))[..., None]
+            angle_offset = np.arctan2(np.sin(angle - direction), np.cos(angle - direction))
+            ring *= np.exp(-((angle_offset / opening_angle) ** 2))[..., None]
         if random.random() < 0.3:
             fine = sum(random.normal(0, 0.3) * np.cos(k * angle + random.uniform(0, 7))
                        for k in random.integers(8, 120, 6))

@@ -81,9 +81,10 @@ def _random_defocus(random: Random, scene: Pixels) -> Pixels:
     """Blur the scene as a lens that is focused nearer does: lights become discs or polygons."""
     radius = math.hypot(*scene.shape[:2]) * log_uniform(random, 0.004, 0.04)
     blades = int(random.integers(5, 9)) if random.random() < 0.4 else 48  # enough to look round
-    at = np.arange(blades) * (2 * math.pi / blades) + random.uniform(0, 2 * math.pi)
+    angles = np.arange(blades) * (2 * math.pi / blades) + random.uniform(0, 2 * math.pi)
     side = 2 * math.ceil(radius) + 1
-    return defocus(scene, _draw_polygon(np.stack([np.cos(at), np.sin(at)], -1) * radius + side // 2, side, side))
+    points = np.stack([np.cos(angles), np.sin(angles)], -1) * radius + side // 2
+    return defocus(scene, _draw_polygon(points, side, side))
 
 
 def defocus(scene: Pixels, aperture: Pixels) -> Pixels:
@@ -126,9 +127,10 @@ def _draw_leaf(random: Random, width: int, height: int) -> Pixels:
         shape = _draw_blob(random, width, height)
     else:
         corners = int(random.integers(3, 8)) if kind == 1 else 48  # enough to look round
-        at = np.sort(random.uniform(0, 2 * math.pi, corners)) if kind == 1 else np.linspace(0, 2 * math.pi, corners)
-        reach = random.uniform(0.5, 1, (corners, 1)) if kind == 1 else 0.95
-        shape = _draw_polygon((np.stack([np.cos(at), np.sin(at)], -1) * reach + 1) / 2 * (width, height), width, height)
+        angles = np.sort(random.uniform(0, 2 * math.pi, corners)) if kind == 1 else np.linspace(0, 2 * math.pi, corners)
+        radius = random.uniform(0.5, 1, (corners, 1)) if kind == 1 else 0.95
+        points = (np.stack([np.cos(angles), np.sin(angles)], -1) * radius + 1) / 2 * (width, height)
+        shape = _draw_polygon(points, width, height)
     if random.random() < 1 / 3:
         softness = max(width, height) * log_uniform(random, 0.005, 0.08)
         return np.asarray(cv2.GaussianBlur(shape, (0, 0), softness, borderType=cv2.BORDER_CONSTANT), np.float32)

@@ -159,8 +159,9 @@ def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearan
     near = np.zeros((height, width), np.float32)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     for place in layers.lights:
-        at = _canvas_to_frame(matrix, layers, place)
-        near = np.maximum(near, np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / np.float32((LIGHT_RADIUS * half) ** 2)))
+        position = _canvas_to_frame(matrix, layers, place)
+        squared_distance = (x - position[0]) ** 2 + (y - position[1]) ** 2
+        near = np.maximum(near, np.exp(-squared_distance / np.float32((LIGHT_RADIUS * half) ** 2)))
     red, green, blue = np.moveaxis(rest + glow, -1, 0)
     min_channel = np.minimum(np.minimum(red, green), blue)
     # What a camera clips, even in one channel of a coloured light, is clipped with flare and without.

@@ -148,19 +148,19 @@ class RemovalTrainer:
         targets = torch.stack([frame - scene, frame - scene_with_glow])
         flares = targets.square().mean(2)
         errors = (torch.stack([prediction.flare, prediction.flare_without_glow]) - targets).square().mean(2)
-        before, error = flares.mean((2, 3)), errors.mean((2, 3))
+        mean_flare, error = flares.mean((2, 3)), errors.mean((2, 3))
         power, faint_mse, error_floor = schedule.unbind()
         if psnr_phase:
-            error_term = _log_error_ratio(error, before, error_floor)
+            error_term = _log_error_ratio(error, mean_flare, error_floor)
             if self.recipe.patch_loss_share:
                 in_patches = _log_error_ratio(_patch_means(errors), _patch_means(flares), error_floor).mean((2, 3))
                 error_term = torch.lerp(error_term, in_patches, self.recipe.patch_loss_share)
         else:
-            error_term = error / (before[0] + faint_mse) ** power
+            error_term = error / (mean_flare[0] + faint_mse) ** power
         loss = error_term[0].mean() + 0.5 * error_term[1].mean()
         with torch.no_grad():
-            gain = 10 * torch.log10((before[0] + ERROR_FLOOR_MSE[1]) / (error[0] + ERROR_FLOOR_MSE[1]))
-            metrics = torch.stack([loss.detach(), error[0].mean(), before[0].mean(), gain.mean()])
+            gain = 10 * torch.log10((mean_flare[0] + ERROR_FLOOR_MSE[1]) / (error[0] + ERROR_FLOOR_MSE[1]))
+            metrics = torch.stack([loss.detach(), error[0].mean(), mean_flare[0].mean(), gain.mean()])
         return loss, metrics
 
     @torch.no_grad()
@@ -176,9 +176,9 @@ class RemovalTrainer:
                 frame, scene = (torch.from_numpy(part).permute(2, 0, 1)[None].to(self.device)
                                 for part in (pair.frame, pair.scene))
                 prediction = network(frame).flare.clamp(min=0)
-                after = ((frame - prediction).clamp(min=0) - scene).square().mean()
-                before = (frame - scene).square().mean()
-                values.append(float(10 * torch.log10((before + 1e-6) / (after + 1e-6))))
+                error = ((frame - prediction).clamp(min=0) - scene).square().mean()
+                input_error = (frame - scene).square().mean()
+                values.append(float(10 * torch.log10((input_error + 1e-6) / (error + 1e-6))))
             gains[kind] = round(float(np.mean(values)), 3)
         gains["mean"] = round(float(np.mean(list(gains.values()))), 3)
         return gains
@@ -229,9 +229,9 @@ class RemovalTrainer:
         self.optimiser.load_state(state)
 
 
-def _log_error_ratio(error: Tensor, before: Tensor, error_floor: Tensor) -> Tensor:
+def _log_error_ratio(error: Tensor, flare_error: Tensor, error_floor: Tensor) -> Tensor:
     """Return the log of squared errors relative to those of the untouched frame; where it got worse it counts twice."""
-    log_ratio = torch.log((error + error_floor) / (before + error_floor))
+    log_ratio = torch.log((error + error_floor) / (flare_error + error_floor))
     return log_ratio + log_ratio.clamp(min=0)
 
 

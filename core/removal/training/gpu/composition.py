@@ -196,9 +196,9 @@ def _develop(displayed: Tensor, frames: FrameParameters) -> Tensor:
 def _canvas_to_frame(matrices: Tensor, places: Tensor, size: int) -> Tensor:
     """Return positions in pixels (n, k, 2), x and y: (n, 2) by k matrices (n, k, 2, 3), or (n, k, 2) by one (n, 1, 2,
     3)."""
-    at = (places + 1) * (size / 2)
-    at = at[:, None] if at.ndim == 2 else at
-    return (matrices[..., :2] * at[..., None, :]).sum(-1) + matrices[..., 2]
+    positions = (places + 1) * (size / 2)
+    positions = positions[:, None] if positions.ndim == 2 else positions
+    return (matrices[..., :2] * positions[..., None, :]).sum(-1) + matrices[..., 2]
 
 
 def _choose_placement(flares: FlareBatch, matrices: Tensor, scene: Tensor,
@@ -209,8 +209,8 @@ def _choose_placement(flares: FlareBatch, matrices: Tensor, scene: Tensor,
     rows, columns = max(height // 16, 1), max(width // 16, 1)
     brightness = F.adaptive_avg_pool2d(scene.mean(1, keepdim=True), (rows, columns)).flatten(1)
     x, y = _canvas_to_frame(matrices, flares.lights[:, 0], flares.size).unbind(-1)
-    row, column = ((at / side * count).long().clamp(0, count - 1)
-                   for at, side, count in ((y, height, rows), (x, width, columns)))
+    row, column = ((coordinates / side * count).long().clamp(0, count - 1)
+                   for coordinates, side, count in ((y, height, rows), (x, width, columns)))
     is_light = brightness.gather(1, row * columns + column)
     best = torch.where(faces_light & flares.is_light[:, 0], is_light.argmax(1), 0)
     frames = torch.arange(n, device=scene.device)
@@ -228,10 +228,10 @@ def _warp_to_frame(flares: FlareBatch, placement: FlarePlacements, matrix: Tenso
     mean = ((rest[..., ::4, ::4] + glow[..., ::4, ::4]) * placement.gain).clamp(max=1).mean((1, 2, 3), keepdim=True)
     factor = placement.colour * placement.gain * (placement.max_mean / mean.clamp(min=1e-6)).clamp(max=1)
     rest, glow = rest * factor, glow * factor
-    at = _canvas_to_frame(matrix[:, None], flares.lights, flares.size)
+    light_positions = _canvas_to_frame(matrix[:, None], flares.lights, flares.size)
     reach = LIGHT_RADIUS * math.hypot(width, height) / 2
-    away = (_pixel_coordinates(height, width, matrix) - at[:, :, None, None]).square().sum(-1)
-    near = (torch.exp(-away / reach**2) * flares.is_light[:, :, None, None]).amax(1, keepdim=True)
+    squared_distance = (_pixel_coordinates(height, width, matrix) - light_positions[:, :, None, None]).square().sum(-1)
+    near = (torch.exp(-squared_distance / reach**2) * flares.is_light[:, :, None, None]).amax(1, keepdim=True)
     clipped = (((rest + glow).amin(1, keepdim=True) * near - CLIP_START) / CLIP_RANGE).clamp(0, 1)
     clipped = clipped * clipped * (3 - 2 * clipped)
     tint = flares.colour[:, :, None, None]

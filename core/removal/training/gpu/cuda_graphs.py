@@ -44,6 +44,7 @@ class GraphedFunction:
         return outputs
 
     def _capture(self, inputs: list[Tensor]) -> _CapturedGraph:
+        """Warm the function up on a side stream, and capture its graph with these input tensors."""
         side_stream = torch.cuda.Stream(inputs[0].device)
         side_stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side_stream):

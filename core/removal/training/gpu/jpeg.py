@@ -45,8 +45,8 @@ def _quantise_blocks(planes: Tensor, scale: Tensor, table: tuple[int, ...]) -> T
 
 def _dct_matrix(like: Tensor) -> Tensor:
     """Return the orthonormal DCT matrix (BLOCK_SIZE, BLOCK_SIZE)."""
-    at = torch.arange(BLOCK_SIZE, dtype=like.dtype, device=like.device)
-    basis = torch.cos((2 * at[None] + 1) * at[:, None] * (torch.pi / (2 * BLOCK_SIZE))) * (2 / BLOCK_SIZE) ** 0.5
+    index = torch.arange(BLOCK_SIZE, dtype=like.dtype, device=like.device)
+    basis = torch.cos((2 * index[None] + 1) * index[:, None] * (torch.pi / (2 * BLOCK_SIZE))) * (2 / BLOCK_SIZE) ** 0.5
     return torch.cat([basis[:1] * 0.5**0.5, basis[1:]])
 
 

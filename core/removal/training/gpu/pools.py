@@ -168,8 +168,10 @@ class Pools:
 @contextmanager
 def filled_pools(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
                  user_flares: UserFlares | None, processes: int) -> Iterator[None]:
-    """Keep `processes` drawing into the pools within this context, half of them scenes and half flares; it is entered
-    when there are enough to begin with. Raises RunError where none come."""
+    """Keep `processes` drawing into the pools within this context, half of them scenes and half flares.
+
+    The context is entered when the pools hold enough to begin with. Raises RunError where the processes draw nothing.
+    """
     spawning = multiprocessing.get_context("spawn")
     process_counts = (max(processes // 2, 1), max(processes - processes // 2, 1))
     lengths = (SCENES_PER_BLOCK * 3 * max(shape.width * shape.height for shape in pools.shapes),
@@ -179,27 +181,28 @@ def filled_pools(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses:
         files = [Path(folder) / str(kind) for kind in (SCENE, FLARE)]
         memories = [np.memmap(path, np.float16, "w+", shape=(SLOTS_PER_PROCESS * count, length))
                     for path, count, length in zip(files, process_counts, lengths, strict=True)]
-        free, done = [spawning.Queue() for _ in files], spawning.Queue()
-        for slots, memory in zip(free, memories, strict=True):
+        free_slots, drawn = [spawning.Queue() for _ in files], spawning.Queue()
+        for slots, memory in zip(free_slots, memories, strict=True):
             for slot in range(len(memory)):
                 slots.put(slot)
         args = ((backgrounds, pools.shapes), (recipe, lenses, user_flares))
-        drawing = [spawning.Process(target=(_draw_scenes, _draw_flares)[kind], daemon=True,
-                                    args=((recipe.seed, number), files[kind], memories[kind].shape, free[kind], done,
-                                          *args[kind]))
-                   for kind in (SCENE, FLARE) for number in range(process_counts[kind])]
+        processes_drawing = [
+            spawning.Process(target=(_draw_scenes, _draw_flares)[kind], daemon=True,
+                             args=((recipe.seed, number), files[kind], memories[kind].shape, free_slots[kind], drawn,
+                                   *args[kind]))
+            for kind in (SCENE, FLARE) for number in range(process_counts[kind])]
         ended, ready = threading.Event(), threading.Event()
         transfer_thread = threading.Thread(target=_transfer_drawn, daemon=True,
-                                           args=(pools, memories, free, done, ended, ready))
+                                           args=(pools, memories, free_slots, drawn, ended, ready))
         try:
-            for process in drawing:
+            for process in processes_drawing:
                 process.start()
             transfer_thread.start()
-            _wait_until_ready(ready, drawing)
+            _wait_until_ready(ready, processes_drawing)
             yield
         finally:
             ended.set()
-            kill_processes(drawing)
+            kill_processes(processes_drawing)
             transfer_thread.join()
             memories.clear()
 
@@ -214,16 +217,16 @@ def _wait_until_ready(ready: threading.Event, drawing: Sequence[BaseProcess]) ->
                    "fewer --processes.")
 
 
-def _transfer_drawn(pools: Pools, memories: Sequence[Any], free: Sequence[Any], done: Any, ended: threading.Event,
-                    ready: threading.Event) -> None:
+def _transfer_drawn(pools: Pools, memories: Sequence[Any], free_slots: Sequence[Any], drawn: Any,
+                    ended: threading.Event, ready: threading.Event) -> None:
     """Copy drawn items into the pools until the training has ended."""
     while not ended.is_set():
         try:
-            item: DrawnItem = done.get(timeout=0.2)
+            item: DrawnItem = drawn.get(timeout=0.2)
         except queue.Empty:
             continue
         pools.store(item, memories[item.kind][item.slot])
-        free[item.kind].put(item.slot)
+        free_slots[item.kind].put(item.slot)
         if pools.is_ready():
             ready.set()
 
@@ -236,24 +239,24 @@ def _initialise_drawing() -> None:
         os.nice(10)
 
 
-def _draw_scenes(seed: tuple[int, int], path: Path, shape: tuple[int, int], free: Any, done: Any,
+def _draw_scenes(seed: tuple[int, int], path: Path, shape: tuple[int, int], free_slots: Any, drawn: Any,
                  backgrounds: Backgrounds, shapes: Sequence[FrameShape]) -> None:
     """Draw blocks of scenes without end, each of one of the shapes."""
     _initialise_drawing()
     memory = np.memmap(path, np.float16, "r+", shape=shape)
     random = np.random.default_rng((*seed, SCENE))
     while True:
-        slot = free.get()
+        slot = free_slots.get()
         number = int(random.choice(len(shapes), p=[shape.share for shape in shapes]))
         width, height = shapes[number].width, shapes[number].height
         gammas = random.uniform(*GAMMA_RANGE, SCENES_PER_BLOCK).astype(np.float32)
         block = memory[slot, :SCENES_PER_BLOCK * 3 * height * width].reshape(SCENES_PER_BLOCK, 3, height, width)
         for place, gamma in zip(block, gammas, strict=True):
             place[:] = _to_half_planes(backgrounds.draw(random, width, height, float(gamma)))
-        done.put(DrawnItem(SCENE, slot, number, gammas))
+        drawn.put(DrawnItem(SCENE, slot, number, gammas))
 
 
-def _draw_flares(seed: tuple[int, int], path: Path, shape: tuple[int, int], free: Any, done: Any, recipe: Recipe,
+def _draw_flares(seed: tuple[int, int], path: Path, shape: tuple[int, int], free_slots: Any, drawn: Any, recipe: Recipe,
                  lenses: Sequence[Prescription], user_flares: UserFlares | None) -> None:
     """Draw flares without end."""
     _initialise_drawing()
@@ -265,7 +268,7 @@ def _draw_flares(seed: tuple[int, int], path: Path, shape: tuple[int, int], free
                          else synthesis_bank)
     size, serial = recipe.canvas_size, 0
     while True:
-        slot = free.get()
+        slot = free_slots.get()
         serial += 1
         synthesis_bank.renew(serial)
         layers = bank.draw(random)
@@ -277,7 +280,7 @@ def _draw_flares(seed: tuple[int, int], path: Path, shape: tuple[int, int], free
             metadata[2 * light:2 * light + 2] = position
             metadata[2 * MAX_LIGHTS + light] = 1
         metadata[3 * MAX_LIGHTS:] = layers.colour
-        done.put(DrawnItem(FLARE, slot, 0, metadata))
+        drawn.put(DrawnItem(FLARE, slot, 0, metadata))
 
 
 def _to_half_planes(picture: NDArray[np.float32]) -> NDArray[np.float16]:

@@ -81,12 +81,18 @@ def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, number
             progress.say(note)
     node.inputs["Intensity"].default_value = intensity
     node.inputs["Tint"].default_value = (*colour, 1.0)
+    for name in _VARYING_METADATA:
+        setattr(render, f"use_stamp_{name}", False)
     _back_up(out.resolve() / BLEND, progress)
     render_settings.save_blend(out.resolve() / BLEND)
     progress.stage("compose", len(numbers))
     render_settings.render_frames(scene, numbers, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
                              lambda _number: progress.advance())
     return {"frames": str(out), "blend": str(out / BLEND), "blender": bpy.app.version_string}
+
+
+_VARYING_METADATA = ("date", "render_time", "filename", "memory", "hostname")
+"""What Blender would write into the frames' headers and is different each time."""
 
 
 def _back_up(blend: Path, progress: Progress) -> None:

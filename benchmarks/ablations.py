@@ -389,28 +389,31 @@ def main() -> None:
     parser.add_argument("--finished", action="store_true", help="write down what is finished, and fit nothing")
     parser.add_argument("--out", type=Path, default=report.ROOT / "build" / "ablations")
     parser.add_argument("--document", type=Path, default=DOCUMENT)
-    words = parser.parse_args()
+    args = parser.parse_args()
     results: Results = {}
-    wanted: Callable[[Experiment], bool] = lambda one: (  # noqa: E731
-        (not words.only or one.study in words.only) and (not words.variants or one.name in words.variants))
-    # All of a study are as long as each other, those by parallax too, which are longer otherwise.
-    length = partial(_seeded, words.seed, words.preset, iterations=words.iterations or ITERATIONS[words.preset])
-    made = length()
-    seed = f"-seed-{words.seed}" if words.seed else ""
-    section = f"ablations-{words.preset}-{made.iterations}-{words.width}{seed}"
+
+    def is_selected(experiment: Experiment) -> bool:
+        return ((not args.only or experiment.study in args.only)
+                and (not args.variants or experiment.name in args.variants))
+
+    # All fits of a study have one length, also those by parallax, which presets make longer.
+    length = partial(_seeded, args.seed, args.preset, iterations=args.iterations or ITERATIONS[args.preset])
+    result = length()
+    seed = f"-seed-{args.seed}" if args.seed else ""
+    section = f"ablations-{args.preset}-{result.iterations}-{args.width}{seed}"
     progress = TerminalProgress()
-    for experiment in filter(wanted, experiments(length)):
-        for capture in words.captures:
-            folder = words.out / section / experiment.key() / capture.name
-            if words.finished and not (folder / SCORES).is_file():
+    for experiment in filter(is_selected, experiments(length)):
+        for capture in args.captures:
+            folder = args.out / section / experiment.key() / capture.name
+            if args.finished and not (folder / SCORES).is_file():
                 continue
             progress.say(f"{experiment.study}: {experiment.name}, {capture.name}")
-            scores = run(experiment, folder, capture.resolve(), words.width, progress)
+            scores = run(experiment, folder, capture.resolve(), args.width, progress)
             results.setdefault(experiment.study, {}).setdefault(experiment.name, {})[capture.name] = scores
     progress.close()
-    size = f"{words.width} pixels wide" if words.width else "at the size of the frames"
-    size += f", seed {words.seed}" if words.seed else ""
-    text = write(results, section, f"Preset {words.preset} of {made.iterations} iterations, {size}", words.document)
+    size = f"{args.width} pixels wide" if args.width else "at the size of the frames"
+    size += f", seed {args.seed}" if args.seed else ""
+    text = write(results, section, f"Preset {args.preset} of {result.iterations} iterations, {size}", args.document)
     sys.stdout.write(text + "\n")
 
 

@@ -296,11 +296,11 @@ def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
     try:
         for _ in range(3 + repeats):
             spent.clear()
-            whole = time_once(step)
+            iteration_time = time_once(step)
             for name, functions in STAGES.items():
                 samples[name].append(sum(spent.get(function, 0.0) for function in functions))
-            samples["between the kernels"].append(whole - sum(spent.values()))
-            samples["iteration"].append(whole)
+            samples["between the kernels"].append(iteration_time - sum(spent.values()))
+            samples["iteration"].append(iteration_time)
     finally:
         for module in users:
             module.parallel = parallel  # type: ignore[attr-defined]

@@ -162,8 +162,8 @@ def _clean_by_network(paths: list[Path], weights: Path | None) -> Iterator[Any]:
 
 def _read_cleaned(paths: list[Path], folder: Path) -> Iterator[Any]:
     """Yield the codes of frames that were cleaned before, under the same names with any suffix."""
-    there = {path.stem: path for path in folder.iterdir()}
-    return (read_plate(there[path.stem]).codes for path in paths)
+    pictures = {path.stem: path for path in folder.iterdir()}
+    return (read_plate(pictures[path.stem]).codes for path in paths)
 
 
 def clean(folders: list[Path], weights: Path | None = None) -> None:
@@ -332,9 +332,9 @@ class _AsphericBank:
         from core.removal.training.pairs import FlareLayers
 
         seed = (*self._seed, int(random.integers(1 << 30)))
-        made = synthesise_flare(seed, CANVAS_SIZE, built_in_lenses(), "scatter")
-        ghosts = draw_ghosts((*seed, 3), made.lights, CANVAS_SIZE)
-        return FlareLayers(ghosts, np.zeros_like(ghosts), made.light, made.lights)
+        flare = synthesise_flare(seed, CANVAS_SIZE, built_in_lenses(), "scatter")
+        ghosts = draw_ghosts((*seed, 3), flare.lights, CANVAS_SIZE)
+        return FlareLayers(ghosts, np.zeros_like(ghosts), flare.light, flare.lights)
 
 
 def aspheric(folders: list[Path], weights: Path | None = None, count: int = 64) -> None:
@@ -448,8 +448,8 @@ def main() -> None:
                 subparser.add_argument(name, **PARAMETERS[name])
             else:
                 subparser.add_argument(f"--{name}", default=parameter.default, **PARAMETERS[f"--{name}"])
-    given = vars(parser.parse_args())
-    given.pop("benchmark")(**given)
+    options = vars(parser.parse_args())
+    options.pop("benchmark")(**options)
 
 
 if __name__ == "__main__":

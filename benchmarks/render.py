@@ -78,7 +78,7 @@ def load_run(folder: Path) -> RenderedScene:
         flares, positions = [*flares, flares[0]], torch.cat([positions, positions[:1]])
     for view in Capture.open(run.capture_folder, need_frames=False).views:
         pose = torch.from_numpy(view.camera.world_to_camera)
-        if all(one.depth > 0 for one in run.flare.model.views(pose)):
+        if all(light_view.depth > 0 for light_view in run.flare.model.views(pose)):
             camera = view.camera
             return RenderedScene(
                 run.scene, flares, positions, run.flare.blend, camera.world_to_camera, camera.fx / camera.width

@@ -106,19 +106,19 @@ def rendered_target(folder: Path, scene: Path, look: Look) -> tuple[list[Truth],
     target_ = capture_target(capture, look, sources_of(look), scene=scene)
     views = {view.name: view for view in capture.views}
     truths = []
-    for one in target_.frames:
-        view = views[one.frame.view]
+    for frame in target_.frames:
+        view = views[frame.frame.view]
         flare, below = capture.truth_flare(view), capture.truth_scene(view)
         if flare is None or below is None:
             raise CaptureError(f"{folder} has no exact layers; make it with sample_scenes/render.py.")
-        lights = tuple(replace(light, visibility=shares[view.name][light.name]) for light in one.shot.lights)
-        truths.append(Truth(replace(one.shot, lights=lights), flare.pixels, below.pixels))
+        lights = tuple(replace(light, visibility=shares[view.name][light.name]) for light in frame.shot.lights)
+        truths.append(Truth(replace(frame.shot, lights=lights), flare.pixels, below.pixels))
     return truths, target_
 
 
 def sources_of(look: Look) -> dict[str, str]:
     """The light of the look that was found nearest to where each of the desk's lights is."""
-    return {light.name: min(look.lights, key=lambda one: float(np.linalg.norm(one.xyz - light.xyz))).name
+    return {light.name: min(look.lights, key=lambda source: float(np.linalg.norm(source.xyz - light.xyz))).name
             for light in DESK.lights}
 
 

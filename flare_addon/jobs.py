@@ -346,8 +346,8 @@ def _watch() -> None:
 
 def _tick() -> float | None:
     """Poll the running jobs; return the seconds to the next call, None to stop the timer."""
-    news = [_poll_safely(job) for job in running()]
-    if any(news):
+    changes = [_poll_safely(job) for job in running()]
+    if any(changes):
         _redraw_bars()
     return POLL_INTERVAL_S if running() else None
 

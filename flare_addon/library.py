@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The library: a folder of .flare files with thumbnails, which the panel Transfer shows as previews."""
+"""The library: .flare files with thumbnails, which the panel Transfer shows as previews.
+
+The looks that come with the extension are in library_looks/ (`sample_scenes/make_library.py` makes them); those of the
+user are in a folder of their own.
+"""
 from __future__ import annotations
 
+import contextlib
 import struct
 import zlib
 from pathlib import Path
@@ -19,6 +24,8 @@ from ..core.system.files import atomic_path, avoid_device_name
 from .user_settings import library_path
 
 THUMBNAIL_SIZE = 192  # pixels of a thumbnail
+BOX = Path(__file__).parent / "library_looks"
+"""Folder of the looks that come with the extension, each with its thumbnail; nothing is written to it."""
 
 _previews: Any = None
 _items: list[tuple[str, str, str, int, int]] = []
@@ -38,11 +45,12 @@ def folder(create: bool = False) -> Path:
 
 
 def files() -> list[Path]:
-    """Return the .flare files of the library, sorted by name."""
-    try:
-        return sorted(path for path in folder().glob("*.flare") if not path.name.startswith("."))
-    except OSError:
-        return []
+    """Return the .flare files of the library, each part sorted by name: the user's, then those of the extension."""
+    found: list[Path] = []
+    for place in (folder(), BOX):
+        with contextlib.suppress(OSError):
+            found += sorted(path for path in place.glob("*.flare") if not path.name.startswith("."))
+    return found
 
 
 def save(look: Look, name: str, notes: str, licence: str) -> Path:
@@ -69,8 +77,8 @@ def thumbnail(look: Look) -> NDArray[np.float32]:
         _, place = light.query_range.clip(middle, np.array([-0.24, -0.2], np.float32))
         gaussians = light.evaluate(ViewOfLight(middle, np.eye(3, dtype=np.float32), place, 1.0))
         if gaussians is not None:
-            shown = draw([gaussians], k, THUMBNAIL_SIZE, THUMBNAIL_SIZE, look.blend, look.pixel_grid)
-            total += shown if look.blend == "add" else linear_from_srgb(shown)
+            picture = draw([gaussians], k, THUMBNAIL_SIZE, THUMBNAIL_SIZE, look.blend, look.pixel_grid)
+            total += picture if look.blend == "add" else linear_from_srgb(picture)
     return np.clip(srgb_from_linear(np.maximum(total, 0)), 0, 1)
 
 
@@ -111,7 +119,7 @@ def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, 
         path = Path(name)
         try:
             look = read(path)
-            if not path.with_suffix(".png").is_file():
+            if not path.with_suffix(".png").is_file() and path.parent != BOX:
                 write_png(path.with_suffix(".png"), thumbnail(look))
             icon = _previews.load(name, str(path.with_suffix(".png")), "IMAGE").icon_id
             notes = f"{len(look.lights)} lights, {look.count} Gaussians. {look.notes}".strip()

@@ -75,29 +75,29 @@ def add_to_scene(scene: Any, position: Any, name: str = "") -> Any:
 
 def _collection_of(scene: Any) -> Any:
     """Return the collection for new lights: that of the root, unless it is of another scene or file."""
-    root, own = scene.fit_flare.root, {scene.collection, *scene.collection.children_recursive}
+    root, collections = scene.fit_flare.root, {scene.collection, *scene.collection.children_recursive}
     beside = () if root is None else root.users_collection
-    return next((one for one in beside if one in own and one.library is None and one.override_library is None),
-                scene.collection)
+    return next((item for item in beside
+                 if item in collections and item.library is None and item.override_library is None), scene.collection)
 
 
-def mark_as_lights(objects: Iterable[Any], taken: set[str]) -> int:
+def mark_as_lights(objects: Iterable[Any], used_names: set[str]) -> int:
     """Mark objects as lights of the capture; return how many were not lights before."""
     count = 0
     for item in objects:
         if item.type != "CAMERA" and not item.fit_flare.is_light:
-            name = free_name(item.name, taken)
-            taken.add(name)
+            name = free_name(item.name, used_names)
+            used_names.add(name)
             item.fit_flare.is_light, item.fit_flare.light = True, name
             count += 1
     return count
 
 
-def free_name(name: str, taken: set[str]) -> str:
+def free_name(name: str, used_names: set[str]) -> str:
     """Return `name`, with another number where it is taken."""
     stem = name.rstrip("0123456789") or "light"
     number = 1
-    while name in taken:
+    while name in used_names:
         number += 1
         name = f"{stem}{number}"
     return name

@@ -69,7 +69,7 @@ def show_look(scene: Any, path: Path | str) -> Look:
             if state.lights[index].source not in look.names:
                 remove_flare(scene, index)
     for light in look.lights:
-        item = next((one for one in state.lights if one.source == light.name), None)
+        item = next((entry for entry in state.lights if entry.source == light.name), None)
         if item is None:
             item = state.lights.add()
             item.name = item.source = light.name
@@ -90,7 +90,7 @@ def remove_flare(scene: Any, number: int) -> None:
     gains = drivers.connected_flares(scene)
     fcurves.remove_item(scene.fit_flare.lights, "fit_flare.lights", number)
     if gains:
-        drivers.connect(scene, {layer: one - (one > number) for layer, one in gains.items() if one != number})
+        drivers.connect(scene, {layer: index - (index > number) for layer, index in gains.items() if index != number})
 
 
 def _was_learned_here(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> bool:
@@ -114,7 +114,7 @@ def _was_learned_here(look: Look, state: Any, objects: dict[str, Any], depsgraph
 def add_flare(scene: Any, target: Any, source: str) -> Any:
     """Add a flare at the object `target`, with the look of the .flare's light `source`. Raises FlareFileError."""
     look = look_of(scene)
-    light = next((one for one in look.lights if one.name == source), None)
+    light = next((item for item in look.lights if item.name == source), None)
     if light is None:
         raise FlareFileError(f"{look.path} has no light {source!r}; it has {', '.join(look.names)}.")
     state = scene.fit_flare

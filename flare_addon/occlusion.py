@@ -61,12 +61,12 @@ def disc_visibility(scene: Any, depsgraph: Any, eye: Any, light: Any, ignored: s
     """
     from mathutils import Vector
 
-    away = light - eye
-    distance = away.length
+    offset = light - eye
+    distance = offset.length
     if distance < 1e-6:
         return 1.0
     radius = disc_radius or DISC_RADIUS_FRACTION * distance
-    forward = away / distance
+    forward = offset / distance
     right = forward.orthogonal().normalized()
     up = forward.cross(right)
     visible = 0.0
@@ -76,7 +76,8 @@ def disc_visibility(scene: Any, depsgraph: Any, eye: Any, light: Any, ignored: s
         direction = (target - eye).normalized()
         start, remaining, clear = Vector(eye), reach, True
         for _ in range(4):  # past the lamp's own meshes
-            hit, where, _normal, _index, obj, matrix = scene.ray_cast(depsgraph, start, direction, distance=remaining)
+            hit, hit_point, _normal, _index, obj, matrix = scene.ray_cast(depsgraph, start, direction,
+                                                                          distance=remaining)
             if not hit:
                 break
             if obj is None or not (obj.original.name in ignored or _is_invisible_to_camera(obj)
@@ -84,7 +85,7 @@ def disc_visibility(scene: Any, depsgraph: Any, eye: Any, light: Any, ignored: s
                                             for name, place in instances)):
                 clear = False
                 break
-            step = (where - start).length + 1e-4 * distance
+            step = (hit_point - start).length + 1e-4 * distance
             start, remaining = start + direction * step, remaining - step
             if remaining <= 0:
                 break

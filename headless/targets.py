@@ -155,7 +155,7 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
     if kind in (".blend", ".json"):
         path = shot_path(options) if kind == ".blend" else to[0]
         shot = Shot.read(path)
-        numbers = [NumberedFrame("", number, "") for number in sorted({one.frame for one in shot.frames})]
+        numbers = [NumberedFrame("", number, "") for number in sorted({shot_frame.frame for shot_frame in shot.frames})]
         return shot_target(shot, look, sources, plates=options.plates, scene=options.scene,
                            required_frames={frame.number for frame in
                                             select_task_frames(numbers, options.frames, options.job_frames)})
@@ -180,12 +180,12 @@ def _is_plate_folder(folder: Path) -> bool:
     return folder.is_dir() and not capture and bool(pictures_in(folder))
 
 
-def _median_distance(light: LightLook, seen: TrainingViews | None) -> float:
+def _median_distance(light: LightLook, views: TrainingViews | None) -> float:
     """Return the median distance of the training cameras to a light; the middle of its range where that is unknown."""
     import numpy as np
 
-    if seen is not None:
-        return float(np.median(seen.distances))
+    if views is not None:
+        return float(np.median(views.distances))
     reach = light.query_range
     return float(np.linalg.norm((reach.camera_low + reach.camera_high) / 2 - light.xyz)) or 1.0
 

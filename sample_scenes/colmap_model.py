@@ -94,7 +94,7 @@ def _filter_points(reconstruction: Any) -> Any:
     for number, image in sorted(reconstruction.images.items()):
         observations = [(index, point.xy) for index, point in enumerate(image.points2D)
                         if point.has_point3D() and point.point3D_id in good_points]
-        new_index.update({(number, index): at for at, (index, _) in enumerate(observations)})
+        new_index.update({(number, index): new for new, (index, _) in enumerate(observations)})
         keypoints = np.array([xy for _, xy in observations]).reshape(-1, 2)
         filtered_image = pycolmap.Image(name=image.name, keypoints=keypoints, camera_id=image.camera_id,
                                         image_id=number)

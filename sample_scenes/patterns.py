@@ -38,9 +38,9 @@ def noise(rng: np.random.Generator, height: int, width: int, cell: float, octave
 def gradient(values: Texture, palette: Palette) -> Texture:
     """Map values 0..1 to colours along the palette."""
     colours = np.array(palette, np.float32) / 255
-    at = np.clip(values, 0, 1) * (len(colours) - 1)
-    low = np.minimum(at.astype(int), len(colours) - 2)
-    part = (at - low)[..., None]
+    positions = np.clip(values, 0, 1) * (len(colours) - 1)
+    low = np.minimum(positions.astype(int), len(colours) - 2)
+    part = (positions - low)[..., None]
     return colours[low] * (1 - part) + colours[low + 1] * part
 
 

@@ -171,12 +171,12 @@ class Room:
                               metallic=float(random.random() < 0.08), repeat=float(random.choice([1, 1, 2, 4])))
 
     def _emissive_material(self, colour: Colour, power: float, photo: bool = False) -> Any:
-        """power: per unit of its surface, approximately."""
+        """Return a material that emits light; power: approximately per unit of its surface."""
         return self._material(photo=photo, colour=colour, strength=power / 8)
 
     def _material(self, *, photo: bool, colour: Sequence[float], roughness: float = 0.5, metallic: float = 0.0,
                   strength: float = 0.0, glass: bool = False, repeat: float = 1.0) -> Any:
-        """strength: of the emission, in the material's colour or that of its photograph."""
+        """Return a material; strength: of the emission, in the material's colour or that of its photograph."""
         random = self.random
         material = bpy.data.materials.new("Surface")
         material.use_nodes = True

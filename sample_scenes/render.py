@@ -63,9 +63,9 @@ def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
         if not (layer.is_file() and frame.is_file() and clean.is_file()):
             flare = np.zeros((scene.camera.height, scene.camera.width, 3), np.float32)
             for light in scene.lights:
-                at = poses[index][:3, :3] @ np.array(light.xyz) + poses[index][:3, 3]
-                flare += render_flare(setup, scene.camera, at, colour=light.colour,
-                                      intensity=light.flare_strength(float(np.linalg.norm(at))),
+                position = poses[index][:3, :3] @ np.array(light.xyz) + poses[index][:3, 3]
+                flare += render_flare(setup, scene.camera, position, colour=light.colour,
+                                      intensity=light.flare_strength(float(np.linalg.norm(position))),
                                       visible_share=shares[f"{name}{FRAME_SUFFIX}"][light.name])
             write_layer(layer, flare, FLARE_LEVEL)
             # The frames are made of the layers as stored, so that the files agree to the last bit.

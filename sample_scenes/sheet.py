@@ -40,7 +40,7 @@ def contact_sheet(capture: Path, columns: int, rows: int, width: int) -> NDArray
         print(f"{path.stem}  empty flare {psnr_without_flare(frame.display(), scene.display()):.2f} dB")
         height = round(width * frame.size[1] / frame.size[0])
         tiles.append(np.vstack([picture.resized(width, height).display() for picture in (frame, scene, flare)]))
-    lines = [np.hstack(tiles[at:at + columns]) for at in range(0, len(tiles), columns)]
+    lines = [np.hstack(tiles[start:start + columns]) for start in range(0, len(tiles), columns)]
     return np.round(np.clip(np.vstack(lines), 0, 1) * 255).astype(np.uint8)[..., ::-1]
 
 

@@ -90,10 +90,10 @@ def box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: flo
     faces.append([(*corner, z) for corner in corners])
     faces.append([(*corner, 0.0) for corner in corners[::-1]])
     for index, face in enumerate(faces):
-        made = mesh.faces.new([mesh.verts.new(corner) for corner in face])
-        made.material_index = min(index, len(materials) - 1)
-        for loop, at in zip(made.loops, ((0, 0), (1, 0), (1, 1), (0, 1)), strict=True):
-            loop[uv].uv = at
+        mesh_face = mesh.faces.new([mesh.verts.new(corner) for corner in face])
+        mesh_face.material_index = min(index, len(materials) - 1)
+        for loop, corner in zip(mesh_face.loops, ((0, 0), (1, 0), (1, 1), (0, 1)), strict=True):
+            loop[uv].uv = corner
     bmesh.ops.remove_doubles(mesh, verts=mesh.verts, dist=1e-6)
     obj = place(_add(name, mesh, materials), location, turn, tilt)
     if bevel > 0:
@@ -109,8 +109,8 @@ def sheet(name: str, width: float, height: float, location: Vec, material: Any, 
     uv = mesh.loops.layers.uv.new("UVMap")
     x, y = width / 2, height / 2
     face = mesh.faces.new([mesh.verts.new((a, b, 0.0)) for a, b in ((-x, -y), (x, -y), (x, y), (-x, y))])
-    for loop, at in zip(face.loops, ((0, 0), (1, 0), (1, 1), (0, 1)), strict=True):
-        loop[uv].uv = (at[0] * repeat[0], at[1] * repeat[1])
+    for loop, corner in zip(face.loops, ((0, 0), (1, 0), (1, 1), (0, 1)), strict=True):
+        loop[uv].uv = (corner[0] * repeat[0], corner[1] * repeat[1])
     return place(_add(name, mesh, [material]), location, turn, tilt)
 
 

@@ -161,8 +161,8 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
     progress.stage("bake", len(frames), len(done))
 
     def render(frame: NumberedFrame) -> FrameLayers:
-        camera, one = settings.scaled(cameras[frame.view]), renderer_of(frame)
-        return one.finish(_layers(one, camera, edits[frame.view], lights).in_space(space), camera)
+        camera, renderer = settings.scaled(cameras[frame.view]), renderer_of(frame)
+        return renderer.finish(_layers(renderer, camera, edits[frame.view], lights).in_space(space), camera)
 
     @contextlib.contextmanager
     def commit_lock() -> Iterator[None]:

@@ -52,7 +52,7 @@ def read_points(path: Path) -> PointCloud:
             table = ply.read_table(data, vertices.row(ply.BYTE_ORDERS[header.format]), number, header.start)
     except ValueError as problem:
         raise CaptureError(f"{path} is truncated or damaged; export it again.") from problem
-    with np.errstate(over="ignore"):  # told below
+    with np.errstate(over="ignore"):  # infinite values are refused below
         xyz = np.stack([table[name].astype(np.float32) for name in "xyz"], axis=1)
     if not np.isfinite(xyz).all():
         raise CaptureError(f"{path} has points that are not finite numbers; export it again.")

@@ -78,8 +78,8 @@ def _differing_numbers(names: Sequence[str]) -> dict[str, int]:
     numbers = {name: each[differing[0]] for name, each in pieces.items()}
     if any(len(number) > _MAX_DIGITS for number in numbers.values()):
         return {}
-    found = {name: int(number) for name, number in numbers.items()}
-    return found if len(set(found.values())) == len(found) else {}
+    number_by_name = {name: int(number) for name, number in numbers.items()}
+    return number_by_name if len(set(number_by_name.values())) == len(number_by_name) else {}
 
 
 def number_sequences(paths: Iterable[Path]) -> dict[Path, int]:

@@ -81,9 +81,9 @@ class _AddLight(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, scene: Tensor, light: Tensor, white: float) -> Tensor:
         linear, within = decode_with_slope(scene.clamp(0, white))
-        shown, slope = encode_with_slope(linear.add_(light))
+        display, slope = encode_with_slope(linear.add_(light))
         ctx.save_for_backward(within if ctx.needs_input_grad[0] else None, slope)
-        return shown.clamp_(0, white)
+        return display.clamp_(0, white)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, None]:

@@ -88,11 +88,11 @@ def clear_visibilities(scene: SceneGaussians, model: FlareModel, poses: Sequence
 
 def occlusion_loss(scene: SceneGaussians, camera: Tensor, lights: Sequence[Tensor], settings: VisibilitySettings,
                kernels: Kernels = "auto") -> Tensor | None:
-    """Return the loss of a scene that hides lights (3,) from a camera at `camera` (3,) that shows them; None without a
-    light.
+    """Return the loss of a scene that hides lights (3,), which the frame of the camera at `camera` (3,) shows.
 
-    It thins what stands before them, such as a sky, whose distance pictures do not show. It is the logarithm of the
-    visibilities, since with many layers each alone would change next to nothing.
+    It makes Gaussians in front of the lights more transparent, such as a sky at a wrong distance. It uses the logarithm
+    of the visibilities: behind many layers, the visibility itself hardly changes with a single one. None without a
+    light.
     """
     visibilities = [light_visibility(scene, camera, light, settings, kernels) for light in lights]
     return -OCCLUSION_WEIGHT * (torch.stack(visibilities) + MIN_VISIBILITY).log().sum() if visibilities else None
@@ -138,8 +138,8 @@ def _occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: V
     x, y, depth = (means @ rigid[:3, :3].T + rigid[:3, 3]).T
     reach = 3 * np.exp(np.maximum(np.maximum(scales[:, 0], scales[:, 1]), scales[:, 2]))
     between = (depth > _near_plane(scene, distance)) & (depth < (1 - settings.margin) * distance)
-    aside = np.sqrt(x * x + y * y)
-    rows = np.flatnonzero(between & (aside < depth * settings.radius * 4 + reach))
+    off_axis = np.sqrt(x * x + y * y)
+    rows = np.flatnonzero(between & (off_axis < depth * settings.radius * 4 + reach))
     return torch.from_numpy(rows).to(scene.means.device)
 
 

@@ -169,8 +169,8 @@ class _DrawTiles(torch.autograd.Function):
                     remaining, before = behind[..., -1:], after[..., -1:]
                 d_peaks = h.sum(1) / chunk.peaks[:, 0].clamp(min=ALPHA_MIN)
                 d_values = weights.transpose(1, 2) @ upstream
-                found = torch.stack([d_peaks, *d_values.unbind(-1), *chunk.backward(h)], -1)
-                sums.index_add_(0, index.flatten(), found.flatten(0, 1))
+                gradients = torch.stack([d_peaks, *d_values.unbind(-1), *chunk.backward(h)], -1)
+                sums.index_add_(0, index.flatten(), gradients.flatten(0, 1))
                 if ctx.blend == "over" and float(before.max()) < TRANSMITTANCE_MIN:
                     break
         values, places, rings, arcs = sums[:-1].split(columns, 1)

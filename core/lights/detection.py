@@ -51,11 +51,11 @@ class Detector(Protocol):
 
 def union_mask(detections: Sequence[Detection], size: tuple[int, int]) -> Mask:
     """Return (h, w), the union of all masks in a picture of `size` (width, height)."""
-    whole = np.zeros((size[1], size[0]), np.bool_)
+    union = np.zeros((size[1], size[0]), np.bool_)
     for detection in detections:
         left, top, right, bottom = detection.box
-        whole[top:bottom, left:right] |= detection.mask
-    return whole
+        union[top:bottom, left:right] |= detection.mask
+    return union
 
 
 def measure_detection(mask: Mask, corner: tuple[int, int], picture: Picture, display: NDArray[np.float32],

@@ -42,19 +42,19 @@ class ExposureDetector:
         display = picture.display()
         clipped = (display.max(axis=2) >= self.clipped).astype(np.uint8)
         number, labels, boxes, _ = cv2.connectedComponentsWithStats(clipped, connectivity=8)
-        crowd = _neighbourhood_area(clipped)
+        group_areas = _neighbourhood_area(clipped)
         detections = []
         for label in range(1, number):
             left, top, width, height, area = map(int, boxes[label])
             if area < MIN_AREA_PX:
                 continue
-            whole = labels[top:top + height, left:left + width] == label
-            mask = _main_body(whole, MAX_AREA_SHARE * clipped.size)
+            region = labels[top:top + height, left:left + width] == label
+            mask = _main_body(region, MAX_AREA_SHARE * clipped.size)
             if mask is None:
                 continue
-            around = float(crowd[top:top + height, left:left + width][mask].max()) / float(mask.sum()) - 1
-            score = (_shape_score(mask, (left, top), display) * _smoothstep(_attached_share(mask, whole), 0.4, 0.1)
-                     * _smoothstep(around, 5.0, 1.5))
+            group_excess = float(group_areas[top:top + height, left:left + width][mask].max()) / float(mask.sum()) - 1
+            score = (_shape_score(mask, (left, top), display) * _smoothstep(_attached_share(mask, region), 0.4, 0.1)
+                     * _smoothstep(group_excess, 5.0, 1.5))
             if score >= self.threshold:
                 rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
                 tight = mask[rows[0]:rows[-1] + 1, columns[0]:columns[-1] + 1]
@@ -112,12 +112,12 @@ def _open_by_disc(mask: NDArray[np.uint8], reach: int) -> NDArray[np.uint8]:
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         opened = cv2.morphologyEx(np.pad(mask, reach), cv2.MORPH_OPEN, disc)[reach:-reach, reach:-reach]
         return np.asarray(opened, np.uint8)
-    away: Any = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    away = cv2.distanceTransform((away <= reach).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return (away <= reach).astype(np.uint8)
+    distance: Any = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance = cv2.distanceTransform((distance <= reach).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return (distance <= reach).astype(np.uint8)
 
 
-def _attached_share(core: NDArray[np.bool_], whole: NDArray[np.bool_]) -> float:
+def _attached_share(core: NDArray[np.bool_], region: NDArray[np.bool_]) -> float:
     """Return the share of a ring half the core's radius outside it where the clipped region continues.
 
     High for a patch cut out of a surface, low past the short spikes of a star or beside a bracket.
@@ -126,10 +126,10 @@ def _attached_share(core: NDArray[np.bool_], whole: NDArray[np.bool_]) -> float:
 
     radius = float(np.sqrt(core.sum() / np.pi))
     room = 3 + int(radius)
-    away: Any = cv2.distanceTransform(1 - np.pad(core, room).astype(np.uint8), cv2.DIST_L2, 5)
+    distance: Any = cv2.distanceTransform(1 - np.pad(core, room).astype(np.uint8), cv2.DIST_L2, 5)
     middle = max(1.5, 0.5 * radius)
-    ring = (away > middle - 1) & (away <= middle + 1)
-    return float(np.pad(whole, room)[ring].mean())
+    ring = (distance > middle - 1) & (distance <= middle + 1)
+    return float(np.pad(region, room)[ring].mean())
 
 
 def _smoothstep(value: float, low: float, high: float) -> float:
@@ -149,10 +149,10 @@ def _shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDAr
     # A contour runs through pixel centres: half a pixel all round is missing from its area.
     solid = area / (cv2.contourArea(hull) + 0.5 * cv2.arcLength(hull, True) + 1.0)
     sides = np.sort(np.asarray(cv2.minAreaRect(hull)[1]) + 1.0)
-    here = display[corner[1]:corner[1] + mask.shape[0], corner[0]:corner[0] + mask.shape[1]][mask]
+    colours = display[corner[1]:corner[1] + mask.shape[0], corner[0]:corner[0] + mask.shape[1]][mask]
     return (_smoothstep(solid, 0.84, 0.95) * _smoothstep(sides[1] / sides[0], 9.0, 5.0)
             * _smoothstep(area / (width * height), MAX_AREA_SHARE, 0.005)
-            * _smoothstep(float(here.min(axis=1).mean()), 0.78, 0.97)
+            * _smoothstep(float(colours.min(axis=1).mean()), 0.78, 0.97)
             * _smoothstep(_surrounding_level(mask, corner, display), 0.97, 0.9))
 
 
@@ -167,6 +167,6 @@ def _surrounding_level(mask: NDArray[np.bool_], corner: tuple[int, int], display
     bottom = min(corner[1] + mask.shape[0] + 2 * reach, height)
     area = np.zeros((bottom - top, right - left), np.uint8)
     area[corner[1] - top:corner[1] - top + mask.shape[0], corner[0] - left:corner[0] - left + mask.shape[1]] = mask
-    away: Any = cv2.distanceTransform(1 - area, cv2.DIST_L2, 3)
-    ring = (away > reach) & (away <= 1.5 * reach)
+    distance: Any = cv2.distanceTransform(1 - area, cv2.DIST_L2, 3)
+    ring = (distance > reach) & (distance <= 1.5 * reach)
     return float(display[top:bottom, left:right][ring].max(axis=1).mean()) if ring.any() else 1.0

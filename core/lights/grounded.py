@@ -98,16 +98,16 @@ class GroundedDetector:
         scaled = torch.from_numpy(boxes * (side / width, side / height, side / width, side / height)).float()
         answer = self._mask_model(pixel_values=pixels.to(self._device), input_boxes=scaled[None].to(self._device),
                                   multimask_output=False)
-        whole = interpolate(answer.pred_masks[0].cpu().float(), (height, width), mode="bilinear")
-        return [np.asarray(mask[0] > 0) for mask in whole.numpy()]
+        resized = interpolate(answer.pred_masks[0].cpu().float(), (height, width), mode="bilinear")
+        return [np.asarray(mask[0] > 0) for mask in resized.numpy()]
 
 
-def _load_weights(kind: Any, where: str | Path) -> Any:
+def _load_weights(kind: Any, source: str | Path) -> Any:
     try:
-        return kind.from_pretrained(str(where), local_files_only=True)
+        return kind.from_pretrained(str(source), local_files_only=True)
     except (OSError, ValueError) as problem:
-        raise EngineError(f"The weights {where} are neither a folder nor in the hub's cache; fetch them with: "
-                          f"huggingface-cli download {where}, or use the exposure method.") from problem
+        raise EngineError(f"The weights {source} are neither a folder nor in the hub's cache; fetch them with: "
+                          f"huggingface-cli download {source}, or use the exposure method.") from problem
 
 
 def refine_detections(boxes: NDArray[np.float64], masks: Sequence[Mask], display: NDArray[np.float32]) -> list[int]:

@@ -125,8 +125,8 @@ class LookEdits:
     @property
     def changes_light_colours_only(self) -> bool:
         """Return whether no edit changes an element or a shape, so that finished layers of the lights suffice."""
-        whole = (self.master, *self.lights.values())
-        return all(edit == NEUTRAL for edit in self.elements.values()) and not any(edit.changes_shape for edit in whole)
+        edits = (self.master, *self.lights.values())
+        return all(edit == NEUTRAL for edit in self.elements.values()) and not any(edit.changes_shape for edit in edits)
 
     def without_light_colours(self) -> LookEdits:
         """Return the edits without the colours of whole lights, which `matrices` applies to finished layers."""
@@ -171,9 +171,9 @@ class LookEdits:
 
     def texts(self) -> list[str]:
         """Return the texts that `parse` reads as these edits; [] for edits that change nothing."""
-        whole = [(ALL, self.master), *self.lights.items()]
+        light_edits = [(ALL, self.master), *self.lights.items()]
         parts = [(f"{light}/{part}", edit) for (light, part), edit in self.elements.items()]
-        return [f"{name}.{property_name}" for name, edit in (*whole, *parts) for property_name in _to_texts(edit)]
+        return [f"{name}.{property_name}" for name, edit in (*light_edits, *parts) for property_name in _to_texts(edit)]
 
     def interpolate(self, other: LookEdits, share: float) -> LookEdits:
         """Interpolate linearly between these edits (share 0) and others (1); mute and solo change at 1."""
@@ -221,7 +221,7 @@ def _parse_targets(text: str, whom: str, lights: Sequence[str],
 def _parse_change(text: str, property_name: str, value: str) -> Edit:
     """Return the edit of one `property=value`; text: the whole edit, for the SettingsError of an invalid one."""
     if property_name == "tint" and _HEX.fullmatch(value):
-        channels = np.array([int(value[at:at + 2], 16) / 255 for at in (1, 3, 5)])
+        channels = np.array([int(value[start:start + 2], 16) / 255 for start in (1, 3, 5)])
         red, green, blue = linear_from_srgb(channels).tolist()
         return Edit(tint=(red, green, blue))
     expected = 3 if property_name == "tint" else 1
@@ -265,10 +265,10 @@ def apply_edits(gaussians: PlaneGaussians, light: str, light_position: NDArray[A
     light_position: (2,) on the normalised plane, delta_l included. elements: groups of the rows.
     blend: "add" for colours in linear light, "over" for display values.
     """
-    whole = edits.light_edit(light)
+    light_edit = edits.light_edit(light)
     hidden = edits.hidden_elements(light, elements)
     element_edits = [edits.elements.get((light, element.name), NEUTRAL) for element in elements]
-    if not hidden and whole == NEUTRAL and all(edit == NEUTRAL for edit in element_edits):
+    if not hidden and light_edit == NEUTRAL and all(edit == NEUTRAL for edit in element_edits):
         return gaussians
     rows: list[NDArray[np.int64]] = []
     parts: list[PlaneGaussians] = []
@@ -276,13 +276,13 @@ def apply_edits(gaussians: PlaneGaussians, light: str, light_position: NDArray[A
     for element, edit in zip(elements, element_edits, strict=True):
         ungrouped[element.members] = False
         if element.name not in hidden and len(element.members):
-            combined = whole.combine(edit)
+            combined = light_edit.combine(edit)
             part = _apply_shape(gaussians.select(element.members), combined, light_position, element.kind == "streak")
             parts.append(_apply_colour(part, combined, blend))
             rows.append(element.members)
     if ungrouped.any():
-        part = _apply_shape(gaussians.select(ungrouped), whole, light_position, False)
-        parts.append(_apply_colour(part, whole, blend))
+        part = _apply_shape(gaussians.select(ungrouped), light_edit, light_position, False)
+        parts.append(_apply_colour(part, light_edit, blend))
         rows.append(np.flatnonzero(ungrouped))
     whole_flare = concatenate(parts)
     if whole_flare is None:

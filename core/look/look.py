@@ -393,7 +393,7 @@ def _row_widths(form: FlareForm) -> dict[str, int]:
               "rotations": 4 if form.solid else 2, "opacity_logits": 1, "sh": 3 * (form.sh_degree + 1) ** 2}
     extra = {"offsets": (form.static_offset, 2), "rings": (form.rings, 2), "arcs": (form.arcs, 2),
              "latent": (form.latent, form.latent)}
-    return {**widths, **{name: width for name, (there, width) in extra.items() if there}}
+    return {**widths, **{name: width for name, (is_present, width) in extra.items() if is_present}}
 
 
 def _head_widths(form: FlareForm, rows: Mapping[str, Floats]) -> dict[str, int]:

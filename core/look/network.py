@@ -134,8 +134,8 @@ class Network:
         """Return the features of a camera position (3,), world units, and a light (2,), normalised coordinates."""
         extent = self._range.camera_high - self._range.camera_low
         folded = np.append(np.abs(light), np.linalg.norm(light)).astype(np.float32)
-        where = (camera.astype(np.float32) - self._range.camera_low) / extent
-        return np.concatenate([self._light_grid(folded / self._range.light_high), self._camera_grid(where)])
+        position = (camera.astype(np.float32) - self._range.camera_low) / extent
+        return np.concatenate([self._light_grid(folded / self._range.light_high), self._camera_grid(position)])
 
     def check(self, *, has_correction: bool) -> None:
         """Evaluate one Gaussian, and delta_l if `has_correction`. Raises ValueError or KeyError for tensors that do not

@@ -56,9 +56,9 @@ def transmission(aperture: Aperture, size: int, fill: float) -> Array:
         distance = np.hypot(x - far * np.cos(azimuth), y - far * np.sin(azimuth))
         mask *= 1 - 0.9 * np.clip((speck - distance) * fill * size / 2 + 0.5, 0, 1)
     for _ in range(aperture.scratches):
-        turn, offset, width = rng.uniform(0, np.pi), rng.uniform(-0.9, 0.9), rng.uniform(0.002, 0.006)
+        rotation, offset, width = rng.uniform(0, np.pi), rng.uniform(-0.9, 0.9), rng.uniform(0.002, 0.006)
         middle, half = rng.uniform(-0.6, 0.6), rng.uniform(0.1, 0.8)
-        along, across = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
+        along, across = x * np.cos(rotation) + y * np.sin(rotation), y * np.cos(rotation) - x * np.sin(rotation)
         distance = np.maximum(np.abs(across - offset) - width, np.abs(along - middle) - half)
         mask *= 1 - 0.9 * np.clip(0.5 - distance * fill * size / 2, 0, 1)
     return mask

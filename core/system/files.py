@@ -85,10 +85,10 @@ def follow_link(target: Path) -> Path:
     """
     if not target.is_symlink():
         return target
-    named = real_path(target)
-    if named.is_symlink():
+    target_path = real_path(target)
+    if target_path.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(target))
-    return named
+    return target_path
 
 
 def round_for_text(value: float) -> float:
@@ -350,12 +350,12 @@ def _file_identity(path: Path) -> object:
 
     File systems that ignore case know one file as both Plates and plates.
     """
-    whole = real_path(path)
+    resolved = real_path(path)
     try:
-        folder, file = whole.parent.stat(), whole.stat()
+        folder, file = resolved.parent.stat(), resolved.stat()
     except OSError:
-        return whole
-    return (folder.st_dev, folder.st_ino, file.st_ino) if folder.st_ino and file.st_ino else whole
+        return resolved
+    return (folder.st_dev, folder.st_ino, file.st_ino) if folder.st_ino and file.st_ino else resolved
 
 
 def hash_files(paths: Iterable[Path]) -> str:

@@ -149,12 +149,12 @@ def _part(gaussians: PlaneGaussians, row: int, light: NDArray[np.float64], width
     variances, axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
     short, long = np.sqrt(np.maximum(variances, 0)) / width
     x, y = axes[:, 1]
-    turn = math.degrees(math.atan2(axis[0] * y - axis[1] * x, axis[0] * x + axis[1] * y))
+    rotation = math.degrees(math.atan2(axis[0] * y - axis[1] * x, axis[0] * x + axis[1] * y))
     light_here = np.maximum(gaussians.colours[row].astype(np.float64), 0) * float(gaussians.opacities[row])
     peak = float(light_here.max())
     part: dict[str, Any] = {
         "offset": 1 - float(mean @ axis) / distance, "aside": float(axis[0] * mean[1] - axis[1] * mean[0]) / width,
-        "size": [float(long), float(short)], "rotation": (turn + 90) % 180 - 90, "intensity": peak,
+        "size": [float(long), float(short)], "rotation": (rotation + 90) % 180 - 90, "intensity": peak,
         "colour": (light_here / peak).tolist() if peak > 0 else [1.0, 1.0, 1.0],
         "shape": "streak" if long > 4 * short else "glow"}
     if gaussians.rings is not None:

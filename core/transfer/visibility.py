@@ -51,7 +51,8 @@ def smooth_visibility(frames: Sequence[ShotFrame], index: int, light: str, radiu
     total = value = 0.0
     for offset in range(-radius, radius + 1):
         if offset in values:
-            lowest = min(values[at] for at in range(offset - radius, offset + radius + 1) if at in values)
+            window = range(offset - radius, offset + radius + 1)
+            lowest = min(values[other] for other in window if other in values)
             value += weights[offset + radius] * lowest
             total += weights[offset + radius]
     return value / total

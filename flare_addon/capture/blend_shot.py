@@ -80,27 +80,28 @@ def _find_lights(scene: Any, names: Sequence[str]) -> list[Any]:
             raise CaptureError(f"The scene {scene.name!r} has no object {missing[0]!r}; use the names of its objects.")
         return [scene.objects[name] for name in names]
     rendered = {obj.name for layer in scene.view_layers
-                for shown in enabled_collections(layer.layer_collection, "hide_render") for obj in shown.objects}
+                for collection in enabled_collections(layer.layer_collection, "hide_render")
+                for obj in collection.objects}
     return [obj for obj in scene.objects if obj.type == "LIGHT" and obj.data.type in LAMP_TYPES
             and not obj.hide_render and obj.name in rendered]
 
 
 def _place_light(scene: Any, depsgraph: Any, obj: Any, eye: Any, radius: float) -> PlacedLight:
     """Return a light with its position and visibility."""
-    where = _light_position(depsgraph, obj, eye)
+    position = _light_position(depsgraph, obj, eye)
     item = SimpleNamespace(target=obj, radius=radius or _lamp_radius(obj))
     visibility = occlusion.visibility(scene, depsgraph, eye, item)
-    return PlacedLight(obj.name, obj.name, where, float(visibility))
+    return PlacedLight(obj.name, obj.name, position, float(visibility))
 
 
 def _light_position(depsgraph: Any, obj: Any, eye: Any) -> cameras.Floats:
     """Return the position (3,) of a light in the world. Raises CaptureError where it is not finite."""
-    where = np.array(lights.light_position(obj, world_matrix(obj, depsgraph), eye), np.float64)
-    if not np.isfinite(where).all():
+    position = np.array(lights.light_position(obj, world_matrix(obj, depsgraph), eye), np.float64)
+    if not np.isfinite(position).all():
         raise CaptureError(f"The position of the light {obj.name!r} is not finite at frame "
                            f"{depsgraph.scene.frame_current}; correct its transform, and the drivers and parents that "
                            "move it.")
-    return where
+    return position
 
 
 def _lamp_radius(obj: Any) -> float:

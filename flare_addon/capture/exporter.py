@@ -53,16 +53,16 @@ class Footage:
 
 def footage_of(camera: Any) -> Footage | None:
     """Return the image sequence behind a camera, from its background images or its movie clip; None without one."""
-    for back in camera.data.background_images if camera.type == "CAMERA" else ():
-        if back.source == "IMAGE" and back.image is not None and back.image.source == "SEQUENCE":
-            user, path = back.image_user, absolute(back.image.filepath, back.image.library)
+    for background in camera.data.background_images if camera.type == "CAMERA" else ():
+        if background.source == "IMAGE" and background.image is not None and background.image.source == "SEQUENCE":
+            user, path = background.image_user, absolute(background.image.filepath, background.image.library)
             match = _NUMBER.search(path.stem)
-            shown = user.frame_start - user.frame_offset - 1 + int(match[1]) if match else user.frame_start
+            start_frame = user.frame_start - user.frame_offset - 1 + int(match[1]) if match else user.frame_start
             # The sequence shows file number `frame - frame_start + 1 + frame_offset`.
-            return Footage(path, shown)
-        if back.source == "MOVIE_CLIP" and back.clip is not None and back.clip.source == "SEQUENCE":
-            return Footage(absolute(back.clip.filepath, back.clip.library),
-                           back.clip.frame_start - back.clip.frame_offset)
+            return Footage(path, start_frame)
+        if background.source == "MOVIE_CLIP" and background.clip is not None and background.clip.source == "SEQUENCE":
+            return Footage(absolute(background.clip.filepath, background.clip.library),
+                           background.clip.frame_start - background.clip.frame_offset)
     return None
 
 

@@ -45,7 +45,7 @@ def connect(scene: Any, gains: dict[str, int]) -> None:
 
 def connected_flares(scene: Any) -> dict[str, int]:
     """Return the index of the flare whose sliders drive the Gain of each layer."""
-    node, found = find_node(scene), {}
+    node, index_by_layer = find_node(scene), {}
     names = [item.name for item in scene.fit_flare.lights]
     for curve in node_drivers(scene):
         socket, variable = _driven_input(node, curve), curve.driver.variables.get("i")
@@ -56,8 +56,8 @@ def connected_flares(scene: Any) -> dict[str, int]:
             continue
         name = bpy.utils.unescape_identifier(match[2] or "")
         if match[1] or name in names:
-            found[layer] = int(match[1]) if match[1] else names.index(name)
-    return found
+            index_by_layer[layer] = int(match[1]) if match[1] else names.index(name)
+    return index_by_layer
 
 
 def migrate_to_indices(scene: Any) -> None:

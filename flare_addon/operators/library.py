@@ -150,14 +150,14 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
         ray = Vector(core.rays([[self.x * core.width, self.y * core.height]])[0].tolist())
         eye = camera.matrix_world.translation
-        hit, where, *_ = scene.ray_cast(depsgraph, eye, ray)
+        hit, position, *_ = scene.ray_cast(depsgraph, eye, ray)
         if not hit:
-            where = eye + ray * (self.distance or 10.0 * max(camera.matrix_world.to_scale()))
+            position = eye + ray * (self.distance or 10.0 * max(camera.matrix_world.to_scale()))
         look, state = looks.look_of(scene), scene.fit_flare
-        item = next((one for one in state.lights if one.target is None), None)
-        light = lights.add_to_scene(scene, where, item.name if item is not None else "light1")
+        item = next((flare for flare in state.lights if flare.target is None), None)
+        light = lights.add_to_scene(scene, position, item.name if item is not None else "light1")
         light.fit_flare.is_light = state.root is not None
-        light.empty_display_size = 0.02 * (where - eye).length
+        light.empty_display_size = 0.02 * (position - eye).length
         if item is None:
             item = looks.add_flare(scene, light, state.lights[state.light].source if state.lights
                                       else look.names[0])

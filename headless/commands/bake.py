@@ -113,7 +113,8 @@ def run_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             raise SettingsError(f"--{name} does not apply to a shot, which has its own cameras and lights; leave it "
                                 "out.")
     shot = Shot.read(args.run).resized(*layers.parse_size(args.size))
-    selected = frames.select_task([NumberedFrame("", one.frame, "") for one in shot.frames], args, progress)
+    numbered = [NumberedFrame("", shot_frame.frame, "") for shot_frame in shot.frames]
+    selected = frames.select_task(numbered, args, progress)
     if not selected:
         return layers.report_nothing(args.out)
     if args.jobs != 1:

@@ -23,11 +23,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Score the run as the arguments say."""
-    return score_run(args.run, progress, which=args.views, capture_folder=args.capture,
+    return score_run(args.run, progress, view_set=args.views, capture_folder=args.capture,
                      lpips_folder=args.lpips)
 
 
-def score_run(folder: Path, progress: Progress, *, which: str = "held-out",
+def score_run(folder: Path, progress: Progress, *, view_set: str = "held-out",
               capture_folder: Path | None = None, lpips_folder: Path | None = None) -> dict[str, Any]:
     """Score the views of a run, write its eval.json and report the table; return both. Raises RunError."""
     from ...core.conventions.run_files import EVALUATION
@@ -44,7 +44,7 @@ def score_run(folder: Path, progress: Progress, *, which: str = "held-out",
     run_ = Run.open(folder)
     capture = run_.capture(capture_folder)
     train, held_out = capture.split(run_.settings.holdout)
-    views = {"held-out": held_out, "train": train, "all": capture.views}[which]
+    views = {"held-out": held_out, "train": train, "all": capture.views}[view_set]
     if not views:
         raise RunError(f"{folder} has no held-out view; score others with --views train or all.")
     frames = Frames(capture, run_.settings.width)

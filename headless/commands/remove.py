@@ -66,14 +66,14 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     for sentence in left_out:
         progress.say(f"Left out: {sentence}")
     failed = left_out if args.frames is None else []  # a video without frames fails the whole command only
-    wanted = None
+    selected_paths = None
     if args.frames is not None or args.jobs != 1:
         plates = dict(collect_plates(inputs, [args.out, args.flare, args.matte]))
         known = [NumberedFrame(str(path), number, "") for path, number in number_sequences(plates).items()]
         chosen = frames.select_task(known, args, progress)
         if not chosen:
             return {"plates": str(args.out), "made": 0, "kept": 0}
-        wanted = {plates[Path(frame.view)] for frame in chosen}
+        selected_paths = {plates[Path(frame.view)] for frame in chosen}
         if args.jobs != 1:
             jobs.run_jobs(args, "remove", [frame.number for frame in chosen], progress, continue_on_failure=True)
             if failed:
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             progress.say(f"The clean plates are in {args.out}.")
             return {"plates": str(args.out)}
     return remove_all(inputs, args.out, _make_remover(args), progress, flare_folder=args.flare,
-                      mattes=Mattes(args.matte) if args.matte else None, overwrite=args.overwrite, only=wanted,
+                      mattes=Mattes(args.matte) if args.matte else None, overwrite=args.overwrite, only=selected_paths,
                       independent=args.stills, failed_inputs=failed)
 
 

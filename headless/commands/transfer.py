@@ -146,13 +146,13 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     for sentence in target.warnings:
         progress.say(sentence)
     target = resized(target, *layers.parse_size(args.size))
-    plates = [one for one in target.frames if one.plate is not None]
-    if unwritten := sum(one.plate_with_flare_path(args.out) is None for one in plates):
+    plates = [target_frame for target_frame in target.frames if target_frame.plate is not None]
+    if unwritten := sum(target_frame.plate_with_flare_path(args.out) is None for target_frame in plates):
         progress.say(f"For {unwritten} of {len(plates)} plates only the layers are written: the plates have another "
                      "size than is rendered, or lens distortion.")
     settings = TransferSettings(options.query, options.scale, options.smooth, options.plate_space)
     transfer = Transfer(flare, target, settings, training, args.ocio)
-    selected = frames.select_task([one.frame for one in target.frames], args, progress)
+    selected = frames.select_task([target_frame.frame for target_frame in target.frames], args, progress)
     if not selected:
         return layers.report_nothing(args.out)
     if args.jobs != 1:

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Layout of the arrays that kernels pass on to each other: records, gradient rows and entries of tiles."""
+"""Layout of the arrays that kernels pass on to each other: records, gradient rows and entries of tiles.
+
+The arrays are flat. In all kernels `at` is the index of the first number of a record, row or entry, and a field is read
+at `at` + its constant here.
+"""
 from __future__ import annotations
 
 import numpy as np

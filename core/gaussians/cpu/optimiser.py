@@ -50,14 +50,14 @@ def step_lanes(parameter, first, second, at, gradient, rate, constants):
 def step_array(parameter, gradient, first, second, rates, constants):
     """Step all numbers of a parameter; rates: a multiple of 16 numbers, repeated along the parameter."""
     n, period = parameter.size, rates.size
-    place, whole = 0, n - n % LANES
-    for i in range(0, whole, LANES):
+    place, vector_end = 0, n - n % LANES
+    for i in range(0, vector_end, LANES):
         step_lanes(parameter, first, second, i, load(gradient, i), load(rates, place), constants)
         place += LANES
         if place == period:
             place = 0
     beta1, new1, beta2, new2, scale, root, epsilon = constants
-    for i in range(whole, n):
+    for i in range(vector_end, n):
         g = gradient[i]
         first[i] = first[i] * beta1 + g * new1
         second[i] = second[i] * beta2 + g * g * new2

@@ -104,8 +104,8 @@ def filter_in_time(frame: FramePrediction, neighbours: Sequence[Neighbour]) -> F
                                                        for neighbour in neighbours)])
     flare = np.minimum(merge_flare(prediction), display)
     if neighbours:
-        estimate = _clean_estimate(frame)
-        residual = _residual_flare(estimate, [_warped_neighbour(estimate, neighbour) for neighbour in neighbours])
+        reference = _clean_estimate(frame)
+        residual = _residual_flare(reference, [_warped_neighbour(reference, neighbour) for neighbour in neighbours])
         flare = np.clip(flare + upsample(residual, display), 0, display)
     return FlarePrediction(display, flare, confidence, prediction.glow_fraction)
 
@@ -131,41 +131,41 @@ def _clean_estimate(frame: FramePrediction) -> _CleanEstimate:
     return _CleanEstimate(scene, greatest, np.ones_like(greatest))
 
 
-def _warped_neighbour(own: _CleanEstimate, neighbour: Neighbour) -> _CleanEstimate:
+def _warped_neighbour(reference: _CleanEstimate, neighbour: Neighbour) -> _CleanEstimate:
     """Return the estimate of a neighbour, warped to the filtered frame and at its exposure."""
     scene, flare, _ = _clean_estimate(neighbour.frame)
     warped = optical_flow.warp(np.dstack([scene, flare]), neighbour.flow_forward)
     flow_confidence = optical_flow.forward_backward_confidence(neighbour.flow_forward, neighbour.flow_backward)
     estimate = _CleanEstimate(warped[..., :3], warped[..., 3], neighbour.weight * flow_confidence)
-    return estimate._replace(scene=estimate.scene * _exposure_ratio(own, estimate))
+    return estimate._replace(scene=estimate.scene * _exposure_ratio(reference, estimate))
 
 
-def _exposure_ratio(own: _CleanEstimate, other: _CleanEstimate) -> np.float32:
+def _exposure_ratio(reference: _CleanEstimate, other: _CleanEstimate) -> np.float32:
     """Return the exposure of a frame relative to another: the median over pixels that both show without flare, neither
     black nor clipped.
 
     Without it a camera that changes its exposure, or a fade, would pass for a flare. 1 where there are too few pixels.
     """
-    own_level, other_level = own.scene.mean(-1), other.scene.mean(-1)
-    comparable = np.minimum(own_level, other_level) > MIN_EXPOSURE_LEVEL
-    comparable &= np.maximum(own.scene.max(-1), other.scene.max(-1)) < CLIPPING_LEVEL
-    comparable &= np.maximum(own.flare, other.flare) < HALF_WEIGHT_FLARE
+    reference_level, other_level = reference.scene.mean(-1), other.scene.mean(-1)
+    comparable = np.minimum(reference_level, other_level) > MIN_EXPOSURE_LEVEL
+    comparable &= np.maximum(reference.scene.max(-1), other.scene.max(-1)) < CLIPPING_LEVEL
+    comparable &= np.maximum(reference.flare, other.flare) < HALF_WEIGHT_FLARE
     weights = other.flow_confidence[comparable]
     if weights.sum() < MIN_EXPOSURE_AREA * comparable.size:
         return np.float32(1)
-    return np.float32(_weighted_median(own_level[comparable] / other_level[comparable], weights))
+    return np.float32(_weighted_median(reference_level[comparable] / other_level[comparable], weights))
 
 
-def _residual_flare(own: _CleanEstimate, others: Sequence[_CleanEstimate]) -> Pixels:
+def _residual_flare(reference: _CleanEstimate, others: Sequence[_CleanEstimate]) -> Pixels:
     """Return the flare that the prediction for a frame misses, (h, w, 3), by the warped neighbours; below 0 where it
     is too great."""
-    estimates = [own, *others]
+    estimates = [reference, *others]
     scene = _weighted_median(np.stack([estimate.scene for estimate in estimates]),
                              np.stack([estimate.weights for estimate in estimates])[..., None])
     support = np.minimum(np.sum([other.flow_confidence for other in others], 0) / np.float32(FULL_SUPPORT), 1)
-    smooth = blur((own.scene - scene) * support[..., None], RESIDUAL_SIGMA)
+    smooth = blur((reference.scene - scene) * support[..., None], RESIDUAL_SIGMA)
     smooth /= (blur(support, RESIDUAL_SIGMA) + np.float32(SUPPORT_FLOOR))[..., None]
-    greatest = np.max([own.flare, *(other.flow_confidence * other.flare for other in others)], 0)
+    greatest = np.max([reference.flare, *(other.flow_confidence * other.flare for other in others)], 0)
     bound = blur(greatest, BOUND_SIGMA)[..., None]
     return np.clip(smooth, -bound, bound)
 

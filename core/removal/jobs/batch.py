@@ -84,8 +84,8 @@ def _excluded_paths(folder: Path, excluded: Iterable[Path]) -> set[Path]:
 
 def _self_and_parents(path: Path) -> list[Path]:
     """Return the resolved path and all folders that it is in."""
-    whole = real_path(path)
-    return [whole, *whole.parents]
+    resolved = real_path(path)
+    return [resolved, *resolved.parents]
 
 
 def _blocking_path(folder: Path) -> Path | None:

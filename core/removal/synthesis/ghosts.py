@@ -40,7 +40,7 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
     opening = log_uniform(random, 0.12, 1.0)
     stop = lens.semi_aperture[lens.stop] * opening
     entrance = lens.semi_aperture[0]
-    blades, turn = int(random.integers(5, 12)), random.uniform(0, 2 * math.pi)
+    blades, rotation = int(random.integers(5, 12)), random.uniform(0, 2 * math.pi)
     roundness = random.choice([0.0, 0.0, 0.3, 1.0]) if opening < 0.9 else 1.0
     coating_wavelengths = _draw_coatings(random, lens)
     soft = log_uniform(random, 0.002, 0.03)
@@ -75,7 +75,7 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
                    _to_float32(np.outer(t, slopes) / unit), _to_float32(np.maximum(np.abs(s) * entrance / unit, 1e-3)),
                    _to_float32(np.outer(t - magnification * ghost.last_stop[:, 1], slopes) / unit),
                    _to_float32(np.maximum(np.abs(magnification) * stop / unit, 1e-3)),
-                   _to_float32(level), blades, turn, float(roundness), soft * (1 + 0.4 * float(radius[1])), rim,
+                   _to_float32(level), blades, rotation, float(roundness), soft * (1 + 0.4 * float(radius[1])), rim,
                    rim_width, random.uniform(0, 0.6) if rim else 0.0, random.uniform(-0.4, 0.4))
     return layer
 
@@ -93,31 +93,32 @@ def _draw_coatings(random: Random, lens: Prescription) -> NDArray[np.float64]:
 
 def _brightness(ghost: GhostPath, coating_wavelengths: NDArray[np.float64], stop: float,
                 entrance: float) -> tuple[NDArray[np.float64], float]:
-    """Return (3,), a ghost's light by channel before any exposure, and its radius on the sensor, mm."""
+    """Return the light (3,) of a ghost by channel, before any exposure, and its radius on the sensor, mm."""
     i, j = ghost.surfaces
-    waves = np.array(CHANNEL_WAVELENGTHS)
-    k = ghost.contrast
-    mirror = (reflectance(k[:, 0], k[:, 1], waves, float(coating_wavelengths[i]))
-              * reflectance(k[:, 2], k[:, 3], waves, float(coating_wavelengths[j])))
-    a = np.maximum(np.abs(ghost.stop[:, 0]), 1e-4)
-    s = np.maximum(np.abs(ghost.sensor[:, 0]), 0.02)  # a ghost in focus is as large as the light, not a point
-    beam = min(stop / float(a[1]), entrance)
-    return mirror / s**2, float(s[1]) * beam
+    wavelengths = np.array(CHANNEL_WAVELENGTHS)
+    indices = ghost.contrast
+    reflected = (reflectance(indices[:, 0], indices[:, 1], wavelengths, float(coating_wavelengths[i]))
+                 * reflectance(indices[:, 2], indices[:, 3], wavelengths, float(coating_wavelengths[j])))
+    stop_heights = np.maximum(np.abs(ghost.stop[:, 0]), 1e-4)
+    # A ghost in focus is as large as the light, not a point.
+    sensor_heights = np.maximum(np.abs(ghost.sensor[:, 0]), 0.02)
+    beam_radius = min(stop / float(stop_heights[1]), entrance)
+    return reflected / sensor_heights**2, float(sensor_heights[1]) * beam_radius
 
 
 def draw_freehand(random: Random, light: Point, size: int) -> Array:
     """Return ghosts as film effects and phones show them: a chain of discs, polygons and rings on the line through the
     middle, of random positions and colours."""
     layer = np.zeros((size, size, 3), np.float32)
-    blades, turn = int(random.integers(5, 10)), random.uniform(0, 2 * math.pi)
+    blades, rotation = int(random.integers(5, 10)), random.uniform(0, 2 * math.pi)
     one_shape = random.random() < 0.6  # all of one shape, or each of another
     roundness = random.choice([0.0, 0.5, 1.0])
     base = log_uniform(random, 0.02, 0.25)
     for _ in range(int(random.integers(1, 14))):
-        at = random.normal(0, 0.8) if random.random() < 0.7 else -1 + random.normal(0, 0.1)
+        line_position = random.normal(0, 0.8) if random.random() < 0.7 else -1 + random.normal(0, 0.1)
         offset = random.normal(0, 0.01, 2) if random.random() < 0.2 else np.zeros(2)
         spread = random.normal(0, 0.02) if random.random() < 0.4 else 0.0
-        places = at * (1 + spread * np.array([-1.0, 0.0, 1.0]))
+        places = line_position * (1 + spread * np.array([-1.0, 0.0, 1.0]))
         centre = np.outer(places, light) + offset
         radius = base * log_uniform(random, 0.2, 4) * (1 + random.normal(0, 0.03) * np.array([-1, 0, 1]))
         if not one_shape:
@@ -128,7 +129,7 @@ def draw_freehand(random: Random, light: Point, size: int) -> Array:
         level = log_uniform(random, 0.03, 1) * random_tint(random, 0.6)
         draw_ghost(layer, _to_float32(centre), _to_float32(np.abs(radius)), _to_float32(clip),
                    _to_float32(np.abs(radius) * 1.02), _to_float32(centre),
-                   _to_float32(np.abs(radius) * 1.01), level, blades, turn, float(roundness),
+                   _to_float32(np.abs(radius) * 1.01), level, blades, rotation, float(roundness),
                    float(radius[1]) * log_uniform(random, 0.02, 0.8), rim, log_uniform(random, 0.03, 0.3), hollow,
                    random.uniform(-0.6, 0.6))
     return layer

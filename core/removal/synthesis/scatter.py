@@ -52,11 +52,11 @@ def _draw_stop(random: Random, dirt: float) -> Array:
     blades = int(random.integers(5, 10))
     if random.random() < 0.2:
         blades = 18
-    turn = random.uniform(0, 2 * math.pi)
+    rotation = random.uniform(0, 2 * math.pi)
     shape = np.ones((STOP_SAMPLES, STOP_SAMPLES))
     soft = 90.0
     for k in range(blades):
-        angle = turn + 2 * math.pi * (k + random.normal(0, 0.03)) / blades
+        angle = rotation + 2 * math.pi * (k + random.normal(0, 0.03)) / blades
         edge = 0.5 * (1 + random.normal(0, 0.02))
         bend = random.uniform(0, 0.25)  # blades are curved, which fans the spikes out
         across = x * -math.sin(angle) + y * math.cos(angle)

@@ -131,10 +131,11 @@ def light_shape(random: Random, light: Point, x: Array, y: Array) -> Array:
             dx, dy = dx + random.normal(0, 0.03), dy + random.normal(0, 0.03)
         radius = log_uniform(random, 0.006, 0.07)
         if kind < 0.65:
-            far = np.hypot(dx, dy) - radius
+            signed_distance = np.hypot(dx, dy) - radius
         else:
             angle, ratio = random.choice([0.0, random.uniform(0, math.pi)]), log_uniform(random, 1, 6)
             along = np.abs(dx * math.cos(angle) + dy * math.sin(angle)) - radius * ratio ** 0.5
-            far = np.maximum(along, np.abs(dy * math.cos(angle) - dx * math.sin(angle)) - radius / ratio ** 0.5)
-        layer += np.clip(0.5 - far / (2 * edge), 0, 1)[..., None] * colour * level
+            across = np.abs(dy * math.cos(angle) - dx * math.sin(angle)) - radius / ratio ** 0.5
+            signed_distance = np.maximum(along, across)
+        layer += np.clip(0.5 - signed_distance / (2 * edge), 0, 1)[..., None] * colour * level
     return layer

@@ -21,8 +21,11 @@ _FROM_YCC = ((1.0, 0.0, 1.402), (1.0, -0.344136, -0.714136), (1.0, 1.772, 0.0))
 
 
 def simulate_jpeg(codes: Tensor, quality: Tensor) -> Tensor:
-    """Return 8 bit codes as decoded. codes: (n, 3, h, w), whole numbers 0..255 as floats, h and w multiples of
-    SIZE_MULTIPLE. quality: (n,), 50..100."""
+    """Compress pictures as JPEG and decode them.
+
+    codes: (n, 3, h, w), whole numbers 0..255 as floats, h and w multiples of SIZE_MULTIPLE; so is the result.
+    quality: (n,), 50..100.
+    """
     scale = 200 - 2 * quality
     ycc = torch.einsum("ij,njhw->nihw", _constant(_TO_YCC, codes), codes)
     luma = _quantise_blocks(ycc[:, :1] - 128, scale, _LUMA) + 128

@@ -28,6 +28,12 @@ CONFIGURED_NAMES = {
 }
 """Names that configurations use for the built-in linear spaces."""
 _BUILT_IN = "ocio://default"
+_CAMERA_TRANSFORMS = {
+    "logc3": "ARRI_ALEXA-LOGC-EI800-AWG", "logc4": "ARRI_LOGC4", "slog3": "SONY_SLOG3-SGAMUT3",
+    "slog3-cine": "SONY_SLOG3-SGAMUT3.CINE", "vlog": "PANASONIC_VLOG-VGAMUT", "log3g10": "RED_LOG3G10-RWG",
+    "acescct": "ACEScct", "acescc": "ACEScc", "clog2": "CANON_CLOG2-CGAMUT", "clog3": "CANON_CLOG3-CGAMUT",
+    "applelog": "APPLE_LOG"}
+"""OpenColorIO's transforms from the cameras' spaces to ACES2065-1."""
 
 
 def has_configuration() -> bool:
@@ -63,6 +69,18 @@ def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
     forward, inverse = (_processor(library, opened, name, forward=is_forward) for is_forward in (True, False))
     return ColourSpace(name, lambda pixels: _apply_processor(forward, pixels),
                        lambda pixels: _apply_processor(inverse, pixels))
+
+
+def camera_space(name: str) -> ColourSpace:
+    """Return the space of a camera's logarithm, by OpenColorIO's own transforms. Raises EngineError without it."""
+    library = _library()
+    transform = library.BuiltinTransform(style=f"{_CAMERA_TRANSFORMS[name]}_to_ACES2065-1")
+    config = library.Config.CreateRaw()
+    forward, inverse = (config.getProcessor(transform, direction).getDefaultCPUProcessor()
+                        for direction in (library.TRANSFORM_DIR_FORWARD, library.TRANSFORM_DIR_INVERSE))
+    aces = colour_space("aces2065-1")
+    return ColourSpace(name, lambda pixels: aces.to_linear(_apply_processor(forward, pixels)),
+                       lambda light: _apply_processor(inverse, aces.from_linear(light)), has_headroom=True)
 
 
 def _library() -> ModuleType:

@@ -16,6 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
+from .curves import (
+    cineon_from_light,
+    hlg_from_light,
+    light_from_cineon,
+    light_from_hlg,
+    light_from_pq,
+    power_curve,
+    pq_from_light,
+)
 from .srgb import Pixels, linear_from_srgb, srgb_from_linear
 
 Chromaticities = tuple[float, float, float, float, float, float, float, float]
@@ -47,6 +56,7 @@ class ColourSpace:
     from_linear: Curve
     matrix: NDArray[np.float64] | None = None
     chromaticities: Chromaticities | None = None
+    has_headroom: bool = False
 
     @property
     def is_linear(self) -> bool:
@@ -67,14 +77,14 @@ class ColourSpace:
 
 
 def matrix_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
-    """(3, 3) from linear R, G, B to CIE X, Y, Z, white at Y = 1 (SMPTE RP 177)."""
+    """Return the matrix (3, 3) from linear R, G, B to CIE X, Y, Z, white at Y = 1 (SMPTE RP 177)."""
     x, y = np.array(chromaticities[0::2]), np.array(chromaticities[1::2])
     columns = np.stack([x / y, np.ones(4), (1 - x - y) / y])
     return np.asarray(columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3]))
 
 
 def matrix_between(source: Chromaticities, target: Chromaticities) -> NDArray[np.float64]:
-    """(3, 3) from one linear R, G, B to another, with the white point adapted."""
+    """Return the matrix (3, 3) from one linear R, G, B to another, with the white point adapted."""
     first, second = (_BRADFORD @ _white(space) for space in (source, target))
     adapted = np.linalg.inv(_BRADFORD) @ np.diag(second / first) @ _BRADFORD
     return np.asarray(np.linalg.inv(matrix_to_xyz(target)) @ adapted @ matrix_to_xyz(source))
@@ -92,6 +102,18 @@ def linear_space(name: str, matrix: NDArray[np.float64], chromaticities: Chromat
     forward, inverse = matrix.T.astype(np.float32), np.linalg.inv(matrix).T.astype(np.float32)
     return ColourSpace(name, lambda pixels: np.asarray(pixels, np.float32) @ forward,
                        lambda pixels: np.asarray(pixels, np.float32) @ inverse, matrix, chromaticities)
+
+
+def curved_space(name: str, decode: Curve, encode: Curve, chromaticities: Chromaticities, *,
+                 has_headroom: bool = False) -> ColourSpace:
+    """Make a space from its curve, to and from light in its own primaries, and those primaries."""
+    matrix = matrix_between(chromaticities, REC_709)
+    if np.allclose(matrix, np.eye(3), atol=1e-4):
+        return ColourSpace(name, decode, encode, None, chromaticities, has_headroom)
+    forward, inverse = matrix.T.astype(np.float32), np.linalg.inv(matrix).T.astype(np.float32)
+    return ColourSpace(name, lambda pixels: decode(pixels) @ forward,
+                       lambda light: encode(np.asarray(light, np.float32) @ inverse), None, chromaticities,
+                       has_headroom)
 
 
 def space_of_chromaticities(chromaticities: Chromaticities) -> ColourSpace:
@@ -125,13 +147,18 @@ def colour_space(name: str, config: Path | str | None = None) -> ColourSpace:
         from .ocio import ocio_space
 
         return ocio_space(name, config)
-    plain = name.strip().lower().replace(" ", "").replace("_", "")
+    plain = _plain(name)
     if plain in _ALIASES:
-        return _BUILT_IN[_ALIASES[plain]]()
-    from .ocio import has_configuration, ocio_space
+        known = _ALIASES[plain]
+        return (_BUILT_IN.get(known) or _CURVED[known])()
+    from .ocio import camera_space, has_configuration, ocio_space
+
+    if plain in _CAMERAS:
+        return camera_space(_CAMERAS[plain])
 
     if not has_configuration():
-        raise SettingsError(f"The colour space {name!r} is not one of {', '.join(_BUILT_IN)}; for another, name an "
+        names = ", ".join(plate_names())
+        raise SettingsError(f"The colour space {name!r} is not one of {names}; for another, name an "
                             "OpenColorIO configuration with --ocio or the variable OCIO.")
     return ocio_space(name, None)
 
@@ -139,6 +166,17 @@ def colour_space(name: str, config: Path | str | None = None) -> ColourSpace:
 def built_in_names() -> list[str]:
     """Names of the spaces that need no configuration."""
     return list(_BUILT_IN)
+
+
+def plate_names() -> list[str]:
+    """Names of the spaces of plates that need no configuration: built-in ones, those of other curves, and those of
+    cameras' logarithms, which need OpenColorIO."""
+    return list(dict.fromkeys([*_BUILT_IN, *_CURVED, *_CAMERAS.values()]))
+
+
+def _plain(name: str) -> str:
+    """Return a name as the tables below have it: without what people write differently."""
+    return "".join(character for character in name.lower() if character.isalnum())
 
 
 def _identity(pixels: NDArray[Any]) -> Pixels:
@@ -166,11 +204,35 @@ def _linear(name: str) -> Callable[[], ColourSpace]:
     return lambda: linear_space(name, matrix_between(_LINEAR[name], REC_709), _LINEAR[name])
 
 
+_ADOBE_RGB: Chromaticities = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 _BUILT_IN: dict[str, Callable[[], ColourSpace]] = {
     "srgb": lambda: ColourSpace("srgb", linear_from_srgb, srgb_from_linear),
     "rec709": lambda: ColourSpace("rec709", _linear_from_rec709, _rec709_from_linear),
     **{name: _linear(name) for name in _LINEAR},
 }
-_ALIASES = {**{name.replace("_", ""): name for name in _BUILT_IN}, "rec.709": "rec709", "bt709": "rec709",
-            "linearrec.709": "linear", "linrec709": "linear", "linearrec709": "linear", "ap1": "acescg",
-            "ap0": "aces2065-1", "linearrec2020": "rec2020", "linrec2020": "rec2020"}
+_CURVED: dict[str, Callable[[], ColourSpace]] = {
+    "display-p3": lambda: curved_space("display-p3", linear_from_srgb, srgb_from_linear, P3_D65),
+    "adobergb": lambda: curved_space("adobergb", *power_curve(563 / 256), _ADOBE_RGB),
+    "gamma2.2": lambda: curved_space("gamma2.2", *power_curve(2.2), REC_709),
+    "gamma2.4": lambda: curved_space("gamma2.4", *power_curve(2.4), REC_709),
+    "pq": lambda: curved_space("pq", light_from_pq, pq_from_light, REC_2020, has_headroom=True),
+    "hlg": lambda: curved_space("hlg", light_from_hlg, hlg_from_light, REC_2020, has_headroom=True),
+    "cineon": lambda: curved_space("cineon", light_from_cineon, cineon_from_light, REC_709, has_headroom=True),
+}
+_ALIASES = {**{_plain(name): name for name in [*_BUILT_IN, *_CURVED]}, "bt709": "rec709", "linearrec709": "linear",
+            "linrec709": "linear", "ap1": "acescg", "ap0": "aces2065-1", "linearrec2020": "rec2020",
+            "linrec2020": "rec2020", "p3": "display-p3", "adobergb1998": "adobergb", "rec2100pq": "pq",
+            "rec2100hlg": "hlg", "st2084": "pq"}
+_CAMERAS = {
+    **dict.fromkeys(("logc3", "arrilogc3", "logc3awg3", "logcei800", "alexalogc"), "logc3"),
+    **dict.fromkeys(("logc4", "arrilogc4", "logc4awg4"), "logc4"),
+    **dict.fromkeys(("slog3", "slog3sgamut3"), "slog3"),
+    **dict.fromkeys(("slog3cine", "slog3sgamut3cine", "sonyslog3sgamut3cine"), "slog3-cine"),
+    **dict.fromkeys(("vlog", "vlogvgamut", "panasonicvlog"), "vlog"),
+    **dict.fromkeys(("log3g10", "log3g10rwg", "log3g10redwidegamutrgb", "redlog3g10"), "log3g10"),
+    "acescct": "acescct", "acescc": "acescc",
+    **dict.fromkeys(("clog2", "canonlog2", "clog2cgamut"), "clog2"),
+    **dict.fromkeys(("clog3", "canonlog3", "clog3cgamut"), "clog3"),
+    "applelog": "applelog",
+}
+"""Names of the cameras' spaces by what people write."""

@@ -18,6 +18,7 @@ from ..colour.spaces import built_in_names as space_names
 from ..colour.srgb import Pixels
 from ..errors import FrameError, SettingsError
 from ..system.reading import check_regular, open_regular
+from .decoders import open_oiio
 from .formats import exr_header
 from .size import checked_size, picture_size
 from .window import DataWindow
@@ -74,6 +75,7 @@ def read_exr_header(path: Path | str) -> dict[str, Any]:
 
 
 def _exr_headers(path: Path | str) -> list[dict[str, Any]]:
+    """Read the header of each part, at least one. Raises FrameError."""
     import OpenEXR
 
     check_regular(path)
@@ -167,11 +169,36 @@ def _check_finite(path: Path, name: str, channel: NDArray[Any]) -> Pixels:
 
 
 def rgb_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> Pixels:
-    """Stack R, G and B, or Y three times, to (height, width, 3). Raises FrameError where neither exists."""
+    """Stack R, G and B, or Y three times, to (height, width, 3); luminance and chroma are converted to R, G, B.
+
+    Raises FrameError where neither exists.
+    """
+    if has_chroma(channels):
+        return read_luminance_chroma(path)
     names = "RGB" if all(name in channels for name in "RGB") else "YYY" if "Y" in channels else ""
     if not names:
         raise missing_rgb(path, channels)
     return np.stack([_check_finite(path, name, channels[name]) for name in names], axis=-1)
+
+
+def has_chroma(channels: Container[str]) -> bool:
+    """True if a picture is stored as luminance and chroma of half resolution, as OpenEXR's RGBA interface can write."""
+    return all(name in channels for name in ("Y", "RY", "BY"))
+
+
+def read_luminance_chroma(path: Path) -> Pixels:
+    """Read an EXR of luminance and chroma as R, G, B (height, width, 3) in its primaries, by OpenImageIO, which filters
+    the chroma as the library of the format does. Raises FrameError."""
+    opened = open_oiio(path)
+    try:
+        spec = opened.spec()
+        pixels = opened.read_image(0, 0, 0, 3, "float")
+        problem = opened.geterror()
+    finally:
+        opened.close()
+    if pixels is None or problem or spec.channelnames[:3] != ("R", "G", "B"):
+        raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.")
+    return _check_finite(path, "Y, RY, BY", np.asarray(pixels))
 
 
 def missing_rgb(path: Path, channels: Iterable[str]) -> FrameError:

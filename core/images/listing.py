@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..system.file_names import natural_key
+from .formats.kinds import SUFFIXES as KIND_BY_SUFFIX
 
 _SYSTEM_FILES = frozenset({"thumbs.db", "desktop.ini"})
 """Files that file managers leave, in lower case."""
-SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr"})
+SUFFIXES = frozenset(KIND_BY_SUFFIX)
+"""Suffixes of pictures that are read, in lower case."""
 
 
 def pictures_in(folder: Path) -> list[Path]:

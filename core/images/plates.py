@@ -7,9 +7,8 @@ last bit; an unchanged plate is copied.
 """
 from __future__ import annotations
 
-import io
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,25 +19,28 @@ from numpy.typing import NDArray
 
 from ..colour import ColourSpace, colour_space, space_of_chromaticities
 from ..colour.srgb import LUMINANCE, srgb_from_linear
-from ..errors import FrameError, is_out_of_memory
+from ..errors import FrameError, SettingsError, is_out_of_memory
 from ..system.files import atomic_path
-from ..system.reading import open_regular, read_bytes
+from ..system.reading import open_regular
 from .borders import PictureArea, find_picture_area
-from .exr import missing_rgb, read_exr_parts
-from .formats import jpeg, png, tiff
+from .declared import declared_space
+from .decoders import Description, describe, file_kind
+from .exr import has_chroma, missing_rgb, read_exr_parts, read_luminance_chroma
+from .formats import png, tiff
+from .formats.kinds import SUFFIXES as SUFFIX_KINDS
 from .listing import SUFFIXES
+from .metadata import copy_metadata, dropped_parts, with_colour_chunks
+from .oiio_writer import OIIO_FORMATS, needs_oiio_writer, write_by_oiio
 from .picture import Encoding
 from .read import read_stored_pixels
 from .size import picture_size
 from .unsupported import unsupported_file
 from .write import save_exr, write_exr
 
-_KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"pHYs", png.EXIF, b"cICP", b"tEXt", b"zTXt", b"iTXt")
-_KEPT_SEGMENTS = ((jpeg.APP1, b"Exif"), (jpeg.APP1, b"http"), (jpeg.APP2, b"ICC_"))
-"""JPEG segments that are kept; XMP is found by the address of its name space."""
-_KEPT_TAGS = (tiff.ORIENTATION, tiff.EXTRA_SAMPLES, tiff.X_RESOLUTION, tiff.Y_RESOLUTION, tiff.RESOLUTION_UNIT,
-              tiff.XMP, tiff.COLOUR_PROFILE)
 _PLACEMENT = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
+_UNWRITTEN = ("heif", "avif", "jxl", "jp2", "gif", "psd")
+"""Formats whose clean plates are PNG."""
+_DESCRIBED_ELSEWHERE = ("png", "jpeg", "tiff", "exr", "")
 _JPEG_QUALITY = 97
 _JPEGS, _TIFFS = (".jpg", ".jpeg"), (".tif", ".tiff")
 _DEPTHS: dict[str, tuple[type, ...]] = {".png": (np.uint8, np.uint16), **dict.fromkeys(_JPEGS, (np.uint8,))}
@@ -50,7 +52,8 @@ class Plate:
     """A picture file with its code values.
 
     codes: (height, width, 3), the file's type, R G B; a grey file has three equal channels. encoding: "srgb" for
-    integer codes, "linear" for floats. extras: an EXR's header and other channels, written back unchanged.
+    integer codes, "linear" for floats. extras: an EXR's header and other channels, written back unchanged. declared:
+    the space that the file declares, or that the user names; None for the usual one of its encoding.
     """
 
     path: Path
@@ -59,6 +62,7 @@ class Plate:
     grey: bool = False
     alpha: NDArray[Any] | None = None
     extras: dict[str, Any] = field(default_factory=dict)
+    declared: ColourSpace | None = None
 
     @property
     def max_code(self) -> float:
@@ -91,21 +95,95 @@ class Plate:
 
     @property
     def space(self) -> ColourSpace:
-        """The colour space of the codes: sRGB for integers; linear for floats, in an EXR's chromaticities where it has
-        some.
+        """The colour space of the codes: the declared one, else sRGB for integers; linear for floats, in an EXR's
+        chromaticities where it has some.
 
-        Raises SettingsError where those span no space.
+        Raises FrameError where those span no space.
         """
+        if self.declared is not None:
+            return self.declared
         if self.encoding == "srgb":
             return colour_space("srgb")
         chromaticities = self.placement.get("chromaticities")
-        return space_of_chromaticities(tuple(chromaticities)) if chromaticities is not None else colour_space("linear")
+        if chromaticities is None:
+            return colour_space("linear")
+        try:
+            return space_of_chromaticities(tuple(chromaticities))
+        except SettingsError as problem:
+            raise FrameError(f"{self.path}: {problem}") from problem
+
+    @property
+    def is_rec709(self) -> bool:
+        """True if the codes are sRGB display values, or scene-linear Rec. 709 light as floats."""
+        return self.space.name == ("srgb" if self.encoding == "srgb" else "linear")
+
+    @cached_property
+    def in_rec709(self) -> Plate:
+        """The plate as 16 bit sRGB codes, or as float scene-linear Rec. 709 light where its codes are floats or hold
+        light above white; itself where it is so already."""
+        if self.is_rec709:
+            return self
+        values = self.values if self.encoding == "srgb" else finite_light(self.codes)
+        light = self.space.to_linear(values)
+        alpha = None if self.alpha is None else self.alpha.astype(np.float32) / np.float32(self.max_code)
+        if self.encoding == "linear" or self.space.has_headroom:
+            return Plate(self.path, light, "linear", self.grey, alpha)
+        codes, alpha_codes = (None if part is None else (np.clip(part, 0, 1) * 65535 + 0.5).astype(np.uint16)
+                              for part in (srgb_from_linear(light), alpha))
+        assert codes is not None
+        return Plate(self.path, codes, "srgb", self.grey, alpha_codes)
+
+    def without_light(self, light: NDArray[np.float32]) -> NDArray[Any]:
+        """Return the codes minus light (height, width, 3), scene-linear Rec. 709; unchanged to the last bit where the
+        light is 0 or the codes are not finite."""
+        codes, changed = self.codes.copy(), (light != 0).any(-1)
+        if codes.dtype.kind == "f":
+            changed &= np.isfinite(codes).all(-1)
+        values, taken = self.codes[changed].astype(np.float32) / np.float32(self.max_code), light[changed]
+        if self.space.is_linear:
+            values = values - self.space.from_linear(taken)
+        else:
+            values = self.space.from_linear(self.space.to_linear(values) - taken)
+        if codes.dtype.kind == "u":
+            codes[changed] = (np.clip(values, 0, 1) * np.float32(self.max_code) + np.float32(0.5)).astype(codes.dtype)
+        else:
+            limit = np.float32(65504) if codes.dtype == np.float16 else np.finfo(np.float32).max
+            codes[changed] = np.clip(values, -limit, limit).astype(codes.dtype)
+        return codes
+
+    def light_in_own_primaries(self, light: NDArray[Any]) -> NDArray[Any]:
+        """Return scene-linear Rec. 709 light in the primaries of a linear plate, in which its flare is written."""
+        return self.space.from_linear(light) if self.space.is_linear and self.encoding == "linear" else light
+
+    @cached_property
+    def description(self) -> Description | None:
+        """Header of a file whose format is not written; None for others."""
+        kind = file_kind(self.path)
+        is_foreign = clean_name(self.path) != self.path and kind not in _DESCRIBED_ELSEWHERE
+        return describe(self.path, kind) if is_foreign else None
+
+    @property
+    def warning(self) -> str:
+        """Sentence on what the clean plate cannot keep; "" where it keeps all."""
+        return dropped_parts(self.path)
 
     @property
     def placement(self) -> dict[str, Any]:
         """Header attributes that give another EXR this one's windows and colours."""
         header = self.extras.get("header", {})
         return {name: header[name] for name in _PLACEMENT if name in header}
+
+
+def clean_name(path: Path) -> Path:
+    """Return the name of the clean plate of a file: its own, or with the suffix of a lossless format where its own can
+    not be written, or not without loss."""
+    suffix = path.suffix.lower()
+    if suffix == ".cin":
+        return path.with_suffix(".dpx")
+    kind = SUFFIX_KINDS.get(suffix)
+    if kind in ("hdr", "raw"):
+        return path.with_suffix(".exr")
+    return path.with_suffix(".png") if kind in _UNWRITTEN else path
 
 
 def is_plate_error(problem: Exception) -> bool:
@@ -122,8 +200,9 @@ def finite_light(codes: NDArray[Any]) -> NDArray[np.float32]:
     return np.nan_to_num(codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
 
 
-def read_plate(path: Path | str) -> Plate:
-    """Read PNG, JPEG, TIFF or EXR as stored. NaN and infinity are kept.
+def read_plate(path: Path | str, space: ColourSpace | None = None) -> Plate:
+    """Read a picture as stored, with the colour space that it declares, or `space` in its place. NaN and infinity are
+    kept.
 
     Raises FrameError where the file is missing, damaged, of another kind, or has no colour.
     """
@@ -133,16 +212,16 @@ def read_plate(path: Path | str) -> Plate:
     if path.suffix.lower() not in SUFFIXES:
         raise unsupported_file(path)
     picture_size(path)
-    return _read_exr(path) if path.suffix.lower() == ".exr" else _read_codes(path)
+    return _read_exr(path, space) if path.suffix.lower() == ".exr" else _read_codes(path, space)
 
 
-def _read_codes(path: Path) -> Plate:
+def _read_codes(path: Path, space: ColourSpace | None) -> Plate:
     with open_regular(path) as stream:
         pages = tiff.page_count(stream)
     if pages > 1:
         raise FrameError(f"{path} has {pages} pages; export the plate as a file of its own.")
     stored = read_stored_pixels(path)
-    if stored.dtype not in (np.uint8, np.uint16, np.float32):
+    if stored.dtype not in (np.uint8, np.uint16, np.float16, np.float32):
         raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
     if _is_animated(path):
         raise FrameError(f"{path} is an animated PNG; export its frames as files of their own.")
@@ -152,7 +231,8 @@ def _read_codes(path: Path) -> Plate:
     else:
         alpha = stored[..., 3].copy() if stored.shape[2] == 4 else None
         codes = np.ascontiguousarray(stored[..., 2::-1])
-    return Plate(path, codes, "linear" if stored.dtype == np.float32 else "srgb", grey, alpha)
+    encoding: Encoding = "linear" if stored.dtype.kind == "f" else "srgb"
+    return Plate(path, codes, encoding, grey, alpha, declared=space or declared_space(path))
 
 
 def _is_grey_with_alpha(path: Path) -> bool:
@@ -184,11 +264,15 @@ def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
     return np.where(stored == code, 0, top).astype(stored.dtype)
 
 
-def _read_exr(path: Path) -> Plate:
+def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
     parts = read_exr_parts(path)
     header, channels = parts[0]
     if len(parts) > 1:
         raise FrameError(f"{path} has {len(parts)} parts; export the plate as a file of its own.")
+    if has_chroma(channels):  # written back as R, G, B, since chroma of half resolution cannot hold a clean edge
+        colour = read_luminance_chroma(path).astype(np.asarray(channels["Y"]).dtype)
+        channels = {**{name: pixels for name, pixels in channels.items() if name not in ("Y", "RY", "BY")},
+                    **{name: colour[..., k] for k, name in enumerate("RGB")}}
     names = ["R", "G", "B"] if all(name in channels for name in "RGB") else ["Y"] if "Y" in channels else []
     if not names:
         raise missing_rgb(path, channels)
@@ -197,7 +281,7 @@ def _read_exr(path: Path) -> Plate:
     if len({channel.shape for channel in channels.values()}) > 1:
         raise FrameError(f"{path} has channels of several sizes (luminance and chroma, say); export it as R, G, B.")
     codes = np.stack([np.asarray(channels[name]) for name in (names if len(names) == 3 else names * 3)], -1)
-    return Plate(path, codes, "linear", len(names) == 1, None, {"header": header, "channels": channels})
+    return Plate(path, codes, "linear", len(names) == 1, None, {"header": header, "channels": channels}, space)
 
 
 def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDArray[Any] | None = None) -> None:
@@ -217,6 +301,13 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
         return
     if alpha is not None:
         plate = replace(plate, alpha=alpha)
+    if suffix == ".exr":
+        light = plate.space.to_linear(codes.astype(np.float32) / np.float32(plate.max_code))
+        write_exr(path, {name: light[..., k] for k, name in enumerate("RGB")})
+        return
+    if needs_oiio_writer(plate.path) and suffix in OIIO_FORMATS:
+        write_by_oiio(path, plate.path, codes[..., :1] if plate.grey else codes, plate.alpha)
+        return
     if codes.dtype not in _DEPTHS.get(suffix, (codes.dtype,)) or (suffix in _JPEGS and plate.alpha is not None):
         raise FrameError(f"{plate.path} holds what no {suffix[1:].upper()} can hold ({codes.dtype} pixels"
                          f"{', alpha' if plate.alpha is not None else ''}): it has the suffix of another kind of file; "
@@ -229,8 +320,11 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
     done, data = cv2.imencode(suffix, np.ascontiguousarray(stored), _encoder_options(suffix, codes.dtype))
     if not done:
         raise FrameError(f"{path} could not be encoded as {suffix[1:].upper()}.")
+    encoded = copy_metadata(data.tobytes(), plate.path, has_alpha=plate.alpha is not None)
+    if suffix == ".png" and (described := plate.description) is not None:
+        encoded = with_colour_chunks(encoded, described.profile, described.code_points)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(_copy_tags(data.tobytes(), suffix, plate))
+        temporary.write_bytes(encoded)
 
 
 def _encoder_options(suffix: str, kind: np.dtype[Any]) -> list[int]:
@@ -257,26 +351,6 @@ def write_results(results: Sequence[Path], plate: Plate, codes: NDArray[Any], fl
         write_flare(result, plate, flare)
 
 
-def _copy_tags(encoded: bytes, suffix: str, plate: Plate) -> bytes:
-    """Return the encoded file with the tags of the plate's file, where both are of one format."""
-    source = plate.path.suffix.lower()
-    if suffix in _JPEGS and source in _JPEGS:
-        return encoded[:2] + b"".join(_jpeg_tags(plate.path)) + encoded[2:]
-    if suffix == source == ".png":
-        data = read_bytes(plate.path)
-        was_grey, is_grey = (not header[25] & 2 for header in (data, encoded))
-        left_out = (b"iCCP",) if was_grey != is_grey else ()
-        chunks = b"".join(png.make_chunk(name, content) for name, content in png.chunks(io.BytesIO(data), _KEPT_CHUNKS)
-                        if name not in left_out)
-        return encoded[:33] + chunks + encoded[33:]  # behind the header chunk
-    if suffix in _TIFFS and source in _TIFFS:
-        tags = tiff.read_tags(io.BytesIO(read_bytes(plate.path)), _KEPT_TAGS)
-        if plate.alpha is None:
-            tags.pop(tiff.EXTRA_SAMPLES, None)
-        return tiff.with_tags(encoded, tags)
-    return encoded
-
-
 def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
     import OpenEXR
 
@@ -293,10 +367,3 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
         header["compression"] = OpenEXR.ZIP_COMPRESSION
     save_exr(path, header, channels)
 
-
-def _jpeg_tags(path: Path) -> Iterator[bytes]:
-    """Yield the source's EXIF, XMP and colour profile segments."""
-    with open_regular(path) as stream:
-        for marker, content in jpeg.segments(stream):
-            if (marker, content[:4]) in _KEPT_SEGMENTS:
-                yield jpeg.make_segment(marker, content)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads picture files: all commands decode PNG, JPEG, TIFF and EXR here.
+"""Reads picture files: all commands decode pictures here, and convert them from the colours that they declare.
 
-OpenCV is imported where it is used, because Blender's own Python has none.
+Libraries are imported where they are used, because Blender's own Python has few of them.
 """
 from __future__ import annotations
 
@@ -11,22 +11,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..colour import ColourSpace, colour_space
+from ..colour.srgb import srgb_from_linear
 from ..errors import FrameError
 from ..system.reading import open_regular, read_bytes
+from .declared import declared_space
+from .decoders import decode_foreign, file_kind
 from .exr import main_part, read_exr_parts, rec709_pixels, rgb_channels, window_from_header
 from .formats import exr_header, png, tiff
 from .listing import SUFFIXES
 from .picture import Picture
 from .size import picture_size
-from .unsupported import compression_reason, unsupported_file, unsupported_reason
+from .unsupported import needs_openimageio, unsupported_file, unsupported_reason
 from .window import crop_to_display_window
 
 
-def read_picture(path: Path | str, *, keep_primaries: bool = False) -> Picture:
-    """Decode PNG, JPEG, TIFF (8 or 16 bit, grey or colour, alpha dropped) or EXR.
+def read_picture(path: Path | str, *, keep_primaries: bool = False, space: ColourSpace | None = None) -> Picture:
+    """Decode a picture of any format (docs/file_formats.md) to display values, or to scene-linear light where its codes
+    hold light above white; alpha is dropped.
 
-    An EXR with `chromaticities` other than Rec. 709 (ACEScg, say) is converted, unless `keep_primaries`. One with more
-    pixels than the frame (overscan), or fewer, is cropped to the frame, and black where it has none.
+    What the file declares (profile, curve, primaries) is converted to Rec. 709; `space` is used instead where it is not
+    None. `keep_primaries` leaves an EXR's primaries. An EXR with more pixels than the frame (overscan), or fewer, is
+    cropped to the frame, and black where it has none.
 
     Raises FrameError where the file is missing, damaged or of another kind, or holds NaN or infinity.
     """
@@ -36,35 +42,56 @@ def read_picture(path: Path | str, *, keep_primaries: bool = False) -> Picture:
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     if path.suffix.lower() == ".exr":
-        picture_size(path)
-        header, channels = main_part([(part, part[1]) for part in read_exr_parts(path)])
-        stored = rgb_channels(path, channels)
-        pixels = stored if keep_primaries else rec709_pixels(path, stored, header)
-        return Picture(crop_to_display_window(pixels, window_from_header(path, header)), "linear")
+        return _read_exr_picture(path, keep_primaries, space)
     stored = read_stored_pixels(path)
     if stored.ndim == 2:
         stored = np.repeat(stored[..., None], 3, axis=2)
-    colour = stored[..., 2::-1]  # OpenCV keeps B G R (A)
-    if stored.dtype == np.uint8:
-        return Picture(colour.astype(np.float32) / np.float32(255), "srgb")
-    if stored.dtype == np.uint16:
-        return Picture(colour.astype(np.float32) / np.float32(65535), "srgb")
-    if stored.dtype.kind != "f":
+    colour = stored[..., 2::-1]  # B G R (A)
+    if stored.dtype.kind == "f":
+        pixels = np.ascontiguousarray(colour, np.float32)
+        if not np.isfinite(pixels).all():
+            raise FrameError(f"{path} holds pixels that are not finite numbers; clean it before it is used.")
+        return Picture((space or declared_space(path) or colour_space("linear")).to_linear(pixels), "linear")
+    if stored.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
-    pixels = np.ascontiguousarray(colour, np.float32)
-    if not np.isfinite(pixels).all():
-        raise FrameError(f"{path} holds pixels that are not finite numbers; clean it before it is used.")
-    return Picture(pixels, "linear")  # a float TIFF
+    values = colour.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+    space = space or declared_space(path)
+    if space is None or space.name == "srgb":
+        return Picture(values, "srgb")
+    light = space.to_linear(values)
+    return Picture(light, "linear") if space.has_headroom else Picture(np.clip(srgb_from_linear(light), 0, 1), "srgb")
 
 
-def has_float_pixels(path: Path) -> bool:
-    """True if a picture is scene-linear and may hold light above white. Raises FrameError for a damaged TIFF."""
-    suffix = path.suffix.lower()
-    return suffix == ".exr" or (suffix in {".tif", ".tiff"} and read_stored_pixels(path).dtype.kind == "f")
+def _read_exr_picture(path: Path, keep_primaries: bool, space: ColourSpace | None) -> Picture:
+    picture_size(path)
+    header, channels = main_part([(part, part[1]) for part in read_exr_parts(path)])
+    stored = rgb_channels(path, channels)
+    if space is not None:
+        pixels = space.to_linear(stored)
+    else:
+        pixels = stored if keep_primaries else rec709_pixels(path, stored, header)
+    return Picture(crop_to_display_window(pixels, window_from_header(path, header)), "linear")
+
+
+def has_float_pixels(path: Path, space: ColourSpace | None = None) -> bool:
+    """True if a picture is scene-linear and may hold light above white, by its pixels or its space (`space`, else what
+    it declares). Raises FrameError for a damaged file."""
+    if (kind := file_kind(path)) in ("exr", "hdr", "raw"):
+        return True
+    if kind == "tiff":
+        with open_regular(path) as stream:
+            is_big = stream.read(4) in tiff.BIG_TIFF
+            formats = tiff.read_tags(stream, (tiff.SAMPLE_FORMAT,)).get(tiff.SAMPLE_FORMAT)
+        if formats is not None and formats.values[0] == tiff.FLOATS:
+            return True
+        if is_big and read_stored_pixels(path).dtype.kind == "f":
+            return True
+    known = space or declared_space(path)
+    return known is not None and known.has_headroom
 
 
 def has_half_pixels(path: Path) -> bool:
-    """True if a picture is stored in 16 bit floats, which only EXRs can be. Raises FrameError."""
+    """True if a picture is stored in 16 bit floats, as some EXRs are. Raises FrameError."""
     if path.suffix.lower() != ".exr":
         return False
     with open_regular(path) as stream:
@@ -73,20 +100,44 @@ def has_half_pixels(path: Path) -> bool:
 
 
 def read_stored_pixels(path: Path) -> NDArray[Any]:
-    """Read the pixels of a PNG, JPEG or TIFF, without rotation or multiplication: (height, width) or B G R with alpha
+    """Read the pixels of any format but EXR, without rotation or multiplication: (height, width) or B G R with alpha
     last.
 
-    Raises FrameError where the file is missing or damaged, or would be decoded as something else.
+    PNG and usual TIFFs are decoded by OpenCV, faster than OpenImageIO and with the same codes; JPEG by simplejpeg,
+    which reports corrupt data; others in `decoders`. Raises FrameError where the file is missing or damaged, or would
+    be decoded as something else.
     """
     import cv2
 
     width, height = picture_size(path)
     if reason := unsupported_reason(path):
         raise FrameError(f"{path} {reason}.")
-    stored = decode(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    kind = file_kind(path)
+    if kind == "jpeg":
+        stored: NDArray[Any] | None = _decode_jpeg(path)
+    elif kind == "png" or (kind == "tiff" and not needs_openimageio(path)):
+        stored = decode(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    else:
+        stored = decode_foreign(path, kind)
     if stored is None or stored.shape[:2] != (height, width):
-        raise FrameError(f"{path} {compression_reason(path) or 'is damaged or truncated; export it again'}.")
+        raise FrameError(f"{path} is damaged or truncated; export it again.")
     return stored
+
+
+def _decode_jpeg(path: Path) -> NDArray[Any]:
+    """Decode a JPEG to (height, width) or B G R.
+
+    Raises FrameError for one whose data end early or are corrupt, of which OpenCV and OpenImageIO make grey areas.
+    """
+    import simplejpeg
+
+    data = read_bytes(path)
+    try:
+        is_grey = simplejpeg.decode_jpeg_header(data)[2] == "Gray"
+        pixels = simplejpeg.decode_jpeg(data, "GRAY" if is_grey else "BGR", strict=True)
+    except ValueError as problem:
+        raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
+    return pixels[..., 0] if is_grey else pixels
 
 
 def decode(path: Path, flags: int) -> NDArray[Any] | None:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads the size of a picture from its header alone, without a library, so that Blender's own Python can."""
+"""Reads the size of a picture from its header alone; of PNG, JPEG, TIFF and EXR without a library, so that Blender's
+own Python can."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -7,10 +8,8 @@ from typing import BinaryIO
 
 from ..errors import FrameError
 from ..system.reading import open_regular
+from .decoders import MAX_PIXELS, describe, file_kind
 from .formats import exr_header, jpeg, png, tiff
-
-MAX_PIXELS = 500_000_000
-"""Largest picture that is opened; a header that claims more is damaged or hostile."""
 
 
 def picture_size(path: Path | str) -> tuple[int, int]:
@@ -22,11 +21,13 @@ def picture_size(path: Path | str) -> tuple[int, int]:
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     try:
+        kind = file_kind(path)
         with open_regular(path) as stream:
-            if stream.read(4) in tiff.BIG_TIFF:
-                raise FrameError(f"{path} is a BigTIFF; save it as a plain TIFF, of less than 4 GB.")
+            is_big = stream.read(4) in tiff.BIG_TIFF
             stream.seek(0)
             size = _size_from_header(stream)
+        if is_big or kind not in ("png", "jpeg", "tiff", "exr", ""):
+            size = describe(path, kind)[:2]
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     return checked_size(path, size)

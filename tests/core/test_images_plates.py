@@ -20,24 +20,6 @@ from core.images.write import write_exr, write_png
 from tests.core.removal_cases import picture, write_codes, write_tiff
 
 
-def write_luminance_and_chroma(path: Path) -> None:
-    """An EXR of 8 x 8 pixels, 2 x 2 of them with one RY, in 16 bit floats without compression."""
-    def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:
-        return name + b"\0" + kind + b"\0" + struct.pack("<i", len(value)) + value
-
-    channels = b"".join(name + b"\0" + struct.pack("<iIii", 1, 0, step, step) for name, step in ((b"RY", 2), (b"Y", 1)))
-    window = struct.pack("<4i", 0, 0, 7, 7)
-    header = b"".join([b"\x76\x2f\x31\x01\x02\0\0\0", attribute(b"channels", b"chlist", channels + b"\0"),
-                       attribute(b"compression", b"compression", b"\0"), attribute(b"dataWindow", b"box2i", window),
-                       attribute(b"displayWindow", b"box2i", window), attribute(b"lineOrder", b"lineOrder", b"\0"),
-                       attribute(b"pixelAspectRatio", b"float", struct.pack("<f", 1)),
-                       attribute(b"screenWindowCenter", b"v2f", bytes(8)),
-                       attribute(b"screenWindowWidth", b"float", struct.pack("<f", 1)), b"\0"])
-    lines = [struct.pack("<ii", y, length) + bytes(length) for y in range(8) for length in (24 - 8 * (y % 2),)]
-    starts = [len(header) + 8 * 8 + sum(map(len, lines[:y])) for y in range(8)]
-    path.write_bytes(header + struct.pack("<8Q", *starts) + b"".join(lines))
-
-
 def test_colour_tags_of_a_jpeg_are_copied(tmp_path: Path) -> None:
     codes = picture()
     write_codes(tmp_path / "a.jpg", codes)
@@ -136,24 +118,15 @@ def test_unsupported_pictures_are_refused_by_name(tmp_path: Path) -> None:
     write_tiff(tmp_path / "inks.tif", np.zeros((8, 8, 4), np.uint8), {tiff.PHOTOMETRIC: tiff.short(tiff.SEPARATED)})
     with pytest.raises(FrameError, match=r"inks\.tif is CMYK"):
         read_plate(tmp_path / "inks.tif")
-    write_tiff(tmp_path / "grey.tif", np.zeros((8, 8), np.uint8), {tiff.SAMPLES: tiff.short(2)})
-    with pytest.raises(FrameError, match="grey with alpha"):
-        read_plate(tmp_path / "grey.tif")
     write_tiff(tmp_path / "lab.tif", np.zeros((8, 8, 3), np.uint16), {tiff.PHOTOMETRIC: tiff.short(tiff.LAB[0])})
     with pytest.raises(FrameError, match=r"lab\.tif is in Lab colours"):
         read_plate(tmp_path / "lab.tif")
     write_tiff(tmp_path / "mask.tif", np.zeros((8, 8, 4), np.uint8), {tiff.SAMPLES: tiff.short(5)})
     with pytest.raises(FrameError, match=r"mask\.tif has 5 channels"):
         read_plate(tmp_path / "mask.tif")
-    write_tiff(tmp_path / "half.tif", np.zeros((8, 8), np.uint16), {tiff.SAMPLE_FORMAT: tiff.short(tiff.FLOATS)})
-    with pytest.raises(FrameError, match="holds floats of 16 bits"):
-        read_plate(tmp_path / "half.tif")
     write_tiff(tmp_path / "long.tif", np.zeros((8, 8), np.float32), {tiff.SAMPLE_FORMAT: tiff.short(tiff.UNSIGNED)})
     with pytest.raises(FrameError, match="holds whole numbers of 32 bits"):
         read_plate(tmp_path / "long.tif")
-    write_tiff(tmp_path / "zstd.tif", codes, {tiff.COMPRESSION: tiff.short(50000)})
-    with pytest.raises(FrameError, match=r"zstd\.tif is compressed by Zstandard, which .*; save it with LZW"):
-        read_plate(tmp_path / "zstd.tif")
     jpeg[frame + 9], jpeg[frame + 4] = 3, 12
     (tmp_path / "deep.jpg").write_bytes(jpeg)
     with pytest.raises(FrameError, match=r"deep\.jpg holds 12 bits a colour; save it with 8"):
@@ -165,16 +138,10 @@ def test_unsupported_pictures_are_refused_by_name(tmp_path: Path) -> None:
     assert read_plate(tmp_path / "1.png").codes.shape == codes.shape
     with pytest.raises(FrameError, match=r"2\.png is an animated PNG; export its frames"):
         read_plate(tmp_path / "2.png")
-    (tmp_path / "big.tif").write_bytes(tiff.BIG_TIFF[0] + bytes(40))
-    with pytest.raises(FrameError, match="is a BigTIFF"):
-        read_plate(tmp_path / "big.tif")
     _, pages = cv2.imencodemulti(".tif", [codes, codes, codes])
     (tmp_path / "pages.tif").write_bytes(pages.tobytes())
     with pytest.raises(FrameError, match="3 pages"):
         read_plate(tmp_path / "pages.tif")
-    write_luminance_and_chroma(tmp_path / "chroma.exr")
-    with pytest.raises(FrameError, match="several sizes"):
-        read_plate(tmp_path / "chroma.exr")
 
 
 def test_a_multipart_exr_is_refused(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import BinaryIO, NamedTuple
 
 SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers of frame headers (SOF): precision, height, width, number of components."""
-SOS, APP1, APP2 = 0xDA, 0xE1, 0xE2
+SOS, APP1, APP2, COMMENT = 0xDA, 0xE1, 0xE2, 0xFE
 
 
 def segments(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:

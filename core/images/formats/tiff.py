@@ -115,6 +115,24 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
     return bytes(result)
 
 
+def with_directory(data: bytes, number: int, tags: Mapping[int, Tag]) -> bytes:
+    """Return a TIFF with another directory, such as Exif's, to which the tag `number` of its first page points."""
+    order, entries = next(_directories(io.BytesIO(data)), _NO_DIRECTORY)
+    if not entries or not tags:
+        return data
+    result = bytearray(data + b"\0" * (len(data) % 2))
+    listed = []
+    for name, (kind, values) in sorted(tags.items()):
+        raw = values.astype(values.dtype.newbyteorder(order)).tobytes()
+        place = raw.ljust(4, b"\0") if len(raw) <= 4 else struct.pack(order + "I", len(result))
+        if len(raw) > 4:
+            result += raw + b"\0" * (len(raw) % 2)
+        listed.append(struct.pack(order + "HHI", name, kind, len(values) // (2 if kind in _RATIONALS else 1)) + place)
+    at = len(result)
+    result += struct.pack(order + "H", len(listed)) + b"".join(listed) + bytes(4)
+    return with_tags(bytes(result), {number: Tag(4, np.array([at], np.uint32))})
+
+
 def is_premultiplied(path: Path) -> bool:
     """True if a file says that its colours are multiplied with its alpha."""
     with open_regular(path) as stream:

@@ -6,14 +6,15 @@ either encoding; a fit's layers are by the sRGB curve (`jobs.fitted`).
 """
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...colour.srgb import Pixels, linear_from_srgb
+from ...colour.srgb import LUMINANCE, Pixels, linear_from_srgb
 from ...images.picture import Encoding
-from ...images.plates import finite_light
+from ...images.plates import Plate, finite_light
 from ..model import image_formation
 from ..model.image_formation import GAMMA
 
@@ -25,6 +26,41 @@ MAX_FLOAT16 = 65504
 """Greatest finite value of a flare as it is written."""
 
 _LINEAR_FROM_UINT8 = np.power(np.arange(256, dtype=np.float32) / 255, np.float32(GAMMA)).astype(np.float32)
+
+
+_PERCENTILES, _MAX_HIGHLIGHT = (95.0, 99.5), 4.0
+"""Percentiles of the luminance that the exposure follows, and the largest ratio of the two that counts: lamps and the
+sun exceed any picture's highlights."""
+_USUAL_LEVEL = 0.65
+"""Geometric mean of both in usual photographs, linear light."""
+_MAX_GAIN = 1024.0
+"""Largest gain, and smallest by its inverse, of a frame that is all black or all light."""
+_MAX_SAMPLES = 500_000
+
+
+def usual_exposure(plate: Plate) -> np.float32:
+    """Return the gain that brings a scene-linear plate to the exposure of a usual photograph; 1 for other plates.
+
+    A multiple of the exposure gives the same picture times the gain, so the network predicts the same flare.
+    """
+    if plate.encoding != "linear":
+        return np.float32(1)
+    step = max(int(np.sqrt(plate.codes.shape[0] * plate.codes.shape[1] / _MAX_SAMPLES)), 1)
+    luminance = finite_light(plate.codes[::step, ::step]) @ LUMINANCE.astype(np.float32)
+    luminance = luminance[luminance > 0]  # borders are black
+    if not len(luminance):
+        return np.float32(1)
+    bright, highlight = np.percentile(luminance, _PERCENTILES)
+    level = np.sqrt(max(bright * min(highlight, _MAX_HIGHLIGHT * bright), 0))
+    return np.float32(np.clip(_USUAL_LEVEL / max(level, 1e-9), 1 / _MAX_GAIN, _MAX_GAIN))
+
+
+def to_network_plate(plate: Plate) -> tuple[Plate, np.float32]:
+    """Return a plate as the network sees it, and the gain of its light: sRGB codes, or Rec. 709 light of a usual
+    exposure."""
+    rec709 = plate.in_rec709
+    gain = usual_exposure(rec709)
+    return (rec709 if gain == 1 else replace(rec709, codes=finite_light(rec709.codes) * gain, extras={})), gain
 
 
 def to_linear(codes: NDArray[Any], encoding: Encoding, max_code: float) -> Pixels:

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reads ICC profiles of matrix and curves (ICC.1:2022), as cameras, screens and working spaces have.
+
+Parsed here because the libraries that convert by profiles do so in 8 bits, or need a file of the profile, and Blender's
+Python has none of them. Profiles that consist of tables are refused.
+"""
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .spaces import REC_709, ColourSpace, colour_space, matrix_to_xyz
+from .srgb import Pixels, linear_from_srgb
+
+Table = Callable[[NDArray[Any]], Pixels]
+_D50 = (0.9642, 1.0, 0.8249)
+_MAX_TAGS = 200
+_SAMPLES = 4096
+"""Steps by which a curve is inverted."""
+SRGB_TOLERANCE = 4e-3
+"""Difference of display values and matrix entries up to which a profile counts as sRGB: half a step of 8 bits, since
+profiles round their numbers."""
+
+
+class UnreadableProfile(ValueError):
+    """A profile that is damaged, or of tables; the text says which."""
+
+
+def space_of_profile(profile: bytes) -> ColourSpace:
+    """Return the space of an ICC profile: the built-in sRGB where it differs no more than by rounding.
+
+    Raises UnreadableProfile for one that is damaged, not for R G B or grey, or of tables.
+    """
+    tags = _read_tags(profile)
+    if b"cicp" in tags and len(tags[b"cicp"]) >= 12:
+        from .cicp import space_of_code_points
+
+        space = space_of_code_points(*tags[b"cicp"][8:10])
+        if space is not None:
+            return space
+    name = _description(tags)
+    if profile[16:20] == b"GRAY" and b"kTRC" in tags:
+        return _space(name, np.eye(3), [_parse_curve(tags[b"kTRC"])] * 3)
+    if profile[16:20] != b"RGB ":
+        raise UnreadableProfile(f"is for {profile[16:20].decode('latin-1').strip()}, not for R G B")
+    needed = (b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC")
+    if not all(tag in tags for tag in needed):
+        if "srgb" in name.lower():
+            return colour_space("srgb")
+        raise UnreadableProfile("consists of tables")
+    columns = [_parse_xyz(tags[tag]) for tag in needed[:3]]
+    matrix = np.linalg.inv(_to_d50(matrix_to_xyz(REC_709))) @ np.array(columns).T
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-6:
+        raise UnreadableProfile("has primaries that span no space")
+    return _space(name, matrix, [_parse_curve(tags[tag]) for tag in needed[3:]])
+
+
+def _space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> ColourSpace:
+    ramp = np.linspace(0, 1, _SAMPLES, dtype=np.float32)
+    decoded = np.stack([curve(ramp) for curve in curves])
+    is_709 = np.abs(matrix - np.eye(3)).max() < SRGB_TOLERANCE
+    if is_709 and np.abs(decoded - linear_from_srgb(ramp)).max() < SRGB_TOLERANCE:
+        return colour_space("srgb")
+    forward, inverse = matrix.T.astype(np.float32), np.linalg.inv(matrix).T.astype(np.float32)
+    increasing = [np.maximum.accumulate(channel) for channel in decoded]
+
+    def to_linear(pixels: NDArray[Any]) -> Pixels:
+        clipped = np.clip(np.asarray(pixels, np.float32), 0, 1)
+        light = np.stack([curve(clipped[..., k]) for k, curve in enumerate(curves)], -1)
+        return light if is_709 else light @ forward
+
+    def from_linear(light: NDArray[Any]) -> Pixels:
+        own = np.asarray(light, np.float32) if is_709 else np.asarray(light, np.float32) @ inverse
+        values = np.stack([_invert(curves[k], increasing[k], ramp, own[..., k]) for k in range(3)], -1)
+        return np.asarray(values, np.float32)
+
+    return ColourSpace(f"profile {name}", to_linear, from_linear)
+
+
+def _invert(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) -> Pixels:
+    """Invert a curve: by its samples, then one step by the secant, since samples are coarse where it is steep."""
+    value = np.interp(light, decoded, ramp)
+    step = np.float32(0.5 / _SAMPLES)
+    above, below = (curve(np.clip(value + way * step, 0, 1).astype(np.float32)) for way in (1, -1))
+    slope = above - below
+    error = light - curve(value.astype(np.float32))
+    moved = value + np.clip(np.where(slope > 0, error / np.maximum(slope, 1e-9) * 2 * step, 0), -2 * step, 2 * step)
+    return np.clip(np.where((light > 0) & (light < 1), moved, value), 0, 1).astype(np.float32)
+
+
+def _read_tags(profile: bytes) -> dict[bytes, bytes]:
+    """Read the tag table. Raises UnreadableProfile."""
+    if len(profile) < 132 or profile[36:40] != b"acsp":
+        raise UnreadableProfile("is damaged")
+    count = int.from_bytes(profile[128:132], "big")
+    tags = {}
+    for index in range(min(count, _MAX_TAGS)):
+        entry = profile[132 + 12 * index:144 + 12 * index]
+        if len(entry) < 12:
+            raise UnreadableProfile("is damaged")
+        name, at, length = struct.unpack(">4sII", entry)
+        if at + length > len(profile):
+            raise UnreadableProfile("is damaged")
+        tags[name] = profile[at:at + length]
+    return tags
+
+
+def _description(tags: dict[bytes, bytes]) -> str:
+    """Return the profile's name, of version 2 or 4."""
+    text = tags.get(b"desc", b"")
+    if text[:4] == b"mluc" and len(text) >= 28:
+        length, at = struct.unpack(">II", text[20:28])
+        return text[at:at + length].decode("utf-16-be", "replace").strip("\0 ") or "without a name"
+    if text[:4] == b"desc" and len(text) >= 12:
+        return text[12:12 + int.from_bytes(text[8:12], "big")].decode("latin-1").strip("\0 ") or "without a name"
+    return "without a name"
+
+
+def _parse_xyz(data: bytes) -> tuple[float, float, float]:
+    if len(data) < 20:
+        raise UnreadableProfile("is damaged")
+    x, y, z = struct.unpack(">3i", data[8:20])
+    return x / 65536, y / 65536, z / 65536
+
+
+def _parse_curve(data: bytes) -> Table:
+    """Return a curve of type `curv` or `para` as a function of 0..1. Raises UnreadableProfile."""
+    if data[:4] == b"curv" and len(data) >= 12:
+        count = int.from_bytes(data[8:12], "big")
+        values = np.frombuffer(data[12:12 + 2 * count], ">u2")
+        if len(values) != count:
+            raise UnreadableProfile("is damaged")
+        if count == 0:
+            return lambda x: np.asarray(x, np.float32)
+        if count == 1:
+            return _power(float(values[0]) / 256)
+        table, places = values.astype(np.float64) / 65535, np.linspace(0, 1, count)
+        return lambda x: np.interp(x, places, table).astype(np.float32)
+    if data[:4] == b"para" and len(data) >= 12:
+        kind = int.from_bytes(data[8:10], "big")
+        if kind <= 4:
+            length = (1, 3, 4, 5, 7)[kind]
+            if len(data) >= 12 + 4 * length:
+                return _parametric(kind, [n / 65536 for n in struct.unpack(f">{length}i", data[12:12 + 4 * length])])
+    raise UnreadableProfile("is damaged")
+
+
+def _power(gamma: float) -> Table:
+    if not 0.1 <= gamma <= 10:
+        raise UnreadableProfile("has a curve that no picture has")
+    return lambda x: np.power(np.maximum(x, 0), np.float32(gamma)).astype(np.float32)
+
+
+def _parametric(kind: int, numbers: list[float]) -> Table:
+    """Return a parametric curve (ICC.1:2022, table 68)."""
+    g, a, b, c, d, e, f = (numbers + [0.0] * 7)[:7]
+    _power(g)
+    if kind == 0:
+        return _power(g)
+    if a == 0:
+        raise UnreadableProfile("has a curve that no picture has")
+    if kind in (1, 2):  # 0, or c, below -b / a
+        c, d, e, f = 0.0, -b / a, c if kind == 2 else 0.0, c if kind == 2 else 0.0
+
+    def decode(x: NDArray[Any]) -> Pixels:
+        upper = np.power(np.maximum(a * x + b, 0), g) + e
+        return np.where(x >= d, upper, c * x + f).astype(np.float32)
+
+    return decode
+
+
+def _to_d50(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Adapt a matrix to X, Y, Z from white D65 to the D50 of profiles (Bradford)."""
+    from .spaces import _BRADFORD
+
+    white = _BRADFORD @ matrix.sum(1)
+    return np.asarray(np.linalg.inv(_BRADFORD) @ np.diag(_BRADFORD @ np.array(_D50) / white) @ _BRADFORD @ matrix)

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Decodes the formats that OpenCV and OpenEXR do not read, or not exactly, by the libraries of each.
+
+| library | reads |
+| --- | --- |
+| OpenImageIO | WebP, DPX, Cineon, PSD, BMP, Radiance HDR, Targa; BigTIFF, TIFF of 16 bit floats, planes, Zstandard |
+| OpenCV | JPEG 2000, in up to 16 bits |
+| Pillow | GIF, AVIF; HEIC with pillow-heif |
+| pillow-jxl-plugin | JPEG XL, which OpenImageIO's wheels for numpy 1.26 lack |
+| rawpy | raw files of cameras, DNG |
+
+`read.py` calls it. Each library is imported where it is used; where one is missing, FrameError says which.
+"""
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..colour import ColourSpace, colour_space
+from ..colour.cicp import space_of_code_points
+from ..colour.icc import UnreadableProfile, space_of_profile
+from ..errors import FrameError
+from ..system.reading import check_regular, open_regular, read_bytes
+from .formats.kinds import HEAD_BYTES, Kind, kind_of
+
+OIIO_KINDS = frozenset({"webp", "dpx", "cineon", "psd", "bmp", "hdr", "tga"})
+"""Formats that OpenImageIO alone reads."""
+MAX_PIXELS = 500_000_000
+"""Largest picture that is opened; a header that claims more is damaged or hostile."""
+MAX_BYTES = 2 << 30
+"""Bound of a file that is read whole."""
+_PACKAGES = {"OpenImageIO": ("OpenImageIO", "engine"), "pillow_heif": ("pillow-heif", "heif"),
+             "PIL.Image": ("pillow", "heif"), "pillow_jxl": ("pillow-jxl-plugin", "jxl"), "rawpy": ("rawpy", "raw")}
+"""Package and dependency group of each module."""
+_DPX_TRANSFERS = {"linear": "linear", "printing density": "cineon", "logarithmic": "cineon", "kodaklog": "cineon",
+                  "adx": "cineon"}
+
+
+class Description(NamedTuple):
+    """Size, colour space (None where the file names none), Exif orientation, ICC profile and code points of a picture,
+    by its header."""
+
+    width: int
+    height: int
+    space: ColourSpace | None = None
+    orientation: int = 1
+    profile: bytes = b""
+    code_points: tuple[int, int] | None = None
+
+
+def file_kind(path: Path) -> Kind:
+    """Return the format of a file. Raises OSError."""
+    with open_regular(path) as stream:
+        return kind_of(stream.read(HEAD_BYTES), path.suffix)
+
+
+def describe(path: Path, kind: Kind) -> Description:
+    """Read the header of a file of one of this module's formats. Raises FrameError."""
+    if kind in OIIO_KINDS or kind == "tiff":
+        return _describe_by_oiio(path, kind)
+    if kind == "raw":
+        with _open_raw(path) as raw:
+            sizes = raw.sizes
+            turned = sizes.flip in (5, 6)
+            width, height = (sizes.height, sizes.width) if turned else (sizes.width, sizes.height)
+            return Description(width, height, colour_space("linear"))
+    with _open_by_pillow(path, kind) as picture:
+        width, height = picture.size
+        profile = picture.info.get("icc_profile") or b""
+        nclx = picture.info.get("nclx_profile")
+        points = (int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])) if nclx else None
+        space = profile_space(path, profile) or (space_of_code_points(*points) if points else None)
+        return Description(width, height, space, 1, profile, points)
+
+
+def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
+    """Decode a file of one of this module's formats to (height, width), or B G R with alpha last, as stored.
+
+    HEIC, AVIF and raw files come out upright. Raises FrameError.
+    """
+    if kind in OIIO_KINDS or kind == "tiff":
+        return _decode_by_oiio(path, kind)
+    if kind == "raw":
+        return _decode_raw(path)
+    if kind == "jp2":
+        return _decode_by_opencv(path)
+    if kind == "heif":
+        return _decode_heif(path)
+    with _open_by_pillow(path, kind) as picture:
+        if getattr(picture, "n_frames", 1) > 1:
+            raise FrameError(f"{path} has {picture.n_frames} frames; export them as files of their own.")
+        mode = picture.mode if picture.mode in ("L", "RGB", "RGBA") else "RGBA" if "A" in picture.mode else "RGB"
+        try:
+            pixels = np.asarray(picture.convert(mode))
+        except Exception as problem:  # the plug-ins raise what their libraries do
+            raise _damaged(path, problem) from problem
+    return _bgr(pixels)
+
+
+def profile_space(path: Path, profile: bytes) -> ColourSpace | None:
+    """Return the space of a file's ICC profile, None for none. Raises FrameError for one that cannot be honoured."""
+    if not profile:
+        return None
+    try:
+        return space_of_profile(profile)
+    except UnreadableProfile as problem:
+        if "damaged" in str(problem):
+            return None  # as viewers do
+        raise FrameError(f"{path} has a colour profile that {problem}; convert it to sRGB, or name its space with "
+                         "--plate-space.") from problem
+
+
+def _bgr(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Return R G B (A) as B G R (A), grey as (height, width), grey with alpha as four channels."""
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        return np.ascontiguousarray(pixels[..., 0])
+    if pixels.ndim == 2:
+        return np.ascontiguousarray(pixels)
+    order = {2: [0, 0, 0, 1], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[pixels.shape[2]]
+    return np.ascontiguousarray(pixels[..., order])
+
+
+def _library(name: str, path: Path) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ImportError as problem:
+        package, group = _PACKAGES[name]
+        raise FrameError(f"{path} needs the Python package {package}, which is not installed: `pip install --group "
+                         f"{group} -c constraints.txt`, or save the picture as PNG, TIFF or EXR.") from problem
+
+
+def _damaged(path: Path, problem: object) -> FrameError:
+    reason = " ".join(str(problem).split())[:160]
+    return FrameError(f"{path} is damaged or truncated{f' ({reason})' if reason else ''}; export it again.")
+
+
+def open_oiio(path: Path) -> Any:
+    """Open a file with OpenImageIO, for its alpha and colours as stored. Raises FrameError; the caller closes it."""
+    oiio = _library("OpenImageIO", path)
+    check_regular(path)
+    oiio.attribute("limits:imagesize_MB", 8192)
+    settings = oiio.ImageSpec()
+    settings.attribute("oiio:UnassociatedAlpha", 1)
+    opened = oiio.ImageInput.open(str(path), settings)
+    if opened is None:
+        raise _damaged(path, oiio.geterror())
+    return opened
+
+
+def _describe_by_oiio(path: Path, kind: Kind) -> Description:
+    opened = open_oiio(path)
+    try:
+        spec = opened.spec()
+        profile = spec.getattribute("ICCProfile")
+        data = bytes(np.asarray(profile, np.uint8)) if profile is not None else b""
+        space = profile_space(path, data) or _oiio_space(spec, kind)
+        orientation = spec.get_int_attribute("Orientation", 1) if kind in ("webp", "tiff", "psd") else 1
+        return Description(spec.width, spec.height, space, orientation if 1 <= orientation <= 8 else 1, data)
+    finally:
+        opened.close()
+
+
+def _oiio_space(spec: Any, kind: Kind) -> ColourSpace | None:
+    """Return the space that a header without a profile names; None for the usual one of its pixels."""
+    if kind == "cineon":
+        return colour_space("cineon")
+    if kind == "hdr":
+        return colour_space("linear")
+    if kind == "dpx":
+        transfer = str(spec.get_string_attribute("dpx:Transfer")).strip().lower()
+        if transfer in _DPX_TRANSFERS:
+            return colour_space(_DPX_TRANSFERS[transfer])
+        if "709" in transfer or "274m" in transfer:
+            return colour_space("rec709")
+    return None
+
+
+def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
+    opened = open_oiio(path)
+    try:
+        spec = opened.spec()
+        channels = spec.nchannels
+        if kind == "psd" and spec.get_string_attribute("psd:ColorMode") in ("CMYK", "Lab", "Multichannel"):
+            raise FrameError(f"{path} is in {spec.get_string_attribute('psd:ColorMode')} colours; convert it to RGB.")
+        if kind == "tiff" and spec.get_int_attribute("tiff:PhotometricInterpretation", 2) not in (0, 1, 2, 3, 6):
+            raise FrameError(f"{path} is in colours for print or measurement (CMYK or Lab); convert it to RGB.")
+        if channels > 4:
+            channels = 4 if spec.alpha_channel == 3 else 3
+        if spec.width * spec.height > MAX_PIXELS:
+            raise FrameError(f"{path} claims {spec.width} x {spec.height} pixels, more than this program opens.")
+        name = {"uint8": "uint8", "uint16": "uint16", "half": "half"}.get(str(spec.format), "float")
+        pixels = opened.read_image(0, 0, 0, channels, name)
+        problem = opened.geterror()
+        if pixels is None or problem:
+            raise _damaged(path, problem)
+        pixels = np.asarray(pixels).reshape(spec.height, spec.width, channels)
+        if kind == "tiff" and pixels.dtype == np.uint16 and spec.get_int_attribute("tiff:PhotometricInterpretation",
+                                                                                 1) == 0:
+            pixels = 65535 - pixels  # 0 is white, which OpenImageIO converts in 8 bits only
+        return _bgr(pixels)
+    finally:
+        opened.close()
+
+
+def _decode_by_opencv(path: Path) -> NDArray[Any]:
+    import cv2
+
+    data = np.frombuffer(read_bytes(path, MAX_BYTES), np.uint8)
+    try:
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    except cv2.error as problem:
+        raise _damaged(path, problem.err) from problem
+    if pixels is None:
+        raise _damaged(path, "")
+    return np.asarray(pixels)
+
+
+def _open_by_pillow(path: Path, kind: Kind) -> Any:
+    """Open HEIC, AVIF, JPEG XL, JPEG 2000 or GIF with Pillow and its plug-ins. Raises FrameError."""
+    image = _library("PIL.Image", path)
+    if kind == "jxl":
+        _library("pillow_jxl", path)
+    if kind == "heif":
+        _library("pillow_heif", path).register_heif_opener()
+    check_regular(path)
+    try:
+        return image.open(path)
+    except Exception as problem:  # the plug-ins raise what their libraries do
+        raise _damaged(path, problem) from problem
+
+
+def _decode_heif(path: Path) -> NDArray[Any]:
+    """Decode HEIC upright, with the bits of the file spread over 16 where it has more than 8."""
+    library = _library("pillow_heif", path)
+    check_regular(path)
+    try:
+        picture = library.open_heif(path, convert_hdr_to_8bit=False)
+        pixels = np.asarray(picture)
+    except Exception as problem:
+        raise _damaged(path, problem) from problem
+    return _bgr(pixels)
+
+
+def _open_raw(path: Path) -> Any:
+    library = _library("rawpy", path)
+    check_regular(path)
+    try:
+        return library.imread(str(path))
+    except Exception as problem:
+        raise _damaged(path, problem) from problem
+
+
+def _decode_raw(path: Path) -> NDArray[Any]:
+    """Develop a raw file to 16 bit scene-linear Rec. 709, with the camera's white balance, unclipped highlights off."""
+    library = _library("rawpy", path)
+    with _open_raw(path) as raw:
+        try:
+            pixels = raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True,
+                                     output_color=library.ColorSpace.sRGB)
+        except Exception as problem:
+            raise _damaged(path, problem) from problem
+    return _bgr(pixels)
+

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Copies what describes a picture from its file to a new one of the same format: profiles, Exif, XMP, IPTC, text, tags.
+
+By hand, because the libraries that encode either write none of it or only what they parse; here it stays byte for byte.
+What no longer fits the new pixels goes together: a gain map or motion clip behind a JPEG, and the XMP that claims it.
+"""
+from __future__ import annotations
+
+import io
+import xml.etree.ElementTree as ElementTree
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from ..system.reading import open_regular, read_bytes
+from .formats import jpeg, png, tiff
+
+KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"cICP", b"mDCV", b"cLLI", b"mDCv", b"cLLi", b"pHYs", png.EXIF,
+               b"tEXt", b"zTXt", b"iTXt", b"tIME", b"sCAL", b"oFFs", b"pCAL", b"sTER")
+"""PNG chunks that are kept; the second pair are the drafts' names of the first."""
+_STRUCTURE_TAGS = frozenset({
+    tiff.WIDTH, tiff.HEIGHT, tiff.BITS, tiff.COMPRESSION, tiff.PHOTOMETRIC, tiff.SAMPLES, tiff.PLANES,
+    tiff.SAMPLE_FORMAT, 254, 255, 263, 266, 273, 278, 279, 280, 281, 288, 289, 290, 291, 292, 293, 317, 320, 321, 322,
+    323, 324, 325, 330, 332, 334, 336, 340, 341, 342, 343, 347, 512, 513, 514, 515, 517, 518, 519, 520, 521, 529, 530,
+    531, 532})
+"""TIFF tags that say how the pixels are stored, which the encoder writes anew; and offsets of other directories."""
+EXIF_DIRECTORY, GPS_DIRECTORY = 34665, 34853
+_MARKERS = frozenset({jpeg.APP1, jpeg.APP2, 0xED, jpeg.COMMENT, *range(0xE3, 0xED), 0xEF})
+"""JPEG segments that are kept; APP14 says how the encoder stores its colours, and APP0 is replaced as a whole."""
+_INDEX, _ISO_GAIN_MAP = b"MPF\0", b"urn:iso:std:iso:ts:21496:-1"
+"""Segments that describe the pictures behind a JPEG's first one."""
+_XMP = b"http://ns.adobe.com/xap/1.0/\0"
+_CLAIMS = ("http://ns.adobe.com/hdr-gain-map/1.0/", "http://ns.google.com/photos/1.0/container/",
+           "http://ns.google.com/photos/1.0/container/item/", "http://ns.google.com/photos/1.0/camera/")
+"""Name spaces of XMP by which a file claims that a gain map or a clip follows its first picture."""
+
+
+def copy_metadata(encoded: bytes, source: Path, *, has_alpha: bool) -> bytes:
+    """Return an encoded PNG, JPEG or TIFF with what describes the picture in `source`, where that is of the same
+    format."""
+    data = read_bytes(source)
+    if encoded[:2] == b"\xff\xd8" == data[:2]:
+        return _copy_to_jpeg(encoded, data)
+    if encoded[:8] == png.SIGNATURE == data[:8]:
+        was_grey, is_grey = (not header[25] & 2 for header in (data, encoded))
+        left_out = (b"iCCP",) if was_grey != is_grey else ()
+        chunks = b"".join(png.make_chunk(name, content) for name, content in png.chunks(io.BytesIO(data), KEPT_CHUNKS)
+                          if name not in left_out)
+        return encoded[:33] + chunks + encoded[33:]  # behind the header chunk
+    if encoded[:4] in (b"II*\0", b"MM\0*") and data[:4] in (b"II*\0", b"MM\0*"):
+        return _copy_to_tiff(encoded, data, has_alpha)
+    return encoded
+
+
+def with_colour_chunks(encoded: bytes, profile: bytes, code_points: tuple[int, int] | None) -> bytes:
+    """Return a PNG with an ICC profile or, without one, code points, of a picture of another format."""
+    if profile and (encoded[25] & 2 > 0) == (profile[16:20] == b"RGB "):
+        chunk = png.make_chunk(b"iCCP", b"profile\0\0" + zlib.compress(profile))
+    elif code_points and code_points != (1, 13) and 2 not in code_points:
+        chunk = png.make_chunk(b"cICP", bytes((*code_points, 0, 1)))
+    else:
+        return encoded
+    return encoded[:33] + chunk + encoded[33:]
+
+
+def dropped_parts(path: Path) -> str:
+    """Return a sentence on what a clean picture cannot keep of this file; "" where it keeps all."""
+    with open_regular(path) as stream:
+        if stream.read(2) != b"\xff\xd8":
+            return ""
+        for _, content in jpeg.segments(stream):
+            if content.startswith((_INDEX, _ISO_GAIN_MAP)) or (content.startswith(_XMP) and _has_claims(content)):
+                return (f"{path} holds more than one picture (a gain map, a clip or a preview), which would still show "
+                        "the flare; the clean picture goes without it, and without the tags that claim it.")
+    return ""
+
+
+def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
+    """Return a JPEG with the source's segments, in their order, behind the JFIF header of the source or its own."""
+    header, at = b"", 2
+    if encoded[2:4] == b"\xff\xe0":
+        at = 4 + int.from_bytes(encoded[4:6], "big")
+        header = encoded[2:at]
+    kept = []
+    for marker, content in jpeg.segments(io.BytesIO(data)):
+        if marker == 0xE0 and content.startswith(b"JFIF\0") and len(content) >= 14:
+            header = jpeg.make_segment(marker, content[:12] + b"\0\0")  # density, without its thumbnail
+        elif marker in _MARKERS and not content.startswith((_INDEX, _ISO_GAIN_MAP)):
+            content = _without_claims(content) if content.startswith(_XMP) else content
+            if content:
+                kept.append(jpeg.make_segment(marker, content))
+    return encoded[:2] + header + b"".join(kept) + encoded[at:]
+
+
+def _has_claims(segment: bytes) -> bool:
+    return any(name.encode() in segment for name in _CLAIMS)
+
+
+def _without_claims(segment: bytes) -> bytes:
+    """Return an XMP segment without the properties by which it claims parts that are not kept; empty where it cannot be
+    parsed."""
+    if not _has_claims(segment):
+        return segment
+    text = segment[len(_XMP):].rstrip(b"\0 \n")
+    try:
+        for _, (prefix, address) in ElementTree.iterparse(io.BytesIO(text), ("start-ns",)):
+            if not prefix.startswith("ns"):
+                ElementTree.register_namespace(prefix, address)
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError):
+        return b""
+    claims = tuple(f"{{{name}}}" for name in _CLAIMS)
+    for element in root.iter():
+        for name in [name for name in element.attrib if name.startswith(claims)]:
+            del element.attrib[name]
+        for child in [child for child in element if child.tag.startswith(claims)]:
+            element.remove(child)
+    return _XMP + ElementTree.tostring(root, encoding="utf-8")
+
+
+def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
+    """Return a TIFF with all tags of the source but those of its structure, and its Exif and GPS directories."""
+    every = _AllBut(_STRUCTURE_TAGS)
+    tags = tiff.read_tags(io.BytesIO(data), every)
+    directories = {number: tags.pop(number) for number in (EXIF_DIRECTORY, GPS_DIRECTORY) if number in tags}
+    if not has_alpha:
+        tags.pop(tiff.EXTRA_SAMPLES, None)
+    encoded = tiff.with_tags(encoded, tags)
+    for number, place in directories.items():
+        if len(place.values) == 1:
+            inner = tiff.read_tags(io.BytesIO(data), _AllBut({0xA005}), int(np.uint32(place.values[0])))
+            encoded = tiff.with_directory(encoded, number, inner)
+    return encoded
+
+
+class _AllBut:
+    """A container of all numbers but some."""
+
+    def __init__(self, excluded: frozenset[int] | set[int]) -> None:
+        self._excluded = excluded
+
+    def __contains__(self, number: object) -> bool:
+        return number not in self._excluded

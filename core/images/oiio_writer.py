@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Writes clean plates of the formats that OpenCV and OpenEXR do not write, by OpenImageIO: lossless, with the header of
+the plate.
+
+`plates.write_plate` calls it.
+"""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FrameError
+from ..system.files import atomic_path
+from .decoders import file_kind, open_oiio
+from .unsupported import needs_openimageio
+
+OIIO_FORMATS = {".dpx": "dpx", ".webp": "webp", ".bmp": "bmp", ".tga": "targa", ".tif": "tiff", ".tiff": "tiff"}
+"""OpenImageIO's names of the formats that it writes here."""
+
+
+def needs_oiio_writer(path: Path) -> bool:
+    """True for a plate that OpenCV cannot write as it is stored."""
+    kind = file_kind(path)
+    return kind in ("dpx", "cineon", "webp", "bmp", "tga") or (kind == "tiff" and needs_openimageio(path))
+
+
+def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[Any] | None) -> None:
+    """Write codes (height, width, 1 or 3), with alpha (height, width), with the header of `source`. Raises FrameError.
+    """
+    import OpenImageIO as oiio  # noqa: N813 - as its own documents do
+
+    pixels = codes if alpha is None else np.concatenate([codes, alpha[..., None]], -1)
+    name = OIIO_FORMATS[path.suffix.lower()]
+    opened = open_oiio(source)
+    try:
+        spec = opened.spec().copy()
+    finally:
+        opened.close()
+    names = ("R", "G", "B") if codes.shape[2] == 3 else ("Y",)
+    spec.nchannels, spec.channelnames = pixels.shape[2], (*names, "A")[:pixels.shape[2]]
+    spec.alpha_channel = pixels.shape[2] - 1 if alpha is not None else -1
+    types = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float16": oiio.HALF}
+    spec.set_format(types.get(codes.dtype.name, oiio.FLOAT))
+    spec.channelformats = ()
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    if name == "webp":
+        spec.attribute("compression", "lossless")
+    if name == "dpx" and file_kind(source) == "cineon":
+        spec.attribute("dpx:Transfer", "Printing density")
+        spec.attribute("oiio:BitsPerSample", 10)
+    if name == "tiff":
+        spec.attribute("planarconfig", "contig")
+        compression = spec.get_string_attribute("compression")
+        if compression in ("jpeg", "webp", "lerc"):
+            spec.attribute("compression", "zip")
+    with atomic_path(path) as temporary:
+        output = oiio.ImageOutput.create(name)
+        done = (output is not None and output.open(str(temporary), spec)
+                and output.write_image(np.ascontiguousarray(pixels)) and output.close())
+        if not done:
+            raise FrameError(f"{path} could not be encoded as {path.suffix[1:].upper()} "
+                             f"({output.geterror() if output is not None else oiio.geterror()}).")

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Pictures of every format are read as the light that they declare, and clean plates keep what describes them."""
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from core.colour import colour_space
+from core.errors import FrameError
+from core.images.formats import jpeg, png
+from core.images.plates import clean_name, read_plate, write_plate
+from core.images.read import has_float_pixels, read_picture
+from tests.core.picture_files import WRITERS, png_16, scene
+
+MISSING = {name for name, package in (("HEIC", "pillow_heif"),) if importlib.util.find_spec(package) is None}
+TOLERANCE = {"Y/RY/BY EXR": 0.01, "P3 JPEG": 0.006, "HEIC": 0.01, "Radiance HDR": 0.008}
+
+
+def write(name: str, folder: Path, light: Any) -> tuple[Path, Any]:
+    if name in MISSING:
+        pytest.skip(f"no encoder of {name} is installed")
+    file, space, writer = WRITERS[name]
+    writer(folder / file, light)
+    return folder / file, colour_space(space) if space else None
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_format_shows_the_same_light(name: str, tmp_path: Path) -> None:
+    light = scene()
+    path, space = write(name, tmp_path, light)
+    picture = read_picture(path, space=space)
+    means = picture.linear().reshape(-1, 3).mean(0) / light.reshape(-1, 3).mean(0)
+    np.testing.assert_allclose(means, 1, atol=TOLERANCE.get(name, 0.004))
+    assert (picture.encoding == "linear") == has_float_pixels(path, space)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_clean_plate_stays_in_the_space_of_its_file(name: str, tmp_path: Path) -> None:
+    """Less light in a corner: the rest keeps its codes, and the corner is that much darker when it is read again."""
+    light = scene()
+    path, space = write(name, tmp_path, light)
+    plate = read_plate(path, space)
+    taken = np.zeros_like(light)
+    taken[8:24, 10:40] = 0.1
+    target = clean_name(tmp_path / f"clean{path.suffix}")
+    write_plate(target, plate, plate.without_light(taken))
+    again = read_plate(target, space if target.suffix == path.suffix else None)
+    if target.suffix == path.suffix and path.suffix != ".jpg":
+        same = (taken == 0).all(-1)
+        np.testing.assert_array_equal(again.codes[same], plate.codes[same])
+    before, after = (read_picture(file, space=space if file.suffix == path.suffix else None).linear()
+                     for file in (path, target))
+    np.testing.assert_allclose((before - after)[10:22, 12:38].mean(), 0.1, atol=0.004)
+    np.testing.assert_allclose((before - after)[30:].mean(), 0, atol=0.002)
+
+
+def test_light_above_white_survives_in_pq(tmp_path: Path) -> None:
+    light = scene(level=8.0)
+    path, _ = write("PQ PNG", tmp_path, light)
+    picture = read_picture(path)
+    assert picture.encoding == "linear"
+    np.testing.assert_allclose(picture.pixels.reshape(-1, 3).mean(0), light.reshape(-1, 3).mean(0), rtol=0.005)
+
+
+def test_a_file_is_read_as_what_it_is_not_as_it_is_named(tmp_path: Path) -> None:
+    path, _ = write("WebP", tmp_path, scene())
+    named = path.rename(tmp_path / "a.jpg")
+    np.testing.assert_allclose(read_picture(named).linear().mean(), scene().mean(), rtol=0.01)
+
+
+def test_a_jpeg_whose_data_end_early_or_are_corrupt_is_refused(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (96, 128, 3)).astype(np.uint8)
+    data = cv2.imencode(".jpg", noise)[1].tobytes()
+    whole, half = tmp_path / "whole.jpg", len(data) // 2
+    whole.write_bytes(data)
+    assert read_picture(whole).size == (128, 96)
+    for name, damaged in (("cut.jpg", data[:half]), ("ended.jpg", data[:half] + b"\xff\xd9"),
+                          ("zeros.jpg", data[:half] + bytes(len(data) - half - 2) + b"\xff\xd9")):
+        (tmp_path / name).write_bytes(damaged)
+        for read in (read_picture, read_plate):
+            with pytest.raises(FrameError, match=rf"{name} is damaged or truncated"):
+                read(tmp_path / name)
+
+
+def test_a_png_keeps_its_high_dynamic_range_chunks(tmp_path: Path) -> None:
+    chunks = {b"cICP": bytes((9, 16, 0, 1)), b"mDCV": bytes(range(24)), b"cLLI": bytes(8), b"tEXt": b"Author\0Ada"}
+    png_16(tmp_path / "a.png", colour_space("pq").from_linear(scene()), *chunks.items())
+    plate = read_plate(tmp_path / "a.png")
+    write_plate(tmp_path / "b.png", plate, plate.codes // 2)
+    with open(tmp_path / "b.png", "rb") as stream:
+        assert dict(png.chunks(stream, chunks)) == chunks
+
+
+def test_a_jpeg_keeps_comment_density_and_iptc_but_no_gain_map_nor_its_claim(tmp_path: Path) -> None:
+    data = cv2.imencode(".jpg", np.full((32, 32, 3), 128, np.uint8))[1].tobytes()
+    xmp = (b'http://ns.adobe.com/xap/1.0/\0<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
+           b'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description '
+           b'xmlns:hdrgm="http://ns.adobe.com/hdr-gain-map/1.0/" xmlns:dc="http://purl.org/dc/elements/1.1/" '
+           b'hdrgm:Version="1.0" dc:format="image/jpeg"/></rdf:RDF></x:xmpmeta>')
+    segments = [(0xED, b"Photoshop 3.0\x008BIM\x04\x04"), (0xFE, b"stage 4"), (jpeg.APP1, xmp),
+                (jpeg.APP2, b"MPF\0MM\0*\0\0\0\x08")]
+    density = jpeg.make_segment(0xE0, b"JFIF\0\1\1\1\1,\1,\0\0")
+    start = data.index(b"\xff\xdb")
+    (tmp_path / "a.jpg").write_bytes(data[:2] + density + b"".join(jpeg.make_segment(*part) for part in segments)
+                                     + data[start:] + data)
+    plate = read_plate(tmp_path / "a.jpg")
+    assert "gain map" in plate.warning
+    write_plate(tmp_path / "b.jpg", plate, plate.codes // 2)
+    written = (tmp_path / "b.jpg").read_bytes()
+    for part in (density, jpeg.make_segment(*segments[0]), jpeg.make_segment(*segments[1]), b"image/jpeg"):
+        assert part in written
+    assert b"hdrgm" not in written and b"hdr-gain-map" not in written and b"MPF\0" not in written
+    assert not read_plate(tmp_path / "b.jpg").warning
+
+
+def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "rawpy", None)
+    (tmp_path / "a.dng").write_bytes(b"II*\0" + bytes(60))
+    with pytest.raises(FrameError, match=r"a\.dng needs the Python package rawpy.*--group raw"):
+        read_picture(tmp_path / "a.dng")

@@ -117,6 +117,7 @@ def time_range(call: Any, times: int = 10) -> tuple[float, float]:
 
 
 def main() -> None:
+    """Time the import of a capture, the reading of events, and the overlay, inside Blender."""
     import bpy
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
@@ -157,7 +158,7 @@ def main() -> None:
 
         frame()
         fast, slow = time_range(frame, 20)
-        count = sum(len(one) for one in looks.evaluate_flares(scene, depsgraph, scene.camera).values())
+        count = sum(map(len, looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
         lines.append(f"overlay of {count} Gaussians, all but the GPU: {fast:.1f} to {slow:.1f} ms")
     print("\n".join(lines))
     sys.stdout.flush()

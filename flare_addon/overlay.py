@@ -196,13 +196,13 @@ def _gaussian_shader() -> Any:
     import gpu
 
     flow = gpu.types.GPUStageInterfaceInfo("fit_flare_gaussian")
-    flow.smooth("VEC2", "at")
-    flow.flat("VEC3", "shine")
-    flow.flat("VEC3", "hollow")
-    flow.flat("VEC3", "bend")
+    flow.smooth("VEC2", "position")
+    flow.flat("VEC3", "colour")
+    flow.flat("VEC3", "ring_shape")
+    flow.flat("VEC3", "arc_shape")
     info = gpu.types.GPUShaderCreateInfo()
     info.push_constant("VEC2", "size")
-    info.push_constant("FLOAT", "covers")
+    info.push_constant("FLOAT", "is_over")
     info.vertex_in(0, "VEC2", "place")
     info.vertex_in(1, "VEC2", "local")
     info.vertex_in(2, "VEC3", "light")
@@ -211,16 +211,18 @@ def _gaussian_shader() -> Any:
     info.vertex_out(flow)
     info.fragment_out(0, "VEC4", "result")
     info.vertex_source("void main() {\n"
-                       "  at = local; shine = light; hollow = ring; bend = arc;\n"
+                       "  position = local; colour = light; ring_shape = ring; arc_shape = arc;\n"
                        "  vec2 ndc = place / size * 2.0 - 1.0;\n"
                        "  gl_Position = vec4(ndc.x, -ndc.y, 0.0, 1.0);\n"
                        "}\n")
     info.fragment_source("void main() {\n"
-                         "  float away = (sqrt(max(dot(at, at), 1e-12)) - hollow.x) / hollow.y;\n"
-                         "  float profile = exp(dot(bend.xy, at) - bend.z - 0.5 * away * away);\n"
-                         "  float alpha = covers > 0.5 ? profile * hollow.z : 1.0;\n"
-                         "  if (covers > 0.5 ? alpha < 1.0 / 255.0 : profile < 1.0 / 4096.0) { discard; }\n"
-                         "  result = vec4(shine * profile, alpha);\n"
+                         "  float radius = sqrt(max(dot(position, position), 1e-12));\n"
+                         "  float deviations = (radius - ring_shape.x) / ring_shape.y;\n"
+                         "  float log_arc = dot(arc_shape.xy, position) - arc_shape.z;\n"
+                         "  float profile = exp(log_arc - 0.5 * deviations * deviations);\n"
+                         "  float alpha = is_over > 0.5 ? profile * ring_shape.z : 1.0;\n"
+                         "  if (is_over > 0.5 ? alpha < 1.0 / 255.0 : profile < 1.0 / 4096.0) { discard; }\n"
+                         "  result = vec4(colour * profile, alpha);\n"
                          "}\n")
     return gpu.shader.create_from_info(info)
 
@@ -318,7 +320,7 @@ def render(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look) ->
                 gpu.state.depth_test_set("NONE")
                 shader = _shader("gaussian")
                 shader.bind()
-                shader.uniform_float("covers", 0.0 if look.blend == "add" else 1.0)
+                shader.uniform_float("is_over", 0.0 if look.blend == "add" else 1.0)
                 # The size of the level, whose last pixels may reach past the edge of the region.
                 shader.uniform_float("size", (offscreen.width, offscreen.height))
                 _batch(by_level[divisor]).draw(shader)

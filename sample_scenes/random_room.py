@@ -24,6 +24,7 @@ SIZE = (480, 336)
 SAMPLES = 10
 Random = np.random.Generator
 Colour = tuple[float, float, float]
+Position = tuple[float, float, float]
 
 
 def random_colour(random: Random, saturation: float | None = None) -> Colour:
@@ -148,8 +149,8 @@ class Room:
             case "spot":
                 self._add_light("SPOT", position, power * 8, colour)
 
-    def _add_light(self, kind: str, position: Colour, power: float, colour: Colour | None = None) -> None:
-        """Add a light of Blender without a visible shape."""
+    def _add_light(self, kind: str, position: Position, power: float, colour: Colour | None = None) -> None:
+        """Add one of Blender's lights, SPOT or AREA, without a visible shape."""
         random = self.random
         bpy.ops.object.light_add(type=kind, location=position)
         light = bpy.context.object
@@ -160,7 +161,7 @@ class Room:
         else:
             light.data.size = random.uniform(0.3, 3)
 
-    def _random_position(self, height: float, min_distance: float = 0.0) -> Colour:
+    def _random_position(self, height: float, min_distance: float = 0.0) -> Position:
         across = self.random.uniform(-self.width / 2, self.width / 2) * 0.9
         return across, self.random.uniform(min_distance, self.depth * 0.95), height
 

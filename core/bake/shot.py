@@ -61,10 +61,10 @@ class ShotRenderer:
             scene, white = (None, 1.0) if self.run is None else (render_scene(self.run.scene, camera),
                                                                  self.run.scene.display_white)
             parts = linear_layers(dark if scene is None else scene.colour, flares, self.look.blend, white)
-        gaussians = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()
-                 for name, layer in parts.flares.items()}
+        layers = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()
+                  for name, layer in parts.flares.items()}
         depth = dark[..., 0] if scene is None else scene.depth
-        return ViewLayers(parts.scene.numpy(), {name: gaussians.get(name, dark.numpy()) for name in self.lights},
+        return ViewLayers(parts.scene.numpy(), {name: layers.get(name, dark.numpy()) for name in self.lights},
                           depth.detach().numpy())
 
     def _occlude(self, light: PlacedLight, camera: Camera) -> PlacedLight:

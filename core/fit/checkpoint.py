@@ -114,8 +114,8 @@ class FitInputs:
         self._views: list[list[str]] | None = None
 
     def state(self) -> dict[str, Any]:
-        """Return the entries for the checkpoint: "views" ([name, digest]) and, if the fit has lights, "lights" ([name,
-        [x,         y, z]]).
+        """Return the entries for the checkpoint: "views", a list of [name, digest], and, if the fit has lights,
+        "lights", a list of [name, [x, y, z]].
 
         Lights are those of the capture, even where the fit has moved them.
         """
@@ -126,8 +126,8 @@ class FitInputs:
     def check(self, stored: dict[str, Any]) -> None:
         """Raise RunError if the entries of a checkpoint are of other inputs.
 
-        Flares belong to lights by their order, and what was learned of a frame belongs to that frame. Checkpoints of
-        older formats have fewer entries.
+        Flares belong to lights by their order, so a resumed fit needs the same lights and frames. Checkpoints of older
+        formats have fewer entries.
         """
         current = self.state()
         tolerance = LIGHT_TOLERANCE * self._capture.extent

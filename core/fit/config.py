@@ -41,7 +41,7 @@ def _to_toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        # JSON's text is TOML's, but that TOML wants one more control character escaped, and no pairs of surrogates.
+        # A JSON string is a TOML string, except that TOML also escapes U+007F and has no surrogate pairs.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)
 
@@ -53,13 +53,13 @@ def read_config(path: Path, progress: Progress | None = None) -> FitSettings:
     """
     try:
         data = parse_toml(read_text(path, MAX_TOML_BYTES, UTF8_SIG))
-        if "mode" not in data:  # what is cut off would pass for settings that are left as they come
+        if "mode" not in data:  # a truncated file would otherwise pass for one with default settings
             raise ValueError("it has no mode")
         values, renamed = current_names(_flatten(data))
         values.pop("split.excess_unfound", None)  # of versions that fitted an unconverged scene alone
         settings: FitSettings = parse_table(FitSettings, _nest(values)).validated()
     except OSError as problem:
-        raise RunError(f"{path} cannot be read ({problem.strerror}); is this the folder of a run?") from problem
+        raise RunError(f"{path} cannot be read ({problem.strerror}); name the folder of a run.") from problem
     except (ValueError, TypeError, SettingsError) as problem:
         raise RunError(f"{path} is not a fit's configuration ({problem}); start the fit anew.") from problem
     if renamed and progress is not None:

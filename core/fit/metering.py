@@ -180,7 +180,7 @@ def _group_medians(values: Floats, groups: Indices, count: int) -> Floats:
 
 
 def _fit_line(known: Floats, observed: Floats) -> tuple[Floats, float]:
-    """Fit shown = slope * known + veil, both (n,) linear light; return (slope, veil) and the slope's standard error.
+    """Fit observed = slope * known + veil, (n,) linear light; return (slope, veil) and the slope's standard error.
 
     Errors are relative, with Cauchy weights: the glow about a light lifts the points beside it.
     """
@@ -209,10 +209,10 @@ def resolve_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings,
     views, _ = capture.split(settings.holdout)
     if not any(_is_above_white(capture, view) for view in views):
         return replace(settings, white=1.0), ()
-    files = [capture.frame_path(view) for view in views]
+    files = [(capture.frame_path(view), capture.plate_space) for view in views]
     if capture.has_removed and settings.needs_clean_frames:
-        files += [capture.removed_path(view) for view in views]
-    clipped = next((path for path in files if not has_float_pixels(path)), None)
+        files += [(capture.removed_path(view), capture.plate_space) for view in views]
+    clipped = next((path for path, space in files if not has_float_pixels(path, space)), None)
     if clipped is not None:
         return replace(settings, white=1.0), (
             f"The frames hold light above white (1.0), and {clipped} cannot: it is fitted as white, and flares that "
@@ -222,4 +222,4 @@ def resolve_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings,
 
 
 def _is_above_white(capture: Capture, view: View) -> bool:
-    return has_float_pixels(capture.frame_path(view)) and bool(capture.frame(view).pixels.max() > 1)
+    return capture.holds_light_above_white(view) and bool(capture.frame(view).pixels.max() > 1)

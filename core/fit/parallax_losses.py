@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Losses of the scene in a fit by parallax, which has no exact clean frames; `trainer` adds them up.
 
-Frame = encode(scene + flare) leaves open which of the two makes what both could make. Two rules decide. A flare only
-adds light, so no frame is darker than the scene. And what both could make goes to the flare, above all the glow about a
-light, which moves with the light as part of the scene there would; the light's own disc goes to the scene. A scene that
-converges slowly, as plain walls do, would leave what it lacks to the flare as a veil over the frame; so if it has not
-converged, what both could make goes to the flare near the lights only. Estimated clean frames (mode `estimated`) help
-the scene to converge, and show flare that is far from the lights.
+The frame is encode(scene + flare), and some light could belong to either. Two rules decide. First, a flare only adds
+light, so no frame is darker than the scene. Second, light that both could explain goes to the flare. Most of it is the
+glow about a light, which moves with the light as part of the scene there would. The light disc itself goes to the
+scene. A scene that converges slowly, as plain walls do, would leave the missing light to the flare as a veil over the
+frame. So while the scene has not converged, such light goes to the flare near the lights only. Estimated clean frames
+(mode `estimated`) help the scene to converge, and show flare that is far from the lights.
 """
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class Run:
     def check_free(folder: Path) -> None:
         """Raise RunError if the folder holds a run, or cannot be one."""
         if (folder / CONFIG).exists():
-            raise RunError(f"{folder} holds a run already; go on with it by --resume, or choose another folder.")
+            raise RunError(f"{folder} holds a run already; resume it with --resume, or choose another folder.")
         if folder.exists() and not folder.is_dir():
             raise RunError(f"{folder} is a file; name a folder for the run.")
 
@@ -110,8 +110,9 @@ class Run:
         return exposures.read(self.folder)
 
     def capture(self, folder: Path | None = None, *, need_frames: bool = True) -> Capture:
-        """Open the capture of the run, in `folder` or where it was fitted, with the exposures and light positions of
-        the         fit.
+        """Open the capture of the run, in `folder` or where it was fitted.
+
+        It has the exposures and light positions of the fit.
 
         Without `need_frames`, views whose frames are missing have the size of the fitted frames. Raises RunError,
         CaptureError, FrameError.
@@ -128,8 +129,8 @@ class Run:
         """Return the folder of the capture: `folder`, else the one that was fitted. Raises RunError if that is missing.
         """
         if folder is None and not self.capture_folder.is_dir():
-            raise RunError(f"The capture that {self.folder} was fitted to, {self.capture_folder}, is not there; say "
-                           "where it is now with --capture.")
+            raise RunError(f"The capture that {self.folder} was fitted to, {self.capture_folder}, does not exist; "
+                           "name its present folder with --capture.")
         return folder or self.capture_folder
 
     @property

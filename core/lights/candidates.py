@@ -18,7 +18,7 @@ MAX_PAIRS = 60000
 MAX_LISTED_PAIRS = 20 * MAX_PAIRS
 """Number of pairs above which they are drawn at random instead of listed."""
 MAX_DRAWS = 8
-"""Draws of twice MAX_PAIRS, after which the distinct pairs so far are enough."""
+"""Bound of the rounds, each of twice MAX_PAIRS draws, in search of distinct pairs."""
 FIRST_BATCH = 512
 """Candidates scored together: memory is this times the number of detections."""
 BATCH = 32

@@ -101,7 +101,7 @@ def _main_body(mask: NDArray[np.bool_], largest: float) -> NDArray[np.bool_] | N
 
 
 def _open_by_disc(mask: NDArray[np.uint8], reach: int) -> NDArray[np.uint8]:
-    """Remove what a disc of radius `reach` does not fit in.
+    """Remove the parts of a mask that are too narrow for a disc of radius `reach`.
 
     Large regions are opened by distance transforms, whose cost does not grow with the disc, slightly rounder at the
     rim.

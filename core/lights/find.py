@@ -67,7 +67,7 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
     elif len(views) == 1:
         lights, doubtful = _from_one_view(capture, detections[0]), []
         if lights:
-            messages.append("One view gives directions only: distances are those of the points nearby, or a guess.")
+            messages.append("A single view gives directions only; distances are those of nearby points, or guesses.")
     else:
         permissive = replace(settings, min_views=2, max_nfa=np.inf, min_share=0.0)
         candidates = triangulate_lights(views, detections, capture.extent, permissive)
@@ -167,7 +167,7 @@ def detector_for(method: str, threshold: float | None = None, boxes: str | Path 
     if method == "exposure":
         from .exposure import ExposureDetector
 
-        # A low bar: what the views do not agree on falls away later, what is missed here is lost.
+        # A low threshold: triangulation drops false detections, but cannot recover missed ones.
         return ExposureDetector(0.3 if threshold is None else threshold)
     if method == "grounded":
         from .grounded import BOX_WEIGHTS, MASK_WEIGHTS, GroundedDetector

@@ -25,7 +25,7 @@ from .found_light import FoundLight
 from .triangulation import TriangulationSettings, triangulate_lights
 
 GHOST_RATIOS = -np.exp(np.linspace(np.log(0.12), np.log(2.5), 28))
-"""Values of mu that are tried."""
+"""Values of mu that the search tests."""
 MIN_VIEWS, MIN_SHARE, MAX_NFA = 6, 0.35, 1e-6
 """Bounds of `TriangulationSettings`; blobs of one scene are not independent, so the NFA must be low."""
 MIN_MOTION = 0.01

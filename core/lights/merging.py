@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Removes lights that are another light over again: duplicates, and ghosts of a light that is in frame."""
+"""Removes duplicates of lights, and ghosts that were taken for lights."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from .found_light import FoundLight
 
 def merge_duplicates(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
                      extent: float) -> list[FoundLight]:
-    """Merge lights that most views show at one spot: the one with the most support stays and gains the others' views.
+    """Merge lights that most views show at one spot: the one with the most support stays and gets the others' views.
 
     Returns them by support, most first.
     """

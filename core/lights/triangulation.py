@@ -74,7 +74,7 @@ def triangulate_lights(views: Sequence[tuple[str, Camera]], detections: Sequence
         place, inliers, covariance = refine_until_stable(observations, place, remaining, extent)
         if len(np.unique(observations.view[inliers])) < settings.min_views:
             if not candidates.rejected:
-                # Spent, or the search would find it for ever.
+                # Removed from the candidates, or the search would find it again without end.
                 remaining[observations.inliers(place, remaining)] = False
                 failures += 1
             candidates = Candidates(observations, remaining, rng, settings.max_candidates)

@@ -324,13 +324,13 @@ def parse_description(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]
             raise ValueError(f"blend {description['blend']!r}")
         camera = parse_table(TrainedCamera, description["camera"])
         if min(camera.width, camera.height, camera.fx, camera.fy) <= 0:
-            raise ValueError("its camera makes no sense")
+            raise ValueError("its camera is not valid")
         PixelGrid.read(description.get("sampling"))
         for rows in description.get("seen", {}).values():
             if any(len([float(value) for value in row]) != 5 for row in rows):
-                raise ValueError("a training view makes no sense")
+                raise ValueError("a training view is not valid")
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as problem:
-        raise FlareFileError(f"{path} is damaged: its description makes no sense ({problem}); save it again."
+        raise FlareFileError(f"{path} is damaged: its description is not valid ({problem}); save it again."
                              ) from problem
     return description
 
@@ -343,11 +343,11 @@ def _check_light(path: Path, entry: Mapping[str, Any], listed: Any) -> str:
                              "update to open it.")
     name, count, xyz = str(entry["name"]), int(entry["count"]), [float(value) for value in entry["xyz"]]
     if not 0 <= count <= MAX_GAUSSIANS or len(xyz) != 3 or not all(map(math.isfinite, xyz)):
-        raise ValueError("a light's description makes no sense")
+        raise ValueError("a light's description is not valid")
     if not FlareForm(**entry["form"]).is_valid:
-        raise ValueError("a light's form makes no sense")
+        raise ValueError("a light's form is not valid")
     if not 0 <= float(entry.get("clear", 1.0)) <= 1:
-        raise ValueError("a light's clear share makes no sense")
+        raise ValueError("a light's clear share is not valid")
     QueryRange.read(entry["range"])
     elements.read_elements(listed, name, count)
     return name

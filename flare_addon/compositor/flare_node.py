@@ -43,14 +43,14 @@ def node_group(layers: Sequence[str]) -> Any:
 
     layers: names of the inputs, such as "flare_lamp".
     """
-    wanted = ["Scene", *layers, "Intensity", "Tint", *(gain_input(layer) for layer in layers)]
+    input_names = ["Scene", *layers, "Intensity", "Tint", *(gain_input(layer) for layer in layers)]
     for group in bpy.data.node_groups:
         if group.bl_idname == "CompositorNodeTree" and group.name.split(".")[0] == GROUP:
             inputs = [item.name for item in group.interface.items_tree if getattr(item, "in_out", "") == "INPUT"]
-            if inputs == wanted:
+            if inputs == input_names:
                 return group
     group = bpy.data.node_groups.new(GROUP, "CompositorNodeTree")
-    _add_sockets(group, wanted)
+    _add_sockets(group, input_names)
     _add_nodes(group, layers)
     return group
 

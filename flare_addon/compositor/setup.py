@@ -63,7 +63,7 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     state = _scene_state(scene)
     tree = own_tree or _new_tree(scene, keep_image)
     source = tree.nodes.get(LAYERS)
-    shown = None if source is None else {name: getattr(source, name) for name in _IMAGE_NODE_SETTINGS}
+    node_settings = None if source is None else {name: getattr(source, name) for name in _IMAGE_NODE_SETTINGS}
     if source is None:
         source = _set_name(new_node(tree, "CompositorNodeImage", -4, 0), LAYERS)
     _show_layers(source, layers)
@@ -71,7 +71,7 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     sockets = {socket.name: socket for socket in source.outputs if not socket.is_unavailable}
     names = [name for name in sockets if name.startswith("flare_")] or [name for name in sockets if name == "flare"]
     if not names or "scene" not in sockets:
-        _undo_set_up(scene, tree, source, shown, state)
+        _undo_set_up(scene, tree, source, node_settings, state)
         if original is not None and tree != original:  # a copy made for this set-up
             scene.compositing_node_group = original
             bpy.data.node_groups.remove(tree)
@@ -207,14 +207,15 @@ def _image_under_flare(tree: Any, node: Any, state: Any) -> Any:
     return None
 
 
-def _undo_set_up(scene: Any, tree: Any, source: Any, shown: dict[str, Any] | None, state: dict[str, Any]) -> None:
+def _undo_set_up(scene: Any, tree: Any, source: Any, node_settings: dict[str, Any] | None,
+                 state: dict[str, Any]) -> None:
     """Restore the scene after files without flare layers.
 
-    shown: the previous settings of the layers' node, None where it is new. state: from `_scene_state`.
+    node_settings: the previous settings of the layers' node, None where it is new. state: from `_scene_state`.
     """
     image = source.image
-    if shown is not None:
-        for name, value in shown.items():
+    if node_settings is not None:
+        for name, value in node_settings.items():
             setattr(source, name, value)
     else:
         tree.nodes.remove(source)
@@ -355,14 +356,14 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
 
 
 def _output_input(tree: Any, make: bool = True) -> Any:
-    """Return the input socket of the final picture; where there is none it is added, or None without `make`."""
-    found = sorted((node for node in tree.nodes if node.bl_idname == _OUTPUT_TYPE),
-                   key=lambda node: not _is_active_output(tree, node))
+    """Return the input socket of the final picture; without `make` None where there is none, else it is added."""
+    outputs = sorted((node for node in tree.nodes if node.bl_idname == _OUTPUT_TYPE),
+                     key=lambda node: not _is_active_output(tree, node))
     if not make:
-        return found[0].inputs[0] if found and len(found[0].inputs) else None
+        return outputs[0].inputs[0] if outputs and len(outputs[0].inputs) else None
     if GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-    node = found[0] if found else new_node(tree, _OUTPUT_TYPE, 1, 0)
+    node = outputs[0] if outputs else new_node(tree, _OUTPUT_TYPE, 1, 0)
     return node.inputs[0]
 
 
@@ -410,5 +411,5 @@ def colour_space_warning(scene: Any) -> str:
 def _configured_space(image: Any) -> str:
     """Return the name of an EXR's colour space in the colour configuration; "" where it has none."""
     known = {item.identifier for item in image.colorspace_settings.bl_rna.properties["name"].enum_items}
-    return next((one for one in CONFIGURED_NAMES.get(exr_colour_space(absolute(image.filepath)), ()) if one in known),
-                "")
+    names = CONFIGURED_NAMES.get(exr_colour_space(absolute(image.filepath)), ())
+    return next((name for name in names if name in known), "")

@@ -337,7 +337,7 @@ def test_a_form_out_of_bounds_raises_in_all_readers(name: str, tmp_path: Path) -
         description["lights"][0]["form"][name] = value
         rewrite_metadata(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
         for reader in (read, flare_file.load):
-            with pytest.raises(FlareFileError, match="form makes no sense"):
+            with pytest.raises(FlareFileError, match="form is not valid"):
                 reader(tmp_path / "b.flare")
 
 
@@ -356,11 +356,11 @@ def test_a_network_that_does_not_fit_its_form_raises_on_reading(changed: dict[st
 
 
 @pytest.mark.parametrize(("what", "said"), [
-    ("two lights of one name", "two lights have one name"), ("clear 1.5", "clear share makes no sense"),
-    ("clear -0.1", "clear share makes no sense"), ("clear NaN", "clear share makes no sense"),
+    ("two lights of one name", "two lights have one name"), ("clear 1.5", "clear share is not valid"),
+    ("clear -0.1", "clear share is not valid"), ("clear NaN", "clear share makes no sense"),
     ("a newer form", "newer Fit Flare .its form has spiral.; update"), ("elements 3", "is damaged"),
     ("elements without their Gaussians", "names Gaussians that are not there"), ("seen 3", "is damaged"),
-    ("seen from nowhere", "training view makes no sense"), ("a wide camera", "'wide'"),
+    ("seen from nowhere", "training view is not valid"), ("a wide camera", "'wide'"),
     ("endless count", "is damaged")])
 def test_both_readers_raise_the_same_errors(what: str, said: str, tmp_path: Path) -> None:
     saved(tmp_path / "a.flare")

@@ -20,9 +20,9 @@ from ...images.picture import Encoding
 from .plate_light import CLIPPING_LEVEL, STRIP_ROWS, to_display, to_linear
 
 RADIUS, EPSILON = 1, 1e-3
-"""Of the guided filter: radius of its window at the working size, pixels, and regularisation."""
+"""Radius of the guided filter's window at the working size, pixels, and its regularisation."""
 MAX_GAIN = 4
-"""Bound of the gain on both sides."""
+"""Bound of the gain's magnitude."""
 REMAP_COLUMNS = 16384
 """Columns of a plate that are interpolated at a time; OpenCV counts coordinates in 16 bits."""
 

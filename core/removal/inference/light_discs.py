@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Keeps the light discs of a scene, and part of the glow about them at night, when a flare is removed.
 
-A light disc clips, and so does the glow in front of it: nobody can tell how much of the clipped light is glow. A
-network that removes part of it turns lights grey, in photographs of streets at night most lights that are not the
-brightest. So a small region as bright as the sensor goes, which still has contrast to its surroundings when the flare
-is removed, counts as a light disc. What was removed from it is kept, the more the brighter the pixel was left: its
-centre entirely, little of its rim. A bright wall under a veil has little contrast, and a ghost disappears. Of some
-light discs nothing with contrast is left; but a glow about a white region comes from a light in its centre.
+A light disc clips, and so does the glow in front of it, so the frame does not show how much of the clipped light is
+glow. A network that removes part of it turns lights grey; in photographs of streets at night, most of the fainter
+lights. So a small clipped region that still has contrast to its surroundings when the flare is removed counts as a
+light disc. It keeps the more of its predicted flare the brighter a pixel stays: all in its centre, little at its rim. A
+bright wall under a veil has little contrast, and a ghost disappears with the flare. Some light discs have no contrast
+left; but a glow about a white region comes from a light in its centre.
 
-At night no lens is so clean that a light has no glow, and the flare adds to that glow. One frame does not show which
-is which, and the network, whose training flares lie over lights without glow, removes both. So in dark scenes a part
-of the glow is kept near a light disc. Of streaks, starbursts and ghosts nothing is kept, and nothing in bright scenes,
-where a light exceeds the rest by less.
+At night a light has some glow with every lens, and the flare adds to that glow. One frame does not separate the two,
+and the network, whose training flares lie over lights without glow, removes both. So in dark scenes a part of the glow
+is kept near a light disc. Streaks, starbursts and ghosts are removed entirely, and so is all glow in bright scenes,
+where lights stand out less.
 
 `remover.Remover.linear_flare` calls `retained_fraction`.
 """
@@ -25,29 +25,30 @@ from numpy.typing import NDArray
 from ...colour.srgb import Pixels
 
 MIN_DISC_BRIGHTNESS = 0.9
-"""Least mean of the three display values of a pixel of a light disc."""
+"""Smallest mean of the three display values of a pixel of a light disc."""
 RIM_RAMP = (0.8, 0.95)
 """The same mean, as filmed, at which nothing and all of what belongs to a light disc is kept."""
 DISC_AREA_RAMP = (0.01, 0.02)
 """Share of the frame up to which a bright region may be a light disc, and from which on it is none."""
 MIN_DISC_PIXELS = 3
-"""Least pixels of a light disc, at the working size."""
+"""Smallest number of pixels of a light disc, at the working size."""
 CONTRAST_RAMP = (0.15, 0.3)
-"""Display value of a region above its surroundings, without the flare, at which it is no light disc and is one."""
+"""Contrast of a region to its surroundings without the flare, display values, at which it is no light disc and is one.
+"""
 RIM_SIZE, SURROUND_SIZE = 3, 7
 """Sides of the squares that a region is dilated by to its rim and to its surroundings, pixels."""
 BRIGHTNESS_EXPONENT = 4
 """Power of a pixel's brightness, relative to the brightest of its light disc, by which it is kept."""
 SURROUND_GLOW_RAMP = (0.5, 0.8)
-"""Fraction of glow in the flare about a region at which that says nothing of a light disc, and at which there is one in
-its centre: the pixels at least half as far from the region's edge as its innermost."""
+"""Fraction of glow in the flare about a region at which the glow is no evidence of a light disc, and at which it proves
+one in the region's centre. The centre is the pixels at least half as far from the region's edge as its innermost."""
 OBSERVED_CONTRAST_RAMP = (0.05, 0.15)
-"""Display value of such a region above its surroundings, as filmed, at which it is no light disc and is one."""
+"""Contrast of such a region to its surroundings as filmed, display values, at which it is no light disc and is one."""
 MAX_GLOW_KEPT, GLOW_FALLOFF = 0.5, 0.05
 """Fraction of the glow that is kept at a light disc, and the distance, relative to the frame's long side, at which it
 has fallen to 1 / e of that."""
 DARK_SCENE_RAMP = (0.2, 0.3)
-"""Median display value of the frame without the flare, which may light all of it, at which glow is kept and is not."""
+"""Median display value of the frame without the flare at which glow is kept and is not."""
 DISC_PEAK_RAMP = (0.9, 0.97)
 """Display value of the brightest pixel of a light disc at which it keeps no glow and all of its share."""
 DISTANCE_LEVELS = 4

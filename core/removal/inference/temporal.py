@@ -41,8 +41,8 @@ FULL_SUPPORT, SUPPORT_FLOOR = 2.0, 0.1
 """Sum of flow confidences over the neighbouring frames from which on the residual counts fully; and the support below
 which the blurred residual fades out."""
 MIN_EXPOSURE_LEVEL, MIN_EXPOSURE_AREA = 0.05, 0.02
-"""Least display value of pixels that the exposures of two frames are compared by, and the least share of the frame that
-these need to be."""
+"""Smallest display value of the pixels by which the exposures of two frames are compared, and the smallest share of the
+frame that these pixels must cover."""
 FINE_SIGMA, COARSE_SIGMA, DETAIL_STRIDE = 0.01, 0.08, 4
 """The detail of a frame is a difference of Gaussians: their standard deviations relative to the long side, and the
 stride in pixels that it is sampled with."""
@@ -50,7 +50,7 @@ SIMILARITY_RAMP = (0.2, 0.4)
 """Correlation of the detail of two frames at which they are of different shots and of the same: of 120 pairs of
 unrelated photographs it is 0.22 at most, of consecutive frames 0.3 at least."""
 MIN_DETAIL_POWER = 1e-6
-"""Mean square of the detail of a frame without any: that of a quarter of an 8 bit code."""
+"""Mean square of the detail below which a frame counts as having none: that of a quarter of an 8 bit code."""
 
 
 class FrameFeatures(NamedTuple):

@@ -27,11 +27,11 @@ from .manifest import MANIFEST, Manifest, digest_inputs
 from .mattes import Mattes
 
 MIN_CONFIDENCE = 0.5
-"""Confidence of a prediction below which the user is told that a possible flare was kept."""
+"""Confidence of a prediction below which a message names the plate: a possible flare was kept."""
 
 
 def collect_plates(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) -> list[tuple[Path, Path]]:
-    """Return (file, name below the output folder) of the item pictures and of all pictures in the item folders.
+    """Return (file, name below the output folder) of the pictures among `inputs` and of all pictures in folders there.
 
     exclude: files and folders that hold no plates, such as the results of this run and mattes. Results of earlier runs,
     which their manifests list, are excluded too unless their own folder is an input. Raises SettingsError where no
@@ -62,9 +62,9 @@ def collect_plates(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) 
 
 
 def collect_with_neighbours(inputs: Sequence[Path], exclude: Iterable[Path | None] = ()) -> list[Path]:
-    """Return the plates of `collect_plates` and the pictures beside those that were item one by one.
+    """Return the plates of `collect_plates`, and all pictures in the folders of files among `inputs`.
 
-    A frame of a shot that is cleaned alone then comes out as it does with the whole shot.
+    With them as neighbours, a frame that is cleaned by itself gets the same result as with its whole shot.
     """
     excluded = [other for other in exclude if other is not None]
     plates = dict.fromkeys(path for path, _ in collect_plates(inputs, excluded))

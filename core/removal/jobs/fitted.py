@@ -34,7 +34,7 @@ from .manifest import Manifest, digest_inputs
 Floats = NDArray[np.float64]
 
 MAX_SAMPLES = 100_000
-"""Pixels of a frame, about, that the gains of the flares are estimated from."""
+"""Approximate number of a frame's pixels by which the gains of the flares are estimated."""
 DIM_FLARE = 0.5
 """Gain of a light's flare below which the frame is reported."""
 MAX_SCENE_GAIN = 1.25
@@ -133,7 +133,7 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
 
 
 def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) -> dict[str, float]:
-    """Return how much of each light's fitted flare the frame shows, 0..1: least absolute errors beside the scene.
+    """Return the gain of each light's flare in the frame, 0..1, by least absolute errors, with the scene's gain.
 
     A light that is switched off, or hidden by something that the fit does not know, then leaves no dark flare. The
     scene has a gain too, within MAX_SCENE_GAIN, or an underexposed frame would seem to lack flare. Clipped pixels do

@@ -57,9 +57,9 @@ class LayerFolder:
                                for one, two in ((first, path), (path, first)))
                 raise FrameError(f"{folder} holds frames of two bakes: beside the layers of both {first.name} has "
                                  f"{here}, {path.name} {there}; bake each into a folder of its own.")
-        found = cls(folder, files)
-        found._check_windows()
-        return found
+        folder_layers = cls(folder, files)
+        folder_layers._check_windows()
+        return folder_layers
 
     def _check_windows(self) -> None:
         """Raise FrameError for layers that the compositor cannot show in their place."""

@@ -22,7 +22,8 @@ from .sky import add_sky_points
 NEAREST_QUANTILE, NEAR_PLANE_FACTOR = 0.01, 0.5
 """Quantile of the points' depths that counts as the nearest, and the factor on it at which Gaussians are culled, if
 that is less than the usual near plane: captures in small units, such as metres around a watch, need it."""
-SAMPLED_POINTS = 10_000  # that are looked at
+SAMPLED_POINTS = 10_000
+"""Approximate number of points whose depths are computed."""
 SNAP_WIDTH, SNAP_VIEWS = 160, 40
 """Width in pixels of the frames by which lights are moved, and the approximate number of frames."""
 
@@ -48,6 +49,7 @@ def nearest_depth(capture: Capture) -> float:
 
 
 def _load_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
+    """Return a scene trained elsewhere, or one Gaussian for each point, before near plane and white are set."""
     if settings.scene.start:
         scene = read_ply(settings.scene.start)
         if not len(scene):

@@ -165,7 +165,7 @@ def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path,
                       settings: SolveSettings, progress: Progress) -> None:
     """Extract features of every frame that has none yet; one camera for all frames of one size and focal length."""
     with _open_database(pycolmap, database) as db:
-        done = {image.name for image in db.read_all_images()
+        extracted = {image.name for image in db.read_all_images()
                 if db.num_keypoints_for_image(image.image_id) or db.exists_descriptors(image.image_id)}
         cameras: dict[tuple[int, int, float | None], int] = {}
         known = {(c.width, c.height, round(c.params[0], 6)): c.camera_id for c in db.read_all_cameras()}
@@ -174,29 +174,29 @@ def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path,
             key = (source.width, source.height, source.focal)
             if key not in cameras:
                 camera = _make_camera(pycolmap, picture_size(work / "small" / source.name), source.focal, settings.lens)
-                mark = (camera.width, camera.height, round(camera.params[0], 6))
-                cameras[key] = known.get(mark) or db.write_camera(camera)
-                known[mark] = cameras[key]
-            if source.name not in done:
+                parameters = (camera.width, camera.height, round(camera.params[0], 6))
+                cameras[key] = known.get(parameters) or db.write_camera(camera)
+                known[parameters] = cameras[key]
+            if source.name not in extracted:
                 group = (cameras[key], _has_little_texture(work / "small" / source.name))
                 groups.setdefault(group, []).append(source.name)
-    progress.stage("find features", len(sources), len(done))
+    progress.stage("find features", len(sources), len(extracted))
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = settings.features
     options.use_gpu = False
     reader = pycolmap.ImageReaderOptions()
     if settings.mask:
         reader.mask_path = str(work / "masks")
-    usual = options.sift.peak_threshold
+    default_threshold = options.sift.peak_threshold
     for (camera_id, has_little_texture), names in groups.items():
         reader.existing_camera_id = camera_id
         # Walls and skies: weak features are better than none.
-        options.sift.peak_threshold = 0.4 * usual if has_little_texture else usual
-        for at in range(0, len(names), 8):
-            pycolmap.extract_features(database, work / "small", image_names=names[at:at + 8],
+        options.sift.peak_threshold = 0.4 * default_threshold if has_little_texture else default_threshold
+        for start in range(0, len(names), 8):
+            pycolmap.extract_features(database, work / "small", image_names=names[start:start + 8],
                                       camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
                                       extraction_options=options, device=pycolmap.Device.cpu)
-            progress.advance(len(names[at:at + 8]))
+            progress.advance(len(names[start:start + 8]))
 
 
 def _has_little_texture(small: Path) -> bool:

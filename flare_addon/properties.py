@@ -93,9 +93,9 @@ class Edits:
         soft_max=4.0,
         max=100.0, update=redraw_viewports)
     mute: BoolProperty(  # type: ignore[valid-type]
-        name="Mute", description="Do not show this one", default=False, update=redraw_viewports)
+        name="Mute", description="Hide this flare or element", default=False, update=redraw_viewports)
     solo: BoolProperty(  # type: ignore[valid-type]
-        name="Solo", description="Show only this one, with others that are solo", default=False,
+        name="Solo", description="Show only this flare or element, and others that are solo", default=False,
         update=redraw_viewports)
 
 
@@ -127,7 +127,7 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
     """
 
     source: StringProperty(  # type: ignore[valid-type]
-        name="Look", description="The light of the .flare whose look this flare has")
+        name="Look", description="The light of the .flare that this flare looks like")
     target: PointerProperty(  # type: ignore[valid-type]
         name="Light", description="The light object of this flare; the flare follows it",
         type=bpy.types.Object, update=redraw_viewports)
@@ -163,10 +163,11 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     matte: StringProperty(  # type: ignore[valid-type]
         name="Matte", description="Where the flares are, roughly painted in white on black: one picture for all "
                                   "frames, or a "
-        "folder with one of the same name for each. Inside, faint flares are removed too; outside, nothing is. Empty: "
+        "folder with one of the same name for each. In white areas faint flares are removed too; in black areas, "
+        "nothing. Empty: "
         "the network finds the flares", subtype="FILE_PATH", options=PATH_OPTIONS)
     keep_glow: BoolProperty(  # type: ignore[valid-type]
-        name="Keep Glow", description="Keep the glow about the lights in the clean frames: it stays in the scene, and "
+        name="Keep Glow", description="Keep the glow around the lights in the clean frames: it stays in the scene, and "
                                       "the "
         "flare is learned without it", default=False)
     run: StringProperty(  # type: ignore[valid-type]
@@ -186,9 +187,9 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         name="Flare", description="The .flare file that the scene shows", subtype="FILE_PATH",
         options=PATH_OPTIONS, update=redraw_viewports)
     native: BoolProperty(  # type: ignore[valid-type]
-        name="Of This Capture", description="The flare was learned from the imported capture, so its look follows the "
-                                            "camera; in "
-        "another scene it keeps the look of one training view", default=False, update=redraw_viewports)
+        name="Of This Capture", description="The flare was learned from the imported capture, so its appearance "
+                                            "follows the camera; in "
+        "another scene it keeps the appearance of one training view", default=False, update=redraw_viewports)
     lights: CollectionProperty(type=FITFLARE_PG_light)  # type: ignore[valid-type]
     light: IntProperty(name="Light", description="The light whose sliders are shown", default=0)  # type: ignore[valid-type]
     master: PointerProperty(type=FITFLARE_PG_master)  # type: ignore[valid-type]

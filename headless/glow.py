@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""--keep-glow and --all-glow: whether the glow about lights is removed (`core.removal.inference.remover.Glow`)."""
+"""--keep-glow and --all-glow: whether the glow around lights is removed (`core.removal.inference.remover.Glow`)."""
 from __future__ import annotations
 
 import argparse
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the two options, which exclude each other."""
     group = parser.add_mutually_exclusive_group()
-    group.add_argument("--keep-glow", action="store_true", help="keep the glow about the lights")
+    group.add_argument("--keep-glow", action="store_true", help="keep the glow around the lights")
     group.add_argument("--all-glow", action="store_true",
                        help="remove all glow, as a fit needs it (default: lamps at night keep a part of theirs, as a "
                             "clean lens would show it)")

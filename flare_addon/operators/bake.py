@@ -156,7 +156,7 @@ class FITFLARE_OT_remove_compositor(GuardedOperator, bpy.types.Operator):
 
 
 class FITFLARE_OT_set_up_baked(GuardedOperator, bpy.types.Operator):
-    """Combine the layers that were baked from this scene in the compositor"""
+    """Combine the layers baked from this scene in its compositor"""
 
     bl_idname = "fit_flare.set_up_baked"
     bl_label = "Set Up Compositor"

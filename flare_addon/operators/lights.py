@@ -89,7 +89,7 @@ class FITFLARE_OT_find_lights(GuardedOperator, bpy.types.Operator):
 
 
 class FITFLARE_OT_use_lights(GuardedOperator, bpy.types.Operator):
-    """Add the lights that were found since to the scene"""
+    """Add the lights that the engine found while this file was closed"""
 
     bl_idname = "fit_flare.use_lights"
     bl_label = "Use Found Lights"

@@ -62,7 +62,7 @@ class FITFLARE_OT_add_flare(GuardedOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     source: bpy.props.EnumProperty(  # type: ignore[valid-type]
-        name="Look", description="The light of the .flare whose look they get", items=_look_items)
+        name="Look", description="The light of the .flare whose look the selected objects get", items=_look_items)
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:

@@ -107,8 +107,8 @@ def _back_up(blend: Path, progress: Progress) -> None:
 COMMAND = Command(
     "compose", "Combines baked layers in Blender's compositor and renders the frames.",
     f"""Builds the node group "Fit Flare" over LAYERS and writes frame.####.exr (half float, scene-linear),
-frame.####.png (sRGB) and {BLEND}, which opens in Blender and shows the same. An earlier one is kept beside it
-as compositor.blend1, .blend2 and so on.
+frame.####.png (sRGB) and {BLEND}, which opens in Blender and shows the same. An earlier .blend is kept beside
+it as compositor.blend1, .blend2 and so on.
 
   run.py compose build/demo/layers --out build/frames --intensity 1.5 --tint 1,0.8,0.6""",
     arguments, (Step("compose", "blender", run),))

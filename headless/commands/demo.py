@@ -146,7 +146,8 @@ COMMAND = Command(
     "demo", "Runs all steps on the sample capture: lights, fit, eval, bake, composited frames.",
     f"""Writes DIR/capture (a copy of the sample; DIR/capture-removal with --remove), DIR/run, DIR/layers (EXR),
 DIR/frames (through Blender's compositor) and DIR/{SHEET} (frame | composite | scene | flare), and shows the
-table of scores. Run again, it resumes; other settings need another folder.
+table of scores. If you run it again, it resumes. Other
+settings need another folder.
 
   run.py demo
   blender -b -P headless/run.py -- demo""",

@@ -28,11 +28,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--synthetic", type=int, metavar="N",
                         help="instead of PAIRS: N synthesised pictures of every flare class")
     parser.add_argument("--backgrounds", type=Path, nargs="+", default=[], metavar="DIR",
-                        help="clean pictures for --synthetic; used is the tenth of them, by name, that training holds "
-                             "out")
+                        help="clean pictures for --synthetic; only the tenth that training holds out, by name, is "
+                             "used")
     parser.add_argument("--lenses", type=Path, metavar="DIR",
-                        help="lens prescriptions (.lens) for --synthetic; used is the tenth of them, by name, that "
-                             "training holds out (default: the six that come with the program)")
+                        help="lens prescriptions (.lens) for --synthetic; only the tenth that training holds out, by "
+                             "name, is used (default: the six that come with the program)")
     parser.add_argument("--all-backgrounds", action="store_true",
                         help="use every clean picture, not only the held-out tenth")
     parser.add_argument("--seed", type=parse_seed, default=SEED, metavar="N",
@@ -100,8 +100,8 @@ def _load_cases(args: argparse.Namespace, progress: Progress) -> list[Case]:
 COMMAND = Command(
     "eval-removal", "Scores the removal of flares on pairs of pictures.",
     f"""Writes DIR/{SCORES} and DIR/{SHEET} (the ten pictures with the smallest gain) and shows, by category, PSNR,
-SSIM, LPIPS and FLIP against the clean pictures, and PSNR and SSIM of the unchanged input in brackets. The file has all
-of them.
+SSIM, LPIPS and FLIP against the clean pictures, and PSNR and SSIM of the unchanged input in brackets. {SCORES} has all
+scores.
 
   run.py eval-removal Flare7Kpp/test_data/real --out build/eval
   run.py eval-removal --synthetic 25 --backgrounds photos hdri --lenses lenses --out build/eval""",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ...core.capture import LIGHTS
 from ...core.errors import CaptureError, SettingsError
 from ...core.system.progress import Progress
+from .. import plate_space
 from ..command import Command, Step, parse_seed
 
 if TYPE_CHECKING:
@@ -34,10 +35,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--boxes", metavar="FOLDER_OR_NAME", help="weights of GroundingDINO, for grounded")
     parser.add_argument("--masks", metavar="FOLDER_OR_NAME", help="weights of SAM 2, for grounded")
     parser.add_argument("--min-views", type=int, default=3, metavar="N",
-                        help="least number of views that show a light (default 3)")
+                        help="number of views that must show a light (default 3)")
     parser.add_argument("--scene", type=Path, metavar="SCENE.PLY",
                         help="a fitted scene (RUN/scene.ply) on whose Gaussians to place the detections, as the paper "
                              "does")
+    plate_space.add_option(parser)
     parser.add_argument("--seed", type=parse_seed, default=0, metavar="N", help="random seed (default 0)")
 
 
@@ -49,6 +51,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     if args.method != "grounded" and (args.boxes or args.masks):
         raise SettingsError(f"--{'boxes' if args.boxes else 'masks'} is for --method grounded; leave it out.")
+    plate_space.record(args, args.capture)
     capture = Capture.open(args.capture)
     detector = detector_for(args.method, args.threshold, args.boxes, args.masks)
     settings = TriangulationSettings(min_views=args.min_views, seed=args.seed)

@@ -48,12 +48,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "diffusion; needs diffusers, transformers and peft (default network)")
     parser.add_argument("--base", metavar="FOLDER_OR_NAME",
                         help="for diffusion: a base model such as SD-Turbo, in the layout of diffusers")
-    parser.add_argument("--keep-glow", action="store_true", help="for diffusion: keep the glow about the lights")
+    parser.add_argument("--keep-glow", action="store_true", help="for diffusion: keep the glow around the lights")
     parser.add_argument("--lpips", type=Path, metavar="DIR",
                         help="for diffusion: folder with the weights of LPIPS, which is then added to the loss")
     parser.add_argument("--threads", type=int, metavar="N", help="processor threads (default: all)")
     parser.add_argument("--processes", type=int, metavar="N",
-                        help="number of processes; with a GPU all but one draw scenes and flares (default: one per "
+                        help="number of processes; with a GPU all but one make scenes and flares (default: one per "
                              "processor core, at most four without a GPU)")
 
 

@@ -267,7 +267,7 @@ def test_the_help_lists_the_commands_that_resume(capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit):
         cli.build_parser().parse_args(["--help"])
     told = " ".join(capsys.readouterr().out.split())
-    told = told[told.index("run again,"):]
+    told = told[told.index("run it again,"):]
     for name, command in COMMANDS.items():
         resumes = any(option == "--resume" for option in _options(command))
         assert (command.resume_rule == "resumes with --resume") == resumes, name

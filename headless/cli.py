@@ -97,7 +97,8 @@ def _resume_summary() -> str:
                for rule in _RESUME_HINTS}
     text = "; ".join(f"{', '.join(names)} {rule.replace('resumes', 'resume')}" for rule, names in by_rule.items()
                      if names and rule != "starts over")
-    return textwrap.fill(f"If you stop a command with Ctrl-C and run it again, {text}. The others start over.", 110)
+    return textwrap.fill(f"If you stop a command with Ctrl-C and run it again, {text}. The others start over.", 110,
+                         break_on_hyphens=False)
 
 
 def main(argv: Sequence[str]) -> int:

@@ -14,7 +14,6 @@ the end. Whether a job on another machine is running, in a folder that both can 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import platform
 import shutil
@@ -34,7 +33,7 @@ from ..core.system import processes
 from ..core.system.files import remove_file, write_json
 from ..core.system.processes import STOPPED, WINDOWS, new_process_group
 from ..core.system.progress import STOP_FILE
-from ..core.system.reading import parse_json, read_text
+from ..core.system.reading import open_regular, parse_json, read_text
 from .paths import is_file, is_folder
 
 State = Literal["running", "done", "failed", "stopped"]
@@ -45,6 +44,7 @@ POLL_INTERVAL_S = 0.2
 NICENESS = 5
 SIDEBAR_TAB = "Fit Flare"
 READ_CHUNK = 1 << 16  # bytes of events
+MAX_EVENT_BYTES = 1 << 22  # of one event; results name many files
 SILENCE_LIMIT_S = 3600.0  # a job on another machine without events for so long counts as failed
 MIN_FREE_BYTES = 1 << 16  # a disk with less free space counts as full
 
@@ -137,33 +137,38 @@ class Job:
     def _read(self) -> bool:
         """Read and handle one piece of new events; return whether there was any."""
         try:
-            with open(self.folder / EVENTS, "rb") as stream:
+            with open_regular(self.folder / EVENTS) as stream:
                 stream.seek(self._offset)
                 data = stream.read(READ_CHUNK)
         except OSError:  # the folder was removed, or does not exist yet
             return False
         self._offset += len(data)
         *lines, self._partial_line = (self._partial_line + data).split(b"\n")
+        if len(self._partial_line) > MAX_EVENT_BYTES:  # no engine writes such a line
+            self._partial_line = b""
         for line in lines:
             self._handle_event(line)
         return bool(data)
 
     def _handle_event(self, line: bytes) -> None:
-        """Update the state from one line of events; other lines are ignored."""
-        try:
-            event = json.loads(line)
-            kind = event["type"]
-        except (ValueError, KeyError, TypeError):
-            return
+        """Update the state from one line of events; other lines are ignored, and events with other values."""
+        with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, OverflowError):
+            event = parse_json(line)
+            self._apply_event(event["type"], event)
+
+    def _apply_event(self, kind: str, event: Mapping[str, Any]) -> None:
         if kind == "stage":
-            self.stage, self.done, self.total, self.eta_s = event["name"], event["done"], event["total"], None
+            name, done, total = str(event["name"]), int(event["done"]), int(event["total"])
+            self.stage, self.done, self.total, self.eta_s = name, done, total, None
         elif kind == "progress":
-            self.done, self.total, self.eta_s = event["done"], event["total"], event.get("eta_s", event.get("left_s"))
-            self.figures = event["figures"]
+            done, total, eta_s = int(event["done"]), int(event["total"]), event.get("eta_s", event.get("left_s"))
+            figures = {str(name): float(value) for name, value in event["figures"].items()}
+            self.done, self.total, self.eta_s = done, total, None if eta_s is None else float(eta_s)
+            self.figures = figures
         elif kind == "say":
             self.messages.append(str(event["text"]))
         elif kind == "result":
-            self.result.update(event["data"])
+            self.result.update({str(name): value for name, value in event["data"].items()})
             self._has_result = True
         elif kind == "error":
             self.error = str(event["text"])

@@ -32,6 +32,12 @@ def test_the_state_of_a_remote_job_follows_from_its_events(facts: Any) -> None:
     assert facts["silent on a Mac"].startswith("The engine on studio-mac has reported nothing")
 
 
+def test_strange_events_are_ignored_and_a_pipe_is_not_waited_for(facts: Any) -> None:
+    """Block of jobs.py: "events that no engine writes"."""
+    assert facts["strange events"] == ["running", 4, 8]
+    assert facts["events from a pipe"] == 0
+
+
 def test_an_exception_for_one_job_does_not_stop_the_polling_of_others(facts: Any) -> None:
     """Block of jobs.py: "what is done in the scenes with one goes wrong"."""
     again, state, error, is_traced, other = facts["ends badly"]

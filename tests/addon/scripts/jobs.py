@@ -57,6 +57,21 @@ os.utime(named / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENCE_LIMIT_S))
 facts["silent on a Mac"] = jobs.find(named).error
 facts["silent elsewhere"] = [jobs.find(silent).state, jobs.find(silent).error]
 
+# ---- events that no engine writes -----------------------------------------------------------------
+strange = ["[" * 5000, '"text"', "null", '{"type": []}', '{"type": "stage"}', '{"type": "result", "data": [1]}',
+           '{"type": "progress", "done": 1e999, "total": 8, "figures": {}}',
+           '{"type": "progress", "done": 5, "total": 8, "figures": {"loss": "x"}}', "x" * (5 << 20)]
+odd = jobs.find(begun("odd", "\n".join([*strange, GOES_ON]), host="another"))
+while odd.poll() and odd.done != 4:
+    pass
+facts["strange events"] = [odd.state, odd.done, odd.total]
+jobs.stop_watching(odd.folder)
+piped = begun("piped", "", host="another")
+(piped / jobs.EVENTS).unlink()
+os.mkfifo(piped / jobs.EVENTS)
+facts["events from a pipe"] = jobs.find(piped).done
+jobs.stop_watching(piped)
+
 # ---- what is done in the scenes with one goes wrong ---------------------------------------------------
 goes_on, ends = (jobs.find(begun(name, GOES_ON, host="another")) for name in ("goes on still", "ends badly"))
 jobs.ON_FINISHED["fit"] = lambda _job: [].pop()

@@ -144,9 +144,9 @@ def _check_points(solve: CameraSolve) -> list[str]:
     for frame in solve.frames[::max(len(solve.frames) // SAMPLED_VIEWS, 1)]:
         local = points @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]
         before = local[:, 2] > 0
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             plane = np.abs(local[:, :2] / local[:, 2:])
-        reach = np.array([frame.lens.width, frame.lens.height]) / np.array(frame.lens.focal)
+            reach = np.array([frame.lens.width, frame.lens.height]) / np.array(frame.lens.focal)
         is_seen |= before & (plane <= reach).all(axis=1)
         shares.append(before.mean())
     share, before_share = float(is_seen.mean()), float(np.mean(shares))

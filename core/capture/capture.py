@@ -170,6 +170,13 @@ class Capture:
         same.lights = tuple(replace(light, xyz=places.get(light.name, light.xyz)) for light in self.lights)
         return same
 
+    def with_points(self, points: PointCloud, observed: Mapping[str, NDArray[np.int64]]) -> Capture:
+        """Return a copy with other points, and the indices of those observed in each view, by the view's name."""
+        same = copy(self)
+        same.points = points
+        same.views = tuple(replace(view, points=observed.get(view.name, np.zeros(0, np.int64))) for view in self.views)
+        return same
+
     def with_frame_size(self, size: tuple[int, int]) -> Capture:
         """Return a copy in which views without a frame have this size (width, height), where it is a uniform scale of
         theirs.
@@ -228,6 +235,10 @@ class Capture:
         if view.lens is not None:
             picture = self._pictures.undistorted(picture, view, path)
         return np.asarray(picture.resized(*size).pixels.min(axis=2) > MIN_MASK_VALUE)
+
+    def mask_path(self, view: View) -> Path | None:
+        """Return the file of the view's mask; None without one."""
+        return self._masks.get(view.name)
 
     @property
     def has_masks(self) -> bool:

@@ -41,6 +41,14 @@ def sample_colours(xyz: NDArray[Any], camera: Camera, picture: Tensor) -> tuple[
     return inside, picture.numpy()[y, x]
 
 
+def masked(picture: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    """Return a picture (height, width, 3) with its target's values where the mask (height, width) is False.
+
+    A loss of the two ignores these pixels, and gives them no gradient.
+    """
+    return picture if mask is None else torch.where(mask[..., None], picture, target)
+
+
 class Targets(NamedTuple):
     """Camera of a view with its frame and clean frame, display values (height, width, 3) float32 in 0..`display_white`.
     """
@@ -108,11 +116,15 @@ class Frames:
         return None if inside is None or inside.size == size else inside
 
     def targets(self, view: View) -> Targets:
-        """Return camera, frame and clean frame of a view, without borders."""
+        """Return camera, frame and clean frame of a view, without borders.
+
+        Where the view's mask is black the clean frame equals the frame: no flare is learned there.
+        """
         camera, inside = self.camera(view), self.picture_area
         if inside is not None:
             camera = camera.cropped(inside.left, inside.top, *inside.size)
-        return Targets(camera, self.frame(view), self.clean(view))
+        frame, clean, mask = self.frame(view), self.clean(view), self.mask(view)
+        return Targets(camera, frame, clean if clean is None else masked(clean, frame, mask))
 
     def frame(self, view: View) -> Tensor:
         """Return the frame as filmed, without borders. Raises CaptureError."""
@@ -128,6 +140,19 @@ class Frames:
         if self.reference == "truth":
             return self._display(view, "truth", self.capture.truth_scene)
         return None
+
+    def mask(self, view: View) -> Tensor | None:
+        """Return (height, width) which pixels of a view count in the losses, without borders; None if all do."""
+        if self.capture.mask_path(view) is None:
+            return None
+        name = f"mask/{view.name}"
+        stored = self.cache.get(name)
+        if stored is None:
+            mask = self.capture.mask(view, self.camera(view).size)
+            assert mask is not None
+            stored = mask.astype(np.uint16)
+            self.cache.put(name, stored)
+        return torch.from_numpy((stored if self.picture_area is None else stored[self.picture_area.slices]) > 0)
 
     def _display(self, view: View, kind: str,
                  decode: Callable[[View, tuple[int, int]], Picture | None]) -> Tensor | None:

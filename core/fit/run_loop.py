@@ -23,6 +23,7 @@ from ..system.folder_lock import folder_lock
 from ..system.progress import Progress
 from ..system.reading import append_text, parse_json, read_text
 from . import checkpoint
+from .initial_points import ensure_points
 from .metering import resolve_white
 from .preview import preview_row, spread_indices, write_preview, write_small_preview
 from .rendering import render
@@ -53,19 +54,21 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
             if run.finished:
                 progress.say(f"The fit in {folder} is finished already.")
             else:
+                capture, made = ensure_points(capture, run.settings, progress)
                 trainer = Trainer(capture, run.settings, run.exposures)
                 remove_partials_below(folder)
                 if (folder / CHECKPOINT).exists():
                     trainer.load_state(checkpoint.load(folder / CHECKPOINT))
                 else:
-                    _report(trainer.warnings, run, progress)
+                    _report((*made, *trainer.warnings), run, progress)
                 _run_to_end(trainer, run, progress)
         return run
-    settings, said = resolve_white(settings.validated(), capture)
+    settings, warnings = resolve_white(settings.validated(), capture)
+    capture, made = ensure_points(capture, settings, progress)
     trainer = Trainer(capture, settings, progress=progress)  # before anything is written: it may refuse the capture
     with folder_lock(folder):
         run = Run.create(folder, settings, capture.folder, trainer.exposures)
-        _report((*said, *trainer.warnings), run, progress)
+        _report((*warnings, *made, *trainer.warnings), run, progress)
         _run_to_end(trainer, run, progress)
     return run
 
@@ -84,7 +87,7 @@ def _run_to_end(trainer: Trainer, run: Run, progress: Progress) -> None:
             _log(run, f"stopped at iteration {trainer.iteration}")
             raise
         _finish(trainer, run)
-    if len(trainer.losses) == len(trainer.views):  # each has been looked at
+    if len(trainer.losses) == len(trainer.views):  # every view was used
         _report(outlier_warnings(trainer.losses), run, progress)
     _log(run, f"finished at iteration {trainer.iteration}")
 
@@ -105,22 +108,23 @@ def _check_capture(run: Run, capture: Capture) -> None:
 
 
 def _train(trainer: Trainer, run: Run, progress: Progress) -> None:
+    """Run the remaining iterations, with metrics, previews and checkpoints at their intervals."""
     settings, path = run.settings, run.folder / CHECKPOINT
     saved, started, first = time.monotonic(), time.monotonic(), trainer.iteration
     while trainer.iteration < settings.iterations:
         figures = trainer.step()
-        here = trainer.iteration
-        if here % METRICS_INTERVAL == 0 or here == settings.iterations:
+        iteration = trainer.iteration
+        if iteration % METRICS_INTERVAL == 0 or iteration == settings.iterations:
             trainer.check_finite()
             counts = {"scene_gaussians": len(trainer.scene.means),
                       "flare_gaussians": trainer.flare.count if trainer.flare else 0}
-            pace = (time.monotonic() - started) / (here - first)
-            line = {"iteration": here, **figures, **counts, "seconds_per_iteration": round(pace, 5)}
+            pace = (time.monotonic() - started) / (iteration - first)
+            line = {"iteration": iteration, **figures, **counts, "seconds_per_iteration": round(pace, 5)}
             append_text(run.folder / METRICS, json.dumps(line) + "\n")
             figures = {**figures, **counts}
-        if here % settings.preview_every == 0:
+        if iteration % settings.preview_every == 0:
             _write_previews(trainer, run)
-        # Saved before the progress speaks, since that is where a stop is noticed.
+        # Saved before `advance`, which raises Cancelled after a requested stop.
         if time.monotonic() - saved > settings.checkpoint_every_s:
             checkpoint.save(path, trainer.state())
             saved = time.monotonic()
@@ -146,7 +150,7 @@ def _finish(trainer: Trainer, run: Run) -> None:
             flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, training_views=training_views,
                                                 pixel_grid=pixel_grid))
             store_elements(unnamed)
-    with contextlib.suppress(OSError):  # the fit is whole without that
+    with contextlib.suppress(OSError):  # a checkpoint that stays does no harm
         remove_file(run.folder / CHECKPOINT)
 
 

@@ -37,6 +37,8 @@ def add_sky_points(capture: Capture, views: tuple[View, ...], frames: Frames) ->
         camera, frame, _ = frames.targets(view)
         inside, observed = sample_colours(xyz, camera, frame)
         row[inside] = expose(torch.from_numpy(observed), 1 / camera.exposure).numpy()
+        if (mask := frames.mask(view)) is not None:
+            row[np.flatnonzero(inside)[~sample_colours(xyz, camera, mask)[1]]] = np.nan
     is_seen = np.isfinite(view_colours[..., 0]).any(0)
     colours = np.nanquantile(view_colours[:, is_seen], COLOUR_QUANTILE, axis=0)
     rgb = np.concatenate([points.rgb, (colours.clip(0, 1) * 255 + 0.5).astype(np.uint8)])

@@ -32,7 +32,7 @@ from ..gaussians.spherical_harmonics import MAX_DEGREE
 from ..system.progress import Progress
 from . import metering
 from .checkpoint import FitInputs, State
-from .frames import Frames, Targets, subsample
+from .frames import Frames, Targets, masked, subsample
 from .initialise import initial_flare, initial_scene
 from .optimisers import Optimisers
 from .parallax_losses import (
@@ -110,7 +110,7 @@ class Trainer:
         self.iteration += 1
         settings = self.settings
         view = self._view()
-        targets = self.frames.targets(view)
+        targets, mask = self.frames.targets(view), self.frames.mask(view)
         self.optimisers.set_rates(self.iteration)
         scene = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)
         scene_picture = self._clip_as_filmed(scene.colour)
@@ -123,16 +123,17 @@ class Trainer:
         picture = composite(self._flare_background(targets, scene_picture, light_discs), flare, settings.blend,
                             self.frames.display_white)
         weight = 1 - settings.ssim_share
+        joint_target = self._joint_target(targets, picture.detach(), light_discs)
         loss = (scene_picture.new_zeros(()) if scene_only else
-                l1_ssim(picture, self._joint_target(targets, picture.detach(), light_discs), weight))
+                l1_ssim(masked(picture, joint_target, mask), joint_target, weight))
         figures = {} if scene_only else {"loss": float(loss.detach())}
         clean = self._scene_target(targets, picture, scene_picture)
         if clean is not None and self.fits_scene:
-            scene_term = l1_ssim(scene_picture, clean, weight)
+            scene_term = l1_ssim(masked(scene_picture, clean, mask), clean, weight)
             figures["scene_loss"] = float(scene_term.detach())
             loss = loss + scene_term
         elif settings.uses_parallax and self.fits_scene:
-            scene_term = self._parallax_loss(targets, scene_picture, flare, light_discs)
+            scene_term = self._parallax_loss(targets, masked(scene_picture, targets.frame, mask), flare, light_discs)
             figures["scene_loss"] = float(scene_term.detach())
             loss = loss + scene_term
         self.losses[view.name] = sum(figures.values())
@@ -193,13 +194,13 @@ class Trainer:
         if not self.settings.uses_parallax or not 1 <= self._scene_only_iterations == self.iteration - 1:
             return
 
-        def excess(targets: Targets) -> Tensor:
+        def excess(view: View) -> Tensor:
+            targets = self.frames.targets(view)
             scene = render_scene(self.scene, targets.camera, self.settings.kernels, sh_degree=self._sh_degree(),
                                  depth=False)
-            return targets.frame - self._clip_as_filmed(scene.colour)
+            return targets.frame - masked(self._clip_as_filmed(scene.colour), targets.frame, self.frames.mask(view))
 
-        sampled = subsample(self.views, SAMPLED_VIEWS)
-        residuals = (excess(self.frames.targets(view)) for view in sampled)
+        residuals = (excess(view) for view in subsample(self.views, SAMPLED_VIEWS))
         self._excess_ratio = excess_ratio(residuals)
 
     def _occlusion_loss(self, targets: Targets) -> Tensor | None:

@@ -25,6 +25,8 @@ from .compressed import is_compressed, read_compressed
 from .rendering import NEAR
 from .scene import COEFFICIENTS, SceneGaussians
 
+MODE_COMMENT = "SplatRenderMode:"
+"""Header comment of scenes that were trained with a mip filter, as Brush writes it, with the value "mip"."""
 MAX_HEADER_BYTES = 1 << 16
 NEAR_COMMENT, WHITE_COMMENT, FOCAL_COMMENT = "near", "white", "focal_lengths"
 """Header comments of this package: the scene's `near` and `display_white`, a number each, unless they have their
@@ -37,6 +39,9 @@ NORMAL = ("nx", "ny", "nz")
 DC = tuple(f"f_dc_{i}" for i in range(3))
 SCALE = tuple(f"scale_{i}" for i in range(3))
 ROTATION = tuple(f"rot_{i}" for i in range(4))
+LEGAL_INFINITIES = {"opacity": (-20.0, 20.0), **dict.fromkeys(SCALE, (-30.0, np.inf))}
+"""Numbers that stand for minus and plus infinity: opacities of 0 and 1 have infinite logits, and a flat Gaussian has a
+scale of which the logarithm is minus infinity."""
 
 
 def _rest_names(number: int) -> tuple[str, ...]:
@@ -69,6 +74,8 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
     if scene.pixel_grid is not None:
         grid = scene.pixel_grid
         comments.append(f"{FOCAL_COMMENT} {grid.min_focal_length:.9g} {grid.max_focal_length:.9g}")
+    if scene.antialiased:
+        comments.append(f"{MODE_COMMENT} mip")
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments),
              f"element vertex {n}"]
     lines += [f"property float {name}" for name in names] + ["end_header"]
@@ -110,6 +117,10 @@ def read_ply(path: Path | str) -> SceneGaussians:
         values: NDArray[np.float32] = np.empty((n, len(names)), np.float32)
         for column, name in enumerate(names):
             values[:, column] = table[name]
+            if name in LEGAL_INFINITIES:
+                low, high = LEGAL_INFINITIES[name]
+                values[values[:, column] == -np.inf, column] = low
+                values[values[:, column] == np.inf, column] = high
         if not np.isfinite(values).all():
             raise FlareFileError(f"{path} holds numbers that are not finite; export it again.")
         return torch.from_numpy(values)
@@ -122,6 +133,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
         columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0].clone(), sh
     )
     scene.near, scene.display_white, scene.pixel_grid = header.near, header.display_white, header.pixel_grid
+    scene.antialiased = header.antialiased
     return scene
 
 
@@ -134,9 +146,11 @@ class _Header(NamedTuple):
     near: float
     display_white: float
     pixel_grid: PixelGrid | None
+    antialiased: bool
 
 
 def _header(path: Path, head: bytes) -> _Header:
+    """Parse the header of a scene's PLY. Raises FlareFileError."""
     parsed = ply.read_header(head)
     if parsed is None:
         raise FlareFileError(f"{path} is not a PLY file; name one of a scene of Gaussians.")
@@ -162,4 +176,16 @@ def _header(path: Path, head: bytes) -> _Header:
                     display_white = float(number) if 1 < float(number) < MAX_WHITE else 1.0
                 case [word, least, most] if word == FOCAL_COMMENT:
                     pixel_grid = PixelGrid(float(least), float(most))
-    return _Header(vertices.rows, vertices.row(ORDERS[parsed.format]), parsed.start, near, display_white, pixel_grid)
+    antialiased = any(map(_is_mip_comment, parsed.comments))
+    return _Header(vertices.rows, vertices.row(ORDERS[parsed.format]), parsed.start, near, display_white, pixel_grid,
+                   antialiased)
+
+
+def _is_mip_comment(words: Sequence[str]) -> bool:
+    """True for a comment that names a mip filter: "SplatRenderMode: mip", "antialiased 1", "mip_filter: true"."""
+    text = " ".join(words).replace(":", " ").replace("=", " ").lower().split()
+    if len(text) != 2:
+        return False
+    if text[0] in ("splatrendermode", "rendermode", "rasterize_mode", "render_mode"):
+        return text[1] in ("mip", "mip-splatting", "antialiased")
+    return text[0] in ("antialiased", "mip", "mip_filter", "mip_splatting") and text[1] in ("1", "true", "yes")

@@ -12,11 +12,15 @@ from ..conventions.pixel_grid import PixelGrid, dilation
 from ..errors import SettingsError
 from . import spherical_harmonics
 from .ordering import nearest_distances
+from .projection import determinants, project
 from .rasterizer import rasterization
 from .rendering import NEAR, Rendering
 
 COEFFICIENTS = (spherical_harmonics.MAX_DEGREE + 1) ** 2
 INITIAL_OPACITY = 0.1
+MIN_FILTER_RATIO = 1e-8
+"""Smallest squared ratio of a Gaussian's projected area to that with the low-pass filter; its square root has a
+gradient."""
 MIN_SIZE = 1e-7 ** 0.5
 """Smallest initial standard deviation (3DGS), unless the world's unit is so large that MIN_SIZE_RATIO is smaller."""
 MIN_SIZE_RATIO = 0.1
@@ -46,6 +50,9 @@ class SceneGaussians(nn.Module):
         """Display value at which pictures of the scene are clipped; above 1 for frames with values above white."""
         self.near = NEAR
         """Camera depth up to which Gaussians are culled, world units; smaller in a world of a large unit."""
+        self.antialiased = False
+        """True for a scene that was trained with a mip filter: what the low-pass filter of the pixel thickens loses
+        opacity by as much (Yu et al. 2024; gsplat's rasterize_mode "antialiased")."""
         self.pixel_grid: PixelGrid | None = None
         """Pixel grid of the frames that the scene was fitted to, or None if unknown; see `conventions.pixel_grid`."""
 
@@ -99,10 +106,26 @@ class SceneGaussians(nn.Module):
         *, kernels: Kernels = "auto", depth: bool = True,
     ) -> Rendering:  # fmt: skip
         """Render the scene for a camera; see `rasterization`. Differentiable by the Gaussians."""
+        scales: Tensor = self.log_scales
+        opacities: Tensor = self.opacity_logits
+        world_to_camera = torch.as_tensor(camera.world_to_camera).to(self.means)
+        intrinsics = torch.as_tensor(camera.intrinsics).to(self.means)
+        filter_size = dilation(self.pixel_grid, camera.focal_length)
+        if self.antialiased:
+            scales, opacities = self.scales, self.opacities * self._filter_ratios(
+                world_to_camera, intrinsics, camera.width, camera.height, filter_size)
         return rasterization(
-            self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh,
-            torch.as_tensor(camera.world_to_camera).to(self.means),
-            torch.as_tensor(camera.intrinsics).to(self.means),
+            self.means, self.quaternions, scales, opacities, self.sh, world_to_camera, intrinsics,
             camera.width, camera.height, background=background, sh_degree=sh_degree, kernels=kernels,
-            near=self.near, dilation=dilation(self.pixel_grid, camera.focal_length), depth=depth, raw=True,
+            near=self.near, dilation=filter_size, depth=depth, raw=not self.antialiased,
         )  # fmt: skip
+
+    def _filter_ratios(self, world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
+                       filter_size: float) -> Tensor:
+        """Return (n,) ratios of the projected areas without and with the low-pass filter; 1 for culled Gaussians."""
+        projected = project(self.means, self.quaternions, self.scales, world_to_camera, intrinsics, width, height,
+                            self.near, 0.0)
+        plain = determinants(projected.covariances).clamp(min=0)
+        added = torch.tensor([filter_size, 0.0, filter_size]).to(plain)
+        ratios = (plain / determinants(projected.covariances + added)).clamp(min=MIN_FILTER_RATIO).sqrt()
+        return torch.ones(len(self)).to(plain).index_put((projected.indices,), ratios)

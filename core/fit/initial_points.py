@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Makes the points that a fit starts from where a capture has poses without points, as instant-ngp, BlenderNeRF and
+Polycam write it. `run_loop` calls `ensure_points`.
+
+The poses are known, so matches of neighbouring frames give points by triangulation. Where they give too few, points are
+drawn at random in the cameras' view, as 3DGS does for synthetic scenes.
+"""
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import Camera, Capture, PointCloud
+from ..images.picture import Picture
+from ..system.progress import Progress
+from .frames import subsample
+from .settings import FitSettings
+
+MATCHED_VIEWS = 60
+"""Approximate number of frames that are matched."""
+MATCHED_WIDTH, FEATURES = 1000, 4000
+"""Largest width in pixels of the matched frames, and the number of features of each."""
+MATCH_RATIO = 0.8
+"""Ratio of the distances to the nearest and the second nearest descriptor up to which a match counts (Lowe 2004)."""
+MAX_ERROR_PX, MIN_ANGLE = 2.0, np.deg2rad(1.5)
+"""Largest reprojection error and smallest angle between the rays of a point."""
+MIN_TRIANGULATED = 200
+"""Number of triangulated points below which random ones are added."""
+RANDOM_POINTS = 5000
+NEAR_FACTOR, FAR_FACTOR = 0.3, 3.0
+"""Depths of random points relative to the distance of what the cameras look at."""
+
+Floats = NDArray[np.float64]
+
+
+def ensure_points(capture: Capture, settings: FitSettings, progress: Progress) -> tuple[Capture, tuple[str, ...]]:
+    """Return the capture with points, and a sentence where they had to be made. Raises Cancelled."""
+    if len(capture.points) or settings.scene.start:
+        return capture, ()
+    xyz, rgb, observed = _triangulate(capture, progress)
+    made = f"{len(xyz)} points that were triangulated from matches of its frames"
+    if len(xyz) < MIN_TRIANGULATED:
+        random_xyz, random_rgb = _random_points(capture, xyz, settings.seed)
+        xyz, rgb = np.concatenate([xyz, random_xyz]), np.concatenate([rgb, random_rgb])
+        made = (f"{made} and " if len(observed) else "") + f"{len(random_xyz)} random ones in the cameras' view"
+    cloud = PointCloud(xyz.astype(np.float32), rgb, np.zeros(len(xyz), np.float32))
+    return capture.with_points(cloud, observed), (f"{capture.folder} has no 3D points: the fit starts from {made}.",)
+
+
+def _triangulate(capture: Capture,
+                 progress: Progress) -> tuple[Floats, NDArray[np.uint8], dict[str, NDArray[np.int64]]]:
+    """Return points (n, 3), colours (n, 3), and the indices of those observed in each view, by its name."""
+    import cv2
+
+    views = subsample(capture.views, MATCHED_VIEWS)
+    progress.stage("match frames for points", len(views))
+    sift, matcher = cv2.SIFT.create(FEATURES), cv2.BFMatcher(cv2.NORM_L2)
+    cameras: list[Camera] = []
+    features: list[tuple[Floats, Any, NDArray[np.uint8]]] = []
+    for view in views:
+        cameras.append(view.camera.scaled(min(MATCHED_WIDTH, view.camera.width)))
+        features.append(_features(sift, capture.frame(view, cameras[-1].size)))
+        progress.advance()
+    xyz, rgb, observed = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], dict[str, list[NDArray[np.int64]]]()
+    count = 0
+    pairs = [*pairwise(range(len(views))), *((i, i + 2) for i in range(len(views) - 2))]
+    for first, second in pairs:
+        chosen = _match(matcher, features[first][1], features[second][1])
+        if not len(chosen):
+            continue
+        ends = features[first][0][chosen[:, 0]], features[second][0][chosen[:, 1]]
+        points, usable = triangulate_pair(cameras[first], cameras[second], *ends)
+        xyz.append(points[usable])
+        rgb.append(features[first][2][chosen[usable, 0]])
+        indices = np.arange(count, count + int(usable.sum()))
+        count += len(indices)
+        for index in (first, second):
+            observed.setdefault(views[index].name, []).append(indices)
+    return (np.concatenate(xyz), np.concatenate(rgb),
+            {name: np.unique(np.concatenate(parts)) for name, parts in observed.items() if count})
+
+
+def _features(sift: Any, picture: Picture) -> tuple[Floats, Any, NDArray[np.uint8]]:
+    """Return places (n, 2) in pixels, descriptors and colours (n, 3) of a frame's features."""
+    import cv2
+
+    codes = (picture.display() * 255 + 0.5).astype(np.uint8)
+    keys, descriptors = sift.detectAndCompute(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), None)
+    places = np.array([key.pt for key in keys], np.float64).reshape(-1, 2)
+    x, y = np.minimum(np.rint(places).astype(int), np.array(picture.size) - 1).T
+    return places + 0.5, descriptors, codes[y, x]  # OpenCV's pixel centres are whole numbers
+
+
+def _match(matcher: Any, first: Any, second: Any) -> NDArray[np.int64]:
+    """Return (n, 2) indices of features whose descriptors are nearest to each other and to no third one."""
+    if first is None or second is None or min(len(first), len(second)) < 2:
+        return np.zeros((0, 2), np.int64)
+    forward = [(near.queryIdx, near.trainIdx) for near, other in matcher.knnMatch(first, second, 2)
+               if near.distance < MATCH_RATIO * other.distance]
+    back = {near.queryIdx: near.trainIdx for near in matcher.match(second, first)}
+    return np.array([pair for pair in forward if back.get(pair[1]) == pair[0]], np.int64).reshape(-1, 2)
+
+
+def triangulate_pair(first: Camera, second: Camera, pixels: Floats, others: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return points (n, 3) from pixels (n, 2) of two cameras, and which (n,) are sound.
+
+    A point is where the two rays are nearest to each other. It is sound if it lies before both cameras, the rays differ
+    by an angle, and it projects onto both pixels.
+    """
+    rays, other_rays = first.rays(pixels), second.rays(others)
+    baseline = second.position - first.position
+    cosine = (rays * other_rays).sum(axis=1)
+    denominator = np.maximum(1 - cosine * cosine, 1e-12)
+    along = ((rays @ baseline) - cosine * (other_rays @ baseline)) / denominator
+    along_other = (cosine * (rays @ baseline) - (other_rays @ baseline)) / denominator
+    points = 0.5 * (first.position + along[:, None] * rays + second.position + along_other[:, None] * other_rays)
+    sound = (along > 0) & (along_other > 0) & (np.arccos(cosine.clip(-1, 1)) > MIN_ANGLE)
+    for camera, goal in ((first, pixels), (second, others)):
+        places, depth = camera.project(points)
+        with np.errstate(invalid="ignore"):
+            sound &= (depth > 0) & (np.linalg.norm(places - goal, axis=1) < MAX_ERROR_PX)
+    return points, sound
+
+
+def _random_points(capture: Capture, known: Floats, seed: int) -> tuple[Floats, NDArray[np.uint8]]:
+    """Return points (n, 3) in the view of the cameras, with the colours (n, 3) of the frames where they were drawn."""
+    generator = np.random.default_rng(seed)
+    views = subsample(capture.views, MATCHED_VIEWS)
+    focus = None if capture.is_rotation_only else _focus([view.camera for view in views])
+    xyz, rgb = [], []
+    for view in views:
+        camera = view.camera.scaled(min(MATCHED_WIDTH, view.camera.width))
+        distance = _distance(camera, known, focus, capture)
+        count = RANDOM_POINTS // len(views) + 1
+        pixels = generator.random((count, 2)) * camera.size
+        depth = distance * np.exp(generator.uniform(np.log(NEAR_FACTOR), np.log(FAR_FACTOR), count))
+        xyz.append(camera.position + depth[:, None] * camera.rays(pixels))
+        codes = (capture.frame(view, camera.size).display() * 255 + 0.5).astype(np.uint8)
+        x, y = pixels.astype(int).T
+        rgb.append(codes[y, x])
+    return np.concatenate(xyz), np.concatenate(rgb)
+
+
+def _focus(cameras: list[Camera]) -> Floats | None:
+    """Return the point (3,) that is nearest to all optical axes; None where they are parallel."""
+    sums, right = np.zeros((3, 3)), np.zeros(3)
+    for camera in cameras:
+        across = np.eye(3) - np.outer(camera.forward, camera.forward)
+        sums, right = sums + across, right + across @ camera.position
+    return None if np.linalg.cond(sums) > 1e6 else np.linalg.solve(sums, right)
+
+
+def _distance(camera: Camera, known: Floats, focus: Floats | None, capture: Capture) -> float:
+    """Return the distance, world units, of what a camera looks at: of known points, the common focus, or the extent."""
+    if len(known) >= 20:
+        depths = camera.project(known)[1]
+        if (depths > 0).any():
+            return float(np.median(depths[depths > 0]))
+    if focus is not None and (depth := float(camera.project(focus)[1][0])) > 0:
+        return depth
+    return capture.extent

@@ -39,7 +39,7 @@ class HashGrid:
         self._rows, self._values = np.asarray(rows, np.int64), np.asarray(values, np.float32)
         if (self._values.ndim != 2 or self._rows.shape != self._values.shape[:1] or (np.diff(self._rows) <= 0).any()
                 or (len(self._rows) and not 0 <= self._rows[0] <= self._rows[-1] < self._sizes.sum())):
-            raise ValueError("a hash table's rows make no sense")
+            raise ValueError("a hash table's rows are not valid")
 
     def __call__(self, point: Floats) -> Floats:
         """Return features (levels * features,) of a point (3,), clamped to 0..1."""
@@ -89,7 +89,7 @@ class QueryRange:
         """Read the entry of a .flare's description. Raises ValueError for invalid values."""
         parts = [np.asarray(entry[name], np.float32) for name in ("camera_low", "camera_high", "light_high")]
         if any(part.shape != (3,) or not np.isfinite(part).all() for part in parts):
-            raise ValueError("a light's range makes no sense")
+            raise ValueError("a light's range is not valid")
         return cls(*parts)
 
     def clip(self, camera: Floats, light: Floats) -> tuple[Floats, Floats]:

@@ -76,7 +76,7 @@ def training_views(path: Path | str, lights: Sequence[LightLook],
             try:
                 by_light[light.name] = TrainingViews.of(rows, light.xyz)
             except (TypeError, ValueError) as problem:
-                raise FlareFileError(f"{path} is damaged: its training views make no sense ({problem}).") from problem
+                raise FlareFileError(f"{path} is damaged: its training views are not valid ({problem}).") from problem
     return by_light
 
 

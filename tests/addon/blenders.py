@@ -24,8 +24,8 @@ class Blender:
 
     python: Path
 
-    def run(self, script: Path, *words: object, user: Path) -> Any:
-        command: Sequence[str] = [str(self.python), str(script), *map(str, words)]
+    def run(self, script: Path, *args: object, user: Path) -> Any:
+        command: Sequence[str] = [str(self.python), str(script), *map(str, args)]
         environment = {**os.environ, "BLENDER_USER_RESOURCES": str(user)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
         assert done.returncode == 0, f"{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
@@ -39,8 +39,8 @@ class Program(Blender):
 
     words: tuple[str, ...] = ()
 
-    def run(self, script: Path, *words: object, user: Path) -> Any:
-        argv = [str(script), *map(str, words)]
+    def run(self, script: Path, *args: object, user: Path) -> Any:
+        argv = [str(script), *map(str, args)]
         code = f"import runpy, sys; sys.argv = {argv!r}; runpy.run_path({str(script)!r}, run_name='__main__')"
         command = [*self.words, "-b", "--python-exit-code", "1", "--python-expr", code]
         environment = {**os.environ, "BLENDER_USER_RESOURCES": str(user)}
@@ -53,8 +53,8 @@ class Program(Blender):
 def named() -> Blender | None:
     """The Blender that FIT_FLARE_BLENDER names, a program or a whole command line."""
     text = os.environ.get("FIT_FLARE_BLENDER", "")
-    words = [text] if Path(text).is_file() else shlex.split(text, posix=os.name != "nt")
-    return Program(Path(words[0]), tuple(words)) if words else None
+    args = [text] if Path(text).is_file() else shlex.split(text, posix=os.name != "nt")
+    return Program(Path(args[0]), tuple(args)) if args else None
 
 
 def newer() -> Blender | None:

@@ -170,17 +170,17 @@ def test_missing_folders_are_reported(said: Any) -> None:
 
 def test_panels_accept_a_name_that_is_too_long_for_the_disk(said: Any) -> None:
     """Block of broken.py: "places that cannot be looked at"."""
-    told = {name: panels for name, *panels in said["a name too long for the disk"]}
-    assert "does not exist any more" in told["capture"][0]
-    assert "does not exist any more: start a new fit" in told["run"][2]
-    assert len(told) == 6
+    panels_by_case = {name: panels for name, *panels in said["a name too long for the disk"]}
+    assert "does not exist any more" in panels_by_case["capture"][0]
+    assert "does not exist any more: start a new fit" in panels_by_case["run"][2]
+    assert len(panels_by_case) == 6
 
 
 def test_deleted_cameras_and_lights_are_reported_and_scenes_stay_apart(said: Any) -> None:
     """Blocks of broken.py: ".flare files", "cameras and scenes"."""
     assert said["camera deleted"] == [False, True]
-    known, told = said["light taken out of the scene"]
-    assert known and "No flare has a light object" in told
+    known, message = said["light taken out of the scene"]
+    assert known and "No flare has a light object" in message
     assert said["icon of its flare"] == "ERROR"
     assert said["light deleted"]
     assert said["second scene is empty"] == ["", False, 0]

@@ -86,14 +86,14 @@ def test_a_frame_that_was_baked_again_is_shown(facts: Any) -> None:
 def test_frames_without_layers_are_reported_and_show_no_flare(facts: Any) -> None:
     """Block of flares.py: "what is told of frames without layers and of animated sliders"."""
     assert facts["all frames"] == []
-    (told,) = facts["too few"]
-    assert "The scene has the frames 0-6, and there are no layers of 0,4-6," in told
+    (warning,) = facts["too few"]
+    assert "The scene has the frames 0-6, and there are no layers of 0,4-6," in warning
     last, *after = facts["after the last"]
     assert last == PLATE + LAMP + KEY
     if facts["missing is magenta"]:
-        assert "which this version of Blender shows in magenta" in told
+        assert "which this version of Blender shows in magenta" in warning
     else:
-        assert "which are without flare" in told
+        assert "which are without flare" in warning
         assert after == [PLATE, PLATE]
 
 
@@ -105,8 +105,8 @@ def test_frames_without_layers_are_reported_and_show_no_flare(facts: Any) -> Non
 ])
 def test_renders_that_would_not_show_the_composite_give_a_warning(facts: Any, case: str, sentence: str) -> None:
     """Block of flares.py: "what is told of renders that would not show the composite as it is"."""
-    (told,) = facts[case]
-    assert sentence in told
+    (warning,) = facts[case]
+    assert sentence in warning
 
 
 @pytest.mark.parametrize("case", ["muted", "no alpha"])
@@ -118,5 +118,5 @@ def test_renders_that_show_the_composite_give_no_warning(facts: Any, case: str) 
 def test_animated_live_sliders_give_a_warning_for_farms(facts: Any) -> None:
     """Block of flares.py: "what is told of frames without layers and of animated sliders"."""
     assert facts["scale keyed"] == []
-    (told,) = facts["intensity keyed"]
-    assert "without this extension, as on a farm, they do not move" in told
+    (warning,) = facts["intensity keyed"]
+    assert "without this extension, as on a farm, they do not move" in warning

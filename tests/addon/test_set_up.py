@@ -150,12 +150,12 @@ def test_an_engine_that_cannot_be_loaded_is_removed(windows: bool, cure: str, tm
     monkeypatch.setattr(script, "WINDOWS", windows)
     monkeypatch.setattr(script, "unsupported_reason", lambda: "")
     assert script.main([str(tmp_path / "engine")]) == 1
-    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert told[0] == {"type": "stage", "name": "set up", "total": len(ran), "done": 0}
-    assert told[-1]["text"].startswith(
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert events[0] == {"type": "stage", "name": "set up", "total": len(ran), "done": 0}
+    assert events[-1]["text"].startswith(
         "The engine was installed but cannot be loaded (OSError: [WinError 126] c10.dll); ")
-    assert cure in told[-1]["text"]
-    assert [event["text"] for event in told if event["type"] == "say"][:2] == ["Making the virtual environment",
+    assert cure in events[-1]["text"]
+    assert [event["text"] for event in events if event["type"] == "say"][:2] == ["Making the virtual environment",
                                                                                "Installing numpy"]
 
 

@@ -49,8 +49,8 @@ def test_baked_frames_are_not_deleted_without_confirmation(facts: Any) -> None:
 
 def test_edits_of_a_flare_without_a_light_are_not_baked(facts: Any) -> None:
     """Block of shots.py: "an edited flare without a light"."""
-    (light,), words = facts["edits"]
-    assert words == [f"{light}.intensity=2"]
+    (light,), texts = facts["edits"]
+    assert texts == [f"{light}.intensity=2"]
 
 
 def test_every_selected_camera_bakes_to_its_own_folder(facts: Any) -> None:

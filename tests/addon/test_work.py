@@ -296,7 +296,7 @@ def test_blenders_own_camera_becomes_a_capture(facts: Any) -> None:
         assert "choose another folder" in said and kept
 
 
-def test_the_overlay_is_what_is_baked(made: tuple[Any, Path], tmp_path: Path) -> None:
+def test_the_overlay_shows_what_is_baked(made: tuple[Any, Path], tmp_path: Path) -> None:
     """The shot that Blender wrote, through the engine, against what the overlay evaluates for that frame."""
     _, base = made
     shot = Shot.read(base / "shot.json")

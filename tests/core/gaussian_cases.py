@@ -249,8 +249,8 @@ def render(
         }
         if more:
             gradients["centre_gradients"] = full.centre_gradients
-    told = {name: p.detach().cpu() for name, p in {**pictures, **more}.items()}
-    return told, {name: gradient.cpu() for name, gradient in gradients.items()}
+    results = {name: p.detach().cpu() for name, p in {**pictures, **more}.items()}
+    return results, {name: gradient.cpu() for name, gradient in gradients.items()}
 
 
 def differences(case: Case, kernels: str, device: str = "cpu") -> list[str]:

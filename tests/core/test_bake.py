@@ -209,7 +209,7 @@ def test_missing_frame_numbers_are_reported() -> None:
 # ---- bake -----------------------------------------------------------------------------------------
 
 
-def test_bake_writes_every_frame_at_the_size_asked_for(tmp_path: Path) -> None:
+def test_bake_writes_every_frame_at_the_requested_size(tmp_path: Path) -> None:
     record = bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path, BakeSettings(24, edits=("lamp.intensity=2",)))
     assert [entry["file"] for entry in record["frames"]] == [frame.file for frame in FRAMES]
     assert record == read_manifest(tmp_path)
@@ -225,8 +225,8 @@ def test_layers_keep_the_pixel_aspect(tmp_path: Path) -> None:
     make a pixel oblong."""
     cameras = {name: replace(camera(60), fx=fx) for name, fx in zip(VIEWS, (30.0, 60.0, 60.3), strict=True)}
     bake(FakeRenderer(), FRAMES, cameras, tmp_path)
-    told = [read_exr_header(tmp_path / frame.file)["pixelAspectRatio"] for frame in FRAMES]
-    assert told == [2.0, 1.0, 1.0]
+    aspects = [read_exr_header(tmp_path / frame.file)["pixelAspectRatio"] for frame in FRAMES]
+    assert aspects == [2.0, 1.0, 1.0]
     bake(FakeRenderer(), FRAMES[:1], cameras, tmp_path / "square", BakeSettings(24, 8))
     assert read_exr_header(tmp_path / "square" / FRAMES[0].file)["pixelAspectRatio"] == 1.0, "as they are rendered"
 

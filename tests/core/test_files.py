@@ -300,10 +300,10 @@ def test_a_new_folder_removes_the_partial_folder_of_a_killed_process(tmp_path: P
     """And what a living one makes stays."""
     makes = ("import os, sys\nfrom core.system.files import atomic_folder\n"
              "with atomic_folder(sys.argv[1]) as folder:\n    (folder / 'a').touch()\n    ")
-    words = [sys.executable, "-c", f"{makes}os._exit(9)", str(tmp_path / "frames")]
-    assert subprocess.run(words, cwd=ROOT, check=False).returncode == 9
-    words[2] = f"{makes}print('begun', flush=True)\n    sys.stdin.read()"
-    other = subprocess.Popen(words, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    args = [sys.executable, "-c", f"{makes}os._exit(9)", str(tmp_path / "frames")]
+    assert subprocess.run(args, cwd=ROOT, check=False).returncode == 9
+    args[2] = f"{makes}print('begun', flush=True)\n    sys.stdin.read()"
+    other = subprocess.Popen(args, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert other.stdout is not None and other.stdout.readline() == b"begun\n"
     assert len(list(tmp_path.iterdir())) == 1, "what the killed one left is gone"
     with atomic_folder(tmp_path / "frames"):

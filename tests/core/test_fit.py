@@ -323,11 +323,11 @@ def test_the_far_flare_penalty_exempts_more_of_an_estimate_the_nearer_convergenc
         capture: Capture, found: float, believed: float) -> None:
     camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
     added = torch.full((camera.height, camera.width, 3), 0.1)
-    told = torch.linspace(-0.1, 0.3, added.numel()).reshape(added.shape)
+    estimated_flare = torch.linspace(-0.1, 0.3, added.numel()).reshape(added.shape)
     settings = SplitSettings(far_flare_penalty=2.0, diverged_ratio=10.0, converged_ratio=20.0)
     far = torch.from_numpy(1 - light_proximity(camera, lights, settings.light_radius))
-    expected = 2 * ((0.1 - believed * told.clamp(min=0)).clamp(min=0) * far[..., None]).mean()
-    penalty = far_flare_penalty(added, told, found, camera, lights, settings)
+    expected = 2 * ((0.1 - believed * estimated_flare.clamp(min=0)).clamp(min=0) * far[..., None]).mean()
+    penalty = far_flare_penalty(added, estimated_flare, found, camera, lights, settings)
     assert float(penalty) == pytest.approx(float(expected), rel=1e-4)
 
 
@@ -623,11 +623,11 @@ def test_a_view_that_the_light_passes_leaves_other_views_unchanged(capture: Capt
 
 
 def test_a_scene_only_iteration_has_no_composite_loss(tmp_path: Path) -> None:
-    """None is told, where a nought would pass for a perfect fit."""
+    """The loss is absent, since a loss of 0 would pass for a perfect fit."""
     trainer = Trainer(Capture.open(flared_capture(tmp_path / "c", 5)), quick(120, mode="split"))
-    told = [trainer.step() for _ in range(trainer._scene_only_iterations + 1)]
-    assert all("loss" not in figures and figures["scene_loss"] > 0 for figures in told[:-1])
-    assert told[-1]["loss"] > 0
+    figures_of_steps = [trainer.step() for _ in range(trainer._scene_only_iterations + 1)]
+    assert all("loss" not in figures and figures["scene_loss"] > 0 for figures in figures_of_steps[:-1])
+    assert figures_of_steps[-1]["loss"] > 0
 
 
 @pytest.mark.parametrize("converged", [True, False])

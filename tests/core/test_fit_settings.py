@@ -20,7 +20,7 @@ from tests.core.recording_progress import RecordingProgress
 
 @pytest.mark.parametrize("name", ["draft", "standard", "high", "paper"])
 @pytest.mark.parametrize("model", ["paper", "ours"])
-def test_config_round_trip(tmp_path: Path, name: Any, model: Any) -> None:
+def test_a_config_is_read_as_it_was_written(tmp_path: Path, name: Any, model: Any) -> None:
     settings = override_settings(preset(name, model=model), {"holdout": 'odd "name"\\.json', "seed": 7})
     write_config(tmp_path / "config.toml", settings)
     assert read_config(tmp_path / "config.toml") == settings

@@ -83,7 +83,7 @@ def test_every_run_and_every_thread_count_gives_the_same_bits() -> None:
 
 
 @pytest.mark.parametrize("planes", [1, 3])
-def test_equal_depths_are_drawn_in_the_order_given(planes: int) -> None:
+def test_equal_depths_are_drawn_in_input_order(planes: int) -> None:
     """Depths that many share: cuts between the threads' parts fall on them, and parts may be empty."""
     means = scene()["means"]  # type: ignore[operator]
     z = means[:, 2].quantile((torch.arange(planes) + 0.5) / planes)[torch.arange(len(means)) % planes]

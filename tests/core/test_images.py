@@ -40,7 +40,7 @@ def test_srgb_matches_the_standard_and_inverts() -> None:
 
 
 @pytest.mark.parametrize(("bits", "step"), [(8, 1 / 255), (16, 1 / 65535)])
-def test_png_round_trip(tmp_path: Path, bits: int, step: float) -> None:
+def test_a_png_is_read_as_it_was_written(tmp_path: Path, bits: int, step: float) -> None:
     write_png(tmp_path / "a.png", RAMP, bits)  # type: ignore[arg-type]
     picture = read_picture(tmp_path / "a.png")
     assert picture.encoding == "srgb"

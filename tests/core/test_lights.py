@@ -75,7 +75,7 @@ class TestExposure:
         (found,) = ExposureDetector().detect(stored(scene))
         np.testing.assert_allclose(found.colour, (1.0, 0.8, 0.6), atol=0.05)
 
-    def test_two_lamps_and_their_masks(self) -> None:
+    def test_two_lamps_have_a_mask_each(self) -> None:
         scene = with_disc(with_disc(backdrop(), (60, 60), 6), (250, 150), 9, colour=(0.6, 0.8, 1))
         found = ExposureDetector().detect(stored(scene))
         assert len(found) == 2
@@ -504,7 +504,7 @@ class TestFind:
                         settings=TriangulationSettings(min_views=0))
 
 
-def test_grounded_without_its_libraries_or_weights(tmp_path: Path) -> None:
+def test_the_grounded_detector_names_missing_libraries_and_weights(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match="exposure method"):
         detector_for("grounded", boxes=tmp_path / "none", masks=tmp_path / "none")
 

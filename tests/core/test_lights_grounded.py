@@ -66,14 +66,14 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("models")
-    words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", "light", "source", "."]
-    tokens = transformers.BertTokenizer(vocab={word: i for i, word in enumerate(words)})
+    vocabulary = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", "light", "source", "."]
+    tokens = transformers.BertTokenizer(vocab={word: i for i, word in enumerate(vocabulary)})
     pictures = transformers.GroundingDinoImageProcessor(size={"shortest_edge": 96, "longest_edge": 128})
     boxes = transformers.GroundingDinoForObjectDetection(transformers.GroundingDinoConfig(
         backbone_config=transformers.SwinConfig(image_size=96, embed_dim=16, depths=[1, 1, 1, 1],
                                                 num_heads=[1, 1, 2, 2], window_size=4,
                                                 out_features=["stage2", "stage3", "stage4"]),
-        text_config=transformers.BertConfig(vocab_size=len(words), hidden_size=16, num_hidden_layers=1,
+        text_config=transformers.BertConfig(vocab_size=len(vocabulary), hidden_size=16, num_hidden_layers=1,
                                             num_attention_heads=2, intermediate_size=16, max_position_embeddings=64),
         num_queries=8, encoder_layers=1, decoder_layers=2, encoder_ffn_dim=16, decoder_ffn_dim=16, d_model=32,
         encoder_attention_heads=2, decoder_attention_heads=2, max_text_len=16))

@@ -263,10 +263,10 @@ def ghosts() -> tuple[PlaneGaussians, list[grouping.Element]]:
     return gaussians, grouping.group_elements(gaussians, gaussians.means[:, 0] / np.float32(0.3))
 
 
-def after(*words: str, blend: str = "add") -> PlaneGaussians:
+def after(*texts: str, blend: str = "add") -> PlaneGaussians:
     gaussians, elements = ghosts()
     names = {"lamp": [element.name for element in elements]}
-    return apply_edits(gaussians, "lamp", LIGHT, elements, LookEdits.parse(words, ["lamp"], names), blend)
+    return apply_edits(gaussians, "lamp", LIGHT, elements, LookEdits.parse(texts, ["lamp"], names), blend)
 
 
 def test_neutral_edits_change_nothing() -> None:
@@ -357,7 +357,7 @@ def test_a_network_that_does_not_fit_its_form_raises_on_reading(changed: dict[st
 
 @pytest.mark.parametrize(("what", "said"), [
     ("two lights of one name", "two lights have one name"), ("clear 1.5", "clear share is not valid"),
-    ("clear -0.1", "clear share is not valid"), ("clear NaN", "clear share makes no sense"),
+    ("clear -0.1", "clear share is not valid"), ("clear NaN", "clear share is not valid"),
     ("a newer form", "newer Fit Flare .its form has spiral.; update"), ("elements 3", "is damaged"),
     ("elements without their Gaussians", "names Gaussians that are not there"), ("seen 3", "is damaged"),
     ("seen from nowhere", "training view is not valid"), ("a wide camera", "'wide'"),
@@ -429,10 +429,10 @@ def test_intensity_fades_and_brightens_an_over_flare() -> None:
 
 def test_edits_are_restored_from_their_texts() -> None:
     names = {"lamp": ["ghost", "streak 2"], "key/1": []}
-    words = ["*.intensity=0.5", "lamp.tint=1,0.8,0.6", "lamp/streak 2.streak=2.5", "key/1.solo=1", "key/1.rotation=-30"]
-    edits = LookEdits.parse(words, ["lamp", "key/1"], names)
+    texts = ["*.intensity=0.5", "lamp.tint=1,0.8,0.6", "lamp/streak 2.streak=2.5", "key/1.solo=1", "key/1.rotation=-30"]
+    edits = LookEdits.parse(texts, ["lamp", "key/1"], names)
     assert LookEdits.parse(edits.texts(), ["lamp", "key/1"], names) == edits
-    assert set(edits.texts()) == set(words)
+    assert set(edits.texts()) == set(texts)
     assert LookEdits().texts() == []
     assert edits.elements["lamp", "streak 2"].streak == 2.5
     both = LookEdits.parse(["*/ghost.scale=2", "lamp/*.scale=3"], ["lamp"], names)
@@ -501,13 +501,13 @@ def test_the_rasterizer_draws_edits_as_the_look(tmp_path: Path) -> None:
 # ---- shots ----------------------------------------------------------------------------------------
 
 
-def a_shot(tmp_path: Path, *words: str) -> Shot:
+def a_shot(tmp_path: Path, *texts: str) -> Shot:
     """One camera, three frames, the look of lamp 0 twice: as it was, and elsewhere and half hidden."""
     saved(tmp_path / "a.flare")
     lights = (PlacedLight("lamp 0", "lamp 0", np.array([-0.2, -0.4, 1.0])),
               PlacedLight("second", "lamp 0", np.array([0.5, 0.2, 1.5]), 0.5))
     return Shot(tmp_path / "a.flare", tuple(
-        ShotFrame(number + 1, "Camera", camera, lights, words) for number, camera in enumerate(cameras(3))))
+        ShotFrame(number + 1, "Camera", camera, lights, texts) for number, camera in enumerate(cameras(3))))
 
 
 def test_a_shot_is_restored_from_its_file(tmp_path: Path) -> None:
@@ -628,8 +628,8 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of Rec. 709
 
 
 def test_saturation_is_applied_before_the_tint() -> None:
-    words = ["lamp.tint=1,0.5,0.25", "lamp.saturation=0", "lamp.intensity=2"]
-    matrix = LookEdits.parse(words, ["lamp"]).matrices(["lamp"])["lamp"]
+    texts = ["lamp.tint=1,0.5,0.25", "lamp.saturation=0", "lamp.intensity=2"]
+    matrix = LookEdits.parse(texts, ["lamp"]).matrices(["lamp"])["lamp"]
     np.testing.assert_allclose(matrix @ (0.2, 0.6, 1.0), 2 * (LUMINANCE @ (0.2, 0.6, 1.0)) * np.array([1, 0.5, 0.25]),
                                rtol=1e-6)
 

@@ -97,9 +97,9 @@ def test_the_machine_id_of_a_mac_is_independent_of_the_network(tmp_path: Path, m
     machine = processes.machine_id.__wrapped__
     assert machine() != machine(), "its name, elsewhere"
     monkeypatch.setattr(processes.sys, "platform", "darwin")
-    told = machine()
-    assert told == machine()
-    assert len(told) == 36
+    machine_id = machine()
+    assert machine_id == machine()
+    assert len(machine_id) == 36
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["machine"]
     monkeypatch.setattr(processes.Path, "home", lambda: tmp_path.joinpath(*tmp_path.rglob("machine")))  # a file
     assert machine() == "studio.local"

@@ -139,8 +139,8 @@ except Cancelled as stop:
 @pytest.mark.usefixtures("hangups_are_heard")
 def test_a_closed_terminal_stops_the_work(tmp_path: Path) -> None:
     ours, theirs = os.openpty()
-    words = [sys.executable, "-c", ON_A_TERMINAL, str(tmp_path / "saved")]
-    with subprocess.Popen(words, cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True) as work:
+    args = [sys.executable, "-c", ON_A_TERMINAL, str(tmp_path / "saved")]
+    with subprocess.Popen(args, cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True) as work:
         os.close(theirs)
         try:
             while b"a step" not in os.read(ours, 1000):

@@ -150,9 +150,9 @@ def test_a_read_only_folder_ends_the_batch(tmp_path: Path, no_flare: Path, numbe
         write_codes(tmp_path / "in" / f"{name}.png", picture())
     opened, tried = os.open, []
 
-    def refuse(path: Any, *words: Any, **options: Any) -> int:
+    def refuse(path: Any, *args: Any, **options: Any) -> int:
         if Path(path).parent != tmp_path / "out":
-            return opened(path, *words, **options)
+            return opened(path, *args, **options)
         tried.append(path)
         raise OSError(number, os.strerror(number), path)
 

@@ -37,8 +37,8 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     DDPMScheduler(beta_start=0.00085, beta_end=0.012,
                   beta_schedule="scaled_linear").save_pretrained(folder / "scheduler")
     letters = [chr(c) for c in range(97, 123)]
-    words = ["<|startoftext|>", "<|endoftext|>", *letters, *(letter + "</w>" for letter in letters)]
-    vocabulary = {token: k for k, token in enumerate(words)}
+    symbols = ["<|startoftext|>", "<|endoftext|>", *letters, *(letter + "</w>" for letter in letters)]
+    vocabulary = {token: k for k, token in enumerate(symbols)}
     CLIPTextModel(CLIPTextConfig(vocab_size=len(vocabulary), hidden_size=16, intermediate_size=16, num_hidden_layers=1,
                                  num_attention_heads=2, max_position_embeddings=77, bos_token_id=0, eos_token_id=1,
                                  pad_token_id=1)).save_pretrained(folder / "text_encoder")
@@ -62,7 +62,7 @@ def pairs() -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 @needs
-def test_what_is_trained_and_what_keeps_its_bits(base: Path) -> None:
+def test_training_changes_the_loras_and_no_weight_of_the_base(base: Path) -> None:
     model = diffusion.DiffusionRemoval(base)
     frozen = {name: value.clone() for name, value in model.named_parameters() if not value.requires_grad}
     names = model.trained_tensors().keys()
@@ -116,12 +116,12 @@ def test_lora_files_load_back(base: Path, tmp_path: Path) -> None:
 
 
 @needs
-def test_a_base_that_is_none(tmp_path: Path) -> None:
+def test_an_invalid_base_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="no base model"):
         diffusion.DiffusionRemoval(tmp_path)
 
 
-def test_without_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
     with pytest.raises(EngineError, match="needs diffusers, transformers, peft"):
         diffusion.check_packages()

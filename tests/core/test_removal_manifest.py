@@ -169,13 +169,13 @@ def test_a_flare_of_an_outdated_clean_plate_is_made_again(tmp_path: Path, flare_
     """It would not go with the clean plate."""
     write_codes(tmp_path / "in" / "a.png", picture())
     one, other = (Remover(flare_everywhere, working_size=size) for size in (64, 96))
-    words = ([tmp_path / "in"], tmp_path / "out")
-    remove_all(*words, one, Progress(), flare_folder=tmp_path / "flares")
+    args = ([tmp_path / "in"], tmp_path / "out")
+    remove_all(*args, one, Progress(), flare_folder=tmp_path / "flares")
     stale = (tmp_path / "flares" / "a.exr").read_bytes()
-    remove_all(*words, other, Progress())
-    assert remove_all(*words, other, Progress(), flare_folder=tmp_path / "flares")["made"] == 1
+    remove_all(*args, other, Progress())
+    assert remove_all(*args, other, Progress(), flare_folder=tmp_path / "flares")["made"] == 1
     assert (tmp_path / "flares" / "a.exr").read_bytes() != stale
-    assert remove_all(*words, other, Progress(), flare_folder=tmp_path / "flares")["kept"] == 1
+    assert remove_all(*args, other, Progress(), flare_folder=tmp_path / "flares")["kept"] == 1
 
 
 def test_an_edited_clean_plate_is_kept(tmp_path: Path, flare_everywhere: Path) -> None:

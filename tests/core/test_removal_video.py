@@ -2,15 +2,22 @@
 """Videos in `remove`: their frames are extracted once, and what is missing is said."""
 from __future__ import annotations
 
+import shutil
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from core.errors import Cancelled, FrameError, SettingsError
 from core.images.read import read_picture
-from core.images.video import Video
+from core.images.video import Video, VideoFrame
+from core.images.video_writer import rewrite_video
+from core.images.write import write_png
+from core.removal.jobs.clean_video import check_request, frames_folder, write_clean_video
 from core.removal.jobs.video_frames import expand_videos, extract_frames
 from core.system.progress import Progress
 from tests.core.recording_progress import RecordingProgress
@@ -91,3 +98,112 @@ def test_an_unreadable_or_cancelled_video_leaves_no_frames(tmp_path: Path) -> No
     assert len(left_out) == 1 and left_out[0].startswith(f"{given[0]} cannot be decoded")
     with pytest.raises(FrameError, match=r"^\S+empty\.mov cannot be decoded"):
         expand_videos(given[:1], out, Progress())
+
+
+def darkened(frame: VideoFrame) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """A change of the upper left corner; the second frame has none."""
+    if frame.number == 1:
+        return None
+    before = frame.picture().pixels
+    after = before.copy()
+    after[:24, :24] *= 0.5
+    return before, after
+
+
+def frames_of(path: Path) -> list[VideoFrame]:
+    with Video(path) as video:
+        return list(video)
+
+
+@pytest.mark.parametrize(("suffix", "codec", "source", "pixels", "tags", "full", "bound"), [
+    (".mkv", "ffv1", "libx264", "yuv420p", (1, 1, 1), True, 0),
+    (".mkv", "ffv1", "ffv1", "yuv444p12le", (9, 16, 9), False, 0),
+    (".mkv", "ffv1", "ffv1", "gbrp10le", None, False, 0),
+    (".mp4", "h264", "libx264", "yuv422p10le", (1, 1, 1), False, 2),
+    (".mkv", "h265", "libx265", "yuv420p10le", (9, 18, 9), False, 2),
+    (".mp4", "h265", "libx264", "yuv444p", (6, 6, 6), True, 6),
+    (".mov", "prores", "libx264", "yuv422p10le", (1, 1, 1), True, 2),
+    (".mov", "prores4444", "ffv1", "gbrp10le", None, False, 3)])
+def test_a_video_is_written_with_what_changed_alone(suffix: str, codec: str, source: str, pixels: str,
+                                                    tags: tuple[int, int, int] | None, full: bool, bound: int,
+                                                    tmp_path: Path) -> None:
+    film = write_video(tmp_path / "film.mkv", source, pixels, [stripes(96) * (1 - 0.1 * n) for n in range(4)], full=full,
+                       matrix=tags[0] if tags else 1, tags=tags,
+                       options=X265 if source == "libx265" else LOSSLESS if source == "libx264" else {})
+    target = tmp_path / f"out{suffix}"
+    assert rewrite_video(film, target, codec, darkened) == []
+    before, after = frames_of(film), frames_of(target)
+    assert len(after) == 4 and [frame.number for frame in after] == [0, 1, 2, 3]
+    for old, new in zip(before, after, strict=True):
+        assert new.colour.transfer == old.colour.transfer and new.colour.primaries == old.colour.primaries
+        assert float(new.raw.pts * new.raw.time_base) == pytest.approx(float(old.raw.pts * old.raw.time_base), abs=1e-3)
+        was, is_now = old.picture().pixels.copy(), new.picture().pixels
+        if old.number != 1:
+            was[:24, :24] *= 0.5
+        was, is_now = (new.colour.from_pixels(pixels) * 255 for pixels in (was, is_now))
+        assert np.abs(was - is_now)[32:, 4:24].max() <= bound, "untouched"
+        assert np.abs(was - is_now)[4:20, 4:20].max() <= bound + 1, "darkened"
+
+
+def test_sound_tags_timecode_shape_and_alpha_of_a_video_stay(tmp_path: Path) -> None:
+    alpha = np.repeat(np.linspace(0, 1, 96)[:, None], 192, 1)
+    film = write_video(tmp_path / "film.mov", "prores_ks", "yuva444p10le", [stripes(96)] * 3, alpha=alpha,
+                       options={"profile": "4444", "alpha_bits": "16"}, sound="pcm_s16le", rotation=90,
+                       aspect=Fraction(4, 3), tags=(1, 1, 1), metadata={"title": "Shot 10", "timecode": "01:02:03:04"})
+    target = tmp_path / "out.mov"
+    assert rewrite_video(film, target, "prores4444", darkened) == []
+    with Video(film) as old, Video(target) as new:
+        assert new.matrix == old.matrix and new.aspect == old.aspect and new.has_alpha
+        first, second = next(iter(old)), next(iter(new))
+        assert np.array_equal(first.alpha(), second.alpha())
+    with av.open(str(film)) as old_file, av.open(str(target)) as new_file:
+        assert new_file.metadata["title"] == "Shot 10"
+        assert new_file.streams.video[0].metadata["timecode"] == "01:02:03:04"
+        assert new_file.streams.video[0].average_rate == old_file.streams.video[0].average_rate
+        sounds = [[bytes(packet) for packet in file.demux(audio=0) if packet.size] for file in (old_file, new_file)]
+        assert b"".join(sounds[0]) == b"".join(sounds[1])
+
+
+def test_what_the_new_video_cannot_hold_is_said(tmp_path: Path) -> None:
+    film = write_video(tmp_path / "film.mkv", "ffv1", "yuva420p", [stripes(96)] * 2, sound="flac",
+                       alpha=np.ones((96, 192)))
+    sentences = rewrite_video(film, tmp_path / "out.mov", "prores", darkened)
+    assert len(sentences) == 2
+    assert "(flac) does not fit into the new file and is encoded as pcm_s24le" in sentences[0]
+    assert "prores has no alpha" in sentences[1]
+    with av.open(str(tmp_path / "out.mov")) as file:
+        assert file.streams.audio[0].codec_context.name == "pcm_s24le"
+
+
+def test_a_clean_video_waits_for_its_frames_and_is_kept(tmp_path: Path) -> None:
+    film, target, heard = clip_of(tmp_path / "film.mp4"), tmp_path / "out.mkv", RecordingProgress()
+    assert check_request([film], target, None) == film
+    folder = frames_folder(target)
+    filmed = extract_frames(film, folder, Progress())
+    for number in (1, 2):
+        shutil.copy(filmed / f"film.{number:06d}.png", folder)
+    assert not write_clean_video(film, target, None, heard) and not target.exists()
+    assert "1 of 3 frames are not clean yet" in heard.texts[-1]
+    write_png(folder / "film.000003.png", np.zeros((64, 192, 3)))
+    assert write_clean_video(film, target, None, heard)
+    levels = [frame.picture().pixels.mean() for frame in frames_of(target)]
+    assert levels[0] > 0.3 and levels[2] < 0.01
+    written = target.stat().st_mtime_ns
+    assert write_clean_video(film, target, None, heard) and target.stat().st_mtime_ns == written
+    target.write_bytes(b"someone's work")
+    with pytest.raises(SettingsError, match=r"out\.mkv exists and was not made from these frames"):
+        write_clean_video(film, target, None, heard)
+    assert write_clean_video(film, target, None, heard, overwrite=True) and target.stat().st_size > 1000
+
+
+@pytest.mark.parametrize(("given", "name", "codec", "sentence"), [
+    (["film.mp4"], "out.webm", None, r"out\.webm is no video that this program writes"),
+    (["film.mp4"], "out.mp4", "prores", r"prores is not written to \.mp4; use \.mov or \.mkv"),
+    (["film.mp4", "film.mp4"], "out.mov", None, "so one video has to be cleaned"),
+    (["."], "out.mov", None, "so one video has to be cleaned"),
+    (["film.mp4"], "film.mp4", None, "is the video itself")])
+def test_a_video_that_cannot_be_written_is_refused(given: list[str], name: str, codec: str | None, sentence: str,
+                                                   tmp_path: Path) -> None:
+    clip_of(tmp_path / "film.mp4")
+    with pytest.raises(SettingsError, match=sentence):
+        check_request([tmp_path / path for path in given], tmp_path / name, codec)

@@ -23,9 +23,9 @@ sys.exit(rooms.main())
 """
 
 
-def made(*words: str | Path) -> subprocess.CompletedProcess[str]:
+def made(*args: str | Path) -> subprocess.CompletedProcess[str]:
     """`rooms.py` with smaller pictures, in a process of its own: Blender's module does not like others beside it."""
-    return subprocess.run([sys.executable, "-W", "ignore", "-c", SMALL, *map(str, words)], cwd=ROOT,
+    return subprocess.run([sys.executable, "-W", "ignore", "-c", SMALL, *map(str, args)], cwd=ROOT,
                           capture_output=True, text=True, timeout=300)
 
 
@@ -43,8 +43,8 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_rooms_are_functions_of_their_numbers_and_none_is_rendered_twice(sources: tuple[Path, Path],
                                                                          tmp_path: Path) -> None:
     photos, maps = sources
-    words = ("--photos", photos, "--maps", maps)
-    first = made("--out", tmp_path / "one", "--count", 3, *words)
+    args = ("--photos", photos, "--maps", maps)
+    first = made("--out", tmp_path / "one", "--count", 3, *args)
     assert first.returncode == 0, first.stderr
     names = [f"room_{number:05d}.png" for number in range(3)]
     one = [read_picture(tmp_path / "one" / name).pixels for name in names]
@@ -56,7 +56,7 @@ def test_rooms_are_functions_of_their_numbers_and_none_is_rendered_twice(sources
     kept, worked_on = (tmp_path / "one" / name for name in names[:2])
     before = kept.stat().st_mtime_ns
     worked_on.unlink()
-    assert made("--out", tmp_path / "one", "--count", 3, *words).returncode == 0
+    assert made("--out", tmp_path / "one", "--count", 3, *args).returncode == 0
     assert kept.stat().st_mtime_ns == before
     assert np.abs(read_picture(worked_on).pixels - one[1]).mean() < 0.02  # but for the order of sums
 
@@ -76,8 +76,8 @@ def test_rooms_refuse_unreadable_pictures_and_a_count_of_0(sources: tuple[Path, 
     broken = tmp_path / "photos" / "broken.png"
     broken.parent.mkdir()
     broken.write_bytes(b"no picture")
-    words = ("--out", tmp_path / "out", "--photos", broken.parent, "--maps", sources[1])
-    refused = made(*words, "--count", 8)  # of eight rooms one shows a photograph for certain
+    args = ("--out", tmp_path / "out", "--photos", broken.parent, "--maps", sources[1])
+    refused = made(*args, "--count", 8)  # of eight rooms one shows a photograph for certain
     assert refused.returncode == 1
     assert f"{broken} cannot be read" in refused.stderr
-    assert "1 or more, not 0" in made(*words, "--count", 0).stderr
+    assert "1 or more, not 0" in made(*args, "--count", 0).stderr

@@ -555,7 +555,7 @@ def test_a_capture_is_rendered_in_chunks(flare: Path, look: Look, tmp_path: Path
 
 
 @pytest.mark.parametrize(("model", "params"), [("PINHOLE", None), ("OPENCV", (57.6, 57.6, 32, 24, 0.02, 0, 0, 0))])
-def test_the_given_plate_space_overrides_the_file(model: str, params: Any, flare: Path, look: Look,
+def test_the_plate_space_setting_overrides_the_file(model: str, params: Any, flare: Path, look: Look,
                                                         tmp_path: Path) -> None:
     """With a lens that distorts as well, whose frames are straightened first."""
     folder = make_capture(tmp_path / "capture", views=3, model=model, params=params)

@@ -25,6 +25,7 @@ import tempfile
 import time
 import traceback
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -227,6 +228,9 @@ def mutate(data: bytes, chance: random.Random) -> bytes:
     """Return a damaged copy of a file."""
     head = int.from_bytes(data[:8], "little") if len(data) > 16 and data[8:9] == b"{" else 0
     kind = chance.random()
+    if data[:4] == b"\x89PNG" and kind < 0.5:  # a wrong header with a right checksum
+        header = bytearray(_mutate_bytes(data[16:29], chance)[:13].ljust(13, b"\0"))
+        return data[:16] + header + zlib.crc32(data[12:16] + header).to_bytes(4, "big") + data[33:]
     if head and kind < 0.6:  # the header of safetensors
         header = data[8:8 + head]
         changed = _mutate_json(header, chance) if kind < 0.45 else _mutate_text(header, chance)

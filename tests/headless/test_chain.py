@@ -52,9 +52,9 @@ class Ended(NamedTuple):
         return [event["name"] for event in self.events if event["type"] == "stage"]
 
 
-def run(command: Sequence[str], *words: object, stop_at: str = "", **variables: str) -> Ended:
+def run(command: Sequence[str], *args: object, stop_at: str = "", **variables: str) -> Ended:
     """Run to the end; `stop_at` interrupts at the first progress of that stage."""
-    whole = [*command, *map(str, words), "--progress", "json"]
+    whole = [*command, *map(str, args), "--progress", "json"]
     child = subprocess.Popen(whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                              env={**os.environ, **variables}, start_new_session=True)
     events = []

@@ -39,10 +39,10 @@ def events(text: str) -> list[dict[str, Any]]:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([name, "--help"]) == 0
-    told = capsys.readouterr().out
-    assert COMMANDS[name].summary in told
-    assert "run.py " + name in told.split("options:")[0].split("\n\n", 1)[1], "an example of its use"
-    assert "--progress" in told
+    help_text = capsys.readouterr().out
+    assert COMMANDS[name].summary in help_text
+    assert "run.py " + name in help_text.split("options:")[0].split("\n\n", 1)[1], "an example of its use"
+    assert "--progress" in help_text
 
 
 def test_runs_of_a_list_lie_below_the_folder_for_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,8 +106,8 @@ def test_an_earlier_compositor_file_is_backed_up(tmp_path: Path) -> None:
 def test_the_help_lists_every_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")  # a narrow terminal breaks names at their hyphens
     assert cli.main(["--help"]) == 0
-    told = capsys.readouterr().out
-    words = told.split()
+    help_text = capsys.readouterr().out
+    words = help_text.split()
     assert all(name in words for name in COMMANDS)
     assert cli.main([]) == 2
 
@@ -118,10 +118,10 @@ def test_the_help_lists_every_command(capsys: pytest.CaptureFixture[str], monkey
     ["eval", "a", "--views", "none"]])
 def test_misuse_is_status_2_and_one_line(words: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words) == 2
-    told = capfd.readouterr()
-    assert told.out == ""
-    assert told.err.startswith("error: ")
-    assert told.err.count("\n") == 1
+    output = capfd.readouterr()
+    assert output.out == ""
+    assert output.err.startswith("error: ")
+    assert output.err.count("\n") == 1
     assert cli.main([*words, "--progress", "json"]) == 2
     (event,) = events(capfd.readouterr().out)
     assert event["type"] == "error"
@@ -192,9 +192,9 @@ def test_invalid_arguments_are_status_2_and_one_line(words: list[str], capture: 
 def _is_refused(words: list[str], status: int, capture: Path, tmp_path: Path,
                 capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.main([word.format(tmp=tmp_path, capture=capture) for word in words]) == status
-    told = capfd.readouterr().err
-    assert told.startswith("error: ")
-    assert told.count("\n") == 1
+    message = capfd.readouterr().err
+    assert message.startswith("error: ")
+    assert message.count("\n") == 1
     assert not list(tmp_path.iterdir()), "nothing was written"
 
 
@@ -247,9 +247,9 @@ def test_every_error_has_its_status_and_message(problem: BaseException, status: 
                              capfd: pytest.CaptureFixture[str]) -> None:
     ending_with(problem, monkeypatch)
     assert cli.main(["try", "--progress=json"]) == status
-    told = capfd.readouterr()
-    assert events(told.out) == [{"type": "say", "text": "working"}, {"type": "error", "text": sentence}]
-    assert ("Traceback" in told.err) == sentence.startswith("A defect")
+    output = capfd.readouterr()
+    assert events(output.out) == [{"type": "say", "text": "working"}, {"type": "error", "text": sentence}]
+    assert ("Traceback" in output.err) == sentence.startswith("A defect")
 
 
 @pytest.mark.parametrize(("resume_rule", "hint"), [
@@ -266,12 +266,13 @@ def test_a_stop_reports_how_to_resume(resume_rule: ResumeRule, hint: str, monkey
 def test_the_help_lists_the_commands_that_resume(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.build_parser().parse_args(["--help"])
-    told = " ".join(capsys.readouterr().out.split())
-    told = told[told.index("run it again,"):]
+    help_text = " ".join(capsys.readouterr().out.split())
+    help_text = help_text[help_text.index("run it again,"):]
     for name, command in COMMANDS.items():
         resumes = any(option == "--resume" for option in _options(command))
         assert (command.resume_rule == "resumes with --resume") == resumes, name
-        assert (f" {name}," in told or f" {name} resume" in told) == (command.resume_rule != "starts over"), name
+        is_listed = f" {name}," in help_text or f" {name} resume" in help_text
+        assert is_listed == (command.resume_rule != "starts over"), name
 
 
 def _options(command: Command) -> list[str]:
@@ -293,9 +294,9 @@ def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPa
                                                     capfd: pytest.CaptureFixture[str]) -> None:
     ending_with(None, monkeypatch)
     assert cli.main(["try", "--progress", "json"]) == 0
-    told = capfd.readouterr()
-    assert [event["type"] for event in events(told.out)] == ["say", "result"]
-    assert "a library prints" in told.err
+    output = capfd.readouterr()
+    assert [event["type"] for event in events(output.out)] == ["say", "result"]
+    assert "a library prints" in output.err
     assert cli.main(["try"]) == 0
     assert "a library prints" in capfd.readouterr().out
 
@@ -304,8 +305,8 @@ def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPa
 def test_commands_run_with_closed_streams(closed: tuple[int, ...]) -> None:
     """Daemons and schedulers start programs so."""
     for extra in ([], ["--progress", "json"]):
-        words = [sys.executable, str(cli.hand_off.RUN_SCRIPT), "engine", *extra]
-        launcher = f"import os; [os.close(n) for n in {closed}]; os.execv({words[0]!r}, {words!r})"
+        args = [sys.executable, str(cli.hand_off.RUN_SCRIPT), "engine", *extra]
+        launcher = f"import os; [os.close(n) for n in {closed}]; os.execv({args[0]!r}, {args!r})"
         done = subprocess.run([sys.executable, "-c", launcher], capture_output=True, check=False)
         assert done.returncode == 0, done.stderr
         assert bool(done.stdout) == (1 not in closed and bool(extra))
@@ -350,9 +351,9 @@ def test_an_option_may_end_with_an_equals_sign(capture: Path, tmp_path: Path,
 
 
 def test_farm_messages_are_written_as_utf8(tmp_path: Path) -> None:
-    words = [sys.executable, str(cli.hand_off.RUN_SCRIPT), "bake", str(tmp_path / "写真"), "--out",
+    args = [sys.executable, str(cli.hand_off.RUN_SCRIPT), "bake", str(tmp_path / "写真"), "--out",
              str(tmp_path / "out"), "--progress", "openjd"]
-    done = subprocess.run(words, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "cp1252"}, check=False)
+    done = subprocess.run(args, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "cp1252"}, check=False)
     assert done.returncode == 1
     lines = done.stdout.decode("utf-8").splitlines()
     assert lines[-1].startswith("openjd_fail: ")
@@ -412,17 +413,17 @@ def test_a_python_without_numpy_runs_the_engine_instead(tmp_path: Path) -> None:
     venv.create(bare, with_pip=False, symlinks=os.name != "nt")
     python = next(path for path in (bare / "bin" / "python", bare / "Scripts" / "python.exe") if path.is_file())
 
-    def said(*words: str, **named: str) -> tuple[int, str]:
-        done = subprocess.run([str(python), str(ROOT / "headless" / "run.py"), *words], capture_output=True, text=True,
+    def said(*args: str, **named: str) -> tuple[int, str]:
+        done = subprocess.run([str(python), str(ROOT / "headless" / "run.py"), *args], capture_output=True, text=True,
                               check=False, env={**os.environ, **named})
         return done.returncode, done.stdout + done.stderr
 
-    status, told = said("fit", "--help", FIT_FLARE_ENGINE=sys.executable)
-    assert status == 0 and "--holdout" in told, told
-    status, told = said("fit", str(tmp_path / "none"), "--out", str(tmp_path / "run"), "--engine", sys.executable)
-    assert status == 1 and "Traceback" not in told and "none" in told, told
-    status, told = said("engine", FIT_FLARE_ENGINE=str(tmp_path / "nowhere"))
-    assert (status, told.count("\n")) == (1, 1) and "is not a Python with torch" in told, told
+    status, output = said("fit", "--help", FIT_FLARE_ENGINE=sys.executable)
+    assert status == 0 and "--holdout" in output, output
+    status, output = said("fit", str(tmp_path / "none"), "--out", str(tmp_path / "run"), "--engine", sys.executable)
+    assert status == 1 and "Traceback" not in output and "none" in output, output
+    status, output = said("engine", FIT_FLARE_ENGINE=str(tmp_path / "nowhere"))
+    assert (status, output.count("\n")) == (1, 1) and "is not a Python with torch" in output, output
 
 
 def test_parsing_arguments_needs_numpy_only() -> None:

@@ -49,10 +49,10 @@ def made(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def job(template: str, step: str, *options: str, **parameters: object) -> str:
     """Run a step as `openjd run` does; its log."""
-    words = [sys.executable, "-m", "openjd", "run", str(ROOT / "headless" / "farm" / template), "--step", step]
+    args = [sys.executable, "-m", "openjd", "run", str(ROOT / "headless" / "farm" / template), "--step", step]
     for name, value in {"RunScript": RUN, "Python": sys.executable, **parameters}.items():
-        words += ["-p", f"{name}={value}"]
-    ended = subprocess.run([*words, *options], capture_output=True, text=True, timeout=300, check=False,
+        args += ["-p", f"{name}={value}"]
+    ended = subprocess.run([*args, *options], capture_output=True, text=True, timeout=300, check=False,
                            env={**os.environ, "OMP_NUM_THREADS": "1"})
     assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-2000:]
     return ended.stdout
@@ -98,10 +98,10 @@ def test_three_chunks_make_what_one_command_makes(capture: Path, made: Path, who
 def test_a_task_that_is_killed_and_run_again_leaves_the_same_files(capture: Path, made: Path, whole: Path,
                                                                   tmp_path: Path) -> None:
     out = tmp_path / "out"
-    words = [sys.executable, RUN, "bake", made, "--capture", capture, "--out", out, "--set", "*.intensity=1",
+    args = [sys.executable, RUN, "bake", made, "--capture", capture, "--out", out, "--set", "*.intensity=1",
              "--frames", FRAMES, "--progress", "openjd"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    task = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
+    task = subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
     begun = time.monotonic()
     while len(list(out.glob("layers.*.exr"))) < 3 and time.monotonic() - begun < 120:
         time.sleep(0.001)
@@ -111,7 +111,7 @@ def test_a_task_that_is_killed_and_run_again_leaves_the_same_files(capture: Path
     # What a kill in the middle of writing leaves: a file begun, a frame cut short, a list without it.
     (out / ".partial-layers.0006.exr-x.exr").write_bytes(b"half")
     (out / "layers.0007.exr").write_bytes((whole / "layers.0007.exr").read_bytes()[:500])
-    again = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    again = subprocess.run(args, capture_output=True, text=True, timeout=300, check=False, env=environment)
     assert again.returncode == 0, again.stderr
     found = contents(out)
     assert found == contents(whole)
@@ -132,14 +132,14 @@ def test_a_job_that_fails_says_why_and_stops_the_others(capture: Path, made: Pat
     assert "openjd_fail: The path of a folder to create is a file" in capfd.readouterr().out
 
 
-def test_fits_over_a_list_of_captures(capture: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_every_capture_of_a_list_is_fitted(capture: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     listed = tmp_path / "captures.txt"
     listed.write_text(f"# the shoot\n{capture}\n{tmp_path / 'absent'}\n")
     job("fit.yaml", "Fit", "--tasks", '[{"Entry": "1"}]', Captures=listed, Entries="1-2", Out=tmp_path / "runs",
         Preset="draft", Set="iterations=3")
     assert (tmp_path / "runs" / capture.name / "flare.flare").is_file()
-    words = [sys.executable, RUN, "fit", "--list", listed, "--out", tmp_path / "runs", "--resume"]
-    assert cli.main([*map(str, words[2:]), "--entry", "3"]) == 2
+    args = [sys.executable, RUN, "fit", "--list", listed, "--out", tmp_path / "runs", "--resume"]
+    assert cli.main([*map(str, args[2:]), "--entry", "3"]) == 2
     assert "lists 2 captures; --entry 3 is none of them" in capfd.readouterr().err
     # All of the list, one after the other: the first cannot be, the second is made all the same.
     listed.write_text(f"{tmp_path / 'absent'}\n{capture}\n")
@@ -149,7 +149,7 @@ def test_fits_over_a_list_of_captures(capture: Path, tmp_path: Path, capfd: pyte
     assert (tmp_path / "all" / capture.name / "flare.flare").is_file()
 
 
-def test_a_transfer_in_chunks(capture: Path, made: Path, tmp_path: Path) -> None:
+def test_a_transfer_runs_in_chunks(capture: Path, made: Path, tmp_path: Path) -> None:
     """On to a shot: two tasks and the record."""
     flare = made / "flare.flare"
     name = read(flare).names[0]

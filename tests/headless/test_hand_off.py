@@ -121,8 +121,8 @@ def test_a_blender_in_a_folder_with_spaces(on_windows: bool, tmp_path: Path, mon
     program = tmp_path / "Program Files" / "blender.exe"
     program.parent.mkdir()
     shutil.copy(sys.executable, program)
-    for text, words in ((str(program), []), (f'"{program}"', []), (f'"{program}" --threads 2', ["--threads", "2"])):
-        assert hand_off.blender_command(text)[:1 + len(words)] == [str(program), *words]
+    for text, args in ((str(program), []), (f'"{program}"', []), (f'"{program}" --threads 2', ["--threads", "2"])):
+        assert hand_off.blender_command(text)[:1 + len(args)] == [str(program), *args]
     with pytest.raises(EngineError, match="is not a program"):
         hand_off.blender_command(f'"{program} --threads 2')
 

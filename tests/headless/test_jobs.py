@@ -48,9 +48,9 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run(*frames: str) -> None:
-    words = argparse.Namespace(argv=["remove"])
+    args = argparse.Namespace(argv=["remove"])
     parts = [["--frames", word] for word in frames]
-    jobs.run_parts(words, "remove", parts, len(parts), len(parts), Progress(), continue_on_failure=True)
+    jobs.run_parts(args, "remove", parts, len(parts), len(parts), Progress(), continue_on_failure=True)
 
 
 @pytest.mark.parametrize(("numbers", "count", "expected"), [
@@ -78,8 +78,8 @@ def test_processes_share_the_available_cores(monkeypatch: pytest.MonkeyPatch,
 def test_names_after_the_end_of_options_stay_names() -> None:
     words = argparse.Namespace(argv=["remove", "--", "bad", "--frames"])
     jobs.run_parts(words, "remove", [["--frames", "told"]], 1, 1, Progress(), continue_on_failure=True)
-    told = json.loads(Path(f"{hand_off.RUN_SCRIPT}.json").read_text(encoding="utf-8"))
-    assert told == ["remove", "--step", "remove", "--frames", "told", "--progress", "json", "--", "bad", "--frames"]
+    args = json.loads(Path(f"{hand_off.RUN_SCRIPT}.json").read_text(encoding="utf-8"))
+    assert args == ["remove", "--step", "remove", "--frames", "told", "--progress", "json", "--", "bad", "--frames"]
 
 
 @pytest.mark.usefixtures("program")
@@ -126,8 +126,8 @@ def test_a_python_that_cannot_start_is_reported_in_one_line(monkeypatch: pytest.
 
 @pytest.mark.usefixtures("program")
 def test_a_failed_process_stops_the_others(tmp_path: Path) -> None:
-    words, began = argparse.Namespace(argv=["bake"]), time.monotonic()
+    args, began = argparse.Namespace(argv=["bake"]), time.monotonic()
     with pytest.raises(FitFlareError, match=r"^Frame 7 is damaged\.$"):
-        jobs.run_parts(words, "bake", [["--frames", "sleep"], ["--frames", "bad"]], 2, 2, Progress())
+        jobs.run_parts(args, "bake", [["--frames", "sleep"], ["--frames", "bad"]], 2, 2, Progress())
     assert time.monotonic() - began < 30
     assert not (tmp_path / "slept").exists()

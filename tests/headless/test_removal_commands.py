@@ -35,12 +35,12 @@ def backgrounds(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_training_stops_at_its_length_and_resumes(backgrounds: Path, tmp_path: Path,
                                                   capsys: pytest.CaptureFixture[str]) -> None:
     torch.set_num_threads(1)
-    words = ["train-removal", "--backgrounds", str(backgrounds), "--out", str(tmp_path / "made"), *SMALL]
-    subprocess.run([sys.executable, RUN, *words, "--iterations", "2"], check=True)  # as many processes as is usual
-    words += ["--processes", "1"]
-    assert cli.main([*words, "--iterations", "3"]) == 1
+    args = ["train-removal", "--backgrounds", str(backgrounds), "--out", str(tmp_path / "made"), *SMALL]
+    subprocess.run([sys.executable, RUN, *args, "--iterations", "2"], check=True)  # as many processes as is usual
+    args += ["--processes", "1"]
+    assert cli.main([*args, "--iterations", "3"]) == 1
     assert "--resume" in capsys.readouterr().err
-    assert cli.main([*words, "--iterations", "3", "--resume"]) == 0
+    assert cli.main([*args, "--iterations", "3", "--resume"]) == 0
     made = tmp_path / "made"
     shorter = ["train-removal", "--backgrounds", str(backgrounds), "--out", str(made), "--resume", "--processes", "1"]
     assert cli.main([*shorter, "--set", "clean_share=0.5"]) == 0
@@ -59,8 +59,8 @@ def test_training_reports_unreadable_files(backgrounds: Path, tmp_path: Path,
     folder = tmp_path / "pictures"
     shutil.copytree(backgrounds, folder)
     (folder / "0_bad.png").write_bytes(b"no picture")
-    words = ["train-removal", "--backgrounds", str(folder), "--out", str(tmp_path / "made"), *SMALL]
-    assert cli.main([*words, "--processes", "1", "--iterations", "1"]) == 0
+    args = ["train-removal", "--backgrounds", str(folder), "--out", str(tmp_path / "made"), *SMALL]
+    assert cli.main([*args, "--processes", "1", "--iterations", "1"]) == 0
     assert f"Left out: 1 of the pictures, {folder / '0_bad.png'} first" in "".join(capsys.readouterr())
 
 
@@ -80,13 +80,13 @@ def test_bad_plates_are_listed_at_the_end(backgrounds: Path, tmp_path: Path,
 def test_an_unreadable_video_is_reported_once(backgrounds: Path, tmp_path: Path,
                                               capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "take.mov").touch()
-    words = ["remove", str(backgrounds / "a.png"), str(tmp_path / "take.mov"), "--out", str(tmp_path / "clean"),
+    args = ["remove", str(backgrounds / "a.png"), str(tmp_path / "take.mov"), "--out", str(tmp_path / "clean"),
              "--progress", "json"]
-    assert cli.main(words) == 1
-    told = [event["text"] for line in capfd.readouterr().out.splitlines() if "take.mov" in (event := json.loads(line))
-            .get("text", "")]
-    assert [text.count("take.mov") for text in told] == [1, 1]  # when it is left out, and at the end
-    assert all("cannot be decoded" in text for text in told) and "1 of 2 plates" in told[-1]
+    assert cli.main(args) == 1
+    messages = [event["text"] for line in capfd.readouterr().out.splitlines()
+                if "take.mov" in (event := json.loads(line)).get("text", "")]
+    assert [text.count("take.mov") for text in messages] == [1, 1]  # when it is left out, and at the end
+    assert all("cannot be decoded" in text for text in messages) and "1 of 2 plates" in messages[-1]
     assert (tmp_path / "clean" / "a.png").exists()
 
 
@@ -97,8 +97,8 @@ def test_an_unreadable_video_does_not_fail_a_range_of_frames(more: list[str], st
     (tmp_path / "take.mov").touch()
     for number in (1, 2):
         shutil.copyfile(backgrounds / "a.png", tmp_path / f"f{number}.png")
-    words = ["remove", *(str(tmp_path / name) for name in ("f1.png", "f2.png", "take.mov"))]
-    assert cli.main([*words, "--out", str(tmp_path / "clean"), *more]) == status
+    args = ["remove", *(str(tmp_path / name) for name in ("f1.png", "f2.png", "take.mov"))]
+    assert cli.main([*args, "--out", str(tmp_path / "clean"), *more]) == status
     said = capsys.readouterr().err
     assert said.count("Left out:") == 1 and "plates could not be cleaned" not in said
     assert {path.name for path in (tmp_path / "clean").iterdir()} == {"f1.png", "f2.png", "remove.json"}
@@ -122,11 +122,11 @@ def test_bad_plates_do_not_stop_other_processes(backgrounds: Path, tmp_path: Pat
 def test_diffusion_needs_a_base_and_its_packages(backgrounds: Path, tmp_path: Path,
                                                  capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path), "--model", "diffusion"]) == 1
-    told = capsys.readouterr().err
-    assert "--base" in told or "needs diffusers" in told
+    message = capsys.readouterr().err
+    assert "--base" in message or "needs diffusers" in message
 
 
-def test_scores_of_pairs(tmp_path: Path, backgrounds: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pairs_are_scored(tmp_path: Path, backgrounds: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for kind in ("input", "gt"):
         shutil.copytree(backgrounds, tmp_path / "pairs" / kind)
     assert cli.main(["eval-removal", str(tmp_path / "pairs"), "--out", str(tmp_path / "eval")]) == 0
@@ -146,19 +146,19 @@ def test_unreadable_pairs_do_not_stop_the_scores_of_others(tmp_path: Path, backg
     pairs = tmp_path / "pairs"
     for kind in ("input", "gt"):
         shutil.copytree(backgrounds, pairs / kind)
-    words = ["--out", str(tmp_path / "eval")]
+    args = ["--out", str(tmp_path / "eval")]
     (pairs / "gt" / "b.png").write_bytes((pairs / "gt" / "b.png").read_bytes()[:60])
-    assert cli.main(["eval-removal", str(pairs), *words]) == 1
+    assert cli.main(["eval-removal", str(pairs), *args]) == 1
     assert "1 of 2 pairs could not be read; the scores of the others are in" in capsys.readouterr().err
     scores = json.loads((tmp_path / "eval" / "eval.json").read_text(encoding="utf-8"))
     assert [row["name"] for row in scores["pictures"]] == ["a"] and "b.png" in scores["failed"][0]
     (pairs / "gt" / "a.png").write_bytes(b"none")
-    assert cli.main(["eval-removal", str(pairs), *words]) == 1
+    assert cli.main(["eval-removal", str(pairs), *args]) == 1
     assert "None of 2 pairs could be read" in capsys.readouterr().err
     (pairs / "input" / "a.jpg").touch()
     for given, said in ((pairs, "a under two suffixes"), (pairs / "input", "holds no pairs"),
                         (tmp_path / "nowhere", "is missing")):
-        assert cli.main(["eval-removal", str(given), *words]) == 2
+        assert cli.main(["eval-removal", str(given), *args]) == 2
         assert said in capsys.readouterr().err
 
 
@@ -173,18 +173,18 @@ def test_a_fit_in_mode_split_makes_no_clean_frames(capture: Path, tmp_path: Path
     assert cli.main(["remove", "--run", str(run), "--out", str(clean), "--frames", "0-1"]) == 0
     filmed = sorted(path.name for path in (bare / "images").iterdir())
     assert sorted(path.name for path in clean.iterdir()) == [*filmed[:2], MANIFEST]
-    for words in (["remove", "--out", str(clean)], ["remove", str(bare), "--run", str(run), "--out", str(clean)],
+    for args in (["remove", "--out", str(clean)], ["remove", str(bare), "--run", str(run), "--out", str(clean)],
                   ["remove", "--run", str(run), "--out", str(clean), "--keep-glare"],
                   ["remove", "--run", str(run), "--out", str(clean), "--all-glare"]):
-        assert cli.main(words) == 2
+        assert cli.main(args) == 2
         assert "--run" in capsys.readouterr().err
 
 
 def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
-    words = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2"]
-    assert cli.main(words) == 0
+    args = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2"]
+    assert cli.main(args) == 0
     said = capsys.readouterr().err
     assert "has no removed/" in said and "the mode is estimated" in said
     frames = {path.stem: path for path in (bare / "images").iterdir()}
@@ -193,7 +193,7 @@ def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys:
     for name, path in made.items():
         assert (read_picture(path).pixels <= read_picture(frames[name]).pixels + 1e-6).all()
     shutil.rmtree(tmp_path / "run")
-    assert cli.main(words) == 0
+    assert cli.main(args) == 0
     said = capsys.readouterr().err
     assert "has no removed/" not in said and "the mode is estimated" in said, "they are kept, and known for estimates"
     assert 'mode = "estimated"' in (tmp_path / "run" / "config.toml").read_text(encoding="utf-8")

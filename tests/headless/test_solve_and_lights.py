@@ -18,14 +18,14 @@ from tests.core.test_solve import SIZE, shoot
 RUN = Path(__file__).resolve().parents[2] / "headless" / "run.py"
 
 
-def run(*words: object) -> tuple[int, list[dict[str, Any]]]:
+def run(*args: object) -> tuple[int, list[dict[str, Any]]]:
     """Exit status and events."""
-    done = subprocess.run([sys.executable, str(RUN), *map(str, words), "--progress", "json"], capture_output=True,
+    done = subprocess.run([sys.executable, str(RUN), *map(str, args), "--progress", "json"], capture_output=True,
                           text=True, check=False)
     return done.returncode, [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def test_from_frames_to_lights(tmp_path: Path) -> None:
+def test_solve_and_lights_make_a_capture_of_frames(tmp_path: Path) -> None:
     frames = shoot(tmp_path / "frames", orbit(9, size=SIZE, arc=0.9))
     status, events = run("solve", frames, "--out", tmp_path / "c")
     assert status == 0 and events[-1]["data"]["registered"] == 9
@@ -36,7 +36,7 @@ def test_from_frames_to_lights(tmp_path: Path) -> None:
     assert any("No light was found" in event["text"] for event in events if event["type"] == "say")
 
 
-def test_lights_and_keep(tmp_path: Path) -> None:
+def test_keep_preserves_the_names_of_lights(tmp_path: Path) -> None:
     folder = lit_capture(tmp_path / "c", 8, [(0.4, -0.5, 0.3)])
     status, events = run("lights", folder)
     (light,) = events[-1]["data"]["lights"]

@@ -49,12 +49,12 @@ Run = Callable[..., list[dict[str, Any]]]
 @pytest.fixture
 def run(capfd: pytest.CaptureFixture[str]) -> Run:
     """The events of a command."""
-    def go(*words: object, status: int = 0) -> list[dict[str, Any]]:
+    def go(*args: object, status: int = 0) -> list[dict[str, Any]]:
         capfd.readouterr()
-        ended = cli.main([*map(str, words), "--progress", "json"])
-        told = capfd.readouterr()
-        assert ended == status, told.out + told.err
-        return [json.loads(line) for line in told.out.splitlines()]
+        ended = cli.main([*map(str, args), "--progress", "json"])
+        output = capfd.readouterr()
+        assert ended == status, output.out + output.err
+        return [json.loads(line) for line in output.out.splitlines()]
 
     return go
 
@@ -120,7 +120,7 @@ def test_a_bare_flare_is_baked_as_its_run_is(run: Run, made: Path, capture: Path
     assert "--blend" in sentence
 
 
-def test_export(run: Run, made: Path, tmp_path: Path) -> None:
+def test_splats_and_preset_have_every_gaussian_of_the_flare(run: Run, made: Path, tmp_path: Path) -> None:
     run("export", made, "--as", "ply", "--out", tmp_path / "ply", "--frames", "2")
     assert len(read_ply(tmp_path / "ply" / "flare.0002.ply")) == read(made / "flare.flare").count
     run("export", made, "--as", "preset", "--out", tmp_path / "lamp.json", "--frames", "2")
@@ -139,12 +139,12 @@ def test_a_preset_needs_a_light_in_front_of_the_camera(run: Run, tmp_path: Path)
     flare = some_flare(lights=2)
     flare.positions[1] = torch.tensor([0.0, 0.0, -8.0])
     save_flare(tmp_path / "a.flare", FlareFile(flare, "add", TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5)))
-    words = ["export", tmp_path / "a.flare", "--capture", folder, "--as", "preset", "--out", tmp_path / "a.json"]
-    told = [event["text"] for event in run(*words) if event["type"] == "say"]
-    assert told[-1] == "Lights behind the camera in frame 0 are left out: lamp 1."
+    args = ["export", tmp_path / "a.flare", "--capture", folder, "--as", "preset", "--out", tmp_path / "a.json"]
+    messages = [event["text"] for event in run(*args) if event["type"] == "say"]
+    assert messages[-1] == "Lights behind the camera in frame 0 are left out: lamp 1."
     made = (tmp_path / "a.json").read_text()
     assert [light["name"] for light in json.loads(made)["lights"]] == ["lamp 0"]
-    assert "No light is in front of the camera in frame 1" in run(*words, "--frames", "1", status=1)[-1]["text"]
+    assert "No light is in front of the camera in frame 1" in run(*args, "--frames", "1", status=1)[-1]["text"]
     assert (tmp_path / "a.json").read_text() == made
 
 
@@ -250,10 +250,11 @@ def test_a_missing_target_lists_the_kinds_of_target(run: Run, made: Path, tmp_pa
 
 
 def test_a_target_of_an_unsupported_kind_is_reported(run: Run, made: Path, tmp_path: Path) -> None:
-    for name, told in (("a.mov", "a.mov is a video; take its frames out first"), ("a.txt", "a.txt is not a picture")):
+    for name, sentence in (("a.mov", "a.mov is a video; take its frames out first"),
+                           ("a.txt", "a.txt is not a picture")):
         (tmp_path / name).touch()
         text = run("transfer", made, "--to", tmp_path / name, "--light", "9,9", "--out", tmp_path / "o", status=1)[-1]
-        assert told in text["text"]
+        assert sentence in text["text"]
 
 
 def test_the_animated_camera_of_a_blend_is_a_capture(run: Run, blend: Path, tmp_path: Path) -> None:

@@ -177,18 +177,18 @@ class Video:
         if first is None:
             self.close()
             raise self._unreadable()
-        self.colour = _colour_of(self.path, first, self._stream)
+        self.colour = _colour_of(self.path, first, self.stream)
         """What the codes of the first frame mean."""
         self.matrix = display_matrix(first)
         self.orientation = orientation_from_matrix(self.matrix)
         self.stored_size = int(first.width), int(first.height)
         """(width, height) of frames before they are turned upright."""
         self.length = self._promised_length()
-        ratio = Fraction(self._stream.sample_aspect_ratio or 0)
+        ratio = Fraction(self.stream.sample_aspect_ratio or 0)
         aspect = float(ratio) if ratio > 0 else 1.0
         self.aspect = 1 / aspect if self.orientation.transposed else aspect
         self.has_alpha = _has_alpha(first)
-        self.rate = Fraction(self._stream.average_rate or self._stream.guessed_rate or 25)
+        self.rate = Fraction(self.stream.average_rate or self.stream.guessed_rate or 25)
         """Frames a second, on average."""
         self.estimated_length = self.length or self._length_by_duration()
         """About how many frames there are, for progress; 0 where even the duration is unknown."""
@@ -217,7 +217,7 @@ class Video:
                 return
             tags = (raw.colorspace, raw.color_range, raw.color_trc, raw.color_primaries)
             if tags not in colours:
-                colours[tags] = _colour_of(self.path, raw, self._stream)
+                colours[tags] = _colour_of(self.path, raw, self.stream)
             frame = VideoFrame(number, raw, colours[tags], self.orientation)
             if frame.is_damaged:
                 damaged.append(number + 1)
@@ -246,9 +246,11 @@ class Video:
             if not streams:
                 raise FrameError(f"{self.path} holds no video; give the file with the picture.")
             best = self._container.streams.best("video")
-            self._stream = best if best in streams else streams[0]
-            self._stream.codec_context.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
-            self._stream.thread_type = "AUTO"
+            self.stream: Any = best if best in streams else streams[0]
+            if self.stream.codec_context is None:  # no decoder
+                raise self._unreadable()
+            self.stream.codec_context.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
+            self.stream.thread_type = "AUTO"
         except (av.error.FFmpegError, OSError, ValueError, MemoryError) as problem:
             raise self._unreadable() from problem
 
@@ -262,7 +264,7 @@ class Video:
         """Yield PyAV's frames from the present position; what cannot be decoded is passed over, and missing then."""
         av = import_av()
         errors = (av.error.FFmpegError, OSError, ValueError, RuntimeError, MemoryError)
-        packets = self._container.demux(self._stream)
+        packets = self._container.demux(self.stream)
         while True:
             try:
                 packet = next(packets)
@@ -271,7 +273,7 @@ class Video:
             except errors:  # the container is damaged here; what the decoder still holds comes out
                 packet = None
             try:
-                frames = self._stream.codec_context.decode(packet)
+                frames = self.stream.codec_context.decode(packet)
             except errors:
                 frames = []
             for frame in frames:
@@ -306,7 +308,7 @@ class Video:
         av = import_av()
         self._open()
         try:
-            self._container.seek(ticks, stream=self._stream, backward=True)
+            self._container.seek(ticks, stream=self.stream, backward=True)
         except (av.error.FFmpegError, OSError, ValueError):
             return False
         return True
@@ -316,7 +318,7 @@ class Video:
         av = import_av()
         times = list[int]()
         try:
-            for packet in self._container.demux(self._stream):
+            for packet in self._container.demux(self.stream):
                 if packet.size == 0 or packet.is_discard:
                     continue
                 if packet.pts is None:
@@ -328,7 +330,7 @@ class Video:
 
     def _promised_length(self) -> int:
         """Return the number of frames by the header; those that an edit list hides do not count."""
-        stream = self._stream
+        stream = self.stream
         if not stream.frames:
             return 0
         if "mov" not in self._container.format.name:

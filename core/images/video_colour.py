@@ -142,7 +142,8 @@ class VideoColour:
 
     @property
     def _decoding(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(3, 3) and (3,): signal R G B = matrix @ codes + offset; for G B R planes they arrive as R G B."""
+        """Return matrix (3, 3) and offset (3,): signal R G B = matrix @ codes + offset; codes of RGB planes are R G B.
+        """
         step, top = float(1 << (self.bits - 8)), float((1 << self.bits) - 1)
         luma, difference, black = ((219 * step, 224 * step, 16 * step) if self.limited else (top, top, 0.0))
         if self.matrix == RGB:

@@ -24,8 +24,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--run", type=Path, metavar="RUN",
                         help="instead of PLATE: subtract the flare of this run from the frames that it was fitted to")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="the run's capture, if it was moved")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR",
-                        help="folder for the clean plates; they keep the names of the plates")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR_OR_VIDEO",
+                        help="folder for the clean plates, which keep the names of the plates; or, for one video, a "
+                             "video (.mov, .mp4, .mkv) with its sound, tags and timing, beside its frames in "
+                             "NAME.frames")
+    parser.add_argument("--codec", choices=("prores", "prores4444", "h264", "h265", "ffv1"),
+                        help="of a video that is written: ProRes 422 HQ or 4444, H.264, H.265 or FFV1 (default: ProRes "
+                             "in .mov, FFV1 in .mkv, H.264 or, for more than 8 bits, H.265 in .mp4)")
     frames.add_option(parser, "numbers of frames, as in the names of the plates, such as 1-20,31 or 1-99:2; of "
                                "several sequences, in each (default: all)")
     frames.add_job_option(parser)
@@ -52,16 +57,40 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Clean the plates, in `--jobs` processes. Raises FrameError for plates that failed, after the others are done."""
+    from ...core.images.video import is_video
+
+    if (args.run is None) == (not args.plates):
+        raise SettingsError("remove needs either plates or a fitted run with --run.")
+    if args.run is not None:
+        reject_unused_options(args, {"codec": None}, "a video that is cleaned to a video")
+        return _remove_fitted_flare(args, progress)
+    reject_unused_options(args, {"capture": None}, "--run")
+    if is_video(args.out) and not args.out.is_dir():
+        return _clean_video(args, progress)
+    reject_unused_options(args, {"codec": None}, "a video that is cleaned to a video")
+    return _clean_plates(args, progress)
+
+
+def _clean_video(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Clean the frames of one video, and write them as a video when all are clean."""
+    from ...core.removal.jobs.clean_video import check_request, frames_folder, write_clean_video
+
+    target = args.out
+    source = check_request(args.plates, target, args.codec)
+    args.out = frames_folder(target)
+    result = _clean_plates(args, progress)
+    if write_clean_video(source, target, args.codec, progress, overwrite=args.overwrite):
+        result["video"] = str(target)
+    return result
+
+
+def _clean_plates(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Clean plates into a folder. Raises FrameError for plates that failed, after the others are done."""
     from ...core.conventions.frame_numbers import NumberedFrame, number_sequences
     from ...core.removal.jobs.batch import collect_plates, remove_all
     from ...core.removal.jobs.mattes import Mattes
     from ...core.removal.jobs.video_frames import expand_videos
 
-    if (args.run is None) == (not args.plates):
-        raise SettingsError("remove needs either plates or a fitted run with --run.")
-    if args.run is not None:
-        return _remove_fitted_flare(args, progress)
-    reject_unused_options(args, {"capture": None}, "--run")
     inputs, left_out = expand_videos(args.plates, args.out, progress)
     for sentence in left_out:
         progress.say(f"Left out: {sentence}")
@@ -152,7 +181,8 @@ that cannot be read does not stop the others and is listed at the end.
 
   run.py remove plate.exr --out clean
   run.py remove shots/sh010 --out clean/sh010 --flare flares/sh010 --keep-glow
-  run.py remove clip.mp4 --out clean/clip                               # the clean frames as PNG
+  run.py remove clip.mp4 --out clean/clip                               # the clean frames as PNG or EXR
+  run.py remove clip.mov --out clean.mov                                # a video, with the sound and tags of the first
   run.py remove shots/sh010 --matte roto/sh010 --out clean/sh010        # only where the artist has marked flares
   run.py remove --run my_run --out clean          # subtracts the fitted flare""",
     arguments, (Step("remove", "engine", run),), resume_rule="resumes")

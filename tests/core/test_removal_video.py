@@ -127,7 +127,8 @@ def frames_of(path: Path) -> list[VideoFrame]:
 def test_a_video_is_written_with_what_changed_alone(suffix: str, codec: str, source: str, pixels: str,
                                                     tags: tuple[int, int, int] | None, full: bool, bound: int,
                                                     tmp_path: Path) -> None:
-    film = write_video(tmp_path / "film.mkv", source, pixels, [stripes(96) * (1 - 0.1 * n) for n in range(4)], full=full,
+    signals = [stripes(96) * (1 - 0.1 * n) for n in range(4)]
+    film = write_video(tmp_path / "film.mkv", source, pixels, signals, full=full,
                        matrix=tags[0] if tags else 1, tags=tags,
                        options=X265 if source == "libx265" else LOSSLESS if source == "libx264" else {})
     target = tmp_path / f"out{suffix}"

@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Writes a video anew with changed frames: its sound, tags, timecode, colour tags and timing stay.
+
+`core/removal/jobs/clean_video.py` calls `rewrite_video`. A change is added to the codes of the decoded frame, in its
+own matrix, range and curve, so what does not change keeps its codes up to the encoder; FFV1 then loses nothing.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FrameError, SettingsError
+from ..system.files import atomic_path
+from .video import Video, VideoFrame, import_av
+from .video_planes import PlaneFormat, plane_arrays, plane_format, shrink_plane, to_planar
+
+CONTAINERS = {".mov": "mov", ".mp4": "mp4", ".m4v": "mp4", ".mkv": "matroska"}
+"""FFmpeg's names of the containers that are written, by suffix."""
+MOV_SOUND = ("pcm_", "aac", "alac", "mp3", "ac3", "eac3")
+"""Starts of the names of sound codecs that QuickTime files hold; others are encoded as PCM of 24 bits."""
+LEAD_S = Fraction(1, 2)
+"""Seconds of sound that are written ahead of the picture."""
+_BRANDS = ("major_brand", "minor_version", "compatible_brands", "encoder")
+_STREAM_FACTS = ("rotate", "encoder", "duration", "bps", "number_of", "_statistics", "vendor_id")
+"""Starts of tags that describe the old stream rather than its content."""
+Change = Callable[[VideoFrame], tuple[NDArray[np.float32], NDArray[np.float32]] | None]
+"""Returns the pixels of a frame before and after, upright, as display values 0..1 or light; None where none change."""
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """An encoder by FFmpeg's name: its options, its containers, and the formats it gets what it does not take in."""
+
+    name: str
+    options: dict[str, str]
+    suffixes: tuple[str, ...]
+    fallback: str
+    alpha: str | None = None
+    deep: str | None = None
+    limited: bool = False
+    tag: str | None = None
+    keeps: Callable[[PlaneFormat], bool] = field(default=lambda planar: not planar.has_alpha)
+
+
+CODECS: dict[str, Encoder] = {
+    "prores": Encoder("prores_ks", {"profile": "hq", "vendor": "apl0"}, (".mov", ".mkv"), "yuv422p10le",
+                      limited=True, keeps=lambda planar: planar.name == "yuv422p10le"),
+    "prores4444": Encoder("prores_ks", {"profile": "4444", "vendor": "apl0", "alpha_bits": "16"}, (".mov", ".mkv"),
+                          "yuv444p10le", alpha="yuva444p10le", limited=True,
+                          keeps=lambda planar: planar.name in ("yuv444p10le", "yuva444p10le")),
+    "h264": Encoder("libx264", {"crf": "10", "preset": "medium"}, (".mov", ".mp4", ".m4v", ".mkv"), "yuv444p",
+                    deep="yuv444p10le"),
+    "h265": Encoder("libx265", {"crf": "10", "preset": "medium", "x265-params": "log-level=none"},
+                    (".mov", ".mp4", ".m4v", ".mkv"), "yuv444p", deep="yuv444p10le", tag="hvc1"),
+    "ffv1": Encoder("ffv1", {"level": "3", "slicecrc": "1"}, (".mkv",), "gbrp16le", alpha="gbrap16le",
+                    keeps=lambda planar: planar.bits > 0),
+}
+"""Encoders by the names of the command line."""
+
+
+def choose_codec(target: Path, video: Video, codec: str | None) -> str:
+    """Return the codec for a file: `codec`, else one by the container, the depth and the alpha of a video.
+
+    Raises SettingsError for a container that is not written, or that does not hold the codec.
+    """
+    suffix = target.suffix.lower()
+    check_target(target, codec)
+    if codec is not None:
+        return codec
+    if suffix == ".mkv":
+        return "ffv1"
+    if suffix == ".mov":
+        return "prores4444" if video.has_alpha or video.colour.matrix == 0 else "prores"
+    return "h265" if video.colour.bits > 8 or video.colour.is_light else "h264"
+
+
+def check_target(target: Path, codec: str | None) -> None:
+    """Raise SettingsError for a video that cannot be written."""
+    suffix = target.suffix.lower()
+    if suffix not in CONTAINERS:
+        raise SettingsError(f"{target} is no video that this program writes; name it .mov, .mp4 or .mkv.")
+    if codec is not None and suffix not in CODECS[codec].suffixes:
+        raise SettingsError(f"{codec} is not written to {suffix}; use {' or '.join(CODECS[codec].suffixes)}.")
+
+
+def rewrite_video(source: Path, target: Path, codec: str, change: Change, *,
+                  on_frame: Callable[[], None] = lambda: None) -> list[str]:
+    """Write `source` to `target` with changed frames, and return sentences about what was left out.
+
+    on_frame: called after each frame, and may raise to stop. Raises FrameError where the source cannot be decoded or
+    the target not be encoded.
+    """
+    av = import_av()
+    encoder = CODECS[codec]
+    with Video(source) as video, atomic_path(target) as temporary, av.open(str(source), metadata_errors="replace") as \
+            other:
+        options = {"movflags": "use_metadata_tags"} if any("." in name for name in other.metadata) else {}
+        container_format = CONTAINERS[target.suffix.lower()]
+        if container_format == "matroska":
+            options = {}
+        left_out = list[str]()
+        try:
+            with av.open(str(temporary), "w", format=container_format, container_options=options) as out:
+                _copy_tags(other.metadata, out.metadata, _BRANDS)
+                stream = _add_picture(out, video, other, encoder)
+                sound = _OtherStreams(other, out, video, left_out)
+                _copy_chapters(other, out)
+                _encode(out, stream, encoder, video, change, sound, on_frame)
+        except (av.error.FFmpegError, ValueError) as problem:
+            raise FrameError(f"{target} cannot be written as {codec}: {problem}; choose another --codec or another "
+                             "suffix.") from problem
+        if video.has_alpha and encoder.alpha is None:
+            left_out.append(f"{codec} has no alpha, so that of {source} is left out; use --codec prores4444 or ffv1.")
+        if encoder.name == "ffv1" and video.aspect != 1:
+            left_out.append(f"FFV1 in .mkv is written without the pixel aspect of {source}, {video.aspect:.4g}; set it "
+                            "where it is used, or write another codec.")
+        return left_out + video.problems
+
+
+def _copy_tags(tags: Any, target: Any, skipped: tuple[str, ...]) -> None:
+    target.update({name: value for name, value in tags.items() if not name.lower().startswith(skipped)})
+
+
+def _copy_chapters(source: Any, target: Any) -> None:
+    if hasattr(source, "chapters") and (chapters := source.chapters()):
+        target.set_chapters(chapters)
+
+
+def _timecode(container: Any, stream: Any) -> str | None:
+    """Return the timecode of the first frame, wherever a container keeps it."""
+    for tags in (stream.metadata, container.metadata, *(other.metadata for other in container.streams)):
+        for name, value in tags.items():
+            if name.lower() == "timecode":
+                return str(value)
+    return None
+
+
+def _output_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFormat:
+    """Return the planar format that is encoded: the source's, or the nearest that the encoder takes."""
+    av = import_av()
+    _, planar = to_planar(first.raw, video.colour.limited)
+    taken = {pixel_format.name for pixel_format in av.codec.Codec(encoder.name, "w").video_formats or ()}
+    if encoder.keeps(planar) and planar.name in taken and not (encoder.limited and not video.colour.limited):
+        return planar
+    name, plain = encoder.fallback, planar.name.replace("yuvj", "yuv")
+    if encoder.alpha is None:
+        plain = plain.replace("yuva", "yuv")
+    if plain in taken and not encoder.limited:
+        name = plain
+    elif planar.has_alpha and encoder.alpha is not None:
+        name = encoder.alpha
+    elif encoder.deep is not None and planar.bits > 8:
+        name = encoder.deep
+    chosen = plane_format(name)
+    assert chosen is not None
+    return chosen
+
+
+def _add_picture(out: Any, video: Video, source: Any, encoder: Encoder) -> Any:
+    """Add the stream of the frames, with the tags, timing and shape of the source's."""
+    first = next(iter(video), None)
+    if first is None:
+        raise FrameError(f"{video.path} has no frame that can be read; copy it again.")
+    planar, raw = _output_format(encoder, video, first), first.raw
+    original = video.stream
+    options = dict(encoder.options)
+    stream = out.add_stream(encoder.name, rate=video.rate, options=options)
+    stream.width, stream.height = video.stored_size
+    stream.pix_fmt = planar.name
+    context = stream.codec_context
+    context.time_base = original.time_base if first.time is not None else 1 / video.rate
+    if encoder.tag is not None and out.format.name != "matroska":
+        context.codec_tag = encoder.tag
+    ratio = original.sample_aspect_ratio
+    if ratio:
+        context.sample_aspect_ratio = ratio
+    tags = {"colorspace": raw.colorspace, "color_trc": raw.color_trc, "color_primaries": raw.color_primaries}
+    for name, value in tags.items():
+        setattr(context, name, value if value not in (0, 2) else getattr(original.codec_context, name))
+    if not planar.is_rgb and video.colour.matrix == 0:
+        context.colorspace = 1 if min(video.stored_size) > 576 else 6
+    context.color_range = 1 if _is_limited(planar, video, encoder) else 2
+    if video.matrix is not None:
+        stream.set_display_matrix(video.matrix)
+    _copy_tags(original.metadata, stream.metadata, _STREAM_FACTS)
+    if timecode := _timecode(source, original):
+        stream.metadata["timecode"] = timecode
+    return stream
+
+
+def _is_limited(planar: PlaneFormat, video: Video, encoder: Encoder) -> bool:
+    if planar.is_rgb:
+        return False
+    return encoder.limited or video.colour.limited or video.colour.matrix == 0
+
+
+class _OtherStreams:
+    """Sound and subtitles of the source, copied packet by packet beside the frames."""
+
+    def __init__(self, source: Any, out: Any, video: Video, left_out: list[str]) -> None:
+        self._out, self._targets, self._encoded = out, dict[int, Any](), dict[int, Any]()
+        chosen = list[Any]()
+        for stream in source.streams:
+            if stream.index == video.stream.index or stream.type == "video":
+                continue
+            codec = stream.codec_context.name if stream.codec_context is not None else ""
+            if stream.type == "audio" and codec:
+                is_mov = out.format.name == "mov"
+                anew = "pcm_s24le" if is_mov else out.default_audio_codec
+                if codec.startswith(MOV_SOUND) if is_mov else codec in out.supported_codecs:
+                    target = out.add_stream_from_template(stream)
+                else:
+                    target = out.add_stream(anew, rate=stream.codec_context.sample_rate)
+                    target.codec_context.layout = stream.codec_context.layout
+                    self._encoded[stream.index] = target
+                    left_out.append(f"The sound of {video.path} ({codec}) does not fit into the new file and is "
+                                    f"encoded as {anew}.")
+            elif stream.type == "subtitle" and codec in out.supported_codecs:
+                target = out.add_stream_from_template(stream)
+            else:
+                if codec or "timecode" not in str(stream.metadata).lower():
+                    left_out.append(f"Stream {stream.index} of {video.path} ({stream.type}) is left out.")
+                continue
+            _copy_tags(stream.metadata, target.metadata, _STREAM_FACTS)
+            self._targets[stream.index] = target
+            chosen.append(stream)
+        self._packets: Iterator[Any] = iter(source.demux(chosen)) if chosen else iter(())
+        self._waiting: Any = None
+
+    def write_until(self, time: Fraction | None) -> None:
+        """Write what is due at `time` seconds; all that is left for None."""
+        av = import_av()
+        while True:
+            try:
+                packet = self._waiting or next(self._packets, None)
+            except (av.error.FFmpegError, OSError):
+                packet = None
+            self._waiting = None
+            if packet is None:
+                break
+            if packet.dts is not None and time is not None and packet.dts * packet.time_base > time:
+                self._waiting = packet
+                return
+            self._write(packet)
+        if time is None:
+            for target in self._encoded.values():
+                self._out.mux(target.encode())
+            self._encoded.clear()
+
+    def _write(self, packet: Any) -> None:
+        target = self._targets[packet.stream.index]
+        if packet.stream.index in self._encoded:
+            for frame in packet.decode():
+                self._out.mux(target.encode(frame))
+        elif packet.dts is not None:
+            packet.stream = target
+            self._out.mux(packet)
+
+
+def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Change, sound: _OtherStreams,
+            on_frame: Callable[[], None]) -> None:
+    planar = plane_format(stream.pix_fmt)
+    assert planar is not None
+    context, time_base = stream.codec_context, stream.codec_context.time_base
+    limited = _is_limited(planar, video, encoder)
+    last: int | None = None
+    for frame in video:
+        both = change(frame)
+        raw = apply_change(frame, *both) if both is not None else frame.raw
+        if raw.format.name != planar.name or (not planar.is_rgb and frame.colour.limited != limited):
+            raw = _reformat(raw, frame, planar, context, limited=limited)
+        ticks = frame.number if frame.time is None else frame.time[0]
+        if last is not None and ticks <= last:  # a damaged file may repeat a time
+            ticks = last + 1
+        raw.pts, raw.time_base, raw.pict_type, last = ticks, time_base, 0, ticks
+        raw.color_range, raw.colorspace = context.color_range, context.colorspace
+        sound.write_until(ticks * time_base + LEAD_S)
+        out.mux(stream.encode(raw))
+        on_frame()
+    out.mux(stream.encode())
+    sound.write_until(None)
+
+
+def _reformat(raw: Any, frame: VideoFrame, planar: PlaneFormat, context: Any, *, limited: bool) -> Any:
+    """Convert a frame to another planar format by swscale, exactly."""
+    from av.video.reformatter import Interpolation
+
+    exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | \
+        Interpolation.FULL_CHR_H_INP
+    source = _SWSCALE_MATRICES.get(frame.colour.matrix, 5)
+    target = _SWSCALE_MATRICES.get(int(context.colorspace), source)
+    return raw.reformat(format=planar.name, interpolation=exact, src_colorspace=source, dst_colorspace=target,
+                        src_color_range=1 if frame.colour.limited else 2,
+                        dst_color_range=1 if limited and not planar.is_rgb else 2)
+
+
+_SWSCALE_MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9}
+"""swscale's numbers of matrix coefficients."""
+
+
+def apply_change(frame: VideoFrame, before: NDArray[np.float32], after: NDArray[np.float32]) -> Any:
+    """Return PyAV's frame with the change from `before` to `after` added to its codes, in a planar format.
+
+    Codes of pixels that do not change stay as they are; those of subsampled colour change by the mean of their pixels.
+    """
+    colour = frame.colour
+    difference = colour.from_pixels(after) - colour.from_pixels(before)
+    difference[(after == before).all(-1)] = 0
+    raw, planar = to_planar(frame.raw, colour.limited)
+    raw.make_writable()
+    arrays, top = plane_arrays(raw, planar), (1 << planar.bits) - 1
+    codes = colour.to_plane_differences(frame.orientation.stored(difference))
+    for index in range(1 if planar.is_grey else 3):
+        plane = codes[..., index]
+        if index and not planar.is_rgb and planar.sampling != (1, 1):
+            plane = shrink_plane(np.ascontiguousarray(plane), planar)
+        changed = np.clip(np.rint(arrays[index].astype(np.float32) + plane), 0, top)
+        arrays[index][...] = changed.astype(planar.dtype)
+    return raw

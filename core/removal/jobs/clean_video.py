@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Writes a video of clean frames, with sound and metadata of the source video.
+
+`headless/commands/remove.py` calls it for `--out NAME.mov`: `frames_folder` names where the clean frames lie, and
+`write_clean_video` writes the video once all of them are there, so that the tasks of a farm need no order.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import FrameError, SettingsError
+from ...images.listing import pictures_in
+from ...images.read import read_picture
+from ...images.video import Video, VideoFrame, is_video
+from ...images.video_writer import check_target, choose_codec, rewrite_video
+from ...system.files import content_hash, read_json, real_path, write_json
+from ...system.progress import Progress
+from .manifest import digest_inputs
+
+RECORD = "clean_video.json"
+"""The file beside the clean frames that says which video was written of them."""
+
+
+def check_request(inputs: Sequence[Path], target: Path, codec: str | None) -> Path:
+    """Return the video that is to be cleaned to another. Raises SettingsError for anything but one video."""
+    check_target(target, codec)
+    if len(inputs) != 1 or not is_video(inputs[0]) or not inputs[0].is_file():
+        raise SettingsError(f"--out {target} is a video, so one video has to be cleaned; name a folder for the clean "
+                            "frames of anything else.")
+    if real_path(inputs[0]) == real_path(target):
+        raise SettingsError(f"{target} is the video itself; choose another name for the clean one.")
+    return inputs[0]
+
+
+def frames_folder(target: Path) -> Path:
+    """Return the folder of the clean frames of a video: NAME.frames beside NAME.mov."""
+    return target.with_suffix(".frames")
+
+
+def write_clean_video(source: Path, target: Path, codec: str | None, progress: Progress, *,
+                      overwrite: bool = False) -> bool:
+    """Write the clean frames in `frames_folder` as a video; False while some are missing.
+
+    A video that was written of the same frames is kept. Raises SettingsError where the target is another file, unless
+    `overwrite`, and FrameError where it cannot be written.
+    """
+    folder = frames_folder(target)
+    filmed = {path.stem: path for path in pictures_in(folder / f"{source.name}.frames")}
+    clean = {stem: folder / path.name for stem, path in filmed.items()}
+    if missing := sum(not path.is_file() for path in clean.values()):
+        progress.say(f"{missing} of {len(clean)} frames are not clean yet; {target} is written when all are.")
+        return False
+    with Video(source) as video:
+        name = choose_codec(target, video, codec)
+    digest = digest_inputs(name, [source, *clean.values()])
+    record = read_json(folder / RECORD, SettingsError) if (folder / RECORD).is_file() else {}
+    if target.exists() and not overwrite:
+        if record.get("written") != content_hash(target):
+            raise SettingsError(f"{target} exists and was not made from these frames, so it may be someone's work; "
+                                "choose another name, or replace it with --overwrite.")
+        if record.get("from") == digest:
+            progress.say(f"{target} is up to date; --overwrite makes it again.")
+            return True
+
+    def change(frame: VideoFrame) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        stem = f"{source.stem}.{frame.number + 1:06d}"
+        if stem not in filmed:
+            raise FrameError(f"{folder / stem} is missing among the frames of {source}; delete {folder} and clean it "
+                             "again.")
+        before, after = read_picture(filmed[stem]), read_picture(clean[stem])
+        return None if np.array_equal(before.pixels, after.pixels) else (before.pixels, after.pixels)
+
+    progress.stage(f"write {target.name}", len(clean))
+    for sentence in rewrite_video(source, target, name, change, on_frame=progress.advance):
+        progress.say(sentence)
+    write_json(folder / RECORD, {"from": digest, "written": content_hash(target)})
+    progress.say(f"The clean video is {target}.")
+    return True

@@ -64,7 +64,7 @@ class ShotPredictor:
         self._evict({path, *before, *after}, before)
         for neighbour in (*before, *after):
             self._read_features(neighbour)
-        plate = read_plate(path)
+        plate = read_plate(path, self._remover.plate_space)
         features = self._features[path] = self._features.get(path) or self._compute_features(plate)
         frame = self._predict_frame(path, features)
         return plate, filter_in_time(frame, [
@@ -94,7 +94,8 @@ class ShotPredictor:
         """Return the features of a plate; None where it cannot be read."""
         if path not in self._features:
             try:
-                self._features[path] = self._compute_features(read_plate(path))
+                self._features[path] = self._compute_features(
+                    read_plate(path, self._remover.plate_space))
             except Exception as problem:
                 if not is_plate_error(problem):
                     raise

@@ -15,17 +15,35 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...colour import ColourSpace
 from ...colour.srgb import Pixels
 from ...errors import SettingsError
 from ...images.plates import Plate
 from ...system.reading import read_bytes
 from ..model.image_formation import flare_to_linear
-from ..model.network import SIZE_MULTIPLE, RemovalNetwork
+from ..model.network import RemovalNetwork
 from ..model.weights import IN_THE_BOX, load
 from .confidence import gate_by_mean
+from .framing import (
+    fill_hidden,
+    input_size,
+    merge_columns,
+    predict_in_parts,
+    wrap_columns,
+    wrap_margin,
+    wrap_plate,
+)
 from .guided_filter import fit_guided_filter, upsample_flare
 from .light_discs import retained_fraction
-from .plate_light import downscale_linear, removed_light, subtract_flare, to_display, to_linear
+from .plate_light import (
+    MAX_FLOAT16,
+    downscale_linear,
+    removed_light,
+    subtract_flare,
+    to_display,
+    to_linear,
+    to_network_plate,
+)
 from .prediction import FlarePrediction, TtaPrediction
 from .test_time_augmentation import merge_flare, predict_with_tta, shot_confidence
 
@@ -35,11 +53,11 @@ MIN_FLARE = 0.002
 """What a flare adds to display values, up to which there is none: half a code of 8 bits."""
 MIN_MEAN_FLARE = 0.0005
 """Gate (`gate_by_mean`) of the network's predictions, display values: it predicts small flares where there are none."""
-REVISION = 3
+REVISION = 4
 """Raised whenever the same plate, weights and settings give another result, so that existing results are made again."""
 Glow = Literal["keep", "keep at lights", "remove"]
-"""What to do with the glow about lights: keep it; keep the part that lights at night have with a clean lens, too
-(`light_discs`); or remove it all, as a fit needs it, to which it is flare."""
+"""What to do with the glow about lights: keep all of it; keep the part that lights at night have with a clean lens too
+(`light_discs`); or remove all of it, as for a fit, which learns it as flare."""
 _GLOW_IN_CACHE_KEY = {"keep": "kept", "keep at lights": "kept at lamps", "remove": "taken"}
 """Text of each mode in cache keys. It never changes, so that existing results stay valid."""
 
@@ -62,6 +80,15 @@ class Remover:
         self.cache_key = compute_cache_key("network", weights or IN_THE_BOX, working_size,
                                            _GLOW_IN_CACHE_KEY[glow])
 
+    plate_space: ColourSpace | None = None
+    """Space of the plates, in place of what their files declare."""
+
+    def use_plate_space(self, space: ColourSpace) -> None:
+        """Read plates in this space, in place of what their files declare; results of others are made again."""
+        if self.plate_space is None:
+            self.cache_key = f"{self.cache_key} {space.fingerprint}"
+        self.plate_space = space
+
     def remove(self, plate: Plate, matte: Pixels | None = None, prediction: FlarePrediction | None = None
                ) -> tuple[NDArray[Any], NDArray[np.float16]]:
         """Return the codes without flare, in the plate's own type, and the flare in linear light (height, width, 3).
@@ -69,20 +96,33 @@ class Remover:
         matte: (height, width), 0..1, where an artist has marked a flare: that share of the predicted flare is removed
         there, whatever its confidence. prediction: for the plate, where it is known (`neighbours.ShotPredictor`).
         """
-        prediction = prediction or self.predict(self.to_network_input(plate))
+        opaque, margin = fill_hidden(plate), wrap_margin(plate)
+        shown, gain = to_network_plate(opaque)
+        seen = wrap_plate(shown, margin)
+        prediction = prediction or self.predict(self._scale_to_input(seen))
         maps = fit_guided_filter(prediction.display, self.linear_flare(prediction, inside_matte=matte is not None))
-        codes = plate.codes.copy()
-        flare = np.zeros(plate.codes.shape, np.float16)
+        codes = seen.codes.copy()
+        flare = np.zeros(codes.shape, np.float16 if seen is plate else np.float32)
         if not maps.is_empty:
-            area, encoding, max_code = plate.picture_area.slices, plate.encoding, plate.max_code
-            observed, clean, removed = (part[area] for part in (plate.codes, codes, flare))
+            matte = None if matte is None else wrap_columns(matte, margin)
+            area, encoding, max_code = seen.picture_area.slices, seen.encoding, seen.max_code
+            observed, clean, removed = (part[area] for part in (seen.codes, codes, flare))
             for rows, light in upsample_flare(maps, observed, encoding, max_code):
-                light = plate.to_plate_channels(light)
+                light = seen.to_plate_channels(light)
                 if matte is not None:
                     light *= matte[area][rows, :, None]
                 clean[rows] = subtract_flare(observed[rows], light, encoding, max_code)
                 removed[rows] = removed_light(observed[rows], clean[rows], light, encoding, max_code)
-        return codes, flare
+        if seen is plate:
+            return codes, flare.astype(np.float16)
+        light = merge_columns(flare.astype(np.float32), margin) / gain
+        alpha = plate.straight_alpha
+        if alpha is not None:
+            light = np.where(alpha[..., None] > 0, light, 0)
+        written = np.minimum(plate.light_in_own_primaries(light), MAX_FLOAT16)
+        if alpha is not None:
+            written = written * alpha[..., None]
+        return plate.without_light(light), written.astype(np.float16)
 
     def clean_display(self, display: Pixels) -> Pixels:
         """Return display values 0..1 (height, width, 3) without flare, with the precision of 16 bit codes."""
@@ -92,15 +132,16 @@ class Remover:
 
     def to_network_input(self, plate: Plate) -> Pixels:
         """Return a plate as the network takes it: display values 0..1 of what lies inside its black borders, scaled to
-        the working size, (h, w, 3), h and w multiples of SIZE_MULTIPLE."""
+        the working size, (h, w, 3), h and w multiples of SIZE_MULTIPLE; with the margins of a panorama (`framing`)."""
+        return self._scale_to_input(wrap_plate(to_network_plate(fill_hidden(plate))[0], wrap_margin(plate)))
+
+    def _scale_to_input(self, plate: Plate) -> Pixels:
+        """Scale what `to_network_plate` returns to the network's input."""
         import cv2
 
         codes, encoding, max_code = plate.codes[plate.picture_area.slices], plate.encoding, plate.max_code
         height, width = codes.shape[:2]
-        scale = self.working_size / max(height, width)
-        new_width, new_height = (
-            int(np.clip(round(side * scale / SIZE_MULTIPLE), 2, max(self.working_size // SIZE_MULTIPLE, 2)))
-            * SIZE_MULTIPLE for side in (width, height))
+        new_width, new_height = input_size(width, height, self.working_size)
         if new_width > width or new_height > height:
             light = np.clip(to_linear(codes, encoding, max_code), 0, 1)
             scaled = cv2.resize(light, (new_width, new_height), interpolation=cv2.INTER_LINEAR)
@@ -116,7 +157,7 @@ class Remover:
 
     def predict_with_tta(self, display: Pixels) -> TtaPrediction:
         """Predict the flare of display values 0..1 (h, w, 3), h and w multiples of SIZE_MULTIPLE."""
-        return predict_with_tta(display, self._forward)
+        return predict_with_tta(display, lambda picture: predict_in_parts(picture, self._forward))
 
     @torch.inference_mode()
     def _forward(self, display: Pixels) -> Pixels:

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Tells whether a picture says that it is a panorama of the whole circle, whose right edge continues at its left one.
+
+Photographs say so in XMP (Google's Photo Sphere metadata, GPano), EXRs in the attribute envmap. `removal` wraps such
+pictures.
+"""
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..system.reading import open_regular
+from .formats import png
+
+_PROJECTIONS = ("equirectangular", "cylindrical")
+_PROJECTION = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*(\w+)")
+_XMP_KEYWORD = b"XML:com.adobe.xmp\0"
+_MAX_XMP_BYTES = 1 << 22
+"""Largest compressed XMP packet of a PNG that is decompressed."""
+
+
+def wraps_around(path: Path, header: Mapping[str, Any] | None = None) -> bool:
+    """Return whether a picture is a panorama of 360 degrees by what its file says. header: of an EXR, if it is one.
+
+    False for a part of a panorama, for a cube map, and for a file that cannot be read.
+    """
+    if header:
+        return str(header.get("envmap", "")).upper().endswith("LATLONG") or str(
+            header.get("wrapmodes", "")).startswith("periodic")
+    try:
+        with open_regular(path) as stream:
+            data = stream.read()
+            stream.seek(0)
+            packets = [data, *(_decompressed(content) for _, content in png.chunks(stream, (b"iTXt",)))]
+    except OSError:
+        return False
+    return any(_is_full_panorama(packet) for packet in packets)
+
+
+def _is_full_panorama(packet: bytes) -> bool:
+    match = _PROJECTION.search(packet)
+    if match is None or match[1].decode().lower() not in _PROJECTIONS:
+        return False
+    full, cropped = _number(packet, b"FullPanoWidthPixels"), _number(packet, b"CroppedAreaImageWidthPixels")
+    return full is None or cropped is None or cropped >= full
+
+
+def _number(packet: bytes, name: bytes) -> int | None:
+    match = re.search(name + rb"\s*(?:=\s*[\"']|>)\s*(\d{1,9})", packet)
+    return int(match[1]) if match else None
+
+
+def _decompressed(content: bytes) -> bytes:
+    """Return the XMP of a PNG's iTXt chunk that is compressed (PNG specification, 11.3.3.4); empty for others."""
+    if not content.startswith(_XMP_KEYWORD) or content[len(_XMP_KEYWORD):len(_XMP_KEYWORD) + 1] != b"\1":
+        return b""
+    text = content[len(_XMP_KEYWORD) + 2:].split(b"\0", 2)[-1]
+    try:
+        return zlib.decompressobj().decompress(text, _MAX_XMP_BYTES)
+    except zlib.error:
+        return b""

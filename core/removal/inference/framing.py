@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Prepares plates of any shape for the network: transparent ones, panoramas, and long ones.
+
+What alpha hides continues the picture for the network (`fill_hidden`). A panorama of the whole circle gets a margin
+from its other side at each edge, and both predictions of a margin are merged, so that there is no seam. A long picture
+is predicted in parts that overlap. `remover` calls all of it.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...colour.srgb import Pixels
+from ...images.panorama import wraps_around
+from ...images.plates import Plate
+from ..model.network import SIZE_MULTIPLE
+
+MAX_ASPECT = 3.0
+"""Long side relative to the short one up to which a picture is predicted as a whole."""
+PART_ASPECT = 2
+"""Long side of a part relative to the short one."""
+MAX_LONG_SIDE = 32
+"""Largest long side of the network's input, relative to the working size."""
+FILL_SIZE = 256
+"""Long side at which hidden parts are filled, pixels."""
+WRAP_SHARE = 8
+"""Width of a panorama relative to the margin at each of its edges."""
+
+
+def fill_hidden(plate: Plate) -> Plate:
+    """Return an opaque plate whose hidden parts continue the colours beside them, where the codes are not multiplied
+    with an alpha below 1; else the plate itself.
+
+    The colours that a file stores under alpha 0 are arbitrary, and black there would look like a vignette.
+    """
+    import cv2
+
+    alpha = plate.straight_alpha
+    if alpha is None or (alpha >= 1).all():
+        return plate
+    height, width = alpha.shape
+    scale = min(FILL_SIZE / max(height, width), 1)
+    small = max(round(width * scale), 1), max(round(height * scale), 1)
+    light = plate.space.to_linear(plate.values) * alpha[..., None]
+    filling = _diffuse(*(np.asarray(cv2.resize(part, small, interpolation=cv2.INTER_AREA), np.float32)
+                         for part in (light, alpha)))
+    light += (1 - alpha)[..., None] * np.asarray(cv2.resize(filling, (width, height)), np.float32)
+    values = plate.space.from_linear(light)
+    if plate.encoding == "srgb":
+        values = np.clip(values * np.float32(plate.max_code) + np.float32(0.5), 0, plate.max_code)
+    codes = np.where((alpha < 1)[..., None], values.astype(plate.codes.dtype), plate.codes)
+    return replace(plate, codes=codes, alpha=None)
+
+
+def _diffuse(light: Pixels, alpha: Pixels) -> Pixels:
+    """Fill premultiplied light (h, w, 3) where its alpha (h, w) is below 1 by means over larger and larger windows
+    (pull-push, Gortler et al. 1996)."""
+    import cv2
+
+    if min(alpha.shape) <= 2:
+        total = alpha.sum()
+        return np.broadcast_to(light.sum((0, 1)) / max(total, np.float32(1e-6)), light.shape).astype(np.float32)
+    coarse = _diffuse(np.asarray(cv2.pyrDown(light), np.float32), np.asarray(cv2.pyrDown(alpha), np.float32))
+    above = np.asarray(cv2.pyrUp(coarse, dstsize=(alpha.shape[1], alpha.shape[0])), np.float32)
+    return light + (1 - alpha)[..., None] * above
+
+
+def wrap_margin(plate: Plate) -> int:
+    """Return the columns that a panorama gets from its other side at each edge; 0 for other pictures."""
+    is_panorama = wraps_around(plate.path, plate.extras.get("header"))
+    return plate.codes.shape[1] // WRAP_SHARE if is_panorama else 0
+
+
+def wrap_plate(plate: Plate, margin: int) -> Plate:
+    """Return a plate with `margin` columns from its other side at each edge; itself without a margin."""
+    return replace(plate, codes=wrap_columns(plate.codes, margin), alpha=None) if margin else plate
+
+
+def wrap_columns(pixels: NDArray[Any], margin: int) -> NDArray[Any]:
+    """Return pixels (height, width, ...) with `margin` columns from the other side at each edge."""
+    return np.concatenate([pixels[:, pixels.shape[1] - margin:], pixels, pixels[:, :margin]], 1) if margin else pixels
+
+
+def merge_columns(light: Pixels, margin: int) -> Pixels:
+    """Return light (height, width, 3) from that of a wrapped plate: the two predictions of each edge meet half and half
+    at the seam, and the one with more picture around it counts more, up to all, away from it."""
+    if not margin:
+        return light
+    width = light.shape[1] - 2 * margin
+    merged = light[:, margin:margin + width].copy()
+    share = (np.arange(margin, 0, -1, dtype=np.float32) - np.float32(0.5))[None, :, None] / (2 * margin)
+    merged[:, :margin] += share * (light[:, margin + width:] - merged[:, :margin])
+    merged[:, width - margin:] += share[:, ::-1] * (light[:, :margin] - merged[:, width - margin:])
+    return merged
+
+
+def input_size(width: int, height: int, working_size: int) -> tuple[int, int]:
+    """Return (width, height) of the network's input for a picture: the long side is the working size, or that of each
+    part of a long picture; multiples of SIZE_MULTIPLE."""
+    long, short = max(width, height), min(width, height)
+    scale = working_size / long
+    if long > MAX_ASPECT * short:
+        scale = min(working_size / (PART_ASPECT * short), MAX_LONG_SIDE * working_size / long)
+    largest = max(int(max(long * scale, working_size)) // SIZE_MULTIPLE, 2)
+    columns, rows = (int(np.clip(round(side * scale / SIZE_MULTIPLE), 2, largest)) for side in (width, height))
+    return columns * SIZE_MULTIPLE, rows * SIZE_MULTIPLE
+
+
+def predict_in_parts(display: Pixels, predict: Callable[[Pixels], Pixels]) -> Pixels:
+    """Return `predict` of display values (h, w, 3); of a long picture, of overlapping parts, merged where they overlap.
+
+    predict: (h, w, 3) to (h, w, n), h and w multiples of SIZE_MULTIPLE.
+    """
+    height, width = display.shape[:2]
+    if max(height, width) <= MAX_ASPECT * min(height, width):
+        return predict(display)
+    if height > width:
+        return predict_in_parts(display.swapaxes(0, 1), lambda part: predict(part.swapaxes(0, 1)).swapaxes(0, 1)
+                                ).swapaxes(0, 1)
+    part = PART_ASPECT * height
+    starts = np.linspace(0, width - part, -(-2 * (width - part) // part) + 1).round().astype(int)
+    place = np.arange(part, dtype=np.float32) + np.float32(0.5)
+    weight = np.minimum(place, part - place)[None, :, None]
+    total, merged = np.zeros((1, width, 1), np.float32), None
+    for start in starts:
+        prediction = predict(display[:, start:start + part]) * weight
+        if merged is None:
+            merged = np.zeros((height, width, prediction.shape[2]), np.float32)
+        merged[:, start:start + part] += prediction
+        total[:, start:start + part] += weight
+    assert merged is not None
+    return merged / total

@@ -8,6 +8,7 @@ from typing import Any
 
 from ...core.errors import RunError
 from ...core.system.progress import Progress
+from .. import tallies
 from ..command import Command, Step
 
 VIEWS = ("held-out", "train", "all")
@@ -43,6 +44,7 @@ def score_run(folder: Path, progress: Progress, *, view_set: str = "held-out",
         perceptual = Lpips(lpips_folder)
     run_ = Run.open(folder)
     capture = run_.capture(capture_folder)
+    tallies.report_capture(capture, progress)
     train, held_out = capture.split(run_.settings.holdout)
     views = {"held-out": held_out, "train": train, "all": capture.views}[view_set]
     if not views:
@@ -56,7 +58,8 @@ def score_run(folder: Path, progress: Progress, *, view_set: str = "held-out",
                      "docs/handbook/first_fit.md describes the footage that a fit needs.")
     write_json(run_.folder / EVALUATION, scores)
     return {"eval": str(run_.folder / EVALUATION),
-            "scores": {layer: part for layer, part in scores.items() if isinstance(part, dict)}}
+            "scores": {layer: part for layer, part in scores.items() if isinstance(part, dict)},
+            **tallies.report_tally(tallies.tally_capture(capture, "scored", len(views)), progress)}
 
 
 COMMAND = Command(

@@ -11,7 +11,7 @@ from ...core.errors import SettingsError
 from ...core.system.progress import Progress
 from ...core.system.reading import UTF8_SIG, read_text
 from ...core.typed import MAX_INT_DIGITS
-from .. import jobs
+from .. import jobs, tallies
 from ..command import Command, Step, check_at_least_one, parse_seed, reject_unused_options
 from .lights import with_lights
 from .remove import with_removed
@@ -88,13 +88,17 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         Run.check_free(out)
     # The fit has its own cache, of smaller pictures.
     capture = Capture.open(folder, cache_bytes=DECODED_CACHE_BYTES)
+    tallies.report_capture(capture, progress)
     settings = Run.open(out).settings if is_resumed else fit_settings(args, capture, progress)
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
     capture = with_supervision(capture, settings, progress)
     result = fit(capture, settings, out, progress, resume=args.resume)
     progress.say(f"The run is in {result.folder}: look at preview.png there, then run `eval` and `bake`.")
-    return {"run": str(result.folder)}
+    used = {view.name for part in capture.split(settings.holdout) for view in part}
+    tally = tallies.tally_capture(capture, used=len(used))
+    tally.skip("in no list of the capture", *(view.name for view in capture.views if view.name not in used))
+    return {"run": str(result.folder), **tallies.report_tally(tally, progress)}
 
 
 def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress) -> FitSettings:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ...core.capture import LIGHTS
 from ...core.errors import CaptureError, SettingsError
 from ...core.system.progress import Progress
-from .. import plate_space
+from .. import plate_space, tallies
 from ..command import Command, Step, parse_seed
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise SettingsError(f"--{'boxes' if args.boxes else 'masks'} is for --method grounded; leave it out.")
     plate_space.record(args, args.capture)
     capture = Capture.open(args.capture)
+    tallies.report_capture(capture, progress)
     detector = detector_for(args.method, args.threshold, args.boxes, args.masks)
     settings = TriangulationSettings(min_views=args.min_views, seed=args.seed)
     gaussians = _read_gaussians(args.scene) if args.scene else None
@@ -60,7 +61,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         check_replaceable(capture.folder / LIGHTS)
     report = _find_and_record(capture, detector, progress, settings, gaussians=gaussians, keep=args.keep)
     return {"lights": report["lights"], "file": str(capture.folder / LIGHTS),
-            "sheets": [str(capture.folder / sheet) for sheet in report["sheets"]]}
+            "sheets": [str(capture.folder / sheet) for sheet in report["sheets"]],
+            **tallies.report_tally(tallies.tally_capture(capture, "searched"), progress)}
 
 
 def with_lights(capture: Capture, progress: Progress) -> Capture:

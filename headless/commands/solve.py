@@ -9,6 +9,7 @@ from typing import Any, get_args
 from ...core.choices import Matching
 from ...core.errors import CaptureError, SettingsError
 from ...core.system.progress import Progress
+from .. import tallies
 from ..command import Command, Step, parse_seed, reject_unused_options
 
 SOLVE_DEFAULTS = {"frames": 0, "matching": "auto", "lens": "RADIAL", "work_size": 1000, "size": 0, "no_mask": False,
@@ -57,7 +58,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                  f"{report['track_length']:.1f} frames a point. See {args.out / PICTURE}; next: `lights {args.out}`.")
     return {"capture": str(args.out), "report": str(args.out / REPORT), "picture": str(args.out / PICTURE),
             **{name: report[name] for name in ("frames", "registered", "points", "reprojection_error_px",
-                                               "track_length")}}
+                                               "track_length")},
+            **tallies.report_tally(tallies.tally_solve(report, args.source), progress)}
 
 
 def is_blend(args: argparse.Namespace) -> bool:

@@ -303,18 +303,21 @@ def _draw_features(remover: Remover, seed: int, count: int, backgrounds: Any, le
 
 
 def _logistic(features: Any, gains: Any) -> Any:
-    """Fit weights (6,) of features (n, 5) and a constant: the log odds that a prediction is useful, each weighted by
-    its gain. Newton's method with a ridge of one observation."""
-    middle, spread = features.mean(0), features.std(0)
-    a = np.column_stack([(features - middle) / spread, np.ones(len(features))])
+    """Fit weights (6,) of features (n, 5) and a constant to the log odds that a prediction is useful.
+
+    Predictions are weighted by their gain. Newton's method with a ridge of one observation.
+    """
+    mean, deviation = features.mean(0), features.std(0)
+    design = np.column_stack([(features - mean) / deviation, np.ones(len(features))])
     counts, flares = np.minimum(np.abs(gains), 15) / 5, gains > 0
-    ridge, solution = np.diag([1.0] * features.shape[1] + [0.0]), np.zeros(a.shape[1])
+    ridge, solution = np.diag([1.0] * features.shape[1] + [0.0]), np.zeros(design.shape[1])
     for _ in range(30):
-        p = 1 / (1 + np.exp(-a @ solution))
-        step = a.T @ (counts * (p - flares)) + ridge @ solution
-        solution -= np.linalg.solve(a.T @ (a * (counts * p * (1 - p))[:, None]) + ridge, step)
-    by_sign = solution[:-1] / spread
-    return np.append(by_sign, solution[-1] - by_sign @ middle)
+        probabilities = 1 / (1 + np.exp(-design @ solution))
+        step = design.T @ (counts * (probabilities - flares)) + ridge @ solution
+        curvature = counts * probabilities * (1 - probabilities)
+        solution -= np.linalg.solve(design.T @ (design * curvature[:, None]) + ridge, step)
+    weights = solution[:-1] / deviation
+    return np.append(weights, solution[-1] - weights @ mean)
 
 
 class _AsphericBank:

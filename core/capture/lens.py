@@ -98,29 +98,31 @@ class Lens:
 
         NaN where no direction within 89 degrees of the axis leads to the pixel.
         """
-        goal = np.asarray(pixels, np.float64).reshape(-1, 2)
-        plane = (goal - self.centre) / self.focal
+        target = np.asarray(pixels, np.float64).reshape(-1, 2)
+        plane = (target - self.centre) / self.focal
         if self.model in _FISHEYES or self.model == "EQUIRECTANGULAR":  # the radius is an angle here
             angle = np.minimum(np.linalg.norm(plane, axis=1, keepdims=True), 1.5)
             plane = plane * np.tan(angle) / np.maximum(angle, 1e-12)
         for _ in range(40):
-            miss = self.distort(plane) - goal
-            reach = 1e-6 * np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1.0)
-            slope_x = (self.distort(plane + reach * (1, 0)) - self.distort(plane - reach * (1, 0))) / (2 * reach)
-            slope_y = (self.distort(plane + reach * (0, 1)) - self.distort(plane - reach * (0, 1))) / (2 * reach)
-            area = slope_x[:, 0] * slope_y[:, 1] - slope_x[:, 1] * slope_y[:, 0]
+            error = self.distort(plane) - target
+            step_size = 1e-6 * np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1.0)
+            slope_x, slope_y = (
+                (self.distort(plane + step_size * axis) - self.distort(plane - step_size * axis)) / (2 * step_size)
+                for axis in ((1, 0), (0, 1)))
+            determinant = slope_x[:, 0] * slope_y[:, 1] - slope_x[:, 1] * slope_y[:, 0]
             with np.errstate(invalid="ignore", divide="ignore"):
-                step = np.stack([slope_y[:, 1] * miss[:, 0] - slope_y[:, 0] * miss[:, 1],
-                                 slope_x[:, 0] * miss[:, 1] - slope_x[:, 1] * miss[:, 0]], axis=1) / area[:, None]
+                step = np.stack([slope_y[:, 1] * error[:, 0] - slope_y[:, 0] * error[:, 1],
+                                 slope_x[:, 0] * error[:, 1] - slope_x[:, 1] * error[:, 0]], axis=1)
+                step /= determinant[:, None]
             # A step longer than the place itself would throw the search over a fold of the polynomial.
-            longest = 0.5 * (1.0 + np.linalg.norm(plane, axis=1, keepdims=True))
+            max_length = 0.5 * (1.0 + np.linalg.norm(plane, axis=1, keepdims=True))
             length = np.linalg.norm(step, axis=1, keepdims=True)
-            step *= np.minimum(1.0, longest / np.maximum(length, 1e-30))
+            step *= np.minimum(1.0, max_length / np.maximum(length, 1e-30))
             plane = plane - step
-            if not (np.abs(miss) > 1e-9).any():
+            if not (np.abs(error) > 1e-9).any():
                 break
-        bad = ~(np.linalg.norm(self.distort(plane) - goal, axis=1) < 1e-4) | (np.linalg.norm(plane, axis=1) > 57)
-        plane[bad] = np.nan
+        converged = np.linalg.norm(self.distort(plane) - target, axis=1) < 1e-4
+        plane[~converged | (np.linalg.norm(plane, axis=1) > 57)] = np.nan  # the tangent of 89 degrees
         return plane
 
     @cached_property

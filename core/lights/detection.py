@@ -85,9 +85,9 @@ def measure_detection(mask: Mask, corner: tuple[int, int], picture: Picture, dis
 
 
 def _glow_colour(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.float64]:
-    """Return the colour of the glow: the light just round the disc less that further out.
+    """Return the colour of the glow: the light just round the disc minus the light farther out.
 
-    At most half is subtracted, lest a bright surface nearby leave none.
+    At most half is subtracted, so that some glow is left beside a bright surface.
     """
     import cv2
 

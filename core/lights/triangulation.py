@@ -3,10 +3,10 @@
 
 Every pair of detections proposes a place, finite and at infinity, and the detections near its projections score it
 (`candidates.py`). The best is refined (`refinement.py`), its detections are removed, and so on until no place has
-enough views; `merging.py` then removes duplicates and ghosts. What slides over the views, as highlights on glossy
-things do, finds no place that many views agree on. A place that few views agree on may be an accident, which the
-number of false alarms measures (a contrario detection, Desolneux, Moisan and Morel 2000): pairs of detections, times
-the chance that so many more of the other views have a detection there.
+enough views; `merging.py` then removes duplicates and ghosts. Highlights on glossy surfaces move from view to view, so
+few views agree on a place for them. Such agreement can be chance. The number of false alarms measures that (a contrario
+detection, Desolneux, Moisan and Morel 2000): the number of pairs of detections, times the probability that so many of
+the other views have a detection at the place by chance.
 """
 from __future__ import annotations
 

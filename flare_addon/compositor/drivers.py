@@ -63,7 +63,7 @@ def connected_flares(scene: Any) -> dict[str, int]:
 def migrate_to_indices(scene: Any) -> None:
     """Replace drivers of an earlier version, whose paths contain the names of flares, by ones with indices.
 
-    A renamed flare lost its drivers there.
+    With names in the paths, renaming a flare disconnects its sliders.
     """
     tree = tree_of(scene)
     if tree is None or tree.library is not None or scene.library is not None:
@@ -71,7 +71,7 @@ def migrate_to_indices(scene: Any) -> None:
     if any(target.id == scene and 'lights["' in target.data_path for curve in node_drivers(scene)
            for variable in curve.driver.variables for target in variable.targets):
         for item in scene.fit_flare.lights:
-            item.identity = item.identity or item.name  # by which the layers of that version know it
+            item.identity = item.identity or item.name  # that version identified layers by names
         connect(scene, connected_flares(scene))
 
 

@@ -37,8 +37,8 @@ def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progres
     digest: a text that changes whenever the result would (`digest_inputs`). clean: reads and cleans a frame and returns
     a function that writes its results; nothing is deleted if it raises. keep_finished: keep results that are up to
     date, and edited ones unless `overwrite`. overwrite: replace files that are not in the manifest or were edited.
-    on_error: called with an exception, to raise it or to go on with the next frame; without it the first one is
-    raised.
+    on_error: called with an exception; it raises it, or returns so that the next frame follows. Without it the first
+    exception is raised.
     """
     written, kept = 0, Counter[KeepReason]()
     for frame in frames:

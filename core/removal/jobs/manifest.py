@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The manifest of a folder of clean frames: remove.json, which lists what each frame was made from.
 
-With it `clean_frames` keeps a frame as long as it would come out the same, and never takes a file for a clean frame
-that someone else put there or edited. `provenance` asks it where a capture's clean frames come from.
+With it `clean_frames` keeps the frames that are up to date, and never replaces a file that a person edited or put
+there. `provenance` reads from it where a capture's clean frames come from.
 """
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tells whether the clean frames in a capture's removed/ are someone's own or estimates that `remove` made, and of
-which frames."""
+"""Tells the clean frames in a capture's removed/ that a person made from estimates that `remove` made.
+
+It uses the manifest there, which also shows whether the frames have changed since.
+"""
 from __future__ import annotations
 
 from pathlib import Path

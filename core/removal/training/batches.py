@@ -61,7 +61,8 @@ class Batches:
     def draw_pair(self, iteration: int, number: int, width: int, height: int) -> Pair:
         """Return one frame of an iteration in that size."""
         self._synthesis_bank.renew(self.recipe.bank_size + iteration // self.recipe.renew_every, iteration)
-        random = np.random.default_rng((self.recipe.seed, iteration, number + 1))  # seeds (1, 2) and (1, 2, 0) are one
+        # number + 1, since seeds (1, 2) and (1, 2, 0) are equal
+        random = np.random.default_rng((self.recipe.seed, iteration, number + 1))
         recipe = self.recipe
         pair = make_pair(random, self._bank, self._backgrounds, width, height, clean_share=recipe.clean_share,
                          against_light_share=recipe.against_light_share, shoulder_share=recipe.shoulder_share,

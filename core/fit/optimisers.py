@@ -11,7 +11,7 @@ from ..flare.model import FlareModel
 from ..gaussians.optimiser import Adam
 from ..gaussians.scene import COEFFICIENTS, SceneGaussians
 from .checkpoint import State
-from .settings import FitSettings
+from .settings import FitSettings, FlareRates
 
 COLOUR_RATE_FACTOR = 3.0
 """Factor on the learning rate of the scene's colours where frames go above white, which is farther to go. Lamps of 32
@@ -34,23 +34,16 @@ class Optimisers:
             "opacity_logits": rates.opacity, "sh": features.expand(COEFFICIENTS, 3).contiguous(),
         }
         self.scene = Adam(dict(scene.named_parameters()), rate_by_name)
-        self.flare, self.grids = _flare_optimisers(flare, settings)
-        self._flare_rates = dict(self.flare.rates) if self.flare else {}
+        self._of_flare = None if flare is None else FlareOptimisers(flare, settings.flare.rates)
+        self.flare = None if self._of_flare is None else self._of_flare.dense
+        self.grids = None if self._of_flare is None else self._of_flare.grids
 
     def set_rates(self, iteration: int) -> None:
         """Set the learning rates of an iteration, from 1."""
         progress = iteration / self._settings.iterations
         self.scene.rates["means"] = self._means_rate(progress)
-        if self.flare is None or self.grids is None:
-            return
-        rates = self._settings.flare.rates
-        decay = _decay(1.0, rates.final_ratio, 2 * progress - 1)
-        for name, rate in self._flare_rates.items():
-            position = name.endswith("gaussians.positions")
-            now = _decay(rates.position, rates.position_final, progress) if position else rate * decay
-            self.flare.rates[name] = now
-        for group in self.grids.param_groups:
-            group["lr"] = rates.grids * decay
+        if self._of_flare is not None:
+            self._of_flare.set_rates(progress)
 
     def _means_rate(self, progress: float) -> float:
         rates = self._settings.scene.rates
@@ -86,26 +79,44 @@ def _decay(first: float, last: float, progress: float) -> float:
     return first * (last / first) ** min(max(progress, 0.0), 1.0)
 
 
-def _flare_optimisers(flare: FlareModel | None,
-                      settings: FitSettings) -> tuple[Adam | None, torch.optim.SparseAdam | None]:
-    """Return Adam for networks and Gaussians, and for the grids an optimiser that updates only the rows that a view
-    touched."""
-    if flare is None:
-        return None, None
-    rates = settings.flare.rates
-    gaussian_rates = {
-        "positions": rates.position, "log_scales": rates.scale, "rotations": rates.rotation,
-        "opacity_logits": rates.opacity, "sh": rates.features, "offsets": rates.offset, "rings": rates.ring,
-        "arcs": rates.arc, "latent": rates.latent,
-    }
-    dense: dict[str, Parameter] = {}
-    tables: list[Parameter] = []
-    rate_by_name: dict[str, float | Tensor] = {}
-    for name, parameter in flare.flares.named_parameters():
-        if name.endswith(TABLE):
-            tables.append(parameter)
-            continue
-        dense[name] = parameter
-        last = name.rsplit(".", 1)[1]
-        rate_by_name[name] = gaussian_rates[last] if ".gaussians." in name else rates.network
-    return Adam(dense, rate_by_name), torch.optim.SparseAdam(tables, lr=rates.grids)
+class FlareOptimisers:
+    """The optimisers of a flare: `dense` for networks and Gaussians, and `grids`, which updates only the rows of the
+    hash grids that a view touched."""
+
+    def __init__(self, flare: FlareModel, rates: FlareRates) -> None:
+        self._rates = rates
+        gaussian_rates = {
+            "positions": rates.position, "log_scales": rates.scale, "rotations": rates.rotation,
+            "opacity_logits": rates.opacity, "sh": rates.features, "offsets": rates.offset, "rings": rates.ring,
+            "arcs": rates.arc, "latent": rates.latent,
+        }
+        dense: dict[str, Parameter] = {}
+        tables: list[Parameter] = []
+        rate_by_name: dict[str, float | Tensor] = {}
+        for name, parameter in flare.flares.named_parameters():
+            if name.endswith(TABLE):
+                tables.append(parameter)
+                continue
+            dense[name] = parameter
+            last = name.rsplit(".", 1)[1]
+            rate_by_name[name] = gaussian_rates[last] if ".gaussians." in name else rates.network
+        self.dense = Adam(dense, rate_by_name)
+        self.grids = torch.optim.SparseAdam(tables, lr=rates.grids)
+        self._first_rates = dict(self.dense.rates)
+
+    def set_rates(self, progress: float) -> None:
+        """Set the learning rates at a share of the fit, 0 to 1."""
+        rates = self._rates
+        decay = _decay(1.0, rates.final_ratio, 2 * progress - 1)
+        for name, rate in self._first_rates.items():
+            position = name.endswith("gaussians.positions")
+            new_rate = _decay(rates.position, rates.position_final, progress) if position else rate * decay
+            self.dense.rates[name] = new_rate
+        for group in self.grids.param_groups:
+            group["lr"] = rates.grids * decay
+
+    def step(self) -> None:
+        """Step by the gradients and clear them."""
+        for optimiser in (self.dense, self.grids):
+            optimiser.step()
+            optimiser.zero_grad()

@@ -230,15 +230,15 @@ def _is_valid_holdout(holdout: str | int | None) -> bool:
     return re.fullmatch(rf"[+-]?\d{{1,{MAX_INT_DIGITS}}}", holdout.strip()) is not None
 
 
-# ---- what the numbers may be ----------------------------------------------------------------------
+# ---- bounds of the numbers ------------------------------------------------------------------------
 
 _MAX_INT = 2**63 - 1  # TOML has no greater whole numbers
-_MAX_FLOAT = 1e30  # what float32 still computes with
+_MAX_FLOAT = 1e30  # its products still fit float32
 _FROM_0, _FROM_1 = Bounds(0, _MAX_INT), Bounds(1, _MAX_INT)
 _UNIT = Bounds(0, 1)
 _OPEN_UNIT = Bounds(0, 1, exclusive_minimum=True, exclusive_maximum=True)  # has a logit
-_NON_NEGATIVE = Bounds(0, _MAX_FLOAT)  # a weight, or a rate: at 0 what it is of stays as it is
-# A rate that falls by a ratio, or that its optimiser refuses at 0.
+_NON_NEGATIVE = Bounds(0, _MAX_FLOAT)  # a weight or a rate; 0 switches its term or its parameter's steps off
+# A rate that decays by a ratio, or that the optimiser refuses at 0.
 _POSITIVE = Bounds(0, _MAX_FLOAT, exclusive_minimum=True)
 
 BOUNDS: dict[str, Bounds] = {
@@ -287,8 +287,8 @@ SEPARATE_UNTIL = 0.7
 SCENE_ONLY_UNTIL = 0.08
 """`flare.scene_only_until` of our form."""
 CORRECTION_WEIGHT = 0.1
-"""`flare.correction_weight` of our form: far below what the frames hold delta_l with where there is a flare, far above
-what pulls it elsewhere."""
+"""`flare.correction_weight` of our form: far below the gradients by which frames with a flare determine delta_l, far
+above the noise of frames without one."""
 FINAL_RATIO = 0.05
 """`flare.rates.final_ratio` of the short presets."""
 
@@ -321,8 +321,8 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
     if name == "paper":
         settings = _scale_schedule(settings, length / ITERATIONS["paper"])
     else:
-        count, most = {"draft": (300, 40_000), "standard": (500, 60_000), "high": (700, 200_000)}[name]
-        settings = _shorten_schedule(settings, count, most)
+        count, max_gaussians = {"draft": (300, 40_000), "standard": (500, 60_000), "high": (700, 200_000)}[name]
+        settings = _shorten_schedule(settings, count, max_gaussians)
     if blend == "add":
         # Light that adds is fainter than what covers: a ghost is a hundredth of white, not a tenth of opaque.
         density = replace(settings.flare.density, clone_above=5e-4, prune_below=2e-4)
@@ -332,17 +332,17 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
 
 def _scale_schedule(settings: FitSettings, factor: float) -> FitSettings:
     """Scale every schedule by a factor, so that events keep their share of a fit that is that much longer."""
-    def at(iteration: int) -> int:
+    def scaled(iteration: int) -> int:
         return max(round(iteration * factor), 1)
 
     density, scene = settings.flare.density, settings.scene
-    density = replace(density, start=at(density.start), stop=at(density.stop), every=at(density.every))
+    density = replace(density, start=scaled(density.start), stop=scaled(density.stop), every=scaled(density.every))
     classic, mcmc = scene.classic, scene.mcmc
-    classic = replace(classic, start=at(classic.start), stop=at(classic.stop), every=at(classic.every),
-                      reset_every=at(classic.reset_every))
-    mcmc = replace(mcmc, start=at(mcmc.start), stop=at(mcmc.stop), every=at(mcmc.every))
+    classic = replace(classic, start=scaled(classic.start), stop=scaled(classic.stop), every=scaled(classic.every),
+                      reset_every=scaled(classic.reset_every))
+    mcmc = replace(mcmc, start=scaled(mcmc.start), stop=scaled(mcmc.stop), every=scaled(mcmc.every))
     return replace(settings, flare=replace(settings.flare, density=density),
-                   scene=replace(scene, classic=classic, mcmc=mcmc, sh_every=at(scene.sh_every)))
+                   scene=replace(scene, classic=classic, mcmc=mcmc, sh_every=scaled(scene.sh_every)))
 
 
 def _shorten_schedule(settings: FitSettings, count: int, max_gaussians: int) -> FitSettings:
@@ -409,19 +409,20 @@ def override_settings(settings: FitSettings, values: Mapping[str, Any],
         if progress is not None:
             progress.say(f"The setting {old} is now {new}; the old name still works in this version.")
     for name, value in values.items():
-        settings = _override(settings, name.split("."), value, name)
+        settings = override_field(settings, name.split("."), value, name)
     return settings.validated()
 
 
-def _override(table: Any, keys: list[str], value: Any, name: str) -> Any:
+def override_field(table: Any, keys: list[str], value: Any, name: str) -> Any:
+    """Return a dataclass with the field at the end of `keys` replaced; `name` is for the message of a SettingsError."""
     known = {entry.name for entry in fields(table)}
     if keys[0] not in known:
         raise SettingsError(f"There is no setting {name!r}; here there are {', '.join(sorted(known))}.")
-    now = getattr(table, keys[0])
+    current = getattr(table, keys[0])
     if len(keys) > 1:
-        if not is_dataclass(now):
+        if not is_dataclass(current):
             raise SettingsError(f"There is no setting {name!r}; {keys[0]} has no parts.")
-        return replace(table, **{keys[0]: _override(now, keys[1:], value, name)})
+        return replace(table, **{keys[0]: override_field(current, keys[1:], value, name)})
     try:
         return replace(table, **{keys[0]: parse_field(type(table), keys[0], value)})
     except (ValueError, TypeError) as problem:

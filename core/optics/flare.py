@@ -103,22 +103,22 @@ def render_flare(setup: LensSetup, camera: Camera, light: Sequence[float] | NDAr
         if light[2] <= 1e-6:
             return black
         light = (light[0] / light[2], light[1] / light[2])
-    at = (float(light[0]), float(light[1]))
-    shade = min(max((setup.hood[1] - math.hypot(*at)) / (setup.hood[1] - setup.hood[0]), 0.0), 1.0)
+    position = (float(light[0]), float(light[1]))
+    shade = min(max((setup.hood[1] - math.hypot(*position)) / (setup.hood[1] - setup.hood[0]), 0.0), 1.0)
     shade *= shade * (3 - 2 * shade)
     strength = intensity * visible_share * shade
     if strength <= 0:
         return black
     optics, pairs = build_optics(setup)
-    flare = draw_ghosts(optics, pairs, setup.ghosts, (at[0] / setup.squeeze, at[1]),
+    flare = draw_ghosts(optics, pairs, setup.ghosts, (position[0] / setup.squeeze, position[1]),
                         (camera.fx * setup.squeeze, camera.fy), (camera.cx, camera.cy), camera.width, camera.height)
     x, y = np.meshgrid(((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx).astype(np.float32),
                        ((np.arange(camera.height) + 0.5 - camera.cy) / camera.fy).astype(np.float32))
-    u, v = x - np.float32(at[0]), y - np.float32(at[1])
+    u, v = x - np.float32(position[0]), y - np.float32(position[1])
     flare += draw_starburst(optics.aperture, setup.starburst, u, v)
     flare += draw_glow(setup.glow, u, v)
     for ring in setup.rings:
-        flare += draw_ring(ring, at, x, y)
+        flare += draw_ring(ring, position, x, y)
     for streak in setup.streaks:
-        flare += draw_streak(streak, at, x, y)
+        flare += draw_streak(streak, position, x, y)
     return np.maximum(flare * (np.float32(strength) * np.asarray(colour, np.float32)), 0)

@@ -65,7 +65,7 @@ class Optics:
     def pairs(self, count: int, fill: float = 0.12) -> list[tuple[int, int]]:
         """Return the `count` brightest pairs (first, second) for a light at tan(field angle) = `fill`."""
         surfaces = _trace_arguments(self, REFERENCE_WAVELENGTH)
-        optical = [at for at in range(len(self.coating)) if at != self.lens.stop]
+        optical = [index for index in range(len(self.coating)) if index != self.lens.stop]
         scored = []
         axis = np.linspace(-1, 1, 21) * self.lens.semi_aperture[0]
         for position, first in enumerate(optical):
@@ -83,16 +83,16 @@ class Optics:
 def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.0) -> Array:
     """Return quarter-wave wavelengths, `design` in turn over the surfaces between glass and air."""
     values = np.full(len(lens.index), cemented)
-    before, turn = 1.0, 0
-    for at, after in enumerate(lens.index):
-        if at != lens.stop and (before == 1.0) != (after == 1.0):
-            values[at] = design[turn % len(design)]
-            turn += 1
-        before = after
+    previous, design_index = 1.0, 0
+    for index, glass in enumerate(lens.index):
+        if index != lens.stop and (previous == 1.0) != (glass == 1.0):
+            values[index] = design[design_index % len(design)]
+            design_index += 1
+        previous = glass
     return values
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _non_negative_span(start: float, slope: float, left: float, right: float) -> tuple[float, float]:
     """Return the part of left..right where start + slope u is not negative."""
     if slope > 0.0:
@@ -102,7 +102,7 @@ def _non_negative_span(start: float, slope: float, left: float, right: float) ->
     return (left, right) if start >= 0.0 else (1.0, 0.0)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: Array, stop_x: Array,
                stop_y: Array, radius: float, edges: Array, rim: float, colour: Array,
                picture: NDArray[np.float32]) -> None:

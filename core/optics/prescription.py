@@ -228,7 +228,7 @@ def parse_prescription(text: str, name: str, where: str = "The lens") -> Prescri
 def read_lenses(folder: Path | str, max_count: int = 0) -> list[Prescription]:
     """Return the photographic lenses of a folder, by name.
 
-    Left out are files that are no prescription, mirror lenses, converters, and what is not between 5 and 800 mm.
+    Skips files that are no prescription, mirror lenses, converters, and focal lengths outside 5 to 800 mm.
     max_count: read at most that many, evenly spread; 0 for all. Raises SettingsError where there is none.
     """
     paths = sorted(Path(folder).glob("*.lens"))

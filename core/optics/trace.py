@@ -28,7 +28,7 @@ FIELDS = 10
 """Numbers of a traced ray: the four above and (x, y) of three passages through the stop."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating: float) -> float:
     """Return the unpolarised reflectance between n0 and n2 at an angle of incidence; 1 for total reflection.
 
@@ -63,7 +63,7 @@ def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating:
     return max(0.5 * total, 0.0)  # where the two waves cancel, rounding may fall below zero
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvature: Array, vertices: Array,
               index: Array, semi_aperture: Array, coating: Array, stop: int, sensor: float, wavelength: float,
               out: Array) -> bool:
@@ -140,7 +140,7 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def trace_grid(xs: Array, ys: Array, slope: float, first: int, second: int, curvature: Array, vertices: Array,
                index: Array, semi_aperture: Array, coating: Array, stop: int, sensor: float,
                wavelength: float) -> tuple[Array, NDArray[np.bool_]]:

@@ -13,13 +13,14 @@ from . import (
     export,
     fit,
     lights,
+    make_flare,
     remove,
     solve,
     train_removal,
     transfer,
 )
 
-_MODULES = (demo, solve, lights, remove, fit, evaluate, bake, compose, transfer, export, train_removal, eval_removal,
-            engine)
+_MODULES = (demo, solve, lights, remove, fit, evaluate, bake, compose, transfer, export, make_flare, train_removal,
+            eval_removal, engine)
 
 COMMANDS: dict[str, Command] = {module.COMMAND.name: module.COMMAND for module in _MODULES}

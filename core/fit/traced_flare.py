@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Makes a .flare from a lens prescription: traces its flare at many places of the light, and fits a flare model to it.
+
+There is no scene: the pictures hold the flare alone, so the supervision is exact. The light's places are spread evenly
+over the frame and beyond it. A lens looks the same from everywhere, so the model's camera range is so wide that the
+position of the camera changes nothing. `headless/commands/make_flare.py` and `sample_scenes/make_library.py` call
+`make_flare`.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..capture import Camera
+from ..conventions.pixel_grid import PixelGrid
+from ..errors import SettingsError
+from ..flare import file as flare_file
+from ..flare.compositing import splat_flare
+from ..flare.deformation import QueryRange
+from ..flare.density import clone_and_prune
+from ..flare.file import FlareFile
+from ..flare.model import FlareModel, LightFlare, ViewOfLight
+from ..look import TrainedCamera, store_elements
+from ..optics.flare import LensSetup, build_optics, render_flare
+from ..optics.ghosts import draw_ghosts
+from ..optics.lenses import find_lens
+from ..system.files import atomic_path
+from ..system.processes import available_cores
+from ..system.progress import Progress
+from .optimisers import FlareOptimisers
+from .settings import FitSettings, preset
+from .traced_settings import REFERENCE_REACH, TracedFlareSettings
+
+Pictures = NDArray[np.float32]
+Places = NDArray[np.float64]
+
+LIGHT = "light"
+"""Name of the light in the file."""
+CAMERA_RANGE = 1e6
+"""Half the side of the model's camera range, world units: all cameras fall on one point of its grid."""
+PATH_LENGTH = 12
+"""Places of the path on which the error is measured."""
+PATH_ENDS = (-0.85, 0.7), (0.9, -0.5)
+"""Ends of that path, relative to the frame's half width and height."""
+PROBES = (0.15, 0.12), (-0.4, 0.3), (0.6, -0.5), (0.85, 0.8), (-0.1, -0.8), (-0.95, 0.0)
+"""Places of the light at which the level of the ghosts is measured, relative to the frame's half width and height."""
+PLACE_STEPS = 0.7548776662, 0.5698402910
+"""Steps of the R2 sequence (Roberts 2018): 1 / g and 1 / g^2, g the plastic number."""
+SHARE_AT_LIGHT = 0.4
+"""Share of the first Gaussians that lie about the light."""
+RAY_LENGTHS = 0.004, 0.9
+"""Distances of these from the light, relative to half the frame's width."""
+SQUARED_WEIGHT = 0.3
+"""Weight of the relative error in linear light against that of the encoded light: highlights against faint ghosts."""
+ENCODING_OFFSET = 1e-3
+"""Added to light before the square root that encodes it for the loss: about a display's curve, with a bounded slope at
+black."""
+
+
+class TracedPictures(NamedTuple):
+    """Traced flares: places (n, 2) of the light, normalised coordinates, and pictures (n, height, width, 3), linear."""
+
+    places: Places
+    pictures: Pictures
+
+
+@dataclass(frozen=True)
+class TracedResult:
+    """A made flare. error: relative L2 in linear light, mean over the path; worst: its largest. count: Gaussians."""
+
+    path: Path
+    error: float
+    worst: float
+    count: int
+
+
+def make_flare(settings: TracedFlareSettings, out: Path, progress: Progress, *, notes: str = "", licence: str = ""
+               ) -> TracedResult:
+    """Trace, fit, measure the error on a path that the fit did not see, and write a .flare.
+
+    Raises SettingsError, and Cancelled where the progress stops it; then nothing is written.
+    """
+    settings = settings.validated()
+    camera, setup = traced_camera(settings), exposed_setup(settings)
+    traced = trace(settings, setup, spread_places(settings), progress, "trace")
+    model = fit_traced(settings, traced, progress)
+    path = trace(settings, setup, path_places(settings), progress, "measure")
+    errors = relative_errors(model, camera, path)
+    write_flare(out, model, camera, traced.places, notes or describe(settings), licence)
+    return TracedResult(out, float(np.mean(errors)), float(max(errors)), model.count)
+
+
+def describe(settings: TracedFlareSettings) -> str:
+    """Return the note of a file: the lens and how it was used."""
+    f_number = settings.iris.f_number or 2 * find_lens(settings.lens).widest_f_number()
+    return (f"Traced through {Path(settings.lens).stem}, {settings.used_focal_length:.0f} mm, f/{f_number:.2g}, "
+            f"{settings.iris.blades} blades, on a sensor {settings.sensor:g} mm wide.")
+
+
+def traced_camera(settings: TracedFlareSettings) -> Camera:
+    """Return the camera of the traced pictures, at the origin."""
+    width, height = settings.tracing.width, settings.height
+    focal = width / 2 / settings.reach
+    return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
+
+
+def exposed_setup(settings: TracedFlareSettings) -> LensSetup:
+    """Return the setup of the tracer with the gain that gives the ghosts their level.
+
+    Raises SettingsError where no ghost of the lens reaches the frame.
+    """
+    setup = settings.lens_setup()
+    if settings.ghosts.count == 0 or settings.ghosts.level == 0:
+        return replace(setup, ghosts=replace(setup.ghosts, count=0))
+    optics, pairs = build_optics(setup)
+    camera = traced_camera(settings)
+    drawing = replace(setup.ghosts, bands=3 if settings.ghosts.dispersion else 1, supersample=1)
+    squares = [np.square(draw_ghosts(optics, pairs, drawing, (x / setup.squeeze, y),
+                                     (camera.fx * setup.squeeze, camera.fy), (camera.cx, camera.cy), camera.width,
+                                     camera.height)).mean() for x, y in _in_frame(settings, PROBES)]
+    strength = math.sqrt(float(np.mean(squares)))
+    if not strength > 0:
+        raise SettingsError(f"No ghost of the lens {settings.lens} reaches the frame; check that its file lists clear "
+                            "diameters, or set ghosts.level=0.")
+    return replace(setup, ghosts=replace(setup.ghosts, gain=settings.ghosts.level / strength))
+
+
+def _in_frame(settings: TracedFlareSettings, fractions: Sequence[Sequence[float]] | Places) -> Places:
+    """Convert places relative to the frame's half width and height to normalised coordinates."""
+    half = settings.reach * np.array([1.0, settings.height / settings.tracing.width])
+    return np.asarray(fractions, np.float64) * half
+
+
+def spread_places(settings: TracedFlareSettings) -> Places:
+    """Return places (n, 2) of the light, spread evenly over the frame and beyond it, normalised coordinates."""
+    numbers = np.arange(1, settings.tracing.positions + 1)[:, None] * np.array(PLACE_STEPS)
+    return _in_frame(settings, (numbers % 1 * 2 - 1) * settings.tracing.field)
+
+
+def path_places(settings: TracedFlareSettings) -> Places:
+    """Return the places of a path across the frame, normalised coordinates."""
+    return _in_frame(settings, np.linspace(*PATH_ENDS, PATH_LENGTH))
+
+
+def trace(settings: TracedFlareSettings, setup: LensSetup, places: Places, progress: Progress, stage: str
+          ) -> TracedPictures:
+    """Trace the flare at each place of the light; `stage` names the stage of the progress."""
+    camera = traced_camera(settings)
+    progress.stage(stage, len(places))
+    pictures = np.zeros((len(places), camera.height, camera.width, 3), np.float32)
+    with ThreadPoolExecutor(min(available_cores(), 8)) as pool:
+        jobs = [pool.submit(render_flare, setup, camera, place, colour=settings.colour) for place in places]
+        try:
+            for number, job in enumerate(jobs):
+                pictures[number] = job.result()
+                progress.advance()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return TracedPictures(places, pictures)
+
+
+def _fit_settings(settings: TracedFlareSettings) -> FitSettings:
+    """Return the settings of the flare model: those of a short fit that adds light."""
+    fit = settings.fit
+    base = preset("draft", blend="add", iterations=fit.iterations)
+    density = replace(base.flare.density, start=max(fit.iterations // 10, 10), stop=int(fit.iterations * 0.7),
+                      max_gaussians=fit.max_gaussians)
+    return replace(base, flare=replace(base.flare, count=fit.gaussians, density=density, opacity=0.02))
+
+
+def fit_traced(settings: TracedFlareSettings, traced: TracedPictures, progress: Progress) -> FlareModel:
+    """Fit a flare model to traced pictures; the same settings and pictures give the same model."""
+    fit = _fit_settings(settings)
+    generator = torch.Generator().manual_seed(settings.fit.seed)
+    with torch.random.fork_rng():
+        torch.manual_seed(settings.fit.seed)
+        model = _new_model(settings, fit, traced, generator)
+    flare, camera = model.lights[0], traced_camera(settings)
+    optimisers = FlareOptimisers(model, fit.flare.rates)
+    names = {name: next(key for key in optimisers.dense.parameters if key.endswith(f"gaussians.{name}"))
+             for name in flare.gaussians}
+    pictures = torch.from_numpy(traced.pictures)
+    lights, intrinsics = torch.tensor(traced.places, dtype=torch.float32), _intrinsics(camera)
+    encoded, energies = _encode(pictures), pictures.square().sum((1, 2, 3)).clamp_min(1e-6)
+    order: list[int] = []
+    random = np.random.default_rng(settings.fit.seed)
+    progress.stage("fit", fit.iterations)
+    for iteration in range(1, fit.iterations + 1):
+        order = order or random.permutation(len(pictures)).tolist()
+        number = order.pop()
+        optimisers.set_rates(iteration / fit.iterations)
+        drawn = _draw(flare, lights[number], intrinsics, camera)
+        relative = (drawn - pictures[number]).square().sum() / energies[number]
+        loss = (_encode(drawn) - encoded[number]).abs().mean() + SQUARED_WEIGHT * (relative + 1e-4).sqrt()
+        loss.backward()
+        optimisers.step()
+        if fit.flare.density.is_due(iteration):
+            clone_and_prune(flare, optimisers.dense, names, fit.flare.density, generator)
+        progress.advance(1, loss=float(loss.detach()), gaussians=flare.count)
+    return model
+
+
+def _new_model(settings: TracedFlareSettings, fit: FitSettings, traced: TracedPictures, generator: torch.Generator
+               ) -> FlareModel:
+    """Return the model before the fit, with the light on the camera's axis."""
+    cameras = torch.tensor([[-CAMERA_RANGE] * 3, [CAMERA_RANGE] * 3])
+    corner = math.hypot(settings.reach, settings.reach * settings.height / settings.tracing.width)
+    query_range = QueryRange.of(cameras, torch.tensor(traced.places, dtype=torch.float32), corner)
+    flare = LightFlare(fit.flare.form, query_range, fit.flare.count, generator, fit.flare.opacity)
+    _start_at_light(flare, settings.reach, generator)
+    return FlareModel([LIGHT], torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), [flare])
+
+
+def _start_at_light(flare: LightFlare, reach: float, generator: torch.Generator) -> None:
+    """Move a share of the first Gaussians to the light, as rays of log-uniform length, and scale the others, which are
+    sized for a normal lens, to the frame.
+
+    Starburst and glow, most of a flare's light, follow the light without changing; along the line few would lie there.
+    """
+    rows = flare.gaussians
+    with torch.no_grad():
+        rows["log_scales"] += math.log(reach / REFERENCE_REACH)
+        chosen = torch.randperm(flare.count, generator=generator)[:round(flare.count * SHARE_AT_LIGHT)]
+        low, high = (math.log(bound) for bound in RAY_LENGTHS)
+        distance = torch.exp(low + (high - low) * torch.rand(len(chosen), generator=generator)) * reach
+        angle = 2 * math.pi * torch.rand(len(chosen), generator=generator)
+        direction = torch.stack([angle.cos(), angle.sin()], -1)
+        rows["positions"][chosen] = 1.0
+        rows["offsets"][chosen] = direction * distance[:, None]
+        rows["rotations"][chosen] = direction
+        rows["log_scales"][chosen] = torch.log(torch.stack([0.35 * distance.clamp_min(RAY_LENGTHS[0] * reach * 2),
+                                                            0.12 * distance.clamp_min(RAY_LENGTHS[0] * reach * 4)], -1))
+        rows["rings"][chosen] = 0.0
+
+
+def _encode(light: Tensor) -> Tensor:
+    encoded: Tensor = (light.clamp_min(0) + ENCODING_OFFSET).sqrt()
+    return encoded
+
+
+def _intrinsics(camera: Camera) -> Tensor:
+    return torch.tensor(camera.intrinsics, dtype=torch.float32)
+
+
+def _draw(flare: LightFlare, light: Tensor, intrinsics: Tensor, camera: Camera) -> Tensor:
+    """Return the flare (height, width, 3) of a light at normalised coordinates (2,), linear."""
+    view = ViewOfLight(torch.zeros(3), torch.eye(3), light, 1.0)
+    return splat_flare(flare(view), intrinsics, camera.width, camera.height, "add").colour
+
+
+@torch.no_grad()
+def draw_fitted(model: FlareModel, camera: Camera, places: Places) -> Pictures:
+    """Return the fitted flares (n, height, width, 3) of lights at places (n, 2), linear."""
+    lights, intrinsics = torch.tensor(places, dtype=torch.float32), _intrinsics(camera)
+    return np.stack([_draw(model.lights[0], light, intrinsics, camera).numpy() for light in lights])
+
+
+def relative_errors(model: FlareModel, camera: Camera, traced: TracedPictures) -> list[float]:
+    """Return the L2 norm of fitted minus traced over that of traced, by picture, linear light."""
+    fitted = draw_fitted(model, camera, traced.places)
+    return [float(np.linalg.norm(picture - truth) / max(float(np.linalg.norm(truth)), 1e-9))
+            for picture, truth in zip(fitted, traced.pictures, strict=True)]
+
+
+def write_flare(out: Path, model: FlareModel, camera: Camera, places: Places, notes: str, licence: str) -> None:
+    """Write a .flare atomically, with named elements, the places as training views, and the pixel grid."""
+    lens = TrainedCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    views = {LIGHT: [[0.0, 0.0, 0.0, round(float(x), 5), round(float(y), 5)] for x, y in places]}
+    grid = PixelGrid.from_focal_lengths([camera.fx])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(out) as unnamed:
+        flare_file.save(unnamed, FlareFile(model, "add", lens, licence, notes, training_views=views, pixel_grid=grid))
+        store_elements(unnamed)

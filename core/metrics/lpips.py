@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..colour.srgb import Pixels
 from ..errors import SettingsError
+from ..system.reading import check_regular
 
 _LAYERS = ((0, 4, 2, False), (3, 1, 2, True), (6, 1, 1, True), (8, 1, 1, False), (10, 1, 1, False))
 """Index in AlexNet's features, stride, padding, whether a 3x3 maximum of stride 2 comes first."""
@@ -69,6 +70,7 @@ class Lpips:
 
 def _read_weights(path: Path) -> dict[str, Tensor]:
     """Read a file of weights; {} for a file of another kind. Raises SettingsError for pickled code."""
+    check_regular(path)
     if path.suffix == ".safetensors":
         from safetensors.torch import load_file
 

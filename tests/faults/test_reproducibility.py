@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The first table of docs/reproducibility.md: the same command gives the same bytes, whatever the environment."""
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.core.flared import flared_capture
+from tests.core.removal_cases import network_file
+from tests.faults.cases import Snapshot, fit_argv, snapshot
+
+ROOT = Path(__file__).resolve().parents[2]
+VARY = {"run/metrics.jsonl", "run/log.txt"}
+"""Files with times."""
+CODE = """import importlib.util, json, sys, torch
+spec = importlib.util.spec_from_file_location("fit_flare_run", sys.argv[1])
+run = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(run)
+run.register_package()
+torch.set_num_threads(1)
+from fit_flare.headless import cli
+sys.exit(max(cli.main(argv) for argv in json.loads(sys.argv[2])))"""
+
+
+def results(out: Path, capture: Path, weights: Path, **environment: str) -> Snapshot:
+    """Fit, bake, export, transfer and clean in one process; return the hashes of all files."""
+    import json
+
+    run = f"{out}/run"
+    commands = [fit_argv(capture, out / "run"), ["bake", run, "--out", f"{out}/layers", "--frames", "1-2"],
+                ["export", run, "--as", "preset", "--out", f"{out}/lamp.json"],
+                ["export", run, "--as", "ply", "--out", f"{out}/ply", "--frames", "1"],
+                ["transfer", f"{run}/flare.flare", "--to", str(capture), "--out", f"{out}/added", "--frames", "1"],
+                ["remove", str(capture / "images"), "--out", f"{out}/clean", "--weights", str(weights), "--frames",
+                 "1", "--stills", "--working-size", "256"],
+                ["remove", "--run", run, "--out", f"{out}/subtracted", "--frames", "1"]]
+    done = subprocess.run([sys.executable, "-P", "-c", CODE, str(ROOT / "headless" / "run.py"), json.dumps(commands)],
+                          env={**os.environ, **environment}, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return {name: value for name, value in snapshot(out).items() if name not in VARY}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no TZ")
+def test_the_same_commands_give_the_same_bytes(tmp_path: Path) -> None:
+    """Two processes with another hash seed, time zone, language and working folder write to the same place."""
+    capture, weights = flared_capture(tmp_path / "capture", count=7, dots=60), tmp_path / "weights.safetensors"
+    network_file(weights, bias=0.2)
+    out = tmp_path / "out"
+    first = results(out, capture, weights, PYTHONHASHSEED="1", TZ="UTC")
+    out.rename(tmp_path / "first")
+    second = results(out, capture, weights, PYTHONHASHSEED="2", TZ="Asia/Tokyo", LANG="C", LC_ALL="C")
+    assert first.keys() == second.keys()
+    assert [name for name in first if first[name] != second[name]] == []
+    assert {"run/flare.flare", "run/scene.ply", "lamp.json", "layers/layers.0001.exr"} <= first.keys()
+
+
+def test_the_table_names_tests_that_exist() -> None:
+    import re
+
+    text = (ROOT / "docs" / "reproducibility.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text)
+    assert len(named) >= 4
+    for file, name in named:
+        assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), f"{file}::{name}"

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from core.system.thread_environment import prepare_for_numpy_and_torch
+from core.system.thread_environment import set_thread_environment
 
-prepare_for_numpy_and_torch()
+set_thread_environment()
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start what runs in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -78,7 +78,8 @@ class Job:
         self.kind, self.folder, self.origin = kind, folder, origin
         self.args = [arg for arg in args if arg != "--overwrite"]
         self.state: State = "running"
-        self.stage, self.done, self.total, self.eta_s = "starting", 0, 0, None
+        self.stage, self.done, self.total = "starting", 0, 0
+        self.eta_s: float | None = None
         self.figures: dict[str, float] = {}
         self.messages: list[str] = []
         self.result: dict[str, Any] = {}

@@ -33,7 +33,7 @@ from ..core.system import processes
 from ..core.system.files import remove_file, write_json
 from ..core.system.processes import STOPPED, WINDOWS, new_process_group
 from ..core.system.progress import STOP_FILE
-from ..core.system.reading import open_regular, parse_json, read_text
+from ..core.system.reading import open_regular, parse_json, read_bytes, read_text
 from .paths import is_file, is_folder
 
 State = Literal["running", "done", "failed", "stopped"]
@@ -218,7 +218,7 @@ class Job:
     def _last_log_line(self) -> str:
         """Return the last line of the job's log in brackets and quotes; "" without one."""
         try:
-            text = self.log.read_bytes()[self.origin.log_offset:].decode("utf-8", errors="replace")
+            text = read_bytes(self.log)[self.origin.log_offset:].decode("utf-8", errors="replace")
         except OSError:
             return ""
         lines = [line.strip() for line in text.splitlines() if line.strip()]

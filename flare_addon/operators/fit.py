@@ -9,6 +9,7 @@ from typing import Any
 import bpy
 
 from ...core.conventions.run_files import LOG, PREVIEW
+from ...core.system.reading import open_regular
 from .. import engine, fits, jobs, shots
 from ..paths import is_file, is_folder
 from ..reports import NO_CAPTURE, GuardedOperator
@@ -140,7 +141,7 @@ class FITFLARE_OT_show_log(bpy.types.Operator):
 def _tail(path: Path) -> str:
     """Return the end of a log; the reason in brackets where it cannot be read."""
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             file.seek(max(path.stat().st_size - MAX_LOG_BYTES, 0))
             return file.read().decode("utf-8", "replace")
     except OSError as problem:

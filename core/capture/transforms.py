@@ -246,6 +246,7 @@ def _read_pose(frame: dict[str, Any], where: str) -> Floats:
 
 
 def _read_points(path: Path, meta: dict[str, Any], result: Transforms) -> PointCloud:
+    """Return the points that a transforms.json names, else those of a COLMAP model beside it, moved to its world."""
     folder, name = path.parent, meta.get("ply_file_path")
     if isinstance(name, str):
         file = safe_join(folder, Path(name).as_posix(), CaptureError)

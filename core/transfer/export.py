@@ -150,19 +150,19 @@ def _part(gaussians: PlaneGaussians, row: int, light: NDArray[np.float64], width
     short, long = np.sqrt(np.maximum(variances, 0)) / width
     x, y = axes[:, 1]
     rotation = math.degrees(math.atan2(axis[0] * y - axis[1] * x, axis[0] * x + axis[1] * y))
-    light_here = np.maximum(gaussians.colours[row].astype(np.float64), 0) * float(gaussians.opacities[row])
-    peak = float(light_here.max())
+    colour = np.maximum(gaussians.colours[row].astype(np.float64), 0) * float(gaussians.opacities[row])
+    peak = float(colour.max())
     part: dict[str, Any] = {
         "offset": 1 - float(mean @ axis) / distance, "aside": float(axis[0] * mean[1] - axis[1] * mean[0]) / width,
         "size": [float(long), float(short)], "rotation": (rotation + 90) % 180 - 90, "intensity": peak,
-        "colour": (light_here / peak).tolist() if peak > 0 else [1.0, 1.0, 1.0],
+        "colour": (colour / peak).tolist() if peak > 0 else [1.0, 1.0, 1.0],
         "shape": "streak" if long > 4 * short else "glow"}
     if gaussians.rings is not None:
         r0, w = (float(value) for value in gaussians.rings[row])
         if r0 > w:
             part |= {"shape": "ring" if r0 > 3 * w else "disc", "radius": [r0 * float(long), r0 * float(short)],
                      "thickness": [w * float(long), w * float(short)]}
-        elif r0 != 0 or w != 1:  # its own profile, as a plain one of about its width
+        elif r0 != 0 or w != 1:  # approximated by a plain profile of about the same width
             part["size"] = [(max(r0, 0) + w) * float(long), (max(r0, 0) + w) * float(short)]
         if gaussians.arcs is not None and gaussians.arcs[row].any():
             x, y = (float(value) for value in gaussians.arcs[row])

@@ -40,13 +40,13 @@ def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progres
     on_error: called with an exception; it raises it, or returns so that the next frame follows. Without it the first
     exception is raised.
     """
-    written, kept = 0, Counter[KeepReason]()
+    written, kept_counts = 0, Counter[KeepReason]()
     for frame in frames:
         try:
             key = digest(frame)
             reason = manifest.reason_to_keep(frame.name, frame.source, key, frame.results) if keep_finished else None
             if reason is not None and not (overwrite and reason == "edited"):
-                kept[reason] += 1
+                kept_counts[reason] += 1
             else:
                 write = clean(frame)
                 manifest.begin(frame.name, frame.source, key, frame.results, overwrite)
@@ -58,4 +58,4 @@ def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progres
                 raise
             on_error(frame, error)
         progress.advance()
-    return written, kept
+    return written, kept_counts

@@ -108,11 +108,11 @@ class Manifest:
             tables["written"] |= {_relative_path(self._folder, path): content_hash(path) for path in results}
             self._write(tables)
 
-    def report_kept(self, kept: Mapping[KeepReason, int], progress: Progress) -> None:
+    def report_kept(self, counts: Mapping[KeepReason, int], progress: Progress) -> None:
         """Say how many frames were kept, and why."""
-        if count := kept.get("up to date"):
+        if count := counts.get("up to date"):
             progress.say(f"{count} clean frames in {self._folder} are up to date; --overwrite makes them again.")
-        if count := kept.get("edited"):
+        if count := counts.get("edited"):
             progress.say(f"{count} clean frames in {self._folder} were edited after they were made, and are kept; "
                          "--overwrite makes them again.")
 

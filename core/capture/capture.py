@@ -24,11 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..colour import ColourSpace
 from ..errors import CaptureError, FrameError
 from ..images.formats.exif import read_exif
 from ..images.listing import SUFFIXES
 from ..images.picture import Picture, same_aspect
-from ..images.read import read_picture
+from ..images.read import has_float_pixels, read_picture
 from ..images.size import picture_size
 from ..images.unsupported import unsupported_file
 from ..images.video import is_video
@@ -41,6 +42,7 @@ from .frame_files import mask_pictures, matching_pictures
 from .lens import PINHOLES, Lens
 from .orientation import SWAPS_SIDES, TurnedFrame, find_upright
 from .pictures import PictureCache
+from .plate_space import read_plate_space
 
 LIGHTS, REMOVED, MASKS = "lights.json", "removed", "masks"
 """Names in a capture's folder: the file of its lights, and the folders of its clean frames and of its masks."""
@@ -85,6 +87,7 @@ class Capture:
         self.points = points
         self.lights = tuple(lights)
         self.cache_bytes = cache_bytes
+        self.plate_space = read_plate_space(folder)
         self._frames = frames or {}
         self._pictures = PictureCache(cache_bytes)
         names = [view.name for view in self.views]
@@ -119,10 +122,10 @@ class Capture:
         posed, root = solve.frames, solve.root
         names = [frame.name for frame in posed]
         if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise CaptureError(f"{folder}: the frame {twice} has two poses; remove one of them.")
+            duplicate = next(name for name in names if names.count(name) > 1)
+            raise CaptureError(f"{folder}: the frame {duplicate} has two poses; remove one of them.")
         matched = match_frames(solve)
-        turned = [found for frame in posed if (found := _to_turned(frame, matched.files.get(frame.name)))]
+        turned = [turned_frame for frame in posed if (turned_frame := _to_turned(frame, matched.files.get(frame.name)))]
         upright, sentences = find_upright(turned, solve.points)
         turned_by_name = {frame.posed.name: frame for frame in turned if frame.posed.name in upright}
         views, frames, order, names_of = [], {}, {}, {}
@@ -199,13 +202,13 @@ class Capture:
         """
         if view.name not in self._frames:
             raise FrameError(f"{self.folder} has no frame for {view.name}.")
-        return self._picture(self._frames[view.name], view, size)
+        return self._picture(self._frames[view.name], view, size, self.plate_space)
 
     def frame_in_file_primaries(self, view: View) -> Picture:
         """Return the view's frame, undistorted, at its file's size, without conversion to Rec. 709. Raises FrameError.
         """
         path = self.frame_path(view)
-        stored = self._pictures.upright(read_picture(path, keep_primaries=True), view, path)
+        stored = self._pictures.upright(read_picture(path, keep_primaries=True, space=self.plate_space), view, path)
         return self._pictures.undistorted(stored, view, path) if view.lens else stored
 
     def frame_path(self, view: View) -> Path:
@@ -214,7 +217,17 @@ class Capture:
 
     def removed(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
         """Return the clean frame from removed/; None where there is none."""
-        return self._optional_picture(self._removed, view, size)
+        is_developed = self.has_other_format(view)
+        return self._optional_picture(self._removed, view, size, None if is_developed else self.plate_space)
+
+    def has_other_format(self, view: View) -> bool:
+        """True if a view's clean frame is an EXR and its frame is none: linear light, whatever the frame's space."""
+        path = self._removed.get(view.name)
+        return path is not None and path.suffix.lower() == ".exr" != self.frame_path(view).suffix.lower()
+
+    def holds_light_above_white(self, view: View) -> bool:
+        """True if the file of the view's frame may hold light above white. Raises FrameError."""
+        return has_float_pixels(self.frame_path(view), self.plate_space)
 
     def removed_path(self, view: View) -> Path:
         """Return the file of the view in removed/, where `has_removed`."""
@@ -356,11 +369,13 @@ class Capture:
 
     # How the pictures are had.
 
-    def _picture(self, path: Path, view: View, size: tuple[int, int] | None) -> Picture:
-        return self._pictures.get(path, view, size or view.camera.size)
+    def _picture(self, path: Path, view: View, size: tuple[int, int] | None,
+                 space: ColourSpace | None = None) -> Picture:
+        return self._pictures.get(path, view, size or view.camera.size, space)
 
-    def _optional_picture(self, paths: dict[str, Path], view: View, size: tuple[int, int] | None) -> Picture | None:
-        return self._picture(paths[view.name], view, size) if view.name in paths else None
+    def _optional_picture(self, paths: dict[str, Path], view: View, size: tuple[int, int] | None,
+                          space: ColourSpace | None = None) -> Picture | None:
+        return self._picture(paths[view.name], view, size, space) if view.name in paths else None
 
     def _read_held_out_names(self, path: Path) -> set[str]:
         data = read_json(path, CaptureError)

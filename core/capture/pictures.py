@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..colour import ColourSpace
 from ..errors import FrameError
 from ..images.formats.exif import apply_orientation, read_exif
 from ..images.picture import Picture, same_aspect
@@ -28,13 +29,14 @@ class PictureCache:
         self._maps: OrderedDict[tuple[int, tuple[int, int], float], Any] = OrderedDict()
         self._lock = threading.Lock()
 
-    def get(self, path: Path, view: View, size: tuple[int, int]) -> Picture:
+    def get(self, path: Path, view: View, size: tuple[int, int], space: ColourSpace | None = None) -> Picture:
+        """Return a view's picture at a size. space: in place of what the file declares."""
         key = (path, size)
         with self._lock:
             if key in self._pictures:
                 self._pictures.move_to_end(key)
                 return self._pictures[key]
-        picture = self.upright(read_picture(path), view, path)
+        picture = self.upright(read_picture(path, space=space), view, path)
         if view.lens is not None:
             picture = self.undistorted(picture, view, path)
         elif not same_aspect(picture.size, view.camera.size):
@@ -46,6 +48,7 @@ class PictureCache:
         return picture
 
     def _store(self, key: tuple[Path, tuple[int, int]], picture: Picture) -> None:
+        """Keep a picture, and evict the least recently used ones above the capacity."""
         with self._lock:
             if key in self._pictures or picture.pixels.nbytes > self._capacity:
                 return

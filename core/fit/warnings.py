@@ -13,7 +13,6 @@ import numpy as np
 from ..capture import Capture, View
 from ..colour.srgb import LUMINANCE, linear_from_srgb
 from ..flare.model import FlareModel
-from ..images.read import has_float_pixels
 from .frames import Frames, subsample
 from .settings import FitSettings
 
@@ -53,7 +52,7 @@ def footage_warnings(capture: Capture, settings: FitSettings, views: Sequence[Vi
                         f"capture of {extent:.3g}, and 32 bit positions are too coarse there. Move cameras, points "
                         "and lights to the origin first, with COLMAP's model_transformer or model_aligner for "
                         "instance.")
-    if all(has_float_pixels(capture.frame_path(view)) for view in views):
+    if all(capture.holds_light_above_white(view) for view in views):
         light = [linear_from_srgb(frames.frame(view).numpy()) @ LUMINANCE for view in subsample(views, SAMPLED_VIEWS)]
         median = float(np.median([np.median(luminances) for luminances in light]))
         if median > 0 and abs(math.log2(median / MIDDLE_GREY)) > MAX_STOPS_FROM_GREY:

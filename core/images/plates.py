@@ -305,7 +305,9 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
         light = plate.space.to_linear(codes.astype(np.float32) / np.float32(plate.max_code))
         write_exr(path, {name: light[..., k] for k, name in enumerate("RGB")})
         return
-    if needs_oiio_writer(plate.path) and suffix in OIIO_FORMATS:
+    if suffix not in (".png", *_JPEGS, *_TIFFS) and suffix not in OIIO_FORMATS:
+        raise FrameError(f"{path} is of a format that this program does not write; choose PNG, TIFF or EXR.")
+    if (needs_oiio_writer(plate.path) and suffix in OIIO_FORMATS) or suffix not in (".png", *_JPEGS, *_TIFFS):
         write_by_oiio(path, plate.path, codes[..., :1] if plate.grey else codes, plate.alpha)
         return
     if codes.dtype not in _DEPTHS.get(suffix, (codes.dtype,)) or (suffix in _JPEGS and plate.alpha is not None):

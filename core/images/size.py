@@ -8,7 +8,8 @@ from typing import BinaryIO
 
 from ..errors import FrameError
 from ..system.reading import open_regular
-from .decoders import MAX_PIXELS, describe, file_kind
+from .decoders import MAX_PIXELS as MAX_PIXELS
+from .decoders import describe, file_kind
 from .formats import exr_header, jpeg, png, tiff
 
 
@@ -43,6 +44,7 @@ def checked_size(path: Path, size: tuple[int, int] | None) -> tuple[int, int]:
 
 
 def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
+    """Return (width, height) by the header at the start of a stream; None for other formats and damaged headers."""
     head = stream.read(24)
     if head[:8] == png.SIGNATURE and len(head) == 24:
         return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")

@@ -25,6 +25,7 @@ from ..images.formats.exif import read_exif
 from ..images.formats.tiff import UPRIGHT
 from ..images.listing import pictures_in
 from ..images.picture import Picture, same_aspect
+from ..images.plates import clean_name
 from ..images.views import read_header_and_names, stereo_views
 from ..images.window import DataWindow, union_window
 from ..lights.detection import Detector
@@ -64,7 +65,7 @@ class TargetFrame:
         None if it is not written: without a plate, or if the frame's size or distortion differs from the file's."""
         if self.plate is None or self.undistorted is not None or self.window is None:
             return None
-        return folder / Path(self.frame.file).parent / self.plate.name
+        return folder / Path(self.frame.file).parent / clean_name(self.plate).name
 
     def cache_key(self) -> str:
         """Return a text that changes whenever the frame would; the plate counts by name and content, not by path."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from ...core.errors import RunError
 from ...core.system.progress import Progress
-from .. import tallies
+from .. import plate_space, tallies
 from ..command import Command, Step
 
 VIEWS = ("held-out", "train", "all")
@@ -19,11 +19,16 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="a run, the folder that `fit` writes")
     parser.add_argument("--views", choices=VIEWS, default="held-out", help="which views to score (default held-out)")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="the capture, if it was moved")
+    plate_space.add_option(parser)
     parser.add_argument("--lpips", type=Path, metavar="DIR", help="folder with the weights of LPIPS (AlexNet, v0.1)")
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Score the run as the arguments say."""
+    if args.plate_space is not None:
+        from ...core.fit.run import Run
+
+        plate_space.record(args, Run.open(args.run).find_capture(args.capture))
     return score_run(args.run, progress, view_set=args.views, capture_folder=args.capture,
                      lpips_folder=args.lpips)
 

@@ -11,7 +11,7 @@ from ...core.errors import SettingsError
 from ...core.system.progress import Progress
 from ...core.system.reading import UTF8_SIG, read_text
 from ...core.typed import MAX_INT_DIGITS
-from .. import jobs, tallies
+from .. import jobs, plate_space, tallies
 from ..command import Command, Step, check_at_least_one, parse_seed, reject_unused_options
 from .lights import with_lights
 from .remove import with_removed
@@ -61,6 +61,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "gsplat, nerfstudio, Brush and Postshot write it, or PlayCanvas's compressed one)")
     parser.add_argument("--freeze-scene", action="store_true",
                         help="keep the scene of --scene unchanged and fit the flare alone; needs no clean frames")
+    plate_space.add_option(parser)
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes",
                         help="any other setting by its name in config.toml, such as flare.count=400; repeatable")
 
@@ -86,6 +87,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     is_resumed = args.resume and (out / CONFIG).is_file()
     if not is_resumed:
         Run.check_free(out)
+    plate_space.record(args, folder)
     # The fit has its own cache, of smaller pictures.
     capture = Capture.open(folder, cache_bytes=DECODED_CACHE_BYTES)
     tallies.report_capture(capture, progress)

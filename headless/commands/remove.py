@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.errors import FrameError, RunError, SettingsError, join_failures
 from ...core.system.progress import Progress
-from .. import frames, glow, jobs
+from .. import frames, glow, jobs, plate_space
 from ..command import Command, Step, reject_unused_options
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="where the flares are, white on black: one picture for all plates, or a folder with one "
                              "of the same name for each; nothing is removed outside, and inside faint flares are "
                              "removed as well")
+    plate_space.add_option(parser)
     glow.add_options(parser)
     parser.add_argument("--stills", action="store_true",
                         help="clean each plate by itself, without the plates before and after it")
@@ -125,6 +126,7 @@ def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[s
         raise SettingsError("--run subtracts the fitted flare; only --out, --frames, --flare, --capture and "
                             "--overwrite go with it.")
     fitted = Run.open(args.run)
+    plate_space.record(args, fitted.find_capture(args.capture))
     if fitted.settings.mode == "3dgs":
         raise RunError(fitted.missing_flare_message)
     capture = fitted.capture(args.capture)
@@ -140,9 +142,19 @@ def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[s
 
 def _make_remover(args: argparse.Namespace) -> Remover:
     """Return the remover that the options select. Raises SettingsError."""
-    from ...core.removal.inference.remover import WORKING_SIZE, Remover
+    from ...core.removal.inference.remover import WORKING_SIZE
 
-    size = WORKING_SIZE if args.working_size is None else args.working_size
+    remover = _make_model(args, WORKING_SIZE if args.working_size is None else args.working_size)
+    space = plate_space.named_space(args)
+    if space is not None:
+        remover.use_plate_space(space)
+    return remover
+
+
+def _make_model(args: argparse.Namespace, size: int) -> Remover:
+    """Return the remover of the model that the options select. Raises SettingsError."""
+    from ...core.removal.inference.remover import Remover
+
     if args.model == "network":
         if args.base is not None:
             raise SettingsError("--base is only for --model diffusion; leave it out.")

@@ -9,11 +9,12 @@ from typing import Any, get_args
 from ...core.choices import Matching
 from ...core.errors import CaptureError, SettingsError
 from ...core.system.progress import Progress
-from .. import tallies
+from .. import plate_space, tallies
 from ..command import Command, Step, parse_seed, reject_unused_options
 
 SOLVE_DEFAULTS = {"frames": 0, "matching": "auto", "lens": "RADIAL", "work_size": 1000, "size": 0, "no_mask": False,
-              "seed": 0}
+              "seed": 0, "plate_space": None,
+                  "ocio": None}
 """Defaults of the options that apply to frames without cameras only."""
 
 
@@ -41,6 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-mask", action="store_true",
                         help="also use features on clipped pixels and on the lines of ghosts")
     parser.add_argument("--seed", type=parse_seed, metavar="N", help="random seed (default 0)")
+    plate_space.add_option(parser)
     parser.set_defaults(**SOLVE_DEFAULTS)
 
 
@@ -51,7 +53,9 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.plates or args.lights:
         raise SettingsError(f"--{'plates' if args.plates else 'lights'} is only for a .blend; leave it out.")
     settings = SolveSettings(frames=args.frames, matching=args.matching, lens=args.lens.upper(),
-                             size=args.work_size, output_size=args.size, mask=not args.no_mask, seed=args.seed)
+                             size=args.work_size, output_size=args.size, mask=not args.no_mask, seed=args.seed,
+                             plate_space="" if plate_space.named_space(args) is None else args.plate_space,
+                             ocio=args.ocio)
     report = solve(args.source, args.out, settings, progress)
     progress.say(f"{report['registered']} of {report['frames']} frames placed, {report['points']} points, reprojection "
                  f"error {report['reprojection_error_px']:.2f} px in pictures of {args.work_size} or less, "

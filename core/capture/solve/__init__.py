@@ -46,6 +46,8 @@ class SolveSettings:
     principal_point: estimate it as well, since flares turn about it; the centre where the frames do not determine it.
     mask: exclude clipped pixels and their bloom from feature extraction.
     seed: of all randomness.
+    plate_space: colour space of the frames, in place of what their files declare; "" for that. ocio: the OpenColorIO
+    configuration that defines it.
     """
 
     frames: int = 0
@@ -57,6 +59,8 @@ class SolveSettings:
     principal_point: bool = True
     mask: bool = True
     seed: int = 0
+    plate_space: str = ""
+    ocio: str | None = None
 
     def __post_init__(self) -> None:
         if self.lens not in MODELS or self.lens == "EQUIRECTANGULAR":
@@ -107,7 +111,8 @@ def _solve(source: Path, out: Path, request: dict[str, Any], settings: SolveSett
     began = time.monotonic()
     _prepare_output(source, out, request, progress)
     work = out / WORK_FOLDER
-    chosen, left_out = source_frames.prepare_frames(source, work, settings.frames, settings.size, progress)
+    chosen, left_out = source_frames.prepare_frames(source, work, settings.frames, settings.size, progress,
+                                                     (settings.plate_space, settings.ocio))
     try:
         solved = run_in_child(mapping.solve, chosen, work, settings, is_video(source), progress=progress)
     except ChildDied as problem:  # pycolmap aborts where its database cannot be written

@@ -65,7 +65,7 @@ def _file_names(sources: Sequence[SourceFrame]) -> list[str]:
     used: set[str] = set()
     for source in sources:
         file = Path(source.file)
-        suffix = ".exr" if has_float_pixels(file) else ".png"
+        suffix = ".exr" if has_float_pixels(file, source.colour_space) else ".png"
         name = file.stem + suffix
         names.append(file.name + suffix if name.casefold() in used else name)
         used.add(names[-1].casefold())
@@ -85,6 +85,7 @@ def _write_frame(source: SourceFrame, frame: SolvedFrame, camera: Camera, target
     file = Path(source.file)
     is_distorted = frame.lens.max_distortion_px >= MIN_DISTORTION_PX
     if (not is_distorted and camera.size == (source.width, source.height) and source.orientation == 1
+            and not source.space
             and file.suffix.lower() == target.suffix):
         with atomic_path(target) as temporary:
             shutil.copyfile(file, temporary)

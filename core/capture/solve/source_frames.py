@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...colour import ColourSpace, colour_space
 from ...colour.srgb import Pixels
 from ...errors import CaptureError, FrameError
 from ...images.exr import read_data_window
@@ -43,7 +44,8 @@ class SourceFrame:
     """A frame to solve: `name` of its small picture and mask, its file, its full size in pixels, focal length and
     orientation.
 
-    focal: multiple of the long side, where the file has it. orientation: Exif's.
+    focal: multiple of the long side, where the file has it. orientation: Exif's. space, config: colour space of the
+    pixels, where the user names one, and the OpenColorIO configuration that defines it.
     """
 
     name: str
@@ -52,6 +54,13 @@ class SourceFrame:
     height: int
     focal: float | None
     orientation: int
+    space: str = ""
+    config: str | None = None
+
+    @property
+    def colour_space(self) -> ColourSpace | None:
+        """The space that the user names; None for what the file declares."""
+        return colour_space(self.space, self.config) if self.space else None
 
 
 def choose_sharpest(sharpness: Sequence[float], number: int) -> list[int]:
@@ -86,7 +95,8 @@ def _warn_if_interlaced(interlaced: Sequence[bool], progress: Progress) -> None:
 
 
 def prepare_frames(source: Path, work: Path, number: int, size: int,
-                   progress: Progress) -> tuple[list[SourceFrame], list[str]]:
+                   progress: Progress, space: tuple[str, str | None] = ("", None)
+                   ) -> tuple[list[SourceFrame], list[str]]:
     """Choose frames and write small pictures and masks of them below `work`.
 
     `number`: how many (0: all of a folder, 150 of a video); `size`: long side of the small pictures. Returns the
@@ -97,7 +107,7 @@ def prepare_frames(source: Path, work: Path, number: int, size: int,
     if earlier is not None:
         return earlier
     if source.is_dir():
-        frames, left_out = _from_folder(source, work, number, size, progress)
+        frames, left_out = _from_folder(source, work, number, size, progress, space)
     elif source.is_file() and is_video(source):
         frames, left_out = _from_video(source, work, number or 150, size, progress)
     else:
@@ -123,7 +133,7 @@ def read_record(work: Path) -> tuple[list[SourceFrame], list[str]] | None:
 
 def read_full_size(frame: SourceFrame) -> Picture:
     """Read the frame at full size, upright."""
-    return _to_upright(read_picture(Path(frame.file)), frame.orientation)
+    return _to_upright(read_picture(Path(frame.file), space=frame.colour_space), frame.orientation)
 
 
 def _to_upright(picture: Picture, orientation: int) -> Picture:
@@ -131,7 +141,8 @@ def _to_upright(picture: Picture, orientation: int) -> Picture:
 
 
 def _from_folder(source: Path, work: Path, number: int, size: int,
-                 progress: Progress) -> tuple[list[SourceFrame], list[str]]:
+                 progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
+    named = colour_space(*space) if space[0] else None
     files = pictures_in(source)
     if not files:
         raise CaptureError(f"{source} holds no frames (PNG, JPEG, TIFF or EXR).")
@@ -141,7 +152,7 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
         scores = []
         for file in files:
             try:
-                scores.append(sharpness(read_picture(file).display().mean(axis=2)))
+                scores.append(sharpness(read_picture(file, space=named).display().mean(axis=2)))
             except FrameError:
                 scores.append(-1.0)
             progress.advance()
@@ -152,14 +163,15 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
         try:
             picture_size(file)
             orientation, focal = read_exif(file)
-            picture = _to_upright(read_picture(file), orientation)
+            picture = _to_upright(read_picture(file, space=named), orientation)
             aspect = read_data_window(file).aspect
         except FrameError as problem:
             left_out.append(str(problem))
             progress.say(f"Left out: {problem}")
         else:
             # A number: COLMAP would cut a name at a space, and names may differ only by their suffix.
-            frame = SourceFrame(f"{len(frames):06d}.png", str(file.resolve()), *picture.size, focal, orientation)
+            frame = SourceFrame(f"{len(frames):06d}.png", str(file.resolve()), *picture.size, focal, orientation,
+                                *space)
             _write_small(picture, aspect, work, frame.name, size)
             frames.append(frame)
             interlaced.append(is_interlaced(picture))
@@ -239,7 +251,10 @@ def feature_mask(picture: Picture) -> NDArray[np.bool_]:
 
 
 def _ghost_lines(clipped: NDArray[np.uint8], thickness: int) -> NDArray[np.bool_]:
-    """Bands (h, w) of `thickness` pixels, for the four largest compact spots at most."""
+    """Return the mask (h, w) of lines through the frame's centre and the four largest compact spots at most.
+
+    Ghosts lie on these lines. thickness: of the lines, pixels.
+    """
     import cv2
 
     height, width = clipped.shape
@@ -253,10 +268,10 @@ def _ghost_lines(clipped: NDArray[np.uint8], thickness: int) -> NDArray[np.bool_
         if 9 <= area <= 0.01 * width * height and area >= 0.4 * wide * high and max(wide, high) <= 3 * min(wide, high):
             spots.append((area, label))
     for _, label in sorted(spots, reverse=True)[:4]:
-        away = middle - centres[label]
-        length = float(np.linalg.norm(away))
+        direction = middle - centres[label]
+        length = float(np.linalg.norm(direction))
         if length > 2 * thickness:
-            reach = float(np.hypot(width, height)) * away / length
-            start, end = (middle - reach).astype(int), (middle + reach).astype(int)
+            half = float(np.hypot(width, height)) * direction / length
+            start, end = (middle - half).astype(int), (middle + half).astype(int)
             cv2.line(drawn, tuple(map(int, start)), tuple(map(int, end)), (1.0,), thickness)
     return drawn > 0

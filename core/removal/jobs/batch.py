@@ -16,10 +16,12 @@ from typing import Any
 from ...errors import DISK_FULL, FrameError, SettingsError, join_failures, os_error_message
 from ...images.exr import read_data_window
 from ...images.formats.exif import read_exif
-from ...images.listing import pictures_below, pictures_in
-from ...images.plates import is_plate_error, write_results
+from ...images.listing import passed_over, pictures_below, pictures_in
+from ...images.plates import clean_name, is_plate_error
+from ...images.views import split_views, write_view_results
 from ...system.files import check_no_overwrite, real_path
 from ...system.progress import Progress
+from ...system.tally import Tally
 from ..inference.neighbours import ShotPredictor, shot_sort_key
 from ..inference.remover import Remover
 from .clean_frames import CleanFrame, write_clean_frames
@@ -53,7 +55,7 @@ def collect_plates(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) 
         else:
             files = [(item, Path(item.name))]
         for path, name in files:
-            key = name.as_posix().casefold()
+            key = clean_name(name).as_posix().casefold()
             if key in plates:
                 raise SettingsError(f"{plates[key][0]} and {path} would be written to the same file, on Windows and "
                                     "macOS at least; clean them in separate runs.")
@@ -88,6 +90,29 @@ def _self_and_parents(path: Path) -> list[Path]:
     return [resolved, *resolved.parents]
 
 
+def left_out(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) -> dict[str, list[str]]:
+    """Return the names of the files in the item folders that are no plates, by reason.
+
+    exclude: as for `collect_plates`; these, manifests and locks are not mentioned.
+    """
+    skipped: dict[str, list[str]] = {}
+    for item in inputs:
+        if not item.is_dir():
+            continue
+        excluded_paths = _excluded_paths(item, [other for other in exclude if other is not None])
+        folders = [item, *(path for path in item.rglob("*") if path.is_dir())]
+        for folder in folders:
+            inside = folder.relative_to(item)
+            if any(part.startswith(".") for part in inside.parts) or not excluded_paths.isdisjoint(
+                    _self_and_parents(folder)):
+                continue
+            for reason, names in passed_over(folder, subfolders=False):
+                skipped.setdefault(reason, []).extend(
+                    (inside / name).as_posix() for name in names
+                    if name != MANIFEST and real_path(folder / name) not in excluded_paths)
+    return {reason: names for reason, names in skipped.items() if names}
+
+
 def _blocking_path(folder: Path) -> Path | None:
     """Return what prevents a folder from being created: a file or a dangling link in its place or in that of a parent;
     None if nothing does."""
@@ -117,7 +142,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
             raise SettingsError(f"{other} is not a folder, so {place} cannot be written to; choose another folder.")
     excluded = [folder, flare_folder, mattes.source if mattes else None]
     plates = collect_plates(inputs, excluded)
-    results = {name: [folder / name, *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
+    results = {name: [folder / clean_name(name), *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
                for _, name in plates}
     check_no_overwrite([*(path for path, _ in plates), *(mattes.files if mattes else ())],
                        itertools.chain.from_iterable(results.values()))
@@ -126,7 +151,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     if only is not None:
         plates = [(path, name) for path, name in plates if name in only]
     progress.stage("remove", len(plates))
-    failed, unsure = list(failed_inputs), list[Path]()
+    failed, failed_names, unsure = list(failed_inputs), list[str](), list[Path]()
 
     def digest(frame: CleanFrame) -> str:
         matte = [mattes.path(frame.name)] if mattes else []
@@ -138,7 +163,11 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         matte = mattes.read(frame.name, read_data_window(frame.source), read_exif(frame.source)[0]) if mattes else None
 
         def write() -> None:
-            write_results(frame.results, plate, *remover.remove(plate, matte, prediction))
+            (_, first), *others = split_views(plate)  # the eyes of a stereo picture; the first one is predicted above
+            cleaned = [remover.remove(first, matte, prediction), *(remover.remove(view, matte) for _, view in others)]
+            write_view_results(frame.results, plate, cleaned)
+            if plate.warning:
+                progress.say(plate.warning)
             if matte is None and prediction.confidence < MIN_CONFIDENCE:
                 unsure.append(frame.name)
 
@@ -156,6 +185,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         failed.append(os_error_message(error) if isinstance(error, OSError)
                       else str(error) if isinstance(error, FrameError)
                       else f"{frame.source} does not fit into memory.")
+        failed_names.append(frame.name.as_posix())
         progress.say(f"Left out: {failed[-1]}")
 
     frames = (CleanFrame(name, path, results[name])
@@ -163,11 +193,15 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     written, kept = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
                                        keep_finished=not overwrite, overwrite=overwrite, on_error=leave_out)
     manifest.report_kept(kept, progress)
+    tally = Tally("plate", "cleaned", written + kept.total(), left_out(inputs, excluded))
+    tally.skip("could not be cleaned", *failed_names)
     if failed:
+        progress.say(tally.sentence())
         raise FrameError(f"{len(failed)} of {len(plates) + len(failed_inputs)} plates could not be cleaned: "
                          f"{join_failures(failed)}")
     if unsure:
         progress.say(f"In {len(unsure)} of them a possible flare was kept, because it may be part of the scene or of "
                      "its grade; an all-white matte removes it.")
     progress.say(f"{written + kept.total()} clean frames are in {folder}.")
-    return {"plates": str(folder), "made": written, "kept": kept.total()}
+    progress.say(tally.sentence())
+    return {"plates": str(folder), "made": written, "kept": kept.total(), **tally.as_result()}

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from ...capture import REMOVED, Capture
 from ...errors import CaptureError
-from ...images.plates import write_plate
+from ...images.plates import clean_name
+from ...images.views import split_views, write_view_results
 from ...system.files import retry_while_locked, safe_join
 from ...system.progress import Progress
 from ..inference.neighbours import ShotPredictor, shot_sort_key
@@ -35,6 +36,8 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress) -> Pat
     target, work = capture.folder / REMOVED, capture.folder / UNFINISHED_FOLDER
     if target.exists():
         raise CaptureError(f"{target} exists already; delete it to clean the frames again.")
+    if capture.plate_space is not None:
+        remover.use_plate_space(capture.plate_space)
     names = _clean_names(capture)
     progress.stage("remove", len(capture.views))
     predictor = ShotPredictor(remover, [capture.frame_path(view) for view in capture.views])
@@ -47,7 +50,9 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress) -> Pat
 
     def clean(frame: CleanFrame) -> Callable[[], None]:
         plate, prediction = predictor.predict(frame.source)
-        return lambda: write_plate(frame.results[0], plate, remover.remove(plate, prediction=prediction)[0])
+        (_, first), *others = split_views(plate)
+        return lambda: write_view_results(frame.results, plate, [
+            remover.remove(first, prediction=prediction), *(remover.remove(view) for _, view in others)])
 
     try:
         write_clean_frames(frames, Manifest(work), progress, digest=digest, clean=clean, keep_finished=True,
@@ -73,7 +78,7 @@ def _clean_names(capture: Capture) -> dict[str, Path]:
     views: dict[str, str] = {}
     for view in capture.views:
         name = Path(view.name)
-        name = name.with_suffix(".png") if name.suffix.lower() in _JPEG_SUFFIXES else name
+        name = name.with_suffix(".png") if name.suffix.lower() in _JPEG_SUFFIXES else clean_name(name)
         key = name.as_posix().casefold()
         if key in views:
             raise CaptureError(f"The frames {views[key]} and {view.name} of {capture.folder} would both have "

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,10 @@ from ...capture import Capture, View
 from ...capture.discs import light_disc_mask
 from ...capture.renderer import ViewRenderer
 from ...colour.srgb import Pixels, linear_from_srgb, srgb_from_linear
-from ...errors import CaptureError
+from ...errors import CaptureError, FrameError
 from ...images.exr import read_data_window
-from ...images.plates import Plate, finite_light, read_plate, write_results
+from ...images.plates import Plate, clean_name, finite_light, read_plate, write_results
+from ...images.views import split_views
 from ...system.files import check_no_overwrite, safe_join
 from ...system.progress import Progress
 from ..inference.plate_light import CLIPPING_LEVEL
@@ -98,7 +100,7 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
 
 def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
     """Return the path of the clean frame, then that of its flare where one is requested."""
-    plate = safe_join(folder, view.name, CaptureError)
+    plate = safe_join(folder, str(clean_name(Path(view.name))), CaptureError)
     if flare_folder is None:
         return [plate]
     return [plate, safe_join(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)]
@@ -107,7 +109,13 @@ def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
 def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
                 above_white: bool) -> tuple[Plate, NDArray[Any], Pixels, dict[str, float]]:
     """Return a view's plate, the codes of its clean frame, the removed flare in linear light, and each light's gain."""
-    plate = read_plate(capture.frame_path(view))
+    stored = read_plate(capture.frame_path(view), capture.plate_space)
+    if len(views := split_views(stored)) > 1:
+        names = " and ".join(name for name, _ in views)
+        raise FrameError(f"{stored.path} holds the views {names}, and the fit has the "
+                         "cameras of one; export each view as a file of its own.")
+    is_direct = stored.is_rec709 or (stored.encoding == "linear" and stored.space.is_linear)
+    plate = stored if is_direct else stored.in_rec709
     height, width = plate.codes.shape[:2]
     window = read_data_window(capture.frame_path(view))  # an EXR may have overscan or be cropped
     camera = view.camera if view.camera.size == window.frame else view.camera.scaled(*window.frame)
@@ -129,7 +137,10 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
         codes = subtract_fitted_flare(plate, flare, scene, light_discs)
     else:
         codes = subtract_fitted_flare(plate, np.where(light_discs[..., None], 0, flare), scene)
-    return plate, codes, flare, gains
+    if is_direct:
+        return stored, codes, flare, gains
+    clean = replace(plate, codes=codes)
+    return stored, stored.without_light(_linear_light(plate) - _linear_light(clean)), flare, gains
 
 
 def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) -> dict[str, float]:

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The colour space of a capture's frames where the user names one: `plate_space.json` in its folder.
+
+The commands write it (`--plate-space`), and `Capture.open` reads it, so that lights, fit, scores, clean frames and
+layers see the same light. Without it the frames are read as their files declare.
+"""
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..colour import ColourSpace, colour_space
+from ..errors import CaptureError, os_error_message
+from ..system.files import read_json, write_json
+
+FILE = "plate_space.json"
+AUTO = "auto"
+"""The name that leaves it to the files."""
+
+
+def read_plate_space(folder: Path) -> ColourSpace | None:
+    """Return the space of a capture's frames; None where their files decide.
+
+    Raises CaptureError for a damaged record, SettingsError for an unknown space, EngineError without OpenColorIO.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        return None
+    data = read_json(path, CaptureError)
+    name, config = (data.get(key) for key in ("space", "ocio")) if isinstance(data, dict) else (None, None)
+    if not isinstance(name, str) or not isinstance(config, str | None):
+        raise CaptureError(f'{path} should read {{"space": "logc4"}}; name the space again with --plate-space.')
+    return colour_space(name, config)
+
+
+def record_plate_space(folder: Path, name: str, config: str | None) -> None:
+    """Record the space of a capture's frames; AUTO removes the record.
+
+    Raises CaptureError where the folder cannot be written, SettingsError for an unknown space.
+    """
+    path = folder / FILE
+    try:
+        if name == AUTO:
+            path.unlink(missing_ok=True)
+        elif folder.is_dir():
+            colour_space(name, config)
+            write_json(path, {"space": name, "ocio": config})
+    except OSError as problem:
+        raise CaptureError(f"The space of the frames cannot be recorded: {os_error_message(problem)}") from problem

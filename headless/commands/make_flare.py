@@ -30,25 +30,30 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--settings", type=Path, metavar="FILE", help="a TOML file with settings, as --set names them")
     parser.add_argument("--focal", type=float, metavar="MM", help="scale the lens to this focal length")
     parser.add_argument("--sensor", type=float, metavar="MM", help="width of the sensor (default 36)")
-    parser.add_argument("--squeeze", type=float, metavar="FACTOR", help="of an anamorphic lens, such as 1.8 or 2")
+    parser.add_argument("--squeeze", type=float, metavar="FACTOR",
+                        help="squeeze of an anamorphic lens, such as 1.8 or 2")
     parser.add_argument("--f-number", type=float, metavar="N", help="opening of the iris (default: two stops below the "
                                                                     "widest)")
     parser.add_argument("--blades", type=int, metavar="N", help="blades of the iris (default 8)")
-    parser.add_argument("--roundness", type=float, metavar="SHARE", help="of the blades: 0 straight, 1 a circle")
-    parser.add_argument("--rotation", type=float, metavar="DEGREES", help="of the iris")
+    parser.add_argument("--roundness", type=float, metavar="SHARE",
+                        help="roundness of the blades: 0 straight, 1 a circle")
+    parser.add_argument("--rotation", type=float, metavar="DEGREES", help="rotation of the iris")
     parser.add_argument("--coating", metavar="NM[,NM...]",
                         help="wavelengths in nanometres that the coatings are made for, in turn over the surfaces; 0 "
                              "for bare glass")
     parser.add_argument("--dust", type=int, metavar="N", help="specks of dust on the glass (default 30)")
     parser.add_argument("--scratches", type=int, metavar="N", help="scratches on the glass (default 0)")
-    parser.add_argument("--colour", metavar="R,G,B", help="of the light, linear (default 1,1,1)")
+    parser.add_argument("--colour", metavar="R,G,B", help="colour of the light, linear (default 1,1,1)")
     parser.add_argument("--ghosts", type=float, metavar="LEVEL",
                         help="root mean square of the ghosts over the frame, 1 is white (default 0.02)")
     parser.add_argument("--starburst", type=float, metavar="GAIN", help="brightness of the starburst (default 700)")
     parser.add_argument("--glow", type=float, metavar="GAIN", help="brightness of the glow (default 0.2)")
-    parser.add_argument("--ring", type=float, metavar="GAIN", help="add a ring about the light, such as 0.1")
-    parser.add_argument("--streak", type=float, metavar="GAIN", help="add a horizontal streak, such as 1")
-    parser.add_argument("--seed", type=parse_seed, metavar="N", help="of blades, dust and scratches (default 0)")
+    parser.add_argument("--ring", type=float, metavar="GAIN",
+                        help="add a ring of this brightness around the light, such as 0.1")
+    parser.add_argument("--streak", type=float, metavar="GAIN",
+                        help="add a horizontal streak of this brightness, such as 1")
+    parser.add_argument("--seed", type=parse_seed, metavar="N",
+                        help="random seed of blades, dust and scratches (default 0)")
     parser.add_argument("--notes", default="", metavar="TEXT", help="notes to store in the file")
     parser.add_argument("--licence", default="", metavar="TEXT", help="licence to store in the file")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes",

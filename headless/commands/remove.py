@@ -29,7 +29,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "video (.mov, .mp4, .mkv) with its sound, tags and timing, beside its frames in "
                              "NAME.frames")
     parser.add_argument("--codec", choices=("prores", "prores4444", "h264", "h265", "ffv1"),
-                        help="of a video that is written: ProRes 422 HQ or 4444, H.264, H.265 or FFV1 (default: ProRes "
+                        help="codec of the clean video: ProRes 422 HQ or 4444, H.264, H.265 or FFV1 (default: ProRes "
                              "in .mov, FFV1 in .mkv, H.264 or, for more than 8 bits, H.265 in .mp4)")
     frames.add_option(parser, "numbers of frames, as in the names of the plates, such as 1-20,31 or 1-99:2; of "
                                "several sequences, in each (default: all)")
@@ -194,7 +194,7 @@ that cannot be read does not stop the others and is listed at the end.
   run.py remove plate.exr --out clean
   run.py remove shots/sh010 --out clean/sh010 --flare flares/sh010 --keep-glow
   run.py remove clip.mp4 --out clean/clip                               # the clean frames as PNG or EXR
-  run.py remove clip.mov --out clean.mov                                # a video, with the sound and tags of the first
+  run.py remove clip.mov --out clean.mov                                # a video, with sound and tags of the original
   run.py remove shots/sh010 --matte roto/sh010 --out clean/sh010        # only where the artist has marked flares
   run.py remove --run my_run --out clean          # subtracts the fitted flare""",
     arguments, (Step("remove", "engine", run),), resume_rule="resumes")

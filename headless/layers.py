@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.conventions.frame_numbers import NumberedFrame
 from ..core.errors import SettingsError
 from ..core.system.progress import Progress
+from ..core.system.tally import Tally
 
 if TYPE_CHECKING:
     from ..core.bake.bake import BakeSettings
@@ -57,11 +58,19 @@ def parse_size(text: str | None) -> tuple[int | None, int | None]:
     return int(match[1]), int(match[2]) if match[2] else None
 
 
-def report_layers(frames: Sequence[NumberedFrame], folder: Path, total: int, progress: Progress) -> dict[str, object]:
-    """Report that the layers of `frames` are in a folder of `total` frames; return the command's result."""
+def report_layers(frames: Sequence[NumberedFrame], folder: Path, total: int, progress: Progress,
+                  skipped: Iterable[tuple[str, Iterable[str]]] = ()) -> dict[str, object]:
+    """Report that the layers of `frames` are in a folder of `total` frames, and how many inputs were left out; return
+    the command's result.
+
+    skipped: names of what was left out, by reason.
+    """
     besides = "" if total == len(frames) else f", which holds {total}"
     progress.say(f"Layers of {len(frames)} frame{'s' * (len(frames) != 1)} are in {folder}{besides}.")
-    return {"layers": str(folder), "frames": len(frames), "frames_in_folder": total}
+    tally = Tally("frame", "rendered", len(frames))
+    tally.merge(skipped)
+    progress.say(tally.sentence())
+    return {"layers": str(folder), "frames": len(frames), "frames_in_folder": total, **tally.as_result()}
 
 
 def report_nothing(folder: Path) -> dict[str, object]:

@@ -174,6 +174,16 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
     return capture_target(Capture.open(to[0]), look, sources, lights=lights, scene=options.scene)
 
 
+def left_out(options: TargetOptions, target: Target) -> list[tuple[str, list[str]]]:
+    """Return what is in the folder of pictures that --to names and gets no flare, by reason."""
+    from ..core.images.listing import passed_over
+
+    folder = options.to[0]
+    is_folder = len(options.to) == 1 and folder.is_dir() and _is_plate_folder(folder)
+    dark = [frame.plate.name for frame in target.frames if frame.plate is not None and not frame.shot.lights]
+    return [*(passed_over(folder) if is_folder else ()), ("shows no light, so it has no flare", dark)]
+
+
 def _is_plate_folder(folder: Path) -> bool:
     """Return whether a folder holds pictures themselves and is not a capture."""
     capture = any((folder / name).exists() for name in ("images", "sparse", "colmap", "transforms.json"))

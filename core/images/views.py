@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .exr import read_exr_header
-from .plates import Plate
+from .plates import Plate, write_plate, write_results
+from .write import write_exr
 
 _EYES = ("left", "right")
 
@@ -73,8 +74,30 @@ def join_views(plate: Plate, codes: Sequence[NDArray[Any]]) -> tuple[Plate, NDAr
     views = stereo_views(plate.extras.get("header", {}), plate.extras.get("channels", {}))
     if not views:
         return plate, codes[0]
-    channels = dict(plate.extras["channels"])
+    channels, is_changed = dict(plate.extras["channels"]), False
     for view, each in zip(views[1:], codes[1:], strict=True):
         for index, name in enumerate(view.channels):
-            channels[name] = np.ascontiguousarray(each[..., index], channels[name].dtype)
-    return replace(plate, extras={**plate.extras, "channels": channels}), codes[0]
+            new = np.ascontiguousarray(each[..., index], channels[name].dtype)
+            is_changed = is_changed or not np.array_equal(new, channels[name], equal_nan=True)
+            channels[name] = new
+    # Without its own codes, `write_plate` does not take the file for unchanged because the first view is.
+    return replace(plate, extras={**plate.extras, "channels": channels},
+                   codes=plate.codes[:0] if is_changed else plate.codes), codes[0]
+
+
+def write_view_results(results: Sequence[Path], plate: Plate,
+                       cleaned: Sequence[tuple[NDArray[Any], NDArray[Any]]]) -> None:
+    """Write the clean plate with all its views, and the flares of all if `results` has a second path.
+
+    cleaned: codes and flare of each view of `split_views`.
+    """
+    views = stereo_views(plate.extras.get("header", {}), plate.extras.get("channels", {}))
+    if not views:
+        write_results(results, plate, *cleaned[0])
+        return
+    write_plate(results[0], *join_views(plate, [codes for codes, _ in cleaned]))
+    for result in results[1:]:
+        channels = {f"{view.name}.{name}" if number else name: flare[..., k]
+                    for number, (view, (_, flare)) in enumerate(zip(views, cleaned, strict=True))
+                    for k, name in enumerate("RGB")}
+        write_exr(result, channels, header={**plate.placement, "multiView": [view.name for view in views]})

@@ -12,6 +12,7 @@ from ...core.errors import SettingsError
 from ...core.look import LookEdits
 from ...core.system.files import retry_while_locked
 from ...core.system.progress import Progress
+from ...core.system.tally import Tally
 from .. import frames
 from ..command import Command, Step
 
@@ -44,9 +45,10 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         return {"frames": str(args.out)}
     done = compose_frames(layers, args.out, progress, numbers=[frame.number for frame in selected],
                           intensity=args.intensity, tint=args.tint)
-    progress.say(f"{len(selected)} frame{'s' * (len(selected) != 1)} composed, in {done['frames']}; {done['blend']} "
-                 "opens in Blender.")
-    return done
+    progress.say(f"The frames are in {done['frames']}; {done['blend']} opens in Blender.")
+    tally = Tally("frame", "composed", len(selected))
+    progress.say(tally.sentence())
+    return {**done, **tally.as_result()}
 
 
 def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, numbers: Sequence[int] | None = None,

@@ -159,7 +159,7 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
         extra = ["--shot", str(targets.shot_path(options))] if targets.is_blend(options) else []
         jobs.run_jobs(args, step, [frame.number for frame in selected], progress, extra)
     record = transfer.bake(args.out, selected, layers.bake_settings(args), progress, overwrite=args.overwrite)
-    return layers.report_layers(selected, args.out, len(record["frames"]), progress)
+    return layers.report_layers(selected, args.out, len(record["frames"]), progress, targets.left_out(options, target))
 
 
 COMMAND = Command(

@@ -105,11 +105,11 @@ def test_a_full_disk_ends_the_batch(tmp_path: Path, no_flare: Path, monkeypatch:
             raise OSError(number, os.strerror(number), str(results[0]))
         return write
 
-    monkeypatch.setattr(batch, "write_results", refused(errno.ENOSPC))
+    monkeypatch.setattr(batch, "write_view_results", refused(errno.ENOSPC))
     with pytest.raises(OSError) as full:
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
     assert (full.value.errno, tried) == (errno.ENOSPC, ["a.png"])
-    monkeypatch.setattr(batch, "write_results", refused(errno.EACCES))
+    monkeypatch.setattr(batch, "write_view_results", refused(errno.EACCES))
     with pytest.raises(FrameError, match=r"3 of 3 plates could not be cleaned: The system refused: Permission denied"):
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
 
@@ -135,6 +135,25 @@ def test_a_plate_that_does_not_fit_into_memory_is_left_out(tmp_path: Path, no_fl
     assert (tmp_path / "out" / "b.png").exists()
 
 
+def test_what_is_left_out_is_counted_and_named(tmp_path: Path, no_flare: Path) -> None:
+    for name in ("a", "b", "sub/c"):
+        write_codes(tmp_path / "in" / f"{name}.png", picture())
+    (tmp_path / "in" / "damaged.png").write_bytes((tmp_path / "in" / "a.png").read_bytes()[:100])
+    (tmp_path / "in" / "clip.mp4").write_bytes(b"")
+    (tmp_path / "in" / "sub" / "notes.txt").write_text("notes")
+    progress, sentences = Progress(), list[str]()
+    progress.say = sentences.append  # type: ignore[method-assign]
+    remover = Remover(no_flare, working_size=64)
+    with pytest.raises(FrameError, match="1 of 4 plates"):
+        remove_all([tmp_path / "in"], tmp_path / "in" / "out", remover, progress)
+    assert sentences[-1].startswith("3 plates cleaned; 3 left out: ")
+    for text in ("clip.mp4", "sub/notes.txt", "damaged.png (could not be cleaned)"):
+        assert text in sentences[-1]
+    (tmp_path / "in" / "damaged.png").unlink()
+    done = remove_all([tmp_path / "in"], tmp_path / "in" / "out", remover, progress)  # its own results are no inputs
+    assert (done["used"], done["left_out"]) == (3, 2)
+
+
 def test_a_programming_error_is_not_taken_for_a_bad_plate(tmp_path: Path, no_flare: Path,
                                                           monkeypatch: pytest.MonkeyPatch) -> None:
     write_codes(tmp_path / "in" / "a.png", picture())
@@ -150,9 +169,9 @@ def test_a_read_only_folder_ends_the_batch(tmp_path: Path, no_flare: Path, numbe
         write_codes(tmp_path / "in" / f"{name}.png", picture())
     opened, tried = os.open, []
 
-    def refuse(path: Any, *args: Any, **options: Any) -> int:
-        if Path(path).parent != tmp_path / "out":
-            return opened(path, *args, **options)
+    def refuse(path: Any, flags: int, *args: Any, **options: Any) -> int:
+        if Path(path).parent != tmp_path / "out" or not flags & (os.O_WRONLY | os.O_RDWR):  # reading is possible
+            return opened(path, flags, *args, **options)
         tried.append(path)
         raise OSError(number, os.strerror(number), path)
 

@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -25,6 +26,8 @@ from ..colour import ColourSpace, colour_space
 from ..colour.cicp import space_of_code_points
 from ..colour.icc import UnreadableProfile, space_of_profile
 from ..errors import FrameError
+from ..system.child import ChildDied, run_in_child
+from ..system.progress import Progress
 from ..system.reading import check_regular, open_regular, read_bytes
 from .formats.kinds import HEAD_BYTES, Kind, kind_of
 
@@ -88,7 +91,7 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
     if kind == "raw":
         return _decode_raw(path)
     if kind == "jp2":
-        return _decode_by_opencv(path)
+        return _guarded(_decode_by_opencv, path)
     if kind == "heif":
         return _decode_heif(path)
     with _open_by_pillow(path, kind) as picture:
@@ -207,7 +210,15 @@ def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
         opened.close()
 
 
-def _decode_by_opencv(path: Path) -> NDArray[Any]:
+def _guarded(decode: Callable[..., NDArray[Any]], path: Path) -> NDArray[Any]:
+    """Decode in a child process, since a damaged file ends the process of this library. Raises FrameError."""
+    try:
+        return np.asarray(run_in_child(decode, path, progress=Progress()))
+    except ChildDied as problem:
+        raise _damaged(path, problem) from problem
+
+
+def _decode_by_opencv(path: Path, _progress: Progress | None = None) -> NDArray[Any]:
     import cv2
 
     data = np.frombuffer(read_bytes(path, MAX_BYTES), np.uint8)

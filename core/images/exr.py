@@ -6,7 +6,10 @@ OpenEXR is imported where it is used, because Blender's own Python has none; wha
 """
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+import contextlib
+import shutil
+import tempfile
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -74,14 +77,53 @@ def read_exr_header(path: Path | str) -> dict[str, Any]:
     return _exr_headers(path)[0]
 
 
+def foreign_strings(path: Path | str) -> dict[str, bytes]:
+    """Return the text attributes of an EXR that are not UTF-8, by name; none where it is no EXR. Raises OSError."""
+    with open_regular(path) as stream:
+        if stream.read(4) != exr_header.MAGIC:
+            return {}
+        places = exr_header.string_places(stream)
+    return {name: text for name, (_, text) in places.items() if not _is_utf8(text)}
+
+
+def _is_utf8(text: bytes) -> bool:
+    try:
+        text.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _readable_copy(path: Path | str) -> Iterator[str]:
+    """Yield the path of an EXR that the library can read: the file itself, or a copy with "?" for what is not UTF-8 in
+    its text attributes, for which the library refuses the whole file."""
+    check_regular(path)
+    if not foreign_strings(path):
+        yield str(path)
+        return
+    with open_regular(path) as stream:
+        places = exr_header.string_places(stream)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "copy.exr"
+        shutil.copyfile(path, copy)
+        with open(copy, "r+b") as stream:
+            for at, text in places.values():
+                if not _is_utf8(text):
+                    stream.seek(at)
+                    stream.write(bytes(byte if byte < 128 else ord("?") for byte in text))
+        yield str(copy)
+
+
 def _exr_headers(path: Path | str) -> list[dict[str, Any]]:
     """Read the header of each part, at least one. Raises FrameError."""
     import OpenEXR
 
-    check_regular(path)
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
+        with _readable_copy(path) as readable, OpenEXR.File(readable, header_only=True) as file:
             headers = [dict(part.header) for part in file.parts]
+    except OSError:
+        raise
     except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
         raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
     if not headers:
@@ -96,11 +138,12 @@ def read_exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[A
     """
     import OpenEXR
 
-    check_regular(path)
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with _readable_copy(path) as readable, OpenEXR.File(readable, separate_channels=True) as file:
             parts = [(dict(part.header), {name: channel.pixels for name, channel in part.channels.items()})
                      for part in file.parts]
+    except OSError:
+        raise
     except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
         raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
     if not parts:

@@ -25,7 +25,7 @@ from ..system.reading import open_regular
 from .borders import PictureArea, find_picture_area
 from .declared import declared_space
 from .decoders import Description, describe, file_kind
-from .exr import has_chroma, missing_rgb, read_exr_parts, read_luminance_chroma
+from .exr import foreign_strings, has_chroma, missing_rgb, read_exr_parts, read_luminance_chroma
 from .formats import png, tiff
 from .formats.kinds import SUFFIXES as SUFFIX_KINDS
 from .listing import SUFFIXES
@@ -367,5 +367,5 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
     if header.get("compression") in (OpenEXR.B44_COMPRESSION, OpenEXR.B44A_COMPRESSION, OpenEXR.DWAA_COMPRESSION,
                                      OpenEXR.DWAB_COMPRESSION):  # lossy
         header["compression"] = OpenEXR.ZIP_COMPRESSION
-    save_exr(path, header, channels)
+    save_exr(path, header, channels, strings=foreign_strings(plate.path))
 

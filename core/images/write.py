@@ -16,6 +16,7 @@ from ..errors import FrameError
 from ..system.files import atomic_path
 from ..typed import is_utf8
 from .exr import is_exr_truncated
+from .formats import exr_header
 
 
 def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: bool = True,
@@ -37,8 +38,10 @@ def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: b
 
 
 def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]],
-             commit_lock: AbstractContextManager[None] | None = None) -> None:
-    """Write one part with this header and these channels. commit_lock: see `atomic_path`.
+             commit_lock: AbstractContextManager[None] | None = None,
+             strings: Mapping[str, bytes] | None = None) -> None:
+    """Write one part with this header and these channels. commit_lock: see `atomic_path`. strings: text attributes that
+    are not UTF-8, which the library cannot write; the header holds others of their lengths.
 
     Raises OSError where the system refuses, for instance for a full disk, and FrameError for a path that is not UTF-8.
     """
@@ -52,9 +55,20 @@ def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str,
         except RuntimeError as problem:  # the library reports a refusal of the system as text
             full = os.strerror(errno.ENOSPC) in str(problem)
             raise OSError(errno.ENOSPC if full else errno.EIO, str(problem), str(path)) from problem
+        if strings:
+            _restore_strings(temporary, strings)
         # Errors on closing the file are not reported.
         if not temporary.stat().st_size or is_exr_truncated(temporary):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
+def _restore_strings(path: Path, strings: Mapping[str, bytes]) -> None:
+    """Write text attributes byte for byte over those that have their lengths."""
+    with open(path, "r+b") as stream:
+        for name, (at, text) in exr_header.string_places(stream).items():
+            if len(strings.get(name, b"")) == len(text):
+                stream.seek(at)
+                stream.write(strings[name])
 
 
 def write_png(path: Path | str, display: NDArray[Any], bits: Literal[8, 16] = 8) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,16 @@ import cv2
 import numpy as np
 import pytest
 
+from core.capture.plate_space import read_plate_space, record_plate_space
 from core.colour import colour_space
-from core.errors import FrameError
-from core.images.formats import jpeg, png
-from core.images.plates import clean_name, read_plate, write_plate
+from core.errors import FrameError, SettingsError
+from core.images.exr import foreign_strings, read_exr_header
+from core.images.formats import jpeg, png, tiff
+from core.images.plates import Plate, clean_name, read_plate, write_plate
 from core.images.read import has_float_pixels, read_picture
-from tests.core.picture_files import WRITERS, png_16, scene
+from core.images.write import write_exr
+from core.removal.inference.plate_light import to_network_plate
+from tests.core.picture_files import WRITERS, png_16, scene, tiff_16
 
 MISSING = {name for name, package in (("HEIC", "pillow_heif"),) if importlib.util.find_spec(package) is None}
 TOLERANCE = {"Y/RY/BY EXR": 0.01, "P3 JPEG": 0.006, "HEIC": 0.01, "Radiance HDR": 0.008}
@@ -123,3 +128,55 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (tmp_path / "a.dng").write_bytes(b"II*\0" + bytes(60))
     with pytest.raises(FrameError, match=r"a\.dng needs the Python package rawpy.*--group raw"):
         read_picture(tmp_path / "a.dng")
+
+
+def test_text_of_an_exr_that_is_not_utf8_stays_byte_for_byte(tmp_path: Path) -> None:
+    write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", np.full((8, 8), 0.5, np.float32)),
+              header={"owner": "Studio Brosse", "comments": "plain"})
+    data = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "a.exr").write_bytes(data.replace(b"Studio Brosse", b"Studio Bross\xe9"))
+    plate = read_plate(tmp_path / "a.exr")
+    write_plate(tmp_path / "b.exr", plate, plate.codes / np.float16(2))
+    assert foreign_strings(tmp_path / "b.exr") == {"owner": b"Studio Bross\xe9"}
+    assert read_exr_header(tmp_path / "b.exr")["comments"] == "plain"
+    np.testing.assert_array_equal(read_plate(tmp_path / "b.exr").codes, 0.25)
+
+
+def test_a_tiff_keeps_text_place_and_exif(tmp_path: Path) -> None:
+    text = {315: b"Ada\0", 33432: b"Studio\0", 306: b"2026:01:02 03:04:05\0"}
+    tags = {number: tiff.Tag(2, np.frombuffer(value, np.uint8)) for number, value in text.items()}
+    tags[33550] = tiff.Tag(12, np.array([0.5, 0.5, 0.0]))
+    tags[33723] = tiff.Tag(7, np.arange(12, dtype=np.uint8))
+    tiff_16(tmp_path / "a.tif", scene(), tags)
+    whole = tiff.with_directory((tmp_path / "a.tif").read_bytes(), 34665, {
+        0x829A: tiff.Tag(5, np.array([1, 50], np.uint32)), 0x9003: tiff.Tag(2, np.frombuffer(text[306], np.uint8))})
+    (tmp_path / "a.tif").write_bytes(whole)
+    plate = read_plate(tmp_path / "a.tif")
+    write_plate(tmp_path / "b.tif", plate, plate.codes // 2)
+    data = io.BytesIO((tmp_path / "b.tif").read_bytes())
+    kept = tiff.read_tags(data, [*tags, 34665])
+    for number, tag in tags.items():
+        np.testing.assert_array_equal(kept[number].values, tag.values)
+    exif = tiff.read_tags(data, range(1 << 16), int(kept[34665].values[0]))
+    assert exif[0x829A].values.tolist() == [1, 50] and exif[0x9003].values.tobytes() == text[306]
+    np.testing.assert_array_equal(read_plate(tmp_path / "b.tif").codes, plate.codes // 2)
+
+
+@pytest.mark.parametrize("factor", [0.5, 3.0, 8.0])
+def test_a_plate_of_another_exposure_is_shown_alike_to_the_network(factor: float) -> None:
+    light = scene()
+    plates = [to_network_plate(Plate(Path("a.exr"), (light * gain).astype(np.float32), "linear"))[0]
+              for gain in (1.0, factor)]
+    np.testing.assert_allclose(plates[1].codes, plates[0].codes, rtol=1e-5)
+    assert 0.3 < np.percentile(plates[0].codes, 95) < 1
+
+
+def test_a_capture_keeps_the_space_that_a_command_names(tmp_path: Path) -> None:
+    assert read_plate_space(tmp_path) is None
+    record_plate_space(tmp_path, "LogC4", None)
+    space = read_plate_space(tmp_path)
+    assert space is not None and space.has_headroom
+    with pytest.raises(SettingsError, match="is not one of"):
+        record_plate_space(tmp_path, "no such space", None)
+    record_plate_space(tmp_path, "auto", None)
+    assert read_plate_space(tmp_path) is None

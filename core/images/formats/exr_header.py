@@ -91,6 +91,21 @@ def is_truncated(stream: BinaryIO) -> bool:
     return last + 8 + int.from_bytes(stream.read(4), "little") > end
 
 
+def string_places(stream: BinaryIO) -> dict[str, tuple[int, bytes]]:
+    """Return the offset and the bytes of each text attribute of the first header, by name."""
+    stream.seek(len(MAGIC) + 4)
+    places = {}
+    while name := _read_name(stream):
+        kind, length = _read_name(stream), int.from_bytes(stream.read(4), "little", signed=True)
+        at = stream.tell()
+        if length < 0:
+            break
+        if kind == b"string" and length <= _MAX_ATTRIBUTE_BYTES:
+            places[name.decode("latin-1")] = at, stream.read(length)
+        stream.seek(at + length)
+    return places
+
+
 def _read_attributes(stream: BinaryIO, kinds: dict[bytes, bytes], *, to_the_end: bool = False) -> dict[bytes, bytes]:
     """Read the attributes of these names and types, up to the end of the header or the first damaged one.
 

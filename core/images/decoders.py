@@ -17,7 +17,7 @@ import importlib
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,7 +183,21 @@ def _oiio_space(spec: Any, kind: Kind) -> ColourSpace | None:
     return None
 
 
+def _check_stated_size(path: Path, kind: Kind) -> None:
+    """Raise FrameError for a DPX or Cineon that is smaller than its header says, which OpenImageIO fills with black."""
+    if kind not in ("dpx", "cineon"):
+        return
+    with open_regular(path) as stream:
+        head = stream.read(24)
+        size = stream.seek(0, 2)
+    order: Literal["big", "little"] = "big" if head[:4] in (b"SDPX", b"\x80\x2a\x5f\xd7") else "little"
+    stated = int.from_bytes(head[16:20] if kind == "dpx" else head[20:24], order)
+    if size < stated < 0xFFFFFFFF:
+        raise _damaged(path, f"it has {size} of {stated} bytes")
+
+
 def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
+    _check_stated_size(path, kind)
     opened = open_oiio(path)
     try:
         spec = opened.spec()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -180,3 +181,13 @@ def test_a_capture_keeps_the_space_that_a_command_names(tmp_path: Path) -> None:
         record_plate_space(tmp_path, "no such space", None)
     record_plate_space(tmp_path, "auto", None)
     assert read_plate_space(tmp_path) is None
+
+
+@pytest.mark.parametrize("name", ["log DPX", "WebP", "BMP", "HEIC", "JPEG 2000", "half TIFF", "Radiance HDR"])
+def test_a_file_that_is_cut_off_is_refused_by_name(name: str, tmp_path: Path) -> None:
+    path, _ = write(name, tmp_path, scene())
+    data = path.read_bytes()
+    for share in (0.02, 0.5, 0.9):
+        path.write_bytes(data[:int(share * len(data))])
+        with pytest.raises(FrameError, match=re.escape(str(path))):
+            read_plate(path)

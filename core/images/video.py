@@ -11,6 +11,7 @@ writes videos. PyAV is imported where it is used, because Blender's own Python h
 """
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -145,12 +146,10 @@ class VideoFrame:
         return Picture(pixels, self.encoding)
 
     def grey(self) -> NDArray[np.float32]:
-        """(height, width) mean of the signal R G B at 0..255, upright, for measures of detail; PQ and HLG as coded."""
-        import cv2
-
-        signal = self._signal
-        scale = np.float32(255 / np.iinfo(signal.dtype).max)
-        return self.orientation.upright(np.asarray(cv2.cvtColor(signal, cv2.COLOR_RGB2GRAY)).astype(np.float32) * scale)
+        """(height, width) luma, or the green of RGB, at 0..255 for all codes, upright, for measures of detail."""
+        arrays, planar = self._planes
+        luma = arrays[1 if planar.is_rgb else 0].astype(np.float32)
+        return self.orientation.upright(luma * np.float32(255 / ((1 << planar.bits) - 1)))
 
 
 class Video:
@@ -166,17 +165,21 @@ class Video:
         self.path = Path(path)
         self._start = 0
         self._container: Any = None
+        self._begun: Iterator[Any] | None = None
+        """All frames, for the first iteration: to open and decode anew takes as long as several frames."""
         self.problems: list[str] = []
         """Sentences about frames that the last iteration did not get or got damaged."""
         try:
             self._open()
-            first = next(self._decode(), None)
+            decoded = self._decode()
+            first = next(decoded, None)
         except FrameError:
             self.close()
             raise
         if first is None:
             self.close()
             raise self._unreadable()
+        self._begun = itertools.chain((first,), decoded)
         self.colour = _colour_of(self.path, first, self.stream)
         """What the codes of the first frame mean."""
         self.matrix = display_matrix(first)
@@ -201,6 +204,7 @@ class Video:
 
     def close(self) -> None:
         """Close the file."""
+        self._begun = None
         if self._container is not None:
             self._container.close()
             self._container = None
@@ -284,6 +288,10 @@ class Video:
 
     def _frames_from(self, number: int) -> Iterator[Any]:
         """Yield PyAV's frames from frame `number` on."""
+        begun, self._begun = self._begun, None
+        if number == 0 and begun is not None:
+            yield from begun
+            return
         self._open()
         if number == 0:
             yield from self._decode()

@@ -85,7 +85,7 @@ class VideoColour:
             table = (np.clip(levels / self.signal_top, 0, 1) * top + 0.5).astype(kind)
             return np.asarray(cv2.merge([np.take(table, np.minimum(planes[..., 0], (1 << self.bits) - 1))] * 3))
         if kind == np.uint8 and self.matrix == RGB:
-            return planes
+            return planes.copy()
         affine = np.concatenate([matrix, offset[:, None]], 1) * (top / self.signal_top)
         if kind == np.uint16 and planes.dtype == np.uint8:
             planes = planes.astype(np.uint16)

@@ -7,6 +7,7 @@ converted by swscale to planes of the same depth. `video.py` reads planes, `vide
 from __future__ import annotations
 
 import re
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,7 +95,7 @@ def plane_arrays(frame: Any, planar: PlaneFormat) -> list[NDArray[Any]]:
 
 
 def stack_planes(arrays: list[NDArray[Any]], planar: PlaneFormat) -> NDArray[Any]:
-    """Stack planes without alpha to (height, width, 1 or 3).
+    """Stack planes without alpha to (height, width, 1 or 3), in memory that the next call of this thread overwrites.
 
     Colour differences are interpolated linearly between the centres of their samples.
     """
@@ -105,12 +106,25 @@ def stack_planes(arrays: list[NDArray[Any]], planar: PlaneFormat) -> NDArray[Any
     height, width = arrays[0].shape
     across, down = planar.sampling
     full = [arrays[0]]
-    for codes in arrays[1:3]:
+    for index, codes in enumerate(arrays[1:3]):
         if (across, down) != (1, 1):
             size = codes.shape[1] * across, codes.shape[0] * down
-            codes = np.asarray(cv2.resize(codes, size, interpolation=cv2.INTER_LINEAR))[:height, :width]
+            room = _scratch(index, (size[1], size[0]), codes.dtype)
+            codes = np.asarray(cv2.resize(codes, size, room, interpolation=cv2.INTER_LINEAR))[:height, :width]
         full.append(codes)
-    return np.asarray(cv2.merge(full))
+    return np.asarray(cv2.merge(full, _scratch(2, (height, width, 3), arrays[0].dtype)))
+
+
+_BUFFERS = threading.local()
+
+
+def _scratch(number: int, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+    """Return an array of this thread that the next frame overwrites: fresh memory costs more than the conversion."""
+    buffers: dict[int, NDArray[Any]] = _BUFFERS.__dict__
+    known = buffers.get(number)
+    if known is None or known.shape != shape or known.dtype != dtype:
+        known = buffers[number] = np.empty(shape, dtype)
+    return known
 
 
 def shrink_plane(plane: NDArray[np.float32], planar: PlaneFormat) -> NDArray[np.float32]:

@@ -91,14 +91,16 @@ class ColouredPlate:
         if stored_alpha is not None and alpha is not None:
             lit = np.maximum(self.linear + light, 0)
             grown = alpha_with_light(alpha, lit)
+            top = np.float32(np.iinfo(stored_alpha.dtype).max if stored_alpha.dtype.kind == "u" else 1)
+            if stored_alpha.dtype.kind == "u":  # the colours belong to the alpha as it is stored
+                grown = np.ceil(grown * top - np.float32(1e-3)) / top
             values = self.space.from_linear(lit / np.maximum(grown, 1e-6)[..., None])
             if self.plate.straight_alpha is None:
                 values = values * grown[..., None]
-            top = np.iinfo(stored_alpha.dtype).max if stored_alpha.dtype.kind == "u" else 1
-            grown = undo_orientation(grown, self.orientation) * np.float32(top)
-            grown = np.ceil(grown - 1e-3) if stored_alpha.dtype.kind == "u" else grown
-            new_alpha = grown.astype(stored_alpha.dtype)
-            stored_alpha = np.where(is_lit[..., 0], np.maximum(new_alpha, stored_alpha), stored_alpha)
+            new_alpha = undo_orientation(grown, self.orientation) * top
+            new_alpha = np.round(new_alpha) if top > 1 else new_alpha
+            stored_alpha = np.where(is_lit[..., 0], np.maximum(new_alpha.astype(stored_alpha.dtype), stored_alpha),
+                                    stored_alpha)
         elif self.space.is_linear:
             values = self.values + self.space.from_linear(light)
         else:

@@ -120,10 +120,10 @@ _BUFFERS = threading.local()
 
 def _scratch(number: int, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
     """Return an array of this thread that the next frame overwrites: fresh memory costs more than the conversion."""
-    buffers: dict[int, NDArray[Any]] = _BUFFERS.__dict__
-    known = buffers.get(number)
+    buffers: dict[str, NDArray[Any]] = _BUFFERS.__dict__
+    known = buffers.get(str(number))
     if known is None or known.shape != shape or known.dtype != dtype:
-        known = buffers[number] = np.empty(shape, dtype)
+        known = buffers[str(number)] = np.empty(shape, dtype)
     return known
 
 

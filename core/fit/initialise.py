@@ -24,6 +24,8 @@ NEAREST_QUANTILE, NEAR_PLANE_FACTOR = 0.01, 0.5
 that is less than the usual near plane: captures in small units, such as metres around a watch, need it."""
 SAMPLED_POINTS = 10_000
 """Approximate number of points whose depths are computed."""
+MIN_SHARE_OF_SEEING_VIEWS = 0.5
+"""Share of the views that must have a Gaussian of a scene from elsewhere on their frames."""
 SNAP_WIDTH, SNAP_VIEWS = 160, 40
 """Width in pixels of the frames by which lights are moved, and the approximate number of frames."""
 
@@ -67,14 +69,16 @@ def _load_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...]
 
 
 def _check_in_view(scene: SceneGaussians, views: tuple[View, ...], path: str) -> None:
-    """Raise CaptureError where no view has a Gaussian of the scene on its frame: it is of another world."""
+    """Raise CaptureError where few views have a Gaussian of the scene on their frames: it is of another world."""
     means = scene.means.detach().numpy()
+    seeing = 0
     for points in (means[::max(len(means) // SAMPLED_POINTS, 1)], means):
-        if any(view.camera.contains(*view.camera.project(points)).any() for view in views):
+        seeing = sum(bool(view.camera.contains(*view.camera.project(points)).any()) for view in views)
+        if seeing >= MIN_SHARE_OF_SEEING_VIEWS * len(views):
             return
-    raise CaptureError(f"{path}: none of its {len(scene)} Gaussians is in any view of the capture, so it is of another "
-                       "world; export it in the world of the cameras (for nerfstudio: --orientation-method none "
-                       "--center-method none --auto-scale-poses False).")
+    raise CaptureError(f"{path} is of another world than the capture: {len(views) - seeing} of {len(views)} views have "
+                       f"none of its {len(scene)} Gaussians before them; export it in the world of the cameras (for "
+                       "nerfstudio: --orientation-method none --center-method none --auto-scale-poses False).")
 
 
 def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings) -> FlareModel:

@@ -174,7 +174,12 @@ def scene_at(xyz: np.ndarray) -> SceneGaussians:
 def test_a_scene_of_another_world_is_refused(tmp_path: Path, offset: tuple[float, float, float]) -> None:
     capture = Capture.open(flared_capture(tmp_path / "c", 6))
     write_ply(tmp_path / "s.ply", scene_at(capture.points.xyz + np.array(offset)))
-    with pytest.raises(CaptureError, match=r"s\.ply: none of its 150 Gaussians is in any view"):
+    with pytest.raises(CaptureError, match=r"s\.ply is of another world .*: 5 of 5 views have none of its 150"):
+        Trainer(capture, quick(**{"scene.start": str(tmp_path / "s.ply"), "scene.frozen": True}))
+    stray = np.concatenate([capture.points.xyz + np.array(offset), capture.views[1].camera.position[None]
+                            + capture.views[1].camera.rays([(0.5, 0.5)])])
+    write_ply(tmp_path / "s.ply", scene_at(stray))
+    with pytest.raises(CaptureError, match=r"s\.ply is of another world"):
         Trainer(capture, quick(**{"scene.start": str(tmp_path / "s.ply"), "scene.frozen": True}))
     write_ply(tmp_path / "s.ply", scene_at(capture.points.xyz))
     Trainer(capture, quick(**{"scene.start": str(tmp_path / "s.ply"), "scene.frozen": True}))

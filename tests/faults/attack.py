@@ -73,7 +73,8 @@ class Attack:
         self.case, self._folder, self._injector = case, folder, injector
         self.out = folder / "out"
         first, _ = self._unbroken()
-        second, _ = self._unbroken()
+        second, outcome = self._unbroken()
+        self._calls = outcome.counts
         self.reference: Snapshot = second
         self.varying = {name for name in second if first.get(name) != second[name]}
         if first.keys() != second.keys():
@@ -83,10 +84,7 @@ class Attack:
 
     def faults(self, number: int, kill: bool) -> list[Fault]:
         """Spread `number` faults over the calls that an unbroken run makes."""
-        totals = {}
-        for call in CALLS:
-            _, outcome = self._unbroken(Fault(call, 0))
-            totals[call] = outcome.count
+        totals = self._calls
         used = [call for call in CALLS if totals[call]]
         if not used:
             return []
@@ -157,9 +155,9 @@ class Attack:
         self.out.mkdir(parents=True)
         self.case.prepare(self.out)
 
-    def _unbroken(self, fault: Fault = UNBROKEN) -> tuple[Snapshot, Outcome]:
+    def _unbroken(self) -> tuple[Snapshot, Outcome]:
         self._reset()
-        outcome = self._injector.run(self.case.argv(self.out), self.out, fault, 600)
+        outcome = self._injector.run(self.case.argv(self.out), self.out, UNBROKEN, 600)
         if outcome.status:
             raise RuntimeError(f"{self.case.name}: {outcome.text[-2000:]}")
         return snapshot(self.out), outcome

@@ -2,7 +2,8 @@
 // Fault injection for file operations, preloaded into a process and its children on Linux.
 //
 // Counts calls of one kind (FAULT_CALL: open, write, fsync, rename or unlink) that concern files below one folder
-// (FAULT_FOLDER), over all processes together, in the first eight bytes of a shared file (FAULT_COUNTER). Call number
+// (FAULT_FOLDER), over all processes together, in a shared file (FAULT_COUNTER) of
+// eight bytes for each kind in this order. Call number
 // FAULT_NUMBER (from 1; 0 only counts) fails with FAULT_ERRNO, or kills the process where FAULT_ERRNO is "kill".
 // With FAULT_STICKY=1 all later calls fail too, as on a disk that stays full. `fault_arm` sets all of them anew in a
 // running process, which a fork of a warm process calls.
@@ -23,6 +24,8 @@
 #include <sys/uio.h>
 #include <unistd.h>
 
+#define KINDS 5
+static const char *const kinds[KINDS] = {"open", "write", "fsync", "rename", "unlink"};
 static _Atomic long *counter;
 static long fault_number;
 static int fault_errno, sticky;
@@ -45,7 +48,7 @@ __attribute__((constructor)) static void start(void) {
     if (!path || !call || !below) return;
     int descriptor = (int)syscall(SYS_openat, AT_FDCWD, path, O_RDWR, 0);
     if (descriptor < 0) return;
-    void *shared = mmap(NULL, 8, PROT_READ | PROT_WRITE, MAP_SHARED, descriptor, 0);
+    void *shared = mmap(NULL, 8 * KINDS, PROT_READ | PROT_WRITE, MAP_SHARED, descriptor, 0);
     syscall(SYS_close, descriptor);
     if (shared == MAP_FAILED) return;
     fault_arm(call, number ? atol(number) : 0, getenv("FAULT_ERRNO"), stays && stays[0] == '1', below);
@@ -86,8 +89,10 @@ static int concerns_descriptor(int descriptor) {
 
 // Counts one call; true if it has to fail, with errno set. Does not return from the call that kills.
 static int faulty(const char *call) {
+    int kind = 0;
+    while (kind < KINDS - 1 && strcmp(call, kinds[kind])) kind++;
+    long now = atomic_fetch_add(counter + kind, 1) + 1;
     if (strcmp(call, fault_call)) return 0;
-    long now = atomic_fetch_add(counter, 1) + 1;
     if (fault_number < 1 || now < fault_number || (now > fault_number && !(sticky && fault_errno > 0))) return 0;
     if (fault_errno < 0) {
         syscall(SYS_kill, syscall(SYS_getpid), SIGKILL);

@@ -12,6 +12,7 @@ import mmap
 import os
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -43,11 +44,11 @@ class Fault(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """status: exit status of a command, negative for a signal. text: its output. count: calls of the fault's kind."""
+    """status: exit status of a command, negative for a signal. text: its output. counts: calls by kind."""
 
     status: int
     text: str
-    count: int
+    counts: dict[str, int]
 
 
 def reason_to_skip() -> str:
@@ -61,7 +62,7 @@ def start_preloaded(script: Path, argv: Sequence[str], folder: Path) -> int:
     """Run a Python script with the library preloaded; compile it into `folder`. Return the exit status."""
     library, counter = folder / "inject.so", folder / "counter"
     subprocess.run(["cc", "-O1", "-Wall", "-shared", "-fPIC", str(SOURCE), "-o", str(library), "-ldl"], check=True)
-    counter.write_bytes(bytes(8))
+    counter.write_bytes(bytes(8 * len(CALLS)))
     variables = {"LD_PRELOAD": str(library), "FAULT_COUNTER": str(counter), "FAULT_CALL": "none",
                  _LIBRARY: str(library), "FAULT_FOLDER": "/nowhere", "OMP_NUM_THREADS": "1",
                  "OPENBLAS_NUM_THREADS": "1"}
@@ -81,11 +82,11 @@ class Injector:
         self._log = log
         self._library = ctypes.CDLL(os.environ[_LIBRARY])
         with open(os.environ["FAULT_COUNTER"], "r+b") as stream:
-            self._counter = mmap.mmap(stream.fileno(), 8)
+            self._counter = mmap.mmap(stream.fileno(), 8 * len(CALLS))
 
     def run(self, argv: Sequence[str], folder: Path, fault: Fault, limit_s: float = 120.0) -> Outcome:
         """Run a command with one fault below `folder`. Raises TimeoutError where it takes longer than the limit."""
-        self._counter[:8] = bytes(8)
+        self._counter[:] = bytes(8 * len(CALLS))
         sys.stdout.flush()
         pid = os.fork()
         if not pid:
@@ -100,7 +101,8 @@ class Injector:
                 raise TimeoutError(f"{' '.join(argv)} still ran after {limit_s:g} s at {fault}")
             else:
                 time.sleep(0.01)
-        return Outcome(status, self._log.read_text(errors="replace"), int.from_bytes(self._counter[:8], sys.byteorder))
+        counts = struct.unpack(f"{len(CALLS)}q", self._counter[:])
+        return Outcome(status, self._log.read_text(errors="replace"), dict(zip(CALLS, counts, strict=True)))
 
     def _run_in_fork(self, argv: Sequence[str], folder: Path, fault: Fault) -> None:
         """Run a command in the child of the fork, which it ends."""

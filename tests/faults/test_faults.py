@@ -36,7 +36,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run_with_fault(library: Path, folder: Path, call: str, number: int, error: str) -> subprocess.CompletedProcess[str]:
     """Write two files in a Python with a fault."""
     counter = library.with_name("counter")
-    counter.write_bytes(bytes(8))
+    counter.write_bytes(bytes(8 * len(injection.CALLS)))
     code = ("import os\nfor name in 'ab':\n with open(name, 'w') as file: file.write('whole')\n"
             " os.replace(name, name * 2)")
     return subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False, env={

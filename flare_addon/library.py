@@ -6,7 +6,6 @@ user are in a folder of their own.
 """
 from __future__ import annotations
 
-import contextlib
 import struct
 import zlib
 from pathlib import Path
@@ -45,12 +44,20 @@ def folder(create: bool = False) -> Path:
 
 
 def files() -> list[Path]:
-    """Return the .flare files of the library, each part sorted by name: the user's, then those of the extension."""
-    found: list[Path] = []
-    for place in (folder(), BOX):
-        with contextlib.suppress(OSError):
-            found += sorted(path for path in place.glob("*.flare") if not path.name.startswith("."))
-    return found
+    """Return the .flare files of the library: the user's, then those of the extension, each sorted by name."""
+    return user_files() + _flares_of(BOX)
+
+
+def user_files() -> list[Path]:
+    """Return the .flare files of the user's folder, sorted by name."""
+    return _flares_of(folder())
+
+
+def _flares_of(place: Path) -> list[Path]:
+    try:
+        return sorted(path for path in place.glob("*.flare") if not path.name.startswith("."))
+    except OSError:
+        return []
 
 
 def save(look: Look, name: str, notes: str, licence: str) -> Path:

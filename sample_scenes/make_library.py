@@ -47,7 +47,8 @@ class LibraryLook:
     @property
     def settings(self) -> TracedFlareSettings:
         """The settings of the look."""
-        return TracedFlareSettings().override({"ghosts.count": 14, **self.values})
+        return TracedFlareSettings().override({"ghosts.count": 14, "tracing.positions": 48, "fit.iterations": 1200,
+                                               **self.values})
 
 
 def _streak(gain: float, turn: float, colour: tuple[float, float, float], *, length: float = 0.06, width: float = 0.004,

@@ -59,6 +59,8 @@ SHARE_AT_LIGHT = 0.4
 """Share of the first Gaussians that lie about the light."""
 RAY_LENGTHS = 0.004, 0.9
 """Distances of these from the light, relative to half the frame's width."""
+CORE_GAUSSIANS, CORE_SIZES, CORE_OPACITY = 24, (0.3, 4.0), 0.2
+"""Number, range of standard deviations (pixels) and opacity of the first Gaussians in the light itself."""
 SQUARED_WEIGHT = 0.3
 """Weight of the relative error in linear light against that of the encoded light: highlights against faint ghosts."""
 ENCODING_OFFSET = 1e-3
@@ -217,15 +219,16 @@ def _new_model(settings: TracedFlareSettings, fit: FitSettings, traced: TracedPi
     corner = math.hypot(settings.reach, settings.reach * settings.height / settings.tracing.width)
     query_range = QueryRange.of(cameras, torch.tensor(traced.places, dtype=torch.float32), corner)
     flare = LightFlare(fit.flare.form, query_range, fit.flare.count, generator, fit.flare.opacity)
-    _start_at_light(flare, settings.reach, generator)
+    _start_at_light(flare, settings.reach, 2 * settings.reach / settings.tracing.width, generator)
     return FlareModel([LIGHT], torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), [flare])
 
 
-def _start_at_light(flare: LightFlare, reach: float, generator: torch.Generator) -> None:
+def _start_at_light(flare: LightFlare, reach: float, pixel: float, generator: torch.Generator) -> None:
     """Move a share of the first Gaussians to the light, as rays of log-uniform length, and scale the others, which are
     sized for a normal lens, to the frame.
 
     Starburst and glow, most of a flare's light, follow the light without changing; along the line few would lie there.
+    reach: half the frame's width; pixel: of the traced pictures, normalised coordinates.
     """
     rows = flare.gaussians
     with torch.no_grad():
@@ -241,6 +244,12 @@ def _start_at_light(flare: LightFlare, reach: float, generator: torch.Generator)
         rows["log_scales"][chosen] = torch.log(torch.stack([0.35 * distance.clamp_min(RAY_LENGTHS[0] * reach * 2),
                                                             0.12 * distance.clamp_min(RAY_LENGTHS[0] * reach * 4)], -1))
         rows["rings"][chosen] = 0.0
+        # The light itself is a few pixels of many times white, which one Gaussian's colour would not reach.
+        core = chosen[:CORE_GAUSSIANS]
+        low, high = (math.log(bound * pixel) for bound in CORE_SIZES)
+        rows["offsets"][core] = 0.0
+        rows["log_scales"][core] = low + (high - low) * torch.rand(len(core), 1, generator=generator)
+        rows["opacity_logits"][core] = math.log(CORE_OPACITY / (1 - CORE_OPACITY))
 
 
 def _encode(light: Tensor) -> Tensor:

@@ -22,6 +22,9 @@ from .settings import override_field
 REFERENCE_REACH = 2 / 3
 """Half the frame's width over the focal length of the frame in which the tangents of starburst, glow, rings and streaks
 are given: 27 mm on a sensor of 36 mm. They scale with the frame."""
+MIN_CORE = 0.6
+"""Smallest softening radius of the starburst, pixels of the traced pictures: these are sampled at pixel centres, and a
+smaller core would flicker as the light moves between them."""
 ASPECT = 9 / 16
 """Height of the traced pictures over their width."""
 
@@ -164,7 +167,8 @@ class TracedFlareSettings:
             ghosts=GhostSettings(count=self.ghosts.count, gain=1.0, rim=self.ghosts.rim, size=0.0014 * scale,
                                  bands=self.tracing.bands if self.ghosts.dispersion else 1,
                                  supersample=self.tracing.supersample),
-            starburst=replace(self.starburst, extent=self.starburst.extent * scale, core=self.starburst.core * scale),
+            starburst=replace(self.starburst, extent=self.starburst.extent * scale,
+                              core=max(self.starburst.core * scale, MIN_CORE * 2 * self.reach / self.tracing.width)),
             glow=replace(self.glow, radius=self.glow.radius * scale, wide_radius=self.glow.wide_radius * scale),
             rings=tuple(replace(ring, radius=ring.radius * scale) for ring in self.rings),
             streaks=tuple(replace(streak, length=streak.length * scale, width=streak.width * scale)

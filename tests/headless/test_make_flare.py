@@ -49,4 +49,4 @@ def test_make_flare_says_what_is_wrong(argv: tuple[str, ...], part: str, tmp_pat
 
 def test_make_flare_lists_the_lenses_of_the_program(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--list") == 0
-    assert "US4099850" in capsys.readouterr().out
+    assert "US4099850" in capsys.readouterr().err

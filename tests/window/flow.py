@@ -305,8 +305,8 @@ def transfer():
     shot("08_save")
     ui.press("RET")
     library, overlay = module("library"), module("overlay")
-    yield from wait(library.files, 10)
-    assert [path.stem for path in library.files()] == ["Desk lamp"]
+    yield from wait(library.user_files, 10)
+    assert [path.stem for path in library.user_files()] == ["Desk lamp"]
     other, camera = another_shot()
     yield 0.5
     view = ui.region("WINDOW")

@@ -205,7 +205,8 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
     for frame in number_views(views):
         view = views[frame.view]
         path = None if shown else capture.frame_path(view)
-        undistorted = None if view.lens is None or path is None else _undistorted(capture, view)
+        is_stored_as_seen = view.lens is None and not view.upright
+        undistorted = None if is_stored_as_seen or path is None else _undistorted(capture, view)
         window = camera_window(view.camera, path) if undistorted is None and path is not None else None
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)
         frames.append(TargetFrame(frame, shot, path, undistorted, window))

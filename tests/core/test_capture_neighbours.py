@@ -9,6 +9,7 @@ import json
 import shutil
 import unicodedata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -18,9 +19,11 @@ import pytest
 from core.capture import Capture
 from core.capture.layout import count_images
 from core.capture.ply import read_points
-from core.errors import CaptureError
+from core.errors import CaptureError, FrameError
 from core.images.formats.exif import undo_orientation
 from core.images.write import write_exr
+from core.removal.jobs.fitted import _clean_view
+from core.transfer.target import capture_target
 from tests.core.captures import SIZE, make_capture, make_transforms, orbit, picture
 from tests.core.test_exif import exif_segment
 
@@ -177,7 +180,7 @@ def test_poses_without_a_frame_are_counted_and_named(tmp_path: Path, kind: str) 
 # Names.
 
 @pytest.mark.parametrize("suffix", [".exr", ".tif", ".jpg"])
-def test_a_frame_with_another_suffix_is_taken_and_told(tmp_path: Path, suffix: str) -> None:
+def test_a_frame_with_another_suffix_is_used_and_reported(tmp_path: Path, suffix: str) -> None:
     folder = make_capture(tmp_path / "c")
     for path in sorted((folder / "images").iterdir()):
         if suffix == ".exr":
@@ -411,7 +414,7 @@ def test_harmonics_of_gaussians_are_colours(tmp_path: Path) -> None:
 # Checks of the geometry.
 
 @pytest.mark.parametrize("change", ["behind", "far off", "axes"])
-def test_points_that_the_cameras_do_not_see_are_told(tmp_path: Path, change: str) -> None:
+def test_points_outside_all_views_are_reported(tmp_path: Path, change: str) -> None:
     folder = make_capture(tmp_path / "c", points=200)
     lines = []
     for line in (folder / MODEL / "points3D.txt").read_text().splitlines():
@@ -426,7 +429,7 @@ def test_points_that_the_cameras_do_not_see_are_told(tmp_path: Path, change: str
 
 
 @pytest.mark.parametrize(("focal", "told"), [(0.035, True), (35.0, False), (9e5, True), (2.0, True), (640.0, False)])
-def test_a_focal_length_that_cannot_be_is_told(tmp_path: Path, focal: float, told: bool) -> None:
+def test_an_implausible_focal_length_is_reported(tmp_path: Path, focal: float, told: bool) -> None:
     folder = make_transforms(tmp_path / "t", fl_x=focal, fl_y=focal)
     edit(folder, fl_x=focal, fl_y=focal)
     assert any("focal length of 3 of 3 frames cannot be" in text for text in Capture.open(folder).sentences) == told
@@ -485,9 +488,25 @@ def test_photographs_that_were_solved_as_stored_stay(tmp_path: Path) -> None:
     assert not any(view.upright for view in capture.views) and not capture.sentences
 
 
-def test_an_orientation_that_nothing_decides_is_told(tmp_path: Path) -> None:
+def test_an_undecidable_orientation_is_reported(tmp_path: Path) -> None:
     folder = turned_capture(tmp_path / "c", 3)
     (folder / MODEL / "points3D.txt").unlink()
     capture = Capture.open(folder)
     [sentence] = capture.sentences
     assert "as stored, though their Exif orientation is 3" in sentence and not capture.views[0].upright
+
+
+def test_layers_of_a_fit_are_not_subtracted_from_turned_pixels(tmp_path: Path) -> None:
+    capture = Capture.open(turned_capture(tmp_path / "c", 3))
+    with pytest.raises(FrameError, match=r"0002\.jpg was solved as viewers show it"):
+        _clean_view(None, capture, capture.views[2], False)  # type: ignore[arg-type]
+
+
+def test_a_flare_is_transferred_to_photographs_as_they_were_solved(tmp_path: Path) -> None:
+    capture = Capture.open(turned_capture(tmp_path / "c", 3))
+    (tmp_path / "lights.json").write_text('{"lights": [{"name": "lamp", "xyz": [0, 0, 1]}]}')
+    look = SimpleNamespace(names=("lamp",))
+    target = capture_target(capture, look, {}, lights=tmp_path / "lights.json")  # type: ignore[arg-type]
+    undistorted = target.frames[2].undistorted
+    assert undistorted is not None
+    np.testing.assert_array_equal(undistorted(False).pixels, capture.frame(capture.views[2]).pixels)

@@ -109,6 +109,9 @@ def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
 def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
                 above_white: bool) -> tuple[Plate, NDArray[Any], Pixels, dict[str, float]]:
     """Return a view's plate, the codes of its clean frame, the removed flare in linear light, and each light's gain."""
+    if view.upright:
+        raise FrameError(f"{capture.frame_path(view)} was solved as viewers show it, and its pixels are stored turned; "
+                         "turn the pixels, remove its Exif orientation, and fit again.")
     stored = read_plate(capture.frame_path(view), capture.plate_space)
     if len(views := split_views(stored)) > 1:
         names = " and ".join(name for name, _ in views)

@@ -37,7 +37,7 @@ def tally_solve(report: Mapping[str, Any], source: Path) -> Tally:
     names = [path.name for path in pictures_in(source)] if source.is_dir() else []
     for sentence in report["left_out"]:  # "PATH is damaged or truncated; export it again."
         name = next((name for name in names if sentence.startswith(f"{source / name} ")), "")
-        problem = sentence.removeprefix(f"{source / name} ").partition(";")[0].rstrip(".")
+        problem = sentence.removeprefix(f"{source / name} ").partition(";")[0].partition(" (")[0].rstrip(".")
         tally.skip(problem, name or source.name)
     if source.is_dir():
         tally.merge(passed_over(source))

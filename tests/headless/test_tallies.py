@@ -48,7 +48,8 @@ def test_a_solve_counts_frames_and_other_files(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / "in a" / name), picture(0))
     (tmp_path / "in a" / "cut.mov").write_text("")
     report = {"registered": 8, "unregistered": ["f9.png"],
-              "left_out": [f"{tmp_path / 'in a' / 'f 2.png'} is damaged or truncated; export it again."]}
+              "left_out": [f"{tmp_path / 'in a' / 'f 2.png'} is damaged or truncated (in its "
+                           "header); export it again."]}
     tally = tally_solve(report, tmp_path / "in a")
     assert tally.sentence() == ("8 frames placed; 4 left out: f9.png (no place in the model), f 2.png (is damaged or "
                                 "truncated), cut.mov (MOV is not read here), second (a subfolder with 1 picture).")

@@ -82,7 +82,7 @@ def frames(folder: Path, count: int, progress: Progress) -> None:
 
 
 def iterations(folder: Path, count: int, progress: Progress) -> None:
-    """Fit for `count` iterations, without new Gaussians."""
+    """Fit for `count` iterations; the scene gains Gaussians meanwhile, as in any fit."""
     capture = Capture.open(flared_capture(folder / "capture", count=7, dots=60))
     settings = override_settings(preset("draft", iterations=count), {"flare.count": 24})
     fit(capture, settings, folder / "run", progress)

@@ -177,7 +177,12 @@ def _fit_settings(settings: TracedFlareSettings) -> FitSettings:
     base = preset("draft", blend="add", iterations=fit.iterations)
     density = replace(base.flare.density, start=max(fit.iterations // 10, 10), stop=int(fit.iterations * 0.7),
                       max_gaussians=fit.max_gaussians)
-    return replace(base, flare=replace(base.flare, count=fit.gaussians, density=density, opacity=0.02))
+    # The light's place is known, and its core is a few pixels: a correction, or large steps of the places, would move it
+    # off its pixels, and the loss would turn it dark instead of moving it back.
+    form = replace(base.flare.form, light_correction=False)
+    rates = replace(base.flare.rates, position=base.flare.rates.position / 4, network=base.flare.rates.network / 2)
+    return replace(base, flare=replace(base.flare, form=form, rates=rates, count=fit.gaussians, density=density,
+                                       opacity=0.02))
 
 
 def fit_traced(settings: TracedFlareSettings, traced: TracedPictures, progress: Progress) -> FlareModel:

@@ -23,10 +23,10 @@ from core.gaussians.ply import read_ply
 from core.look import LookEdits
 from core.look import read as read_look
 from core.look.shot import Shot
+from core.optics.prescription import built_in_lenses
 from core.removal.inference.remover import Remover
 from core.removal.jobs.batch import remove_all
 from core.removal.model import weights
-from core.optics.prescription import built_in_lenses
 from core.removal.training import run as training_run
 from core.system.progress import Progress
 from tests.core.test_removal_training import backgrounds

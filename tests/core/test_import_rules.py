@@ -18,7 +18,8 @@ NUMPY_ONLY = ("core.errors", "core.choices", "core.system.files", "core.system.p
               "core.capture", "core.bake.bake", "core.metrics.evaluation", "core.look")
 
 # Layers from the lowest; modules of `core` that are not listed are below all of them.
-LAYERS = ("core.system", "core.conventions", "core.optics", "core.colour", "core.images", "core.capture", "core.metrics",
+LAYERS = ("core.system", "core.conventions", "core.optics", "core.colour", "core.images", "core.capture",
+         "core.metrics",
           "core.gaussians", "core.look", "core.lights", "core.flare", "core.removal.model", "core.removal.synthesis",
           "core.removal.inference", "core.removal.training", "core.removal.jobs", "core.removal", "core.fit",
           "core.bake", "core.transfer", "flare_addon", "headless")

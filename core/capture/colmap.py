@@ -215,6 +215,7 @@ class _ByteReader:
 
 
 def _read_cameras_bin(file: _ByteReader) -> dict[int, Lens]:
+    """Return the lenses of a cameras.bin by camera number. Raises CaptureError."""
     lenses: dict[int, Lens] = {}
     for _ in range(file.count(24)):
         camera, number, width, height = file.take("iiQQ")
@@ -228,6 +229,7 @@ def _read_cameras_bin(file: _ByteReader) -> dict[int, Lens]:
 
 
 def _read_cameras_txt(path: Path, lines: list[str]) -> dict[int, Lens]:
+    """Return the lenses of a cameras.txt by camera number. Raises CaptureError."""
     lenses: dict[int, Lens] = {}
     for number, line in _data_lines(lines):
         words = line.split()
@@ -262,6 +264,7 @@ _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
 def _read_images_bin(file: _ByteReader) -> list[Image]:
+    """Read an images.bin. Raises CaptureError."""
     images: list[Image] = []
     for _ in range(file.count(73)):
         values = file.take("idddddddi")
@@ -342,6 +345,7 @@ Points = tuple[PointCloud, NDArray[np.int64]]
 
 
 def _read_points_bin(file: _ByteReader) -> Points:
+    """Read a points3D.bin. Raises CaptureError."""
     number = file.count(51)
     record = struct.Struct("<Q3d3BdQ")
     values = np.empty((number, 4), np.float64)
@@ -362,6 +366,7 @@ def _read_points_bin(file: _ByteReader) -> Points:
 
 
 def _read_points_txt(path: Path, lines: list[str]) -> Points:
+    """Read a points3D.txt. Raises CaptureError."""
     values, rgb, numbers = [], [], []
     for number, line in _data_lines(lines):
         words = line.split(maxsplit=8)

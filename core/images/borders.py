@@ -99,8 +99,8 @@ def _count_border_lines(line: Callable[[int], NDArray[Any]], count: int) -> tupl
 def _count_leading_lines(line: Callable[[int], NDArray[Any]], order: Iterable[int]) -> int:
     """Count the even, black lines in this order, up to the first other one."""
     colour, number = None, -1
-    for number, at in enumerate(order):
-        pixels = line(at)
+    for number, position in enumerate(order):
+        pixels = line(position)
         if colour is None:
             colour = np.median(pixels, 0)
             if not colour.max() <= MAX_BORDER_LEVEL:

@@ -253,6 +253,7 @@ class _FrameRenderer:
                                   for name in self._transfer.lights}, depth)
 
     def _background(self, camera: Camera) -> tuple[Pixels, Pixels]:
+        """Return scene light (h, w, 3) and depth (h, w) behind the flare: the plate, the rendered scene, or black."""
         target, frame = self._transfer.target, self._frame
         no_depth = np.zeros((camera.height, camera.width), np.float32)
         if frame.plate is not None:
@@ -266,8 +267,8 @@ class _FrameRenderer:
             if frame.window is not None and frame.window.size == camera.size:
                 self._plate = plate
                 return move_to_window(plate.linear, stored, frame.window), no_depth
-            whole = Picture(crop_to_display_window(plate.linear, stored), "linear")
-            return np.asarray(whole.resized(*camera.size).pixels, np.float32), no_depth
+            picture = Picture(crop_to_display_window(plate.linear, stored), "linear")
+            return np.asarray(picture.resized(*camera.size).pixels, np.float32), no_depth
         if target.scene is not None and target.shown:
             rendering = render_scene(target.scene, camera)
             return decode(rendering.colour.clamp(0, target.scene.display_white)).numpy(), rendering.depth.numpy()

@@ -21,9 +21,8 @@ SOLVE_DEFAULTS = {"frames": 0, "matching": "auto", "lens": "RADIAL", "work_size"
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments to a parser."""
     parser.add_argument("source", type=Path, metavar="FRAMES_OR_VIDEO",
-                        help="folder of frames (PNG, JPEG, TIFF, EXR, DPX and others), a video, or a .blend, whose animated "
-                             "camera is "
-                             "used without a solve")
+                        help="folder of frames (PNG, JPEG, TIFF, EXR, DPX and others), a video, or a .blend, whose "
+                             "animated camera is used without a solve")
     parser.add_argument("--plates", type=Path, metavar="DIR",
                         help="for a .blend: the frames as filmed or rendered, whose names end with their numbers")
     parser.add_argument("--lights", metavar="NAMES", help="for a .blend: objects that are lights (default: its lamps)")

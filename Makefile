@@ -14,6 +14,7 @@ demo: .venv/.ready
 pictures: demo
 	.venv/bin/python -c "import cv2; cv2.imwrite('docs/contact_sheet.jpg', cv2.imread('build/demo/contact_sheet.png'), [cv2.IMWRITE_JPEG_QUALITY, 88])"
 	.venv/bin/python -c "import cv2; cv2.imwrite('docs/lights.jpg', cv2.imread('build/demo/capture/lights/sheet1.png')[:606], [cv2.IMWRITE_JPEG_QUALITY, 88])"
+	.venv/bin/python sample_scenes/make_library.py --sheet docs/library.jpg
 
 test: setup check
 	.venv/bin/python -m pytest

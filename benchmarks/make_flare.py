@@ -73,7 +73,8 @@ def main() -> int:
             settings = TracedFlareSettings().override({**dict(map(parse_setting, args.changes)), "lens": name})
             setup, progress = exposed_setup(settings), TerminalProgress()
         except FitFlareError as problem:
-            print(f"| {Path(name).stem} | {problem} |", flush=True)
+            print(f"| {Path(name).stem} | refused | | | | |", flush=True)
+            print(problem, file=sys.stderr)
             continue
         traced = trace(settings, setup, spread_places(settings), progress, "trace")
         model = fit_traced(settings, traced, progress)

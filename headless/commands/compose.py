@@ -38,6 +38,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.folder import LayerFolder
     from ...core.conventions.frame_numbers import NumberedFrame
 
+    if args.out.resolve() == args.layers.resolve():
+        raise SettingsError(f"{args.out} holds the layers; choose another folder for the frames.")
     layers = LayerFolder.open(args.layers)
     known = [NumberedFrame("", number, str(path)) for number, path in layers.files.items()]
     selected = frames.select_task(known, args, progress)
@@ -62,8 +64,6 @@ def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, number
     from ...flare_addon import cameras, render_settings
     from ...flare_addon.compositor import setup
 
-    if out.resolve() == layers.folder.resolve():
-        raise SettingsError(f"{out} holds the layers; choose another folder for the frames.")
     if not 0 <= intensity < float("inf"):
         raise SettingsError(f"The intensity {intensity} is not a number of 0 or more.")
     colour = LookEdits.parse([f"flare.tint={tint}"], ["flare"]).light_edit("flare").tint

@@ -122,8 +122,8 @@ def _exr_headers(path: Path | str) -> list[dict[str, Any]]:
     try:
         with _readable_copy(path) as readable, OpenEXR.File(readable, header_only=True) as file:
             headers = [dict(part.header) for part in file.parts]
-    except OSError:
-        raise
+    except OSError as problem:
+        raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
         raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
     if not headers:
@@ -142,8 +142,8 @@ def read_exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[A
         with _readable_copy(path) as readable, OpenEXR.File(readable, separate_channels=True) as file:
             parts = [(dict(part.header), {name: channel.pixels for name, channel in part.channels.items()})
                      for part in file.parts]
-    except OSError:
-        raise
+    except OSError as problem:
+        raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
         raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
     if not parts:

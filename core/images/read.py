@@ -81,10 +81,12 @@ def has_float_pixels(path: Path, space: ColourSpace | None = None) -> bool:
     if kind == "tiff":
         with open_regular(path) as stream:
             is_big = stream.read(4) in tiff.BIG_TIFF
+            stream.seek(0)
             formats = tiff.read_tags(stream, (tiff.SAMPLE_FORMAT,)).get(tiff.SAMPLE_FORMAT)
         if formats is not None and formats.values[0] == tiff.FLOATS:
             return True
-        if is_big and read_stored_pixels(path).dtype.kind == "f":
+        signed = formats is not None and formats.values[0] != tiff.UNSIGNED  # LogLuv among them: stored as integers
+        if (is_big or signed) and read_stored_pixels(path).dtype.kind == "f":
             return True
     known = space or declared_space(path)
     return known is not None and known.has_headroom

@@ -19,11 +19,8 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import os
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -40,7 +37,8 @@ import torch
 from torch import Tensor
 
 from benchmarks import opensplat, report, workload
-from benchmarks.report import milliseconds, table
+from benchmarks.raster_processes import process_section
+from benchmarks.report import milliseconds, plot_times, table
 from benchmarks.resident import peak_memory, resident_memory
 from benchmarks.timing import median_times, on_threads, time_once, torch_threads
 from core.fit.optimisers import Optimisers
@@ -369,31 +367,11 @@ def curve_section(rasterizers: dict[str, Rasterizer], rounds: int, device: str, 
             seconds = lines[name][str(n)]
             row += [milliseconds(seconds), f"{seconds / n * 1e9:.0f}"]
         rows.append(row)
-    _plot(lines, picture)
+    plot_times(lines, picture)
     head = ["Gaussians, 480x270"]
     for name in fast:
         head += [f"{name}, ms", f"{name}, ns a Gaussian"]
     return table(head, rows) + f"\n\n![Forward + backward against the number of Gaussians]({picture.name})"
-
-
-def _plot(lines: dict[str, dict[str, float]], picture: Path) -> None:
-    """Draw times, ms, against the number of Gaussians, a line for each kernel set."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(6, 3.6), layout="constrained")
-    for name, times in lines.items():
-        thread_counts = [int(n) / 1000 for n in times]
-        axes.plot(thread_counts, [t * 1e3 for t in times.values()], "o-", label=name)
-    axes.set(xlabel="Gaussians, thousands", ylabel="forward + backward, ms", xlim=(0, None), ylim=(0, None))
-    axes.set_title(f"480x270, {torch.get_num_threads()} threads", fontsize=10)
-    axes.grid(alpha=0.3)
-    if len(lines) > 1:
-        axes.legend()
-    figure.savefig(picture, dpi=150)
-    pyplot.close(figure)
 
 
 def peer_section(checkout: Path, rounds: int) -> str:
@@ -418,49 +396,6 @@ def peer_section(checkout: Path, rounds: int) -> str:
     head = ["Forward + backward, ms", "OpenSplat, 1 thread", "cpu, 1 thread", f"cpu, {_thread_label(threads)}"]
     head += [f"OpenSplat / cpu, {_thread_label(count)}" for count in (1, threads)] + ["mean difference of the pictures"]
     return table(head, rows)
-
-
-def process_section(sets: list[str]) -> str:
-    """Memory and the first call, each in a process of its own; other instruction sets."""
-    rows = []
-    for name in sets:
-        if name == "torch":
-            continue
-        cells = _probe("memory", name)
-        rows.append([name, f"{cells['before']:.0f}", f"{cells['peak']:.0f}"])
-    text = table(["Resident memory, training 50k at 480x270, MB", "after import", "peak"], rows)
-    if "cpu" not in sets:
-        return text
-    with tempfile.TemporaryDirectory() as cache:
-        cold, warm = (_probe("start", "cpu", FIT_FLARE_CACHE=cache) for _ in range(2))
-    rows = [
-        [what, f"{cells['import']:.1f}", f"{cells['first']:.1f}", f"{cells['second'] * 1e3:.0f} ms"]
-        for what, cells in (("empty cache: compiles", cold), ("from the cache", warm))
-    ]
-    text += "\n\n" + table(
-        ["Start of a process", "imports (torch, numba), s", "first iteration, s", "second iteration"], rows
-    )
-    rows = []
-    for what, variables in INSTRUCTIONS.items():
-        with tempfile.TemporaryDirectory() as cache:
-            _probe("start", "cpu", FIT_FLARE_CACHE=cache, **variables)
-            rows.append([what, milliseconds(_probe("both", "cpu", FIT_FLARE_CACHE=cache, **variables)["both"])])
-    return text + "\n\n" + table(["50k, 480x270, forward + backward, ms, all threads", "cpu"], rows)
-
-
-INSTRUCTIONS = {
-    "native": {},
-    "AVX2": {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2,+fma,+bmi,+bmi2,+popcnt,+f16c,+lzcnt"},
-    "SSE4.2": {"NUMBA_CPU_NAME": "nehalem", "NUMBA_CPU_FEATURES": "+sse4.2,+popcnt"},
-}
-
-
-def _probe(what: str, name: str, **variables: str) -> dict[str, float]:
-    done = subprocess.run(
-        [sys.executable, __file__, "--probe", what, name],
-        env={**os.environ, **variables}, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def probe(what: str, name: str) -> dict[str, float]:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Write tables into the documents of docs/results, each between its own markers, and describe the machine."""
+"""Write tables into the documents of docs/results, each between its own markers, draw plots, and describe the
+machine."""
 from __future__ import annotations
 
 import os
@@ -67,3 +68,23 @@ def write_section(path: Path, name: str, text: str) -> None:
         new = old.rstrip() + "\n\n" + section + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(new, encoding="utf-8")
+
+
+def plot_times(lines: dict[str, dict[str, float]], picture: Path) -> None:
+    """Draw times, ms, against the number of Gaussians, a line for each kernel set."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(6, 3.6), layout="constrained")
+    for name, times in lines.items():
+        thread_counts = [int(n) / 1000 for n in times]
+        axes.plot(thread_counts, [t * 1e3 for t in times.values()], "o-", label=name)
+    axes.set(xlabel="Gaussians, thousands", ylabel="forward + backward, ms", xlim=(0, None), ylim=(0, None))
+    axes.set_title(f"480x270, {torch.get_num_threads()} threads", fontsize=10)
+    axes.grid(alpha=0.3)
+    if len(lines) > 1:
+        axes.legend()
+    figure.savefig(picture, dpi=150)
+    pyplot.close(figure)

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Memory, start and instruction sets of the kernel sets, measured by `raster.py --probe` in processes of their own."""
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from benchmarks.report import milliseconds, table
+
+SCRIPT = Path(__file__).with_name("raster.py")
+INSTRUCTIONS = {
+    "native": {},
+    "AVX2": {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2,+fma,+bmi,+bmi2,+popcnt,+f16c,+lzcnt"},
+    "SSE4.2": {"NUMBA_CPU_NAME": "nehalem", "NUMBA_CPU_FEATURES": "+sse4.2,+popcnt"},
+}
+
+
+def process_section(sets: list[str]) -> str:
+    """Return the tables of memory, first call and instruction sets, each figure from a process of its own."""
+    rows = []
+    for name in sets:
+        if name == "torch":
+            continue
+        cells = _probe("memory", name)
+        rows.append([name, f"{cells['before']:.0f}", f"{cells['peak']:.0f}"])
+    text = table(["Resident memory, training 50k at 480x270, MB", "after import", "peak"], rows)
+    if "cpu" not in sets:
+        return text
+    with tempfile.TemporaryDirectory() as cache:
+        cold, warm = (_probe("start", "cpu", FIT_FLARE_CACHE=cache) for _ in range(2))
+    rows = [
+        [what, f"{cells['import']:.1f}", f"{cells['first']:.1f}", f"{cells['second'] * 1e3:.0f} ms"]
+        for what, cells in (("empty cache: compiles", cold), ("from the cache", warm))
+    ]
+    text += "\n\n" + table(
+        ["Start of a process", "imports (torch, numba), s", "first iteration, s", "second iteration"], rows
+    )
+    rows = []
+    for what, variables in INSTRUCTIONS.items():
+        with tempfile.TemporaryDirectory() as cache:
+            _probe("start", "cpu", FIT_FLARE_CACHE=cache, **variables)
+            rows.append([what, milliseconds(_probe("both", "cpu", FIT_FLARE_CACHE=cache, **variables)["both"])])
+    return text + "\n\n" + table(["50k, 480x270, forward + backward, ms, all threads", "cpu"], rows)
+
+
+def _probe(what: str, name: str, **variables: str) -> dict[str, float]:
+    """Return what `raster.py --probe` measures in a process of its own, with these environment variables."""
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), "--probe", what, name],
+        env={**os.environ, **variables}, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return json.loads(done.stdout.splitlines()[-1])

@@ -446,7 +446,7 @@ def test_a_training_with_a_non_finite_loss_stops(tmp_path: Path, monkeypatch: py
         return figures if trainer.iteration < 3 else {**figures, "loss": float("nan")}
 
     monkeypatch.setattr(RemovalTrainer, "step", broken)
-    with pytest.raises(RunError, match=r"Iteration 3 .* no number.*learning_rate"):
+    with pytest.raises(RunError, match=r"iteration 3 is not finite.*learning_rate"):
         run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), processes=1, save_every_s=0)
     state, about = weights.read(tmp_path / run.CHECKPOINT)
     assert about["iteration"] == "2", "what was saved last is whole"

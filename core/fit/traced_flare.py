@@ -177,8 +177,8 @@ def _fit_settings(settings: TracedFlareSettings) -> FitSettings:
     base = preset("draft", blend="add", iterations=fit.iterations)
     density = replace(base.flare.density, start=max(fit.iterations // 10, 10), stop=int(fit.iterations * 0.7),
                       max_gaussians=fit.max_gaussians)
-    # The light's place is known, and its core is a few pixels: a correction, or large steps of the places, would move it
-    # off its pixels, and the loss would turn it dark instead of moving it back.
+    # The light's position is known, and its core is a few pixels: a correction, or large steps of the positions, would
+    # move it off its pixels, and the loss would turn it dark instead of moving it back.
     form = replace(base.flare.form, light_correction=False)
     rates = replace(base.flare.rates, position=base.flare.rates.position / 4, network=base.flare.rates.network / 2)
     return replace(base, flare=replace(base.flare, form=form, rates=rates, count=fit.gaussians, density=density,

@@ -632,6 +632,10 @@ def test_a_solve_keeps_the_handler_of_sigterm() -> None:
     assert (done.returncode, done.stdout.strip()) == (0, "stopped as asked"), done.stderr[-500:]
 
 
-def test_frames_whose_names_differ_by_case_or_suffix_get_distinct_files() -> None:
-    stills = [SourceFrame(name, f"/shoot/{name}", 8, 8, None, 1) for name in ("a.jpg", "A.jpeg", "b.jpg")]
+def test_frames_whose_names_differ_by_case_or_suffix_get_distinct_files(tmp_path: Path) -> None:
+    stills = []
+    for folder, name in (("one", "a.jpg"), ("two", "A.jpeg"), ("one", "b.jpg")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / folder / name), np.zeros((8, 8, 3), np.uint8))
+        stills.append(SourceFrame(name, str(tmp_path / folder / name), 8, 8, None, 1))
     assert develop._file_names(stills) == ["a.png", "A.jpeg.png", "b.png"]

@@ -442,7 +442,7 @@ def _is_finite(value: Any) -> bool:
 
 
 def _checked_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:
-    size = turned.shown_size if turned else picture_size(path)
+    size = turned.upright_size if turned else picture_size(path)
     if not same_aspect(size, (lens.width, lens.height)):
         raise FrameError(f"{path} is {size[0]} x {size[1]} pixels and its camera {lens.width} x {lens.height}, "
                          "which is another shape; use the frames that were solved.")

@@ -42,7 +42,7 @@ class TurnedFrame:
     size: tuple[int, int]
 
     @property
-    def shown_size(self) -> tuple[int, int]:
+    def upright_size(self) -> tuple[int, int]:
         """(width, height) as viewers show it."""
         return self.size[::-1] if self.orientation in SWAPS_SIDES else self.size
 
@@ -56,7 +56,7 @@ def find_upright(frames: Sequence[TurnedFrame], points: PointCloud) -> tuple[set
     undecided: dict[int, list[TurnedFrame]] = {}
     for frame in frames:
         lens = (frame.posed.lens.width, frame.posed.lens.height)
-        fits_stored, fits_shown = same_aspect(frame.size, lens), same_aspect(frame.shown_size, lens)
+        fits_stored, fits_shown = same_aspect(frame.size, lens), same_aspect(frame.upright_size, lens)
         if fits_stored and fits_shown:
             undecided.setdefault(frame.orientation, []).append(frame)
         elif fits_shown:

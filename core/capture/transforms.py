@@ -99,7 +99,7 @@ def _read_frame(path: Path, number: int, meta: dict[str, Any], frame: Any, lense
         raise CaptureError(f"{path}, frame {number}: file_path is missing; export it again.")
     where = f"{path}, {name}:"
     name = _with_suffix(path.parent, name)
-    lens = _read_lens(_own_first(meta, frame), path.parent, name, where)
+    lens = _read_lens(_merge_lens_values(meta, frame), path.parent, name, where)
     lens = lenses.setdefault((lens.model, lens.params, lens.width, lens.height), lens)
     result.frames.append(PosedFrame(name, lens, _read_pose(frame, where)))
     mask = frame.get("mask_path")
@@ -112,7 +112,7 @@ def _read_frame(path: Path, number: int, meta: dict[str, Any], frame: Any, lense
     return name
 
 
-def _own_first(meta: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+def _merge_lens_values(meta: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
     """Return the values of a frame's lens: its own, else those of the file.
 
     What a frame says in one form replaces what the file says in another: an angle for a focal length, one list for

@@ -151,7 +151,7 @@ class Plate:
             codes[changed] = np.clip(values, -limit, limit).astype(codes.dtype)
         return codes
 
-    def light_in_own_primaries(self, light: NDArray[Any]) -> NDArray[Any]:
+    def light_in_plate_primaries(self, light: NDArray[Any]) -> NDArray[Any]:
         """Return scene-linear Rec. 709 light in the primaries of a linear plate, in which its flare is written."""
         return self.space.from_linear(light) if self.space.is_linear and self.encoding == "linear" else light
 

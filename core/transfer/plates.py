@@ -59,7 +59,7 @@ class ColouredPlate:
         return apply_orientation(np.clip(values, 0, 1), self.orientation)
 
     @property
-    def has_own_alpha(self) -> bool:
+    def has_straight_alpha(self) -> bool:
         """Return whether the colours are not light: they have to be combined with an alpha first.
 
         An EXR's are, since it is premultiplied in linear light.
@@ -70,7 +70,7 @@ class ColouredPlate:
     def linear(self) -> Pixels:
         """Scene-linear Rec. 709 over black; what alpha hides is black."""
         alpha = self.alpha
-        if not self.has_own_alpha or alpha is None:
+        if not self.has_straight_alpha or alpha is None:
             return self.space.to_linear(self.values)
         return self.space.to_linear(self._straight_values(alpha)) * alpha[..., None]
 
@@ -131,7 +131,7 @@ def alpha_with_light(alpha: Pixels, lit: Pixels) -> Pixels:
     return np.asarray(np.maximum(alpha, np.clip(lit.max(-1), 0, 1)), np.float32)
 
 
-def shown_picture(path: Path, orientation: int = UPRIGHT) -> Picture:
+def upright_picture(path: Path, orientation: int = UPRIGHT) -> Picture:
     """Read a picture as viewers show it: upright, and black where its alpha hides it. Raises FrameError."""
     picture = read_picture(path)
     pixels = picture.pixels

@@ -32,7 +32,7 @@ from ..lights.detection import Detector
 from ..look import Look, PlacedLight
 from ..look.shot import Shot, ShotFrame
 from ..system.files import content_hash
-from .plates import shown_picture
+from .plates import upright_picture
 from .query import TrainingViews
 from .sources import assign_sources
 
@@ -162,7 +162,7 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
 def _detected(path: Path, detector: Detector | None, orientation: int) -> dict[str, tuple[float, float]]:
     if detector is None:
         return {}
-    detections = detector.detect(shown_picture(path, orientation))
+    detections = detector.detect(upright_picture(path, orientation))
     return {f"found{number}": (float(detection.xy[0]), float(detection.xy[1]))
             for number, detection in enumerate(detections, 1)}
 

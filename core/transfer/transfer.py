@@ -287,7 +287,7 @@ class _FrameRenderer:
         layers = replace(layers, window=frame.window)
         plate_matrix, matrix = plate.space.matrix, self._space.matrix
         if plate_matrix is not None and matrix is not None and np.allclose(plate_matrix, matrix, atol=1e-9)\
-                and not plate.has_own_alpha:
+                and not plate.has_straight_alpha:
             layers = replace(layers, scene=move_to_window(plate.values, stored, frame.window))
         if plate.alpha is None:
             return layers

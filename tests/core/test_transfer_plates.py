@@ -15,7 +15,7 @@ from core.images.exr import read_exr
 from core.images.formats.exif import apply_orientation, read_exif, undo_orientation
 from core.images.write import write_exr
 from core.look import Look, read
-from core.transfer.plates import shown_picture
+from core.transfer.plates import upright_picture
 from core.transfer.target import Target, picture_target
 from core.transfer.transfer import Transfer
 from tests.core.test_transfer import flare, look  # noqa: F401 - fixtures
@@ -81,7 +81,7 @@ def test_an_exr_keeps_its_alpha_and_gains_the_light(flare: Path, look: Look, tmp
 def test_hidden_colours_are_no_light(tmp_path: Path) -> None:
     for hidden in (0, 255):
         assert cv2.imwrite(str(tmp_path / f"{hidden}.png"), with_alpha(hidden))
-    first, second = (shown_picture(tmp_path / f"{hidden}.png").pixels for hidden in (0, 255))
+    first, second = (upright_picture(tmp_path / f"{hidden}.png").pixels for hidden in (0, 255))
     np.testing.assert_array_equal(first, second)
 
 

@@ -119,7 +119,7 @@ class Remover:
         alpha = plate.straight_alpha
         if alpha is not None:
             light = np.where(alpha[..., None] > 0, light, 0)
-        written = np.minimum(plate.light_in_own_primaries(light), MAX_FLOAT16)
+        written = np.minimum(plate.light_in_plate_primaries(light), MAX_FLOAT16)
         if alpha is not None:
             written = written * alpha[..., None]
         return plate.without_light(light), written.astype(np.float16)

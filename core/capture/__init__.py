@@ -7,10 +7,11 @@ with the first one. `solve/` makes captures; fit, bake, transfer and removal rea
 from __future__ import annotations
 
 from .camera import Camera
-from .capture import LIGHTS, REMOVED, Capture, Light, View, read_lights
+from .capture import LIGHTS, REMOVED, Capture, View
 from .colmap import PointCloud
 from .frame_files import PictureIndex
 from .lens import Lens
+from .lights import Light, LightKey, LightState, read_lights
 
-__all__ = ["LIGHTS", "REMOVED", "Camera", "Capture", "Lens", "Light", "PictureIndex", "PointCloud", "View",
-           "read_lights"]
+__all__ = ["LIGHTS", "REMOVED", "Camera", "Capture", "Lens", "Light", "LightKey", "LightState", "PictureIndex",
+           "PointCloud", "View", "read_lights"]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 
@@ -46,15 +47,25 @@ class CameraSolve:
     sentences: list[str] = field(default_factory=list)
 
 
-def read_solve(folder: Path) -> CameraSolve:
-    """Read a COLMAP model or a transforms.json, in natural order of the frames. Raises CaptureError where there is
-    none."""
+@overload
+def read_solve(folder: Path) -> CameraSolve: ...
+@overload
+def read_solve(folder: Path, *, required: bool) -> CameraSolve | None: ...
+
+
+def read_solve(folder: Path, *, required: bool = True) -> CameraSolve | None:
+    """Read a COLMAP model or a transforms.json, in natural order of the frames.
+
+    Raises CaptureError where there is none; returns None instead if it is not `required`.
+    """
     models = find_models(folder)
     if not models and transforms_files(folder):
         read = read_transforms(folder)
         solve = CameraSolve(read.frames, read.points, folder, read.masks, read.training, read.held_out, read.sentences)
     else:
         model, sentence = choose_model(models or find_models(folder, LATER_MODEL_PLACES), folder)
+        if model is None and not required:
+            return None
         if model is None:
             raise CaptureError(f"{folder} has no camera solve: neither sparse/0/cameras.bin (or .txt) nor "
                                f"{TRANSFORMS}; run solve first.")

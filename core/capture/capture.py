@@ -3,12 +3,13 @@
 
     images/           frames as filmed
     sparse/0/         COLMAP model, binary or text (or transforms.json); `layout` lists the other places
-    lights.json       {"lights": [{"name": "lamp", "xyz": [x, y, z]}]}; optional
+    lights.json       {"lights": [{"name": "lamp", "xyz": [x, y, z]}]}, or paths (`lights.py`); optional
     removed/          clean frames, same names; optional
     masks/            black where frames must not be learned from; optional
     split.json        {"test": ["0003.png", ...]}; optional
     truth/scene/, truth/flare/    exact layers where they are known; optional
 
+A shot whose cameras are not solved has no model (`unsolved.py`): one camera serves all its frames.
 Opening checks names, sizes and numbers by headers alone; pixels are decoded on demand. Distorted frames, and the
 pictures that belong to them, are undistorted to the pinhole camera of their view.
 """
@@ -19,7 +20,6 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,9 +40,11 @@ from .camera_solve import check_geometry, match_frames, read_solve
 from .colmap import PointCloud, PosedFrame
 from .frame_files import mask_pictures, matching_pictures
 from .lens import PINHOLES, Lens
+from .lights import Light, LightState, check_places, paths_of, read_lights
 from .orientation import SWAPS_SIDES, TurnedFrame, find_upright
 from .pictures import PictureCache
 from .plate_space import read_plate_space
+from .unsolved import cameras_without_solve
 
 LIGHTS, REMOVED, MASKS = "lights.json", "removed", "masks"
 """Names in a capture's folder: the file of its lights, and the folders of its clean frames and of its masks."""
@@ -68,14 +70,6 @@ class View:
     upright: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
-    """A light at `xyz` (3,) in world coordinates."""
-
-    name: str
-    xyz: Floats
-
-
 class Capture:
     """A capture, see the module's head. `Capture.open` makes one."""
 
@@ -86,6 +80,10 @@ class Capture:
         self.views = tuple(views)
         self.points = points
         self.lights = tuple(lights)
+        self.has_cameras = True
+        """False for frames without a camera solve, whose one camera stands at the origin."""
+        self.focal_source = "solved"
+        """Source of the focal length, a noun phrase."""
         self.cache_bytes = cache_bytes
         self.plate_space = read_plate_space(folder)
         self._frames = frames or {}
@@ -96,6 +94,8 @@ class Capture:
         self._truth_flare = matching_pictures(folder / "truth" / "flare", names)
         self._masks = mask_pictures(folder / MASKS, names)
         self._order = {name: number for number, name in enumerate(names)}
+        self._paths = paths_of(self.lights, names)
+        self._focal: float | None = None
         self._lists: tuple[set[str] | None, ...] = (None, None)
         self.sentences: tuple[str, ...] = ()
         """What the user should know of the capture before it is used."""
@@ -103,12 +103,14 @@ class Capture:
         """Names of frames that are not among the views, by reason."""
 
     @classmethod
-    def open(cls, folder: Path | str, *, need_frames: bool = True, cache_bytes: int = 1 << 30) -> Capture:
+    def open(cls, folder: Path | str, *, need_frames: bool = True, cache_bytes: int = 1 << 30,
+             need_cameras: bool = True, focal: float | None = None) -> Capture:
         """Read a capture and check all that can be checked without decoding a picture.
 
         With `need_frames` every frame must exist, at the model's size or a uniform scale of it; without, cameras,
         points and lights suffice, and views whose frames are missing have the model's size. At most `cache_bytes` of
-        decoded pictures are cached.
+        decoded pictures are cached. Without `need_cameras` a folder of frames without a camera solve is a shot; focal:
+        its focal length in pixels of the first frame, None for that of camera.json, of Exif data or a usual one.
 
         Raises CaptureError (model, lights, split) or FrameError (pictures), naming the file.
         """
@@ -118,7 +120,10 @@ class Capture:
                                "and name that.")
         if not folder.is_dir():
             raise CaptureError(f"{folder} is {'no folder' if folder.exists() else 'missing'}; name a capture's folder.")
-        solve = read_solve(folder)
+        solve, focal_source = read_solve(folder, required=need_cameras), "solved"
+        has_cameras = solve is not None
+        if solve is None:
+            solve, focal_source = cameras_without_solve(folder, focal)
         posed, root = solve.frames, solve.root
         names = [frame.name for frame in posed]
         if len(set(names)) < len(names):
@@ -126,7 +131,8 @@ class Capture:
             raise CaptureError(f"{folder}: the frame {duplicate} has two poses; remove one of them.")
         matched = match_frames(solve)
         turned = [turned_frame for frame in posed if (turned_frame := _to_turned(frame, matched.files.get(frame.name)))]
-        upright, sentences = find_upright(turned, solve.points)
+        upright, sentences = (find_upright(turned, solve.points) if has_cameras
+                              else ({frame.posed.name for frame in turned}, []))
         turned_by_name = {frame.posed.name: frame for frame in turned if frame.posed.name in upright}
         views, frames, order, names_of = [], {}, {}, {}
         for number, frame in enumerate(posed):
@@ -143,13 +149,16 @@ class Capture:
             frames[name], order[name], names_of[frame.name] = path, number, name
         capture = cls(folder, views, solve.points, read_lights(find_entry(folder, LIGHTS) or folder / LIGHTS),
                       frames=frames, cache_bytes=cache_bytes)
-        capture._order = order
+        capture._order, capture.has_cameras, capture.focal_source = order, has_cameras, focal_source
+        capture._focal = focal
+        check_places(capture.lights, capture.folder / LIGHTS, list(frames), has_cameras)
         capture._lists = tuple(None if each is None else {names_of[name] for name in each if name in names_of}
                                for each in (solve.training, solve.held_out))
         capture._masks.update({names_of[name]: path for name, path in solve.masks.items() if name in names_of})
         if need_frames:
             capture._check_layer_sizes()
-            capture.sentences = (*solve.sentences, *matched.sentences, *sentences, *check_geometry(solve))
+            capture.sentences = (*solve.sentences, *matched.sentences, *sentences, *check_geometry(solve),
+                                 *capture.light_sentences)
             capture.left_out = {reason: tuple(each) for reason, each in (
                 ("no pose", matched.unposed), ("a pose without a frame", matched.missing)) if each}
         if (folder / "split.json").exists():
@@ -158,7 +167,7 @@ class Capture:
 
     def reopen(self) -> Capture:
         """Open the capture's folder anew, with the same cache size. Raises what `open` raises."""
-        return Capture.open(self.folder, cache_bytes=self.cache_bytes)
+        return Capture.open(self.folder, cache_bytes=self.cache_bytes, need_cameras=self.has_cameras, focal=self._focal)
 
     def with_exposures(self, exposures: Mapping[str, float]) -> Capture:
         """Return a copy with the views' exposures, by name; 1 for views without."""
@@ -168,9 +177,15 @@ class Capture:
         return same
 
     def with_lights_at(self, places: Mapping[str, Floats]) -> Capture:
-        """Return a copy with the lights at these positions (3,), by name."""
+        """Return a copy with the lights at these positions (3,), by name; those on a path stay on it."""
+        return self.with_lights([light if light.moves else replace(light, xyz=places.get(light.name, light.xyz))
+                                 for light in self.lights])
+
+    def with_lights(self, lights: Sequence[Light]) -> Capture:
+        """Return a copy with other lights."""
         same = copy(self)
-        same.lights = tuple(replace(light, xyz=places.get(light.name, light.xyz)) for light in self.lights)
+        same.lights = tuple(lights)
+        same._paths = paths_of(same.lights, [view.name for view in same.views])
         return same
 
     def with_points(self, points: PointCloud, observed: Mapping[str, NDArray[np.int64]]) -> Capture:
@@ -192,6 +207,20 @@ class Capture:
             if not self.frame_path(view).is_file() and same_aspect(view.camera.size, size) else view
             for view in self.views)
         return same
+
+    # Lights.
+
+    def light_state(self, light: Light, view: View) -> LightState:
+        """Return place and brightness of a light of this capture in a view.
+
+        A light that is known on the picture alone lies at the depth of the capture's extent.
+        """
+        return self._paths[light.name].state(view.name, view.camera, self.extent)
+
+    @property
+    def light_sentences(self) -> list[str]:
+        """What the user should know of the lights' paths: frames that are interpolated or unknown."""
+        return [sentence for path in self._paths.values() for sentence in path.sentences()]
 
     # What was filmed.
 
@@ -408,37 +437,6 @@ class Capture:
                     if not same_aspect(size, view.camera.size):
                         raise FrameError(f"{paths[view.name]} is {size[0]} x {size[1]} pixels and the frame "
                                          f"{view.camera.width} x {view.camera.height}; make them one shape.")
-
-
-def read_lights(path: Path) -> tuple[Light, ...]:
-    """Read the lights of a lights.json, none where the file is absent. Raises CaptureError where it is invalid."""
-    if not path.exists():
-        return ()
-    data = read_json(path, CaptureError)
-    entries = data.get("lights") if isinstance(data, dict) else None
-    if not isinstance(entries, list):
-        raise CaptureError(f'{path} should read {{"lights": [{{"name": "lamp", "xyz": [x, y, z]}}, …]}}.')
-    lights: dict[str, Light] = {}
-    for number, entry in enumerate(entries):
-        name = entry.get("name") if isinstance(entry, dict) else None
-        if not isinstance(name, str) or not name.strip():
-            raise CaptureError(f"{path}, light {number}: the name is missing.")
-        if name in lights:
-            raise CaptureError(f"{path} has two lights with the name {name!r}; rename one.")
-        xyz = entry.get("xyz")
-        if not is_point(xyz):
-            raise CaptureError(f"{path}, {name!r}: xyz should be three finite numbers.")
-        lights[name] = Light(name, np.array(xyz, np.float64))
-    return tuple(lights.values())
-
-
-def is_point(xyz: Any) -> bool:
-    """True for three finite numbers, as in JSON."""
-    return isinstance(xyz, list) and len(xyz) == 3 and all(_is_finite(x) for x in xyz)
-
-
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e30
 
 
 def _checked_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:

@@ -110,12 +110,12 @@ class FitInputs:
 
     def __init__(self, capture: Capture, *, removed: bool, lights: bool) -> None:
         self._capture, self._removed = capture, removed
-        self._lights = [[light.name, light.xyz.tolist()] for light in capture.lights] if lights else None
+        self._lights = [light.numbers for light in capture.lights] if lights else None
         self._views: list[list[str]] | None = None
 
     def state(self) -> dict[str, Any]:
         """Return the entries for the checkpoint: "views", a list of [name, digest], and, if the fit has lights,
-        "lights", a list of [name, [x, y, z]].
+        "lights", a list of [name, [x, y, z]], with the paths of those that move.
 
         Lights are those of the capture, even where the fit has moved them.
         """

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from ..capture import LIGHTS, Capture, View
+from ..capture.lights import check_standing
 from ..errors import CaptureError
 from ..flare.deformation import QueryRange
 from ..flare.model import FlareModel, LightFlare, ViewOfLight
@@ -89,6 +90,7 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
         raise CaptureError(f"{capture.folder / LIGHTS} lists no light; add one by hand, or fit with --mode 3dgs."
                            if is_listed else
                            f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
+    check_standing(capture.lights, "this fit")
     generator = torch.Generator().manual_seed(settings.seed)
     positions = torch.tensor([list(map(float, light.xyz)) for light in capture.lights], dtype=torch.float64)
     if not settings.flare.detection:

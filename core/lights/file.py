@@ -20,7 +20,7 @@ import numpy as np
 
 from ..capture import read_lights
 from ..capture.camera import Camera
-from ..capture.capture import is_point
+from ..capture.lights import is_point
 from ..errors import CaptureError
 from ..system.files import follow_link, read_json, round_for_text, write_json
 from .found_light import FoundLight
@@ -38,7 +38,7 @@ def check_replaceable(path: Path) -> None:
     places = _read_earlier_places(data, path)
     by_hand = [str(entry["name"]) for number, entry in enumerate(data["lights"], 1) if not (
         "support" in entry and entry["name"] == f"light{number}"
-        and any(np.allclose(entry["xyz"], place, rtol=1e-3, atol=1e-5) for place in places))]
+        and "xyz" in entry and any(np.allclose(entry["xyz"], place, rtol=1e-3, atol=1e-5) for place in places))]
     if by_hand:
         raise CaptureError(f"{path} has lights that were added or changed by hand ({', '.join(by_hand)}); add --keep "
                            "to keep them, or remove the file to search for all lights again.")
@@ -58,7 +58,7 @@ def write_lights(path: Path, lights: Sequence[FoundLight], views: Sequence[tuple
         entries, found_before = list(data["lights"]), _read_earlier_places(data, path)
         for entry in entries:
             _check_writable(entry, path)
-    known = [*(entry["xyz"] for entry in entries), *found_before]
+    known = [*(entry["xyz"] for entry in entries if "xyz" in entry), *found_before]
     for light in lights:
         if any(_is_same_light(light.xyz, xyz, views) for xyz in known):
             continue

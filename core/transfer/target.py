@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import Camera, Capture, Light, View, read_lights
+from ..capture import Camera, Capture, View, read_lights
 from ..colour import ColourSpace
 from ..conventions.frame_numbers import NumberedFrame, layers_file, number_views, plates_by_number
 from ..errors import CaptureError, FrameError, SettingsError
@@ -199,7 +199,8 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
         raise CaptureError(f"{lights} is missing.")
     if not known:
         raise CaptureError(f"{capture.folder} has no lights; run lights on it, or name a lights.json with --lights.")
-    placed = _placed(known, look, requested)
+    lit = capture.with_lights(known)
+    sources = assign_sources([light.name for light in known], look.names, requested)
     views = {view.name: view for view in capture.views}
     frames = []
     for frame in number_views(views):
@@ -208,14 +209,12 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
         is_stored_as_seen = view.lens is None and not view.upright
         undistorted = None if is_stored_as_seen or path is None else _undistorted(capture, view)
         window = camera_window(view.camera, path) if undistorted is None and path is not None else None
+        states = [lit.light_state(light, view) for light in known]
+        placed = tuple(PlacedLight(state.name, sources[state.name], state.xyz, 1.0 if state.on is None else state.on)
+                       for state in states)
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)
         frames.append(TargetFrame(frame, shot, path, undistorted, window))
     return Target(_share_windows(frames), read_ply(scene) if scene else None, shown)
-
-
-def _placed(lights: Sequence[Light], look: Look, requested: SourceNames) -> tuple[PlacedLight, ...]:
-    sources = assign_sources([light.name for light in lights], look.names, requested)
-    return tuple(PlacedLight(light.name, sources[light.name], light.xyz) for light in lights)
 
 
 def _undistorted(capture: Capture, view: View) -> Callable[[bool], Picture]:

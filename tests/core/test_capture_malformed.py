@@ -102,6 +102,11 @@ def no_model(folder: Path) -> None:
 
 
 HUGE = struct.pack("<Q", 2**62)
+def lights(values: str) -> Damage:
+    """A lights.json with one light of these values."""
+    return put("lights.json", f'{{"lights": [{{"name": "a", {values}}}]}}')
+
+
 IMAGES, CAMERAS, POINTS = (f"sparse/0/{name}.txt" for name in ("images", "cameras", "points3D"))
 TWO_LIGHTS = '{"lights": [{"name": "a", "xyz": [0, 0, 0]}, {"name": "a", "xyz": [1, 0, 0]}]}'
 
@@ -177,6 +182,18 @@ COLMAP_CASES: dict[str, tuple[Damage, type[FitFlareError], str]] = {
                          "lights.json"),
     "light of words": (put("lights.json", '{"lights": [{"name": "a", "xyz": ["0", "0", "0"]}]}'), CaptureError,
                        "lights.json"),
+    "light with a place and a path": (lights('"xyz": [0, 0, 1], "frames": {"0.png": {"xyz": [0, 0, 1]}}'), CaptureError,
+                                      "one place and a path"),
+    "light in the world and on the picture": (
+        lights('"frames": {"0.png": {"xyz": [0, 0, 1]}, "1.png": {"xy": [1, 2]}}'), CaptureError, "one kind"),
+    "light path without frames": (lights('"frames": {}'), CaptureError, "frames should read"),
+    "light path without places": (lights('"frames": {"0.png": {"on": 1}}'), CaptureError, "no frame has a place"),
+    "light frame that says nothing": (lights('"xyz": [0, 0, 1], "frames": {"0.png": {"confidence": 1}}'), CaptureError,
+                                      "0.png"),
+    "light brighter than 1": (lights('"xyz": [0, 0, 1], "frames": {"0.png": {"on": 1.5}}'), CaptureError, "within 0"),
+    "light path of three numbers": (lights('"frames": {"0.png": {"xy": [1, 2, 3]}}'), CaptureError, "two finite"),
+    "light path of other frames": (lights('"frames": {"elsewhere.png": {"xy": [1, 2]}}'), CaptureError,
+                                   "none of its frames"),
     "light twice": (put("lights.json", TWO_LIGHTS), CaptureError, "lights.json"),
     "lights is a folder": (folder_instead("lights.json"), CaptureError, "lights.json"),
     "split of an unknown frame": (put("split.json", '{"test": ["0007.png"]}'), CaptureError, "split.json"),

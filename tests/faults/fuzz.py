@@ -109,7 +109,9 @@ def formats(base: Path) -> list[Format]:
 
     def with_lights(folder: Path) -> None:
         make_transforms(folder / "c")
-        write_json(folder / "lights.json", {"lights": [{"name": "lamp", "xyz": [1.0, 2.0, 3.0]}], "found": [[1, 2, 3]]})
+        write_json(folder / "lights.json", {"lights": [
+            {"name": "lamp", "xyz": [1.0, 2.0, 3.0]},
+            {"name": "torch", "frames": {"0000.png": {"xy": [1.0, 2.0], "on": 0.5}}}], "found": [[1, 2, 3]]})
         write_json(folder / "split.json", {"test": [Capture.open(folder / "c").views[1].name]})
 
     def binary_model(folder: Path) -> None:

@@ -72,7 +72,7 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
     check_no_overwrite([frame.source for frame in frames],
                        itertools.chain.from_iterable(frame.results for frame in frames))
     progress.stage("remove", len(views))
-    manifest, lights = Manifest(folder), [(light.name, light.xyz.tolist()) for light in capture.lights]
+    manifest, lights = Manifest(folder), [tuple(light.numbers) for light in capture.lights]
     dim = Counter[str]()
 
     def digest(frame: CleanFrame) -> str:
@@ -135,7 +135,8 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
     gains = _fit_flare_gains(plate, scene, flares)
     for light, light_flare in flares.items():
         flare[fitted_part] += np.float32(gains[light]) * light_flare[fitted_part]
-    light_discs = light_disc_mask(_display_values(plate), camera, [light.xyz for light in capture.lights])
+    light_discs = light_disc_mask(_display_values(plate), camera,
+                                  [capture.light_state(light, view).xyz for light in capture.lights])
     if above_white and plate.encoding == "linear":
         codes = subtract_fitted_flare(plate, flare, scene, light_discs)
     else:

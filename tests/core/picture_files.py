@@ -66,7 +66,7 @@ def luminance_and_chroma(path: Path, light: NDArray[np.float32]) -> None:
 
     height, width = light.shape[:2]
     luminance = light @ np.array([0.2126, 0.7152, 0.0722], np.float32)
-    red, blue = (((light[..., k] - luminance) / luminance).astype("<f2") for k in (0, 2))
+    red, blue = (((light[..., k] - luminance) / np.maximum(luminance, 1e-6)).astype("<f2") for k in (0, 2))
     channels = b"".join(name + b"\0" + struct.pack("<iIii", 1, 0, step, step)
                         for name, step in ((b"BY", 2), (b"RY", 2), (b"Y", 1)))
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)

@@ -42,12 +42,12 @@ def evaluate(renderer: ViewRenderer, capture: Capture, cameras: Mapping[View, Ca
 
     Scene and flare are scored against truth/ if the capture has it, else against removed/, else not at all. area: the
     area inside the frames' black borders; only that is scored. lpips is null without its weights. Raises FrameError for
-    pictures that cannot be read, and Cancelled.
+    pictures that cannot be read, and Cancelled. Pixels that a view's mask leaves out of the fit are not scored.
     """
     progress = progress or Progress()
     reference: Reference = "truth" if capture.has_truth else "removed" if capture.has_removed else "none"
     progress.stage("eval", len(cameras))
-    scored = []
+    scored, masked = [], dict[str, float]()
     for view, camera in cameras.items():
         rendering = renderer.render(camera)
         composite = sum(rendering.flare_by_light.values(), rendering.scene)
@@ -57,12 +57,16 @@ def evaluate(renderer: ViewRenderer, capture: Capture, cameras: Mapping[View, Ca
         known, exact = (None if picture is None else replace(picture, pixels=picture.pixels[part])
                         for picture in (clean(view, camera.size), flare(view, camera.size)))
         filmed = capture.frame(view, camera.size)
+        mask = capture.mask(view, camera.size)
+        counted = None if mask is None else mask[part]
         scored.append((view.name, score_view(
             composite[part], rendering.scene[part], replace(filmed, pixels=filmed.pixels[part]), known, exact,
-            unscored_mask(capture, view, camera.size)[part], lpips)))
+            unscored_mask(capture, view, camera.size)[part], lpips, counted)))
+        if counted is not None and not counted.all():
+            masked[view.name] = round(1 - float(counted.mean()), 4)
         progress.advance()
     size = next(iter(cameras.values())).size if cameras else (0, 0)
-    return summarise(reference, scored, size)
+    return {**summarise(reference, scored, size), **({"masked": masked} if masked else {})}
 
 
 def _no_picture(_view: View, _size: tuple[int, int]) -> None:
@@ -71,24 +75,26 @@ def _no_picture(_view: View, _size: tuple[int, int]) -> None:
 
 def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: Picture | None,
                flare_truth: Picture | None = None, unscored: NDArray[np.bool_] | None = None,
-               lpips: Perceptual | None = None) -> dict[str, Scores]:
+               lpips: Perceptual | None = None, counted: NDArray[np.bool_] | None = None) -> dict[str, Scores]:
     """Return the scores of one view by layer: psnr, ssim, lpips (null without weights), flip.
 
     composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size. unscored: (height,
     width), pixels in which the linear flare is not scored; by default the clipped ones. A flare also has `empty_psnr`,
-    the score of an empty flare.
+    the score of an empty flare. counted: (height, width), the pixels to score; the others equal the reference where a
+    score is of whole windows. None for all.
     """
     displayed, clean, filmed = _to_display(composite), _to_display(scene), frame.display()
-    scores = {"composite": _score_picture(displayed, filmed, lpips)}
+    scores = {"composite": _score_picture(displayed, filmed, lpips, counted)}
     if scene_reference is not None:
         reference = scene_reference.display()
         flare, flare_reference = displayed_flare(composite, scene), np.abs(filmed - reference)
-        scores["scene"] = _score_picture(clean, reference, lpips)
-        scores["flare"] = {**_score_picture(flare, flare_reference, lpips),
-                           "empty_psnr": psnr(np.zeros_like(flare), flare_reference)}
+        scores["scene"] = _score_picture(clean, reference, lpips, counted)
+        scores["flare"] = {**_score_picture(flare, flare_reference, lpips, counted),
+                           "empty_psnr": psnr(np.zeros_like(flare), flare_reference, counted)}
     if flare_truth is not None:
         truth, layer = flare_truth.linear(), composite - scene
         mask = ~(clipped_mask(frame) if unscored is None else unscored)
+        mask = mask if counted is None else mask & counted
         scores["flare_linear"] = {
             "psnr": psnr(layer, truth, mask), "relative_l2": relative_l2(layer, truth, mask),
             "empty_psnr": psnr(np.zeros_like(layer), truth, mask)}
@@ -111,7 +117,7 @@ def unscored_mask(capture: Capture, view: View, size: tuple[int, int] | None = N
 
 def clipped_mask(frame: Picture, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
     """Return (height, width), the pixels of a frame's brightest code, which hides how bright they were; none in a
-    linear     frame.
+    linear frame.
 
     size: (width, height) of the result, where the frame is larger: pixels with a clipped one among theirs.
     """
@@ -141,9 +147,11 @@ def _to_display(linear: Array) -> Array:
     return np.clip(srgb_from_linear(linear), 0, 1)
 
 
-def _score_picture(image: Array, target: Array, lpips: Perceptual | None) -> Scores:
-    return {"psnr": psnr(image, target), "ssim": ssim(image, target),
-            "lpips": lpips(image, target) if lpips else None, "flip": flip(image, target)}
+def _score_picture(image: Array, target: Array, lpips: Perceptual | None, counted: NDArray[np.bool_] | None) -> Scores:
+    if counted is not None:
+        image = np.where(counted[..., None], image, target)
+    return {"psnr": psnr(image, target, counted), "ssim": ssim(image, target, mask=counted),
+            "lpips": lpips(image, target) if lpips else None, "flip": flip(image, target, counted)}
 
 
 def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]]],
@@ -204,6 +212,9 @@ def format_table(scores: dict[str, Any]) -> str:
         where = f"{worst[layer]['psnr']:.2f} in {worst['name']}" if worst else "-"
         lines.append(f"{layer:13}{''.join(f'{text:>8}' for text in cells)}"
                      f"{format_cell(part.get('relative_l2'), 3):>9}  {where}")
+    if masked := scores.get("masked"):
+        share = sum(masked.values()) / len(masked)
+        lines.append(f"Masks leave {share:.0%} of the pixels of {len(masked)} views out; these are not scored.")
     for layer in LAYERS:
         without = sum(_has_no_flare(view[layer]) for view in scores["views"] if layer in view)
         if without:

@@ -58,12 +58,12 @@ def _check_same_size(image: Array, target: Array) -> None:
                             f"resize one of them.")
 
 
-def ssim(image: Array, target: Array, borders: Borders = "valid") -> float:
+def ssim(image: Array, target: Array, borders: Borders = "valid", mask: Array | None = None) -> float:
     """Return the structural similarity, Wang et al. 2004, eq. 13: 11x11 Gaussian window of sigma 1.5, K = 0.01, 0.03.
 
     borders: "valid" counts only windows inside the picture, as the authors' program does; "same" pads with zeros and
-    counts every pixel, as the 3DGS losses and tables do (slightly higher). The mean is over pixels and channels. Raises
-    SettingsError for a picture smaller than the window.
+    counts every pixel, as the 3DGS losses and tables do (slightly higher). The mean is over pixels and channels; mask:
+    as in `psnr`, for the middle of the window. Raises SettingsError for a picture smaller than the window.
     """
     _check_same_size(image, target)
     if borders == "valid" and min(image.shape[:2]) < WINDOW:
@@ -77,7 +77,10 @@ def ssim(image: Array, target: Array, borders: Borders = "valid") -> float:
     covariance = _blur(x * y, borders) - mean_x * mean_y
     similarity = ((2 * mean_x * mean_y + c1) * (2 * covariance + c2)
                   / ((mean_x ** 2 + mean_y ** 2 + c1) * (variance_x + variance_y + c2)))
-    return float(similarity.mean())
+    if mask is not None:
+        margin = (image.shape[0] - similarity.shape[0]) // 2
+        similarity = similarity[mask[margin:mask.shape[0] - margin, margin:mask.shape[1] - margin]]
+    return float(similarity.mean()) if similarity.size else math.nan
 
 
 def _blur(picture: NDArray[np.float64], borders: Borders) -> NDArray[np.float64]:
@@ -100,11 +103,11 @@ def has_flip() -> bool:
     return importlib.util.find_spec("flip_evaluator") is not None
 
 
-def flip(image: Array, target: Array) -> float | None:
+def flip(image: Array, target: Array, mask: Array | None = None) -> float | None:
     """Return the mean LDR-FLIP (Andersson et al. 2020), 0 for equal pictures, up to 1, at the default 67 pixels a
     degree.
 
-    None if `flip-evaluator` is not installed.
+    mask: as in `psnr`. None if `flip-evaluator` is not installed.
     """
     _check_same_size(image, target)
     if not has_flip():
@@ -112,5 +115,8 @@ def flip(image: Array, target: Array) -> float | None:
     import flip_evaluator
 
     pictures = (np.ascontiguousarray(np.clip(picture, 0, 1), np.float32) for picture in (target, image))
-    _, mean, _ = flip_evaluator.evaluate(*pictures, "LDR", applyMagma=False)
-    return float(mean)
+    errors, mean, _ = flip_evaluator.evaluate(*pictures, "LDR", applyMagma=False)
+    if mask is None:
+        return float(mean)
+    counted = np.asarray(errors).reshape(*image.shape[:2], -1)[mask]
+    return float(counted.mean()) if counted.size else math.nan

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from core.colour.srgb import srgb_from_linear
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.errors import SettingsError
 from core.images.picture import Picture
 from core.metrics.evaluation import (
@@ -172,6 +172,28 @@ def test_clipped_pixels_do_not_count_against_the_linear_flare() -> None:
     assert not clipped_mask(Picture(scene + truth, "linear")).any()
     scores = score_view(scene + flare, scene, frame, Picture(srgb_from_linear(scene), "srgb"), Picture(truth, "linear"))
     assert scores["flare_linear"]["relative_l2"] == pytest.approx(0, abs=1e-6)
+
+
+def test_what_a_mask_leaves_out_of_the_fit_is_not_scored(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    image, target = (part.astype(np.float32) for part in pair)
+    counted = np.ones(image.shape[:2], bool)
+    counted[10:30, 10:30] = False
+    passer_by = target.copy()
+    passer_by[~counted] = 1 - passer_by[~counted]
+    light = linear_from_srgb(image)
+    scores = [score_view(light, light, Picture(frame, "srgb"), Picture(frame, "srgb"), counted=mask)
+              for frame, mask in ((target, counted), (passer_by, counted), (passer_by, None))]
+    for layer in ("composite", "scene"):
+        assert scores[0][layer] == pytest.approx(scores[1][layer], rel=1e-6)
+        assert scores[2][layer]["psnr"] < scores[1][layer]["psnr"] - 3
+        assert scores[2][layer]["ssim"] < scores[1][layer]["ssim"]
+    none = np.zeros_like(counted)
+    assert math.isnan(score_view(light, light, Picture(target, "srgb"), None, counted=none)["composite"]["psnr"])
+
+
+def test_the_table_says_how_much_masks_leave_out() -> None:
+    scores = {**summarise("none", [], (50, 40)), "masked": {"a": 0.5, "b": 0.25}}
+    assert "Masks leave 38% of the pixels of 2 views out" in format_table(scores)
 
 
 def test_exact_layers_reveal_clipping_hidden_by_noise() -> None:

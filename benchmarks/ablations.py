@@ -271,7 +271,7 @@ def _scores(renderer: Run | _SceneAlone, folder: Path, settings: FitSettings, pr
     held_out = capture.split(settings.holdout)[1]
     frames = Frames(capture, settings.width)
     evaluated = evaluate(renderer, capture, {view: frames.camera(view) for view in held_out}, progress,
-                     frames.picture_area)
+                         frames.picture_area)
     scores: dict[str, Any] = {layer: part for layer, part in evaluated.items() if isinstance(part, dict)}
     if settings.mode == "3dgs":  # what it calls a flare is nothing at all
         scores = {layer: part for layer, part in scores.items() if not layer.startswith("flare")}

@@ -290,8 +290,8 @@ def _draw_features(remover: Remover, seed: int, count: int, backgrounds: Any, le
     for number in range(count):
         bare, kind = number % 3 > 0, FLARE_CLASSES[number // 3 % len(FLARE_CLASSES)]
         pair = make_pair(np.random.default_rng((seed, number)), SingleFlareBank((seed, number), 160, lenses, kind),
-                        backgrounds, *SIZE, clean_share=float(bare), lifted_black_share=0.25, shoulder_share=0.3,
-                        against_light_share=0.35)
+                         backgrounds, *SIZE, clean_share=float(bare), lifted_black_share=0.25, shoulder_share=0.3,
+                         against_light_share=0.35)
         prediction = remover.predict_with_tta(pair.frame)
         if prediction.features is None:
             continue
@@ -365,7 +365,7 @@ def _gain(remover: Remover, seed: tuple[int, ...], bank: Any, backgrounds: Any,
     from core.removal.training.pairs import make_pair
 
     pair = make_pair(np.random.default_rng(seed), bank, backgrounds, *SIZE, clean_share=0,
-                    against_light_share=against_light_share)
+                     against_light_share=against_light_share)
     return psnr(remover.clean_display(pair.frame), pair.scene) - psnr(pair.frame, pair.scene)
 
 

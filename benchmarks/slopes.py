@@ -75,7 +75,7 @@ def plates(folder: Path, count: int, progress: Progress) -> None:
 def frames(folder: Path, count: int, progress: Progress) -> None:
     """Bake `count` frames of a shot."""
     save_flare(folder / "look.flare", FlareFile(some_flare(count=6), "over", TrainedCamera(64, 40, 70.0, 70.0, 33.0,
-                                                                                         19.5)))
+                                                                                           19.5)))
     shot = Shot(folder / "look.flare", tuple(ShotFrame(number, "Camera", camera, (), ())
                                              for number, camera in enumerate(cameras(count), 1)))
     bake_shot(shot, folder / "layers", progress=progress)

@@ -255,7 +255,7 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
         with open(folder / EVENTS, "wb") as events, open(folder / LOG, "ab") as log:
             log_offset = log.tell()
             process = _launch(command, stdin=subprocess.DEVNULL, stdout=events, stderr=log,
-                                env={**(os.environ if environment is None else environment),
+                              env={**(os.environ if environment is None else environment),
                                      STOP_FILE: str((folder / STOP).absolute())}, **group)
         _lower_priority(process.pid)
         try:

@@ -53,7 +53,7 @@ def _instances_of(depsgraph: Any, parents: set[str]) -> set[tuple[str, Any]]:
 
 
 def disc_visibility(scene: Any, depsgraph: Any, eye: Any, light: Any, ignored: set[str], disc_radius: float = 0.0,
-               instances: Collection[tuple[str, Any]] = ()) -> float:
+                    instances: Collection[tuple[str, Any]] = ()) -> float:
     """Return the part of a disc about the point `light` that is visible from `eye`, 0..1.
 
     ignored, instances: objects by name, and instances by name and matrix_world, that hide nothing. disc_radius: radius

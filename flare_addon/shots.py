@@ -40,7 +40,7 @@ def frames_to_bake(scene: Any) -> list[int]:
 
 
 def scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int], flare: Path, run: Path | None,
-             done: Callable[[int], None] = lambda _frame: None) -> Shot:
+               done: Callable[[int], None] = lambda _frame: None) -> Shot:
     """Return the shot of these camera objects at these frames; the scene's current frame is restored.
 
     Without camera objects it is the scene's camera, which markers on the timeline may change, under the name of the

@@ -81,12 +81,12 @@ def build_parser() -> argparse.ArgumentParser:
                               "package of this Python, `blender` on the PATH, the system's usual places)")
     options.add_argument("--step", help=argparse.SUPPRESS)
     parser_ = _Parser(prog="run.py", description=_DESCRIPTION, epilog=f"{_resume_summary()}\n{_EPILOGUE}",
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
+                      formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser_.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command in COMMANDS.values():
         subparser = commands.add_parser(command.name, parents=[shared], help=command.summary,
-                                  description=f"{command.summary}\n\n{command.description}",
-                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+                                        description=f"{command.summary}\n\n{command.description}",
+                                        formatter_class=argparse.RawDescriptionHelpFormatter)
         command.arguments(subparser)
     return parser_
 

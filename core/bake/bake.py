@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bakes a run from its views, one EXR a frame, into a folder whose bake resumes after any stop.
+"""Bakes a run from its views, one EXR per frame, into a folder whose bake resumes after any stop.
 
 A frame is rendered unless its file exists and its header names the same settings, so any number of processes may share
 a folder. `bake.json`, the manifest, lists the whole files; it is written after each frame. The commands and
@@ -207,7 +207,7 @@ def _cache_key(fingerprint: str, settings: BakeSettings, keyed: KeyedEdits) -> d
 
 
 def frames_to_delete(out: Path | str, fingerprint: Callable[[], str], lights: Iterable[str],
-             files: Collection[str]) -> list[int]:
+                     files: Collection[str]) -> list[int]:
     """Return the numbers of the frames that a bake of `files` with default settings and `overwrite` would delete from
     `out`.
 
@@ -272,7 +272,7 @@ def _check_is_current(out: Path, cache_key: dict[str, Any], names: dict[str, str
 
 
 def _add_to_manifest(out: Path, cache_key: dict[str, Any], names: dict[str, str],
-                   entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
+                     entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Add entries to bake.json beside those of other writers.
 
     Raises RunError if it lists frames that were made with other settings since this bake started.

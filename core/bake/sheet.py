@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A contact sheet of baked layers: frame | composite | scene | flare, one row a view, in display values."""
+"""A contact sheet of baked layers: frame | composite | scene | flare, one row per view, in display values."""
 from __future__ import annotations
 
 from collections.abc import Iterable

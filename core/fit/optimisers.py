@@ -34,16 +34,16 @@ class Optimisers:
             "opacity_logits": rates.opacity, "sh": features.expand(COEFFICIENTS, 3).contiguous(),
         }
         self.scene = Adam(dict(scene.named_parameters()), rate_by_name)
-        self._of_flare = None if flare is None else FlareOptimisers(flare, settings.flare.rates)
-        self.flare = None if self._of_flare is None else self._of_flare.dense
-        self.grids = None if self._of_flare is None else self._of_flare.grids
+        self._flare_optimisers = None if flare is None else FlareOptimisers(flare, settings.flare.rates)
+        self.flare = None if self._flare_optimisers is None else self._flare_optimisers.dense
+        self.grids = None if self._flare_optimisers is None else self._flare_optimisers.grids
 
     def set_rates(self, iteration: int) -> None:
         """Set the learning rates of an iteration, from 1."""
         progress = iteration / self._settings.iterations
         self.scene.rates["means"] = self._means_rate(progress)
-        if self._of_flare is not None:
-            self._of_flare.set_rates(progress)
+        if self._flare_optimisers is not None:
+            self._flare_optimisers.set_rates(progress)
 
     def _means_rate(self, progress: float) -> float:
         rates = self._settings.scene.rates

@@ -33,7 +33,7 @@ def scene_only_iterations(settings: SplitSettings, views: int, iterations: int) 
 
 
 def scene_loss(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
-                       settings: SplitSettings, progress: float) -> Tensor:
+               settings: SplitSettings, progress: float) -> Tensor:
     """Return the loss of a scene (height, width, 3), display values, beside that of the composite.
 
     lights: (n, 3), world. discs: (height, width), the lights' clipped pixels, or None. progress: of the fit, 0..1; as
@@ -59,7 +59,7 @@ def estimate_loss(scene: Tensor, estimate: Tensor, ssim_share: float, progress: 
 
 
 def far_flare_penalty(added: Tensor, estimated_flare: Tensor | None, ratio: float, camera: Camera, lights: ArrayLike,
-         settings: SplitSettings) -> Tensor:
+                      settings: SplitSettings) -> Tensor:
     """Return the penalty on the light that a flare adds, (height, width, 3) display values, far from the lights (n, 3),
     world.
 

@@ -62,7 +62,7 @@ def render_flare(flare: FlareModel | None, blend: Blend, camera: Camera, kernels
 
 
 def _visibilities(flare: FlareModel, pose: Tensor, scene: SceneGaussians | None, visibility: VisibilitySettings | None,
-            kernels: Kernels) -> dict[str, Tensor] | None:
+                  kernels: Kernels) -> dict[str, Tensor] | None:
     if scene is None or visibility is None:
         return None
     return light_visibilities(scene, flare, pose, visibility, kernels)
@@ -101,7 +101,7 @@ def render_scene(scene: SceneGaussians, camera: Camera, kernels: Kernels = "auto
 
 
 def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels, sh_degree: int | None,
-             depth: bool) -> Rendering:
+                         depth: bool) -> Rendering:
     """Render at the camera's size. Where that is coarser than the fitted frames, pixels are means, in linear light, of
     a larger picture."""
     samples = 1 if scene.pixel_grid is None else scene.pixel_grid.supersampling(camera.focal_length, *camera.size)
@@ -116,7 +116,7 @@ def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels
 
     alpha = mean(large.alpha)
     rendering = replace(large, colour=encode(mean(decode(large.colour.clamp_min(0)))), alpha=alpha,
-                    centres=large.centres / samples, radii=large.radii / samples)
+                        centres=large.centres / samples, radii=large.radii / samples)
     if not depth:
         return rendering
     middle = slice(samples // 2, None, samples)
@@ -125,7 +125,7 @@ def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels
 
 
 def _evaluate_edited(look: Look, edits: LookEdits, camera: Camera,
-            visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
+                     visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
     """Return each light's Gaussians under an artist's edits."""
     visible = {name: float(share) for name, share in (visibilities or {}).items()}
     gaussians_by_light = look.evaluate(camera.world_to_camera, edits=edits, visibilities=visible)

@@ -148,7 +148,7 @@ def _finish(trainer: Trainer, run: Run) -> None:
         training_views = trainer.flare.training_views(poses)
         with atomic_path(run.folder / FLARE) as unnamed:
             flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, training_views=training_views,
-                                                pixel_grid=pixel_grid))
+                                               pixel_grid=pixel_grid))
             store_elements(unnamed)
     with contextlib.suppress(OSError):  # a checkpoint that stays does no harm
         remove_file(run.folder / CHECKPOINT)

@@ -48,7 +48,7 @@ LIGHT = "light"
 CAMERA_RANGE = 1e6
 """Half the side of the model's camera range, world units: all cameras fall on one point of its grid."""
 PATH_LENGTH = 12
-"""Places of the path on which the error is measured."""
+"""Number of places on the path along which the error is measured."""
 PATH_ENDS = (-0.85, 0.7), (0.9, -0.5)
 """Ends of that path, relative to the frame's half width and height."""
 PROBES = (0.15, 0.12), (-0.4, 0.3), (0.6, -0.5), (0.85, 0.8), (-0.1, -0.8), (-0.95, 0.0)
@@ -56,11 +56,11 @@ PROBES = (0.15, 0.12), (-0.4, 0.3), (0.6, -0.5), (0.85, 0.8), (-0.1, -0.8), (-0.
 PLACE_STEPS = 0.7548776662, 0.5698402910
 """Steps of the R2 sequence (Roberts 2018): 1 / g and 1 / g^2, g the plastic number."""
 SHARE_AT_LIGHT = 0.4
-"""Share of the first Gaussians that lie about the light."""
+"""Share of the initial Gaussians that lie about the light, as rays."""
 RAY_LENGTHS = 0.004, 0.9
-"""Distances of these from the light, relative to half the frame's width."""
+"""Smallest and largest distance of the rays from the light, relative to half the frame's width."""
 CORE_GAUSSIANS, CORE_SIZES, CORE_OPACITY = 24, (0.3, 4.0), 0.2
-"""Number, range of standard deviations (pixels) and opacity of the first Gaussians in the light itself."""
+"""Number, range of standard deviations (pixels) and opacity of the initial Gaussians in the light itself."""
 SQUARED_WEIGHT = 0.3
 """Weight of the relative error in linear light against that of the encoded light: highlights against faint ghosts."""
 ENCODING_OFFSET = 1e-3
@@ -77,7 +77,8 @@ class TracedPictures(NamedTuple):
 
 @dataclass(frozen=True)
 class TracedResult:
-    """A made flare. error: relative L2 in linear light, mean over the path; worst: its largest. count: Gaussians."""
+    """The result of `make_flare`. error, worst: mean and largest relative L2 error along the path, linear light. count:
+    number of Gaussians."""
 
     path: Path
     error: float

@@ -55,7 +55,8 @@ class GlassSettings:
 @dataclass(frozen=True)
 class TracedGhosts:
     """The ghosts. level: their root mean square over the frame and over several places of the light, relative to white.
-    count: the brightest so many. dispersion: False for one colour of glass. rim: how much brighter the edge is."""
+    count: number of ghosts, the brightest first. dispersion: True if the glass splits colours. rim: how much brighter a
+    ghost's edge is than its inside."""
 
     level: float = 0.02
     count: int = 18
@@ -65,8 +66,9 @@ class TracedGhosts:
 
 @dataclass(frozen=True)
 class TracingSettings:
-    """The pictures that the flare is fitted to. width: pixels. positions: places of the light. field: how far these go
-    beyond the frame, relative to it. bands: wavelengths. supersample: pixels traced for one."""
+    """The pictures that the flare is fitted to. width: pixels. positions: number of places of the light. field: how far
+    these extend, relative to the frame. bands: number of wavelengths. supersample: samples along each side of a
+    pixel."""
 
     width: int = 240
     positions: int = 64
@@ -77,7 +79,7 @@ class TracingSettings:
 
 @dataclass(frozen=True)
 class TracedFit:
-    """The fit. gaussians, max_gaussians: number at first and at the end."""
+    """The fit. gaussians: initial number. max_gaussians: largest number."""
 
     iterations: int = 1500
     gaussians: int = 800

@@ -118,7 +118,7 @@ class Trainer:
         self._test_scene_converged()
         scene_only = self._is_scene_only(targets)
         flare = None if scene_only else render_flare(self.flare, settings.blend, targets.camera, settings.kernels,
-                                                scene=self.scene, visibility=settings.flare.active_visibility)
+                                                     scene=self.scene, visibility=settings.flare.active_visibility)
         light_discs = self._light_disc_mask(targets)
         picture = composite(self._flare_background(targets, scene_picture, light_discs), flare, settings.blend,
                             self.frames.display_white)

@@ -2,8 +2,8 @@
 """Input encodings of the deformation network (paper, appendix "Flare representation").
 
 Light and camera are the same for all Gaussians of a view, so each hash grid is evaluated at one point per view: 8
-corners on each level. Gradients therefore touch 8 rows a level (of the paper's 16 levels 128, of millions); the tables
-give sparse gradients, for an optimiser that updates those rows only.
+corners on each level. Gradients therefore touch 8 rows per level (of the paper's 16 levels 128, of millions); the
+tables give sparse gradients, for an optimiser that updates those rows only.
 """
 from __future__ import annotations
 

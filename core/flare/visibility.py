@@ -43,7 +43,7 @@ class VisibilitySettings:
 
 
 def light_visibilities(scene: SceneGaussians, model: FlareModel, world_to_camera: Tensor, settings: VisibilitySettings,
-                   kernels: Kernels = "auto") -> dict[str, Tensor]:
+                       kernels: Kernels = "auto") -> dict[str, Tensor]:
     """Return the visibility of each light from a pose (4, 4), by the light's name, relative to `FlareModel.clear`."""
     pose = world_to_camera.double()
     camera = -pose[:3, :3].T @ pose[:3, 3]
@@ -58,7 +58,7 @@ def relative_to_clear(visibility: Tensor, clear: Tensor | float) -> Tensor:
 
 @torch.no_grad()
 def visibility_from(scene: SceneGaussians, camera: NDArray[np.float64], light: NDArray[np.float64],
-               settings: VisibilitySettings, clear: float = 1.0) -> float:
+                    settings: VisibilitySettings, clear: float = 1.0) -> float:
     """Return the visibility, 0..1, of a light at `light` (3,) from a camera at `camera` (3,), world units, relative to
     `clear`.
 
@@ -70,7 +70,7 @@ def visibility_from(scene: SceneGaussians, camera: NDArray[np.float64], light: N
 
 @torch.no_grad()
 def clear_visibilities(scene: SceneGaussians, model: FlareModel, poses: Sequence[Tensor], settings: VisibilitySettings,
-                 kernels: Kernels = "auto") -> Tensor:
+                       kernels: Kernels = "auto") -> Tensor:
     """Return (lights,), the visibility of each light where nothing hides it: that in the clearest tenth of these poses
     (4,     4).
 
@@ -87,7 +87,7 @@ def clear_visibilities(scene: SceneGaussians, model: FlareModel, poses: Sequence
 
 
 def occlusion_loss(scene: SceneGaussians, camera: Tensor, lights: Sequence[Tensor], settings: VisibilitySettings,
-               kernels: Kernels = "auto") -> Tensor | None:
+                   kernels: Kernels = "auto") -> Tensor | None:
     """Return the loss of a scene that hides lights (3,), which the frame of the camera at `camera` (3,) shows.
 
     It makes Gaussians in front of the lights more transparent, such as a sky at a wrong distance. It uses the logarithm
@@ -99,7 +99,7 @@ def occlusion_loss(scene: SceneGaussians, camera: Tensor, lights: Sequence[Tenso
 
 
 def light_visibility(scene: SceneGaussians, camera: Tensor, light: Tensor, settings: VisibilitySettings | None = None,
-                  kernels: Kernels = "auto") -> Tensor:
+                     kernels: Kernels = "auto") -> Tensor:
     """Return the visibility (scalar, 0..1) of a light at `light` (3,) from a camera at `camera` (3,); world units."""
     settings = settings or VisibilitySettings()
     direction = (light - camera).float()

@@ -167,10 +167,10 @@ class Adam:
 
 
 def replace_rows(parameter: Parameter, rows: Tensor) -> None:
-    """Gives a parameter other rows, of any number; its gradient is forgotten.
+    """Replace the rows of a parameter, by any number of them; clears its gradient.
 
-    As long as an old graph is alive, autograd remembers the shape that the parameter had, and lets go of
-    it only at a change of type: hence the step in between.
+    While an old graph is alive, autograd requires the shape that the parameter had. A change of type lifts that
+    requirement: hence the empty tensor in between.
     """
     parameter.data = torch.empty(0, dtype=torch.float16, device=rows.device)
     parameter.data = rows

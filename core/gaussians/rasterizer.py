@@ -74,7 +74,7 @@ def splat(
     *, rings: Tensor | None = None, arcs: Tensor | None = None,
     blend: Blend = "over", resolution: Resolution = "full", kernels: Kernels = "auto",
 ) -> Splats:  # fmt: skip
-    """Lays n 2D Gaussians on a picture: the flare's way in; `reference.py` has the definition.
+    """Rasterizes n 2D Gaussians, such as those of a flare; `reference.py` has the definition.
 
     centres      (n, 2) px, pixel centres at + 1/2
     covariances  (n, 3) xx, xy, yy, px²; taken as they are, without dilation; those that are not positive

@@ -217,7 +217,7 @@ def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
             raise _damaged(path, problem)
         pixels = np.asarray(pixels).reshape(spec.height, spec.width, channels)
         if kind == "tiff" and pixels.dtype == np.uint16 and spec.get_int_attribute("tiff:PhotometricInterpretation",
-                                                                                 1) == 0:
+                                                                                   1) == 0:
             pixels = 65535 - pixels  # 0 is white, which OpenImageIO converts in 8 bits only
         return _bgr(pixels)
     finally:

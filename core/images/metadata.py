@@ -26,6 +26,10 @@ _STRUCTURE_TAGS = frozenset({
     531, 532})
 """TIFF tags that say how the pixels are stored, which the encoder writes anew; and offsets of other directories."""
 EXIF_DIRECTORY, GPS_DIRECTORY = 34665, 34853
+_COLOUR_TYPE_OFFSET, _HEADER_END = 25, 33
+"""Offsets in a PNG of the colour type, whose bit 2 means colour, and of the end of the first chunk, IHDR."""
+_SRGB_POINTS, _UNSPECIFIED = (1, 13), 2
+"""Code points (ITU-T H.273): primaries and transfer of sRGB, and that for an unspecified one."""
 _MARKERS = frozenset({jpeg.APP1, jpeg.APP2, 0xED, jpeg.COMMENT, *range(0xE3, 0xED), 0xEF})
 """JPEG segments that are kept; APP14 says how the encoder stores its colours, and APP0 is replaced as a whole."""
 _INDEX, _ISO_GAIN_MAP = b"MPF\0", b"urn:iso:std:iso:ts:21496:-1"
@@ -54,14 +58,19 @@ def copy_metadata(encoded: bytes, source: Path, *, has_alpha: bool) -> bytes:
 
 
 def with_colour_chunks(encoded: bytes, profile: bytes, code_points: tuple[int, int] | None) -> bytes:
-    """Return a PNG with an ICC profile or, without one, code points, of a picture of another format."""
-    if profile and (encoded[25] & 2 > 0) == (profile[16:20] == b"RGB "):
+    """Return an encoded PNG with the colour space of the picture of another format that it was made from.
+
+    profile: its ICC profile, written if it is for the PNG's number of channels; else code_points: its primaries and
+    transfer (ITU-T H.273), written unless they are sRGB or unspecified.
+    """
+    is_colour = encoded[_COLOUR_TYPE_OFFSET] & 2 > 0
+    if profile and is_colour == (profile[16:20] == b"RGB "):
         chunk = png.make_chunk(b"iCCP", b"profile\0\0" + zlib.compress(profile))
-    elif code_points and code_points != (1, 13) and 2 not in code_points:
+    elif code_points and code_points != _SRGB_POINTS and _UNSPECIFIED not in code_points:
         chunk = png.make_chunk(b"cICP", bytes((*code_points, 0, 1)))
     else:
         return encoded
-    return encoded[:33] + chunk + encoded[33:]
+    return encoded[:_HEADER_END] + chunk + encoded[_HEADER_END:]
 
 
 def dropped_parts(path: Path) -> str:
@@ -135,7 +144,7 @@ def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
 
 
 class _AllBut:
-    """A container of all numbers but some."""
+    """A container that holds every number except the excluded ones, for `tiff.read_tags`."""
 
     def __init__(self, excluded: frozenset[int] | set[int]) -> None:
         self._excluded = excluded

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tells whether a picture says that it is a panorama of the whole circle, whose right edge continues at its left one.
+"""Detects panoramas of the whole circle, whose right edge continues at the left one, by the metadata of the picture.
 
 Photographs say so in XMP (Google's Photo Sphere metadata, GPano), EXRs in the attribute envmap. `removal` wraps such
 pictures.

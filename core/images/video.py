@@ -192,7 +192,7 @@ class Video:
         self.aspect = 1 / aspect if self.orientation.transposed else aspect
         self.has_alpha = _has_alpha(first)
         self.rate = Fraction(self.stream.average_rate or self.stream.guessed_rate or 25)
-        """Frames a second, on average."""
+        """Frames per second, on average."""
         self.estimated_length = self.length or self._length_by_duration()
         """About how many frames there are, for progress; 0 where even the duration is unknown."""
 

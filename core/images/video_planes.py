@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 _PLANAR = re.compile(r"(?P<kind>yuvj|yuva|yuv|gbra|gbr|gray)(?P<sampling>4[0-4]{2})?p?(?P<bits>9|1[0246])?(le)?")
-"""Names of the formats with one component to a plane, in the byte order of the machine."""
+"""Names of the formats with one component per plane, in the byte order of the machine."""
 _SAMPLING = {None: (1, 1), "444": (1, 1), "440": (1, 2), "422": (2, 1), "420": (2, 2), "411": (4, 1), "410": (4, 4)}
-"""Luma columns and lines to a sample of the colour differences."""
+"""Luma columns and lines per chroma sample."""
 _DEPTHS = (8, 9, 10, 12, 14, 16)
 
 
@@ -50,7 +50,7 @@ def plane_format(name: str) -> PlaneFormat | None:
 
 
 def nearest_planar_name(frame: Any) -> str:
-    """Return the planar format that holds all of another one's components: a PyAV frame's format."""
+    """Return the name of the planar format that holds all components of a PyAV frame."""
     components = frame.format.components
     has_alpha = any(component.is_alpha for component in components) or frame.format.has_palette
     bits = max((component.bits for component in components), default=8)
@@ -97,7 +97,7 @@ def plane_arrays(frame: Any, planar: PlaneFormat) -> list[NDArray[Any]]:
 def stack_planes(arrays: list[NDArray[Any]], planar: PlaneFormat) -> NDArray[Any]:
     """Stack planes without alpha to (height, width, 1 or 3), in memory that the next call of this thread overwrites.
 
-    Colour differences are interpolated linearly between the centres of their samples.
+    Chroma is interpolated linearly between the centres of its samples.
     """
     import cv2
 
@@ -128,7 +128,7 @@ def _scratch(number: int, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
 
 
 def shrink_plane(plane: NDArray[np.float32], planar: PlaneFormat) -> NDArray[np.float32]:
-    """Average a plane of the full size to the samples of the colour differences."""
+    """Average a plane of the full size to the size of the chroma planes."""
     import cv2
 
     across, down = planar.sampling

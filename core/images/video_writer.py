@@ -35,7 +35,9 @@ Change = Callable[[VideoFrame], tuple[NDArray[np.float32], NDArray[np.float32]] 
 
 @dataclass(frozen=True)
 class Encoder:
-    """An encoder by FFmpeg's name: its options, its containers, and the formats it gets what it does not take in."""
+    """An encoder. name: FFmpeg's. suffixes: of the containers that hold it. keeps: whether it encodes a planar format
+    as it is. Frames in another format are converted to `alpha` if they have alpha, to `deep` if they have more than 8
+    bits, else to `fallback`. limited: always write limited range. tag: the codec's tag in MP4 and MOV."""
 
     name: str
     options: dict[str, str]
@@ -234,7 +236,7 @@ class _OtherStreams:
         self._waiting: Any = None
 
     def write_until(self, time: Fraction | None) -> None:
-        """Write what is due at `time` seconds; all that is left for None."""
+        """Write the packets up to `time` seconds; all remaining ones for None."""
         av = import_av()
         while True:
             try:

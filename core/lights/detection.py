@@ -59,7 +59,7 @@ def union_mask(detections: Sequence[Detection], size: tuple[int, int]) -> Mask:
 
 
 def measure_detection(mask: Mask, corner: tuple[int, int], picture: Picture, display: NDArray[np.float32],
-             score: float) -> Detection:
+                      score: float) -> Detection:
     """Measure a detection from its mask (h, w) at `corner` of a picture, whose display values are (height, width, 3).
 
     The centroid weighs pixels from 0.8 of full scale up, one pixel past the mask: partly covered pixels of the rim then

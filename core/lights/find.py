@@ -142,8 +142,8 @@ def _from_one_view(capture: Capture, detections: Sequence[Detection]) -> list[Fo
         distance = FAR * capture.extent if far else float(np.median(depth[near])) / float(ray @ view.camera.forward)
         uncertainty = 0.0 if far else distance
         lights.append(FoundLight(view.camera.position + distance * ray, far, (view.name,), 1, 0.0, uncertainty,
-                                detection.colour, detection.radius, how="one view, distance guessed",
-                                detections=((view.name, detection),)))
+                                 detection.colour, detection.radius, how="one view, distance guessed",
+                                 detections=((view.name, detection),)))
     return lights
 
 

@@ -78,7 +78,7 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
 
 
 def locate_by_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float,
-                  seed: int = 0, progress: Progress | None = None) -> list[FoundLight]:
+                     seed: int = 0, progress: Progress | None = None) -> list[FoundLight]:
     """Return at most one light that is out of frame, from the blobs of each view; none where too few views agree.
 
     Raises Cancelled on a stop request.
@@ -108,7 +108,7 @@ def _rank(light: FoundLight, ratio: float) -> tuple[int, float]:
 
 
 def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float, ratio: float,
-                seed: int) -> FoundLight | None:
+                    seed: int) -> FoundLight | None:
     """Return the light out of frame that most views' blobs claim if they are ghosts at this ratio, or None."""
     claims = []
     for (_, camera), in_view in zip(views, blobs, strict=True):

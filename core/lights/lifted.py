@@ -24,12 +24,15 @@ MIN_OPACITY = 0.3
 """Opacity below which a Gaussian hides nothing and is no part of a light."""
 CLUSTER_DISTANCE = 0.03
 """Largest distance between neighbours of one cluster, in extents."""
+MATCH_TOLERANCE = 0.006
+"""Distance of a light's projection from a detection's rim up to which the detection shows the light, in frame
+diagonals."""
 MAX_GAUSSIANS = 4000
 """Gaussians that are clustered, those with the most views first."""
 
 
 def lift_to_gaussians(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[Detection]], means: ArrayLike,
-         opacities: ArrayLike, extent: float, min_views: int = 3, share: float = 0.3) -> list[FoundLight]:
+                      opacities: ArrayLike, extent: float, min_views: int = 3, share: float = 0.3) -> list[FoundLight]:
     """Find lights from detections of each view and scene Gaussians: means (n, 3), opacities (n,) in 0..1.
 
     `share` of the views that see a Gaussian must have it inside a detection.
@@ -92,23 +95,27 @@ def _cluster(xyz: Floats, reach: float) -> list[NDArray[np.int64]]:
 
 
 def _to_light(centre: Floats, spread: float, views: Sequence[tuple[str, Camera]],
-           detections: Sequence[Sequence[Detection]]) -> FoundLight:
-    """Return the light at a cluster's centroid, with the detections that it falls on."""
-    support, off, visible, used = [], [], 0, []
+              detections: Sequence[Sequence[Detection]]) -> FoundLight:
+    """Return the light at a cluster's centroid, with the nearest detection of each view that shows it."""
+    residuals: list[float] = []
+    matched: list[tuple[str, Detection]] = []
+    visible = 0
     for (name, camera), in_view in zip(views, detections, strict=True):
         pixels, depth = camera.project(centre[None])
         if not camera.contains(pixels, depth)[0]:
             continue
         visible += 1
-        near = [(float(np.linalg.norm(detection.xy - pixels[0])), detection) for detection in in_view]
-        near = [(gap, detection) for gap, detection in near if gap < detection.radius + 0.006 * np.hypot(*camera.size)]
-        if near:
-            gap, detection = min(near, key=lambda pair: pair[0])
-            support.append(name)
-            off.append(gap)
-            used.append((name, detection))
-    colour = np.median([detection.colour for _, detection in used], axis=0) if used else np.ones(3)
-    return FoundLight(centre, False, tuple(support), visible, float(np.median(off)) if off else 0.0, spread,
-                      colour / max(float(colour.max()), 1e-6),
-                      float(np.median([detection.radius for _, detection in used])) if used else 0.0,
-                      how="lifted on to the scene", detections=tuple(used))
+        tolerance = MATCH_TOLERANCE * np.hypot(*camera.size)
+        distances = [float(np.linalg.norm(detection.xy - pixels[0])) for detection in in_view]
+        candidates = [(distance, number) for number, distance in enumerate(distances)
+                      if distance < in_view[number].radius + tolerance]
+        if candidates:
+            distance, number = min(candidates)
+            residuals.append(distance)
+            matched.append((name, in_view[number]))
+    colour = np.median([detection.colour for _, detection in matched], axis=0) if matched else np.ones(3)
+    radius = float(np.median([detection.radius for _, detection in matched])) if matched else 0.0
+    return FoundLight(centre, False, tuple(name for name, _ in matched), visible,
+                      float(np.median(residuals)) if residuals else 0.0, spread,
+                      colour / max(float(colour.max()), 1e-6), radius, how="lifted on to the scene",
+                      detections=tuple(matched))

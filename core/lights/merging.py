@@ -23,7 +23,7 @@ def merge_duplicates(lights: Sequence[FoundLight], views: Sequence[tuple[str, Ca
             if _is_same_light(light, other, views, extent):
                 support = tuple(sorted({*other.support, *light.support}))
                 distinct[i] = replace(other, support=support, visible=max(other.visible, len(support)),
-                                  detections=other.detections + light.detections)
+                                      detections=other.detections + light.detections)
                 break
         else:
             distinct.append(light)

@@ -20,7 +20,7 @@ RING_COLOUR = (0.4, 1.0, 0.3)
 
 
 def write_overlay_sheets(folder: Path, capture: Capture, detections: Sequence[Sequence[Detection]],
-                 lights: Sequence[tuple[str, FoundLight]]) -> list[Path]:
+                         lights: Sequence[tuple[str, FoundLight]]) -> list[Path]:
     """Write sheet1.png, sheet2.png, ... of all views into `folder`; returns their paths.
 
     A green ring is a detection; a cross with a name is a light's projection, thick where the view supports it. An arrow
@@ -45,7 +45,7 @@ def write_overlay_sheets(folder: Path, capture: Capture, detections: Sequence[Se
 
 
 def _draw_tile(capture: Capture, number: int, detections: Sequence[Detection],
-          lights: Sequence[tuple[str, FoundLight]]) -> NDArray[np.float32]:
+               lights: Sequence[tuple[str, FoundLight]]) -> NDArray[np.float32]:
     """Draw the frame of view `number` small, with its detections as rings and the lights as marks, or as arrows to
     them."""
     import cv2

@@ -157,7 +157,7 @@ def _observe(views: Sequence[FlareView], positions: Floats, window: float) -> li
             shift = [(weights.sum(axis) @ coordinates) / weight_sum - (support.sum(axis) @ coordinates) / window_sum
                      for axis, coordinates in ((0, across), (1, down))]
             by_light[light].append(_Observation(float(weight_sum) / (2 * np.pi * deviation**2), np.array(shift),
-                                             camera.jacobian(positions[light])))
+                                                camera.jacobian(positions[light])))
     return by_light
 
 

@@ -26,9 +26,9 @@ from .observations import Observations
 from .refinement import parametrise, refine_until_stable
 
 MAX_FAILURES = 6
-"""Places of too few views in a row, after which the search ends."""
+"""Number of successive places with too few views after which the search ends."""
 MAX_REJECTED = 16
-"""Rejected candidates, after which new ones are proposed."""
+"""Number of rejected candidates after which new ones are proposed."""
 
 
 @dataclass(frozen=True)

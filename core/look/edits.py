@@ -194,7 +194,7 @@ class LookEdits:
 
 
 def _parse_targets(text: str, whom: str, lights: Sequence[str],
-             elements: Mapping[str, Sequence[str]] | None) -> list[tuple[str, str]]:
+                   elements: Mapping[str, Sequence[str]] | None) -> list[tuple[str, str]]:
     """Return the (light, element or "") pairs that an edit applies to."""
     if not any(whom == light or whom.startswith(f"{light}/") for light in lights):
         whom = whom.lstrip()  # only here, since a light's name may begin with a blank

@@ -154,7 +154,7 @@ def _split_at_valleys(mu: Floats, energy: Floats) -> list[NDArray[np.int64]]:
 
 
 def _merge_faint(parts: list[tuple[str, NDArray[np.int64]]], energy: Floats,
-               mu: Floats | None) -> list[tuple[str, NDArray[np.int64]]]:
+                 mu: Floats | None) -> list[tuple[str, NDArray[np.int64]]]:
     """Merge the faintest groups into the nearest of their kind, or of any kind, until there are MAX_ELEMENTS."""
     parts = list(parts)
 

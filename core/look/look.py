@@ -373,8 +373,8 @@ def read(path: Path | str) -> Look:
 
 
 def _read_light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: Blend,
-           listed: Any) -> LightLook:
-    """Make the look of light `index` of a file."""
+                listed: Any) -> LightLook:
+    """Make the look of light `number` of a file. listed: its elements in the file."""
     form, name, count = FlareForm(**entry["form"]), str(entry["name"]), int(entry["count"])
     xyz = np.array([float(value) for value in entry["xyz"]], np.float64)
     own_rows = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}

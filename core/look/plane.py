@@ -141,7 +141,7 @@ def colours(rays: Floats, sh: Floats, degree: int) -> Floats:
 
 
 def to_pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike,
-           pixel_grid: PixelGrid | None = None) -> tuple[Floats, Floats]:
+              pixel_grid: PixelGrid | None = None) -> tuple[Floats, Floats]:
     """Return centres (n, 2), px, and covariances (n, 3), px², for intrinsics (3, 3), with the low-pass filter of the
     fit's pixel grid, or the default one if it is unknown."""
     k = np.asarray(intrinsics, np.float32)

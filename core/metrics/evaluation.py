@@ -155,7 +155,7 @@ def _score_picture(image: Array, target: Array, lpips: Perceptual | None, counte
 
 
 def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]]],
-            size: tuple[int, int]) -> dict[str, Any]:
+              size: tuple[int, int]) -> dict[str, Any]:
     """Return the content of eval.json: means over views, then each view. Numbers that are not finite become null.
 
     A flare's PSNR, that of an empty one and the relative error are means over the views whose reference holds a flare:

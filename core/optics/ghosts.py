@@ -27,18 +27,19 @@ Array = NDArray[np.float64]
 REFERENCE_WAVELENGTH = 0.55
 """Micrometres."""
 COARSE_RAYS = 25
-"""Rays a side of the grid that finds the bundle which passes the lens."""
+"""Rays along each side of the coarse grid that finds the bundle of rays which passes the lens."""
 MAX_SUPERSAMPLED_WIDTH = 1300
-"""Pixels a row beyond which ghosts are not supersampled."""
+"""Width in pixels above which ghosts are not supersampled."""
 MAX_DENSITY = 40.0
 """Largest density of light; where rays cross (caustics) it would be unbounded."""
 
 
 @dataclass(frozen=True)
 class GhostSettings:
-    """How ghosts are drawn. count: ghosts, the brightest first. grid: rays a side. bands: wavelengths. gain:
-    brightness. rim: how much brighter the edge is than the inside (diffraction at the stop). size: standard deviation
-    (tan) of the blur by the extent of the light. supersample: pixels drawn for one."""
+    """How ghosts are drawn. count: number of ghosts, the brightest first. grid: rays along each side of the grid.
+    bands: number of wavelengths. gain: factor of their light. rim: how much brighter the edge is than the inside
+    (diffraction at the stop). size: standard deviation (tan) of the blur by the extent of the light. supersample:
+    samples along each side of a pixel."""
 
     count: int = 22
     grid: int = 40
@@ -81,7 +82,10 @@ class Optics:
 
 
 def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.0) -> Array:
-    """Return quarter-wave wavelengths, `design` in turn over the surfaces between glass and air."""
+    """Return the coating of each surface (n,), as the wavelength for which it is a quarter wave thick, micrometres.
+
+    The wavelengths of `design` take turns over the surfaces between glass and air; all other surfaces get `cemented`.
+    """
     values = np.full(len(lens.index), cemented)
     previous, design_index = 1.0, 0
     for index, glass in enumerate(lens.index):
@@ -177,7 +181,8 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
 
 
 def _density(x: Array, y: Array, cell: float) -> Array:
-    """Return area on the plane of entry (of pi f^2) divided by area on the sensor (tan^2), by ray."""
+    """Return the density of light at each ray: the area of its cell where it enters the lens, relative to pi f^2,
+    divided by the cell's area on the sensor, tan^2. x, y: (rows, columns), where the rays meet the sensor."""
     xr, xc = np.gradient(x)
     yr, yc = np.gradient(y)
     stretch = (xr * yc - xc * yr) / cell
@@ -231,8 +236,9 @@ def _trace_arguments(optics: Optics, wavelength: float) -> tuple[Any, ...]:
 
 def _find_bundle(optics: Optics, slope: float, pair: tuple[int, int], surfaces: tuple[Any, ...], grid: int
             ) -> tuple[Array, Array] | None:
-    """Return where rays must enter to pass the lens: a grid over the bounds of those rays of a coarse grid that do;
-    None if none does."""
+    """Return x and y of a grid of rays that covers the bundle which passes the lens; None if no ray passes.
+
+    The bundle's bounds are those of the rays of a coarse grid that pass."""
     extent = 1.15 * optics.lens.semi_aperture[0]
     axis = np.linspace(-extent, extent, COARSE_RAYS)
     rays, arrived = trace_grid(axis, axis, slope, *pair, *surfaces)

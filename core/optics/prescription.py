@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Lens prescriptions: the surfaces of a lens as its patent lists them, and the paraxial ghosts that follow from them.
 
-A prescription is text, one surface a line from the front to the sensor's side:
+A prescription is text, one line per surface from the front to the sensor's side:
 
     radius  thickness  index  Abbe number  clear diameter
 

@@ -22,14 +22,17 @@ from .spectrum import responses, wavelengths
 Pixels = NDArray[np.float32]
 
 TEXTURE_SIZE = 1024
+"""Side of the starburst's texture, pixels."""
 REFERENCE_WAVELENGTH = 0.55
+"""Wavelength at which sizes of starburst and ring are given, micrometres."""
 BANDS = 25
+"""Number of wavelengths that a starburst is summed over."""
 
 
 @dataclass(frozen=True)
 class Starburst:
-    """gain: brightness. extent: tan of the angle that half the pattern spans at 0.55 micrometres. core: softening
-    radius of the centre (tan). peak: where the core saturates."""
+    """A starburst. gain: factor of its light. extent: tan of the angle that half the pattern spans at 0.55 micrometres.
+    core: radius (tan) of the blur that softens the centre. peak: light at which the centre saturates."""
 
     gain: float = 1.0
     extent: float = 0.6
@@ -39,7 +42,8 @@ class Starburst:
 
 @dataclass(frozen=True)
 class Glow:
-    """Two lobes gain / (1 + (r / radius)^2)^power, r the tangent of the angle from the light, and a floor."""
+    """A glow: two lobes gain / (1 + (r / radius)^2)^power, where r is the tangent of the angle from the light, and a
+    constant floor."""
 
     gain: float = 0.25
     radius: float = 0.035
@@ -51,9 +55,10 @@ class Glow:
 
 @dataclass(frozen=True)
 class Ring:
-    """radius: tan at 0.55 micrometres; width: of one wavelength's ring, relative to the radius. follow: position of the
-    centre on the line from the principal point (0) to the light (1). lean: how much brighter the far side is. grow:
-    additional radius per tan of the field angle. dispersion: 1 for that of grooves, 0 for white."""
+    """A ring. radius: tan at 0.55 micrometres. width: width of one wavelength's ring, relative to the radius. follow:
+    position of the centre on the line from the principal point (0) to the light (1). lean: how much brighter the side
+    away from the principal point is. grow: additional radius per tan of the field angle. dispersion: 1 for the colours
+    of grooves, 0 for a white ring."""
 
     gain: float = 0.05
     radius: float = 0.3
@@ -66,8 +71,9 @@ class Ring:
 
 @dataclass(frozen=True)
 class Streak:
-    """A line through the light along `turn` degrees: gain / (1 + (along / length)^2)^power, of Gaussian `width` (tan)
-    across. colour: linear RGB. mirror: share of a second one through the mirrored light."""
+    """A streak: a line through the light at `turn` degrees, gain / (1 + (along / length)^2)^power along it, a Gaussian
+    of standard deviation `width` (tan) across it. colour: linear RGB. mirror: brightness of a second streak through the
+    mirrored light, relative to the first."""
 
     gain: float = 0.6
     length: float = 0.12
@@ -80,7 +86,7 @@ class Streak:
 
 @lru_cache(maxsize=8)
 def starburst_texture(aperture: Aperture, settings: Starburst) -> Pixels:
-    """Return the pattern (TEXTURE_SIZE, TEXTURE_SIZE, 3) about its centre; +-extent wide."""
+    """Return the starburst's texture (TEXTURE_SIZE, TEXTURE_SIZE, 3), which spans -extent..extent about its centre."""
     stop = transmission(aperture, TEXTURE_SIZE, 0.25)
     power = np.abs(np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(stop)))) ** 2
     power = (power / stop.sum() ** 2).astype(np.float32)

@@ -25,7 +25,7 @@ COATING_INDEX = 1.38
 SENSOR_X, SENSOR_Y, STRAY, WEIGHT = 0, 1, 2, 3
 STOP_X, STOP_Y = 4, 5
 FIELDS = 10
-"""Numbers of a traced ray: the four above and (x, y) of three passages through the stop."""
+"""Length of a traced ray's array: the first four of these indices, then x and y of three passages through the stop."""
 
 
 @njit(cache=True, nogil=True)

@@ -34,14 +34,14 @@ from .training.backgrounds import Backgrounds, is_held_out
 INPUT_FOLDERS = ("input", "flare", "blend")
 TRUTH_FOLDERS = ("gt", "target", "clean", "scene")
 SHEET_ROWS = 10
-"""Pictures on the sheet of the worst."""
+"""Number of pictures on the sheet of the worst results."""
 MAX_TILE_ASPECT = 2
 """Height of a tile of the sheet divided by its width, at most; taller pictures, such as a column of pixels, are
 squeezed."""
 CANVAS_SIZE = 640
-"""Pixels a side of the canvas of synthesised flares."""
+"""Side of the canvas of synthesised flares, pixels."""
 IDENTICAL_PSNR = 100.0
-"""PSNR in dB that stands for that of identical pictures in gains and means: an error of 0.00001."""
+"""PSNR in dB of identical pictures in gains and means, in place of infinity."""
 Scores = dict[str, float | None]
 
 

@@ -89,7 +89,7 @@ def _send(stream: IO[bytes], message: Any) -> None:
 
 
 class _ChildProgress(Progress):
-    """Progress in the child: the parent's, which answers each message with whether to continue."""
+    """Progress in the child: sends each call to the parent, which answers whether to continue."""
 
     def __init__(self, to_parent: BinaryIO, replies: queue.Queue[Any]) -> None:
         super().__init__()

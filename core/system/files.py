@@ -51,8 +51,8 @@ def atomic_path(target: Path | str,
     """Yield a temporary path beside `target`; rename it to `target` when the block succeeds, remove it when it fails.
 
     commit_lock: held during the rename. The temporary name keeps the suffix, since writers choose their format by it. A
-    symbolic link is replaced by a file: what it points to may belong to another run. Temporary files that a killed
-    process left of `target` are removed, see `remove_partials_of`.
+    symbolic link is replaced by a file: what it points to may belong to another run. Temporary files for `target`
+    that a killed process left are removed, see `remove_partials_of`.
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ def follow_link(target: Path) -> Path:
 
 
 def round_for_text(value: float) -> float:
-    """For a file that people read: six decimals, and more where the world's unit is so large that it takes them."""
+    """Round a coordinate for a file that people read: to six decimals; values below 1 to about seven digits."""
     return round(value, 6 + max(0, -math.floor(math.log10(abs(value))))) if value and math.isfinite(value) else value
 
 
@@ -159,7 +159,8 @@ def _machine_hash() -> str:
 
 
 def _is_being_written(partial: Path) -> bool:
-    """True if the process in the name of a temporary file still runs; of another machine, for an hour."""
+    """True if the process that a temporary file is named for still runs; for one of another machine, if the file is
+    younger than an hour."""
     writer = _WRITER_TAG.search(partial.name)
     if writer is None:
         return False
@@ -182,7 +183,7 @@ def _remove_abandoned(partial: Path) -> None:
 
 
 def remove_partials_of(target: Path | str) -> None:
-    """Remove the temporary files and folders that killed processes left of `target`, where the system lets it.
+    """Remove the temporary files and folders for `target` that killed processes left, where the system permits it.
 
     Those of a running process stay: a farm may start a task again while its first worker still lives.
     """

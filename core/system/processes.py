@@ -161,7 +161,7 @@ def _start_time_proc(pid: int) -> float | None:
 def _start_time_ps(pid: int) -> float | None:
     """Start time by the age that ps prints, [[days-]hours:]minutes:seconds.
 
-    Of a process that has just begun procps now and then prints 441077234 days.
+    For a process that has just begun, procps sometimes prints 441077234 days.
     """
     listing = subprocess.run(["ps", "-o", "etime=", "-p", str(pid)], capture_output=True, text=True, check=False)
     days, _, clock = listing.stdout.strip().rpartition("-")

@@ -2,7 +2,7 @@
 """Reports progress of a job, and passes on requests to stop it.
 
 Core code takes a `Progress` and calls `stage`, `advance`, `say`, `result`. The base class is silent; `TerminalProgress`
-draws a bar; `OpenJdProgress` writes the Open Job Description of farms; `JsonProgress` writes one JSON object a line for
+draws a bar; `OpenJdProgress` writes the Open Job Description of farms; `JsonProgress` writes a JSON object per line for
 the add-on and other programs:
 
     {"type": "stage", "name": "fit", "total": 3000, "done": 0}
@@ -225,7 +225,7 @@ class TerminalProgress(Progress):
 
 
 class JsonProgress(Progress):
-    """Writes one JSON object a line to stdout, at most ten progress lines a second."""
+    """Writes one JSON object per line to stdout, at most ten progress lines a second."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         super().__init__()
@@ -302,6 +302,7 @@ def stop_on_request(progress: Progress) -> Iterator[Progress]:
 
 @contextlib.contextmanager
 def _stop_on_file(progress: Progress) -> Iterator[Progress]:
+    """Watch for the file that STOP_FILE names, in a thread, for the length of the block."""
     path = os.environ.get(STOP_FILE)
     if not path:
         yield progress

@@ -60,10 +60,7 @@ class ColouredPlate:
 
     @property
     def has_straight_alpha(self) -> bool:
-        """Return whether the colours are not light: they have to be combined with an alpha first.
-
-        An EXR's are, since it is premultiplied in linear light.
-        """
+        """Return whether the colours are straight, not multiplied by the alpha. An EXR's are always premultiplied."""
         return self.plate.alpha is not None
 
     @property

@@ -39,7 +39,7 @@ def open_blend(path: Path) -> Any:
 
 
 def read_shot(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int], *, radius: float = 0.0,
-            done: Callable[[], None] = lambda: None) -> Shot:
+              done: Callable[[], None] = lambda: None) -> Shot:
     """Return the shot of the scene's active camera at these frames, in the coordinates of Blender's world.
 
     Markers may change the camera; the shot has the name of the scene. names: objects that are lights; without any, the
@@ -111,7 +111,7 @@ def _lamp_radius(obj: Any) -> float:
 
 
 def write_capture(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequence[str],
-               done: Callable[[], None] = lambda: None) -> int:
+                  done: Callable[[], None] = lambda: None) -> int:
     """Write a capture of the scene's camera; return its number of frames.
 
     lights.json is written where there are lights (`names`, or the scene's lamps). plates: the picture of each frame.

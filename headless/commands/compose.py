@@ -89,7 +89,7 @@ def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, number
     render_settings.save_blend(out.resolve() / BLEND)
     progress.stage("compose", len(numbers))
     render_settings.render_frames(scene, numbers, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
-                             lambda _number: progress.advance())
+                                  lambda _number: progress.advance())
     return {"frames": str(out), "blend": str(out / BLEND), "blender": bpy.app.version_string}
 
 

@@ -135,7 +135,7 @@ def test_frames_are_undistorted(tmp_path: Path, model: str, scale: int) -> None:
     ("OPENCV", {"k1": -0.1, "k2": 0.02, "k3": -0.003, "p1": 0.004, "p2": -0.005}),
     ("OPENCV_FISHEYE", {"k1": -0.1, "k2": 0.02, "k3": -0.003, "k4": 0.0006})])
 def test_coefficients_of_transforms_json_are_read_by_name(model: str, told: dict[str, float],
-                                                               tmp_path: Path) -> None:
+                                                          tmp_path: Path) -> None:
     found = Capture.open(make_transforms(tmp_path / "c", camera_model=model, **told)).views[0].lens
     assert {name: found.parameters[name] for name in told} == told
 

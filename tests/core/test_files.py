@@ -360,7 +360,7 @@ def test_a_slow_process_leaves_the_lock_that_replaced_its_own(tmp_path: Path) ->
 
 
 def test_two_processes_that_take_over_a_stale_lock_get_it_in_turn(tmp_path: Path,
-                                                                             monkeypatch: pytest.MonkeyPatch) -> None:
+                                                                  monkeypatch: pytest.MonkeyPatch) -> None:
     """Both have seen that it is stale before either removes it."""
     lock = tmp_path / ".lock"
     lock.touch()

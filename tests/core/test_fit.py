@@ -471,7 +471,7 @@ def test_a_capture_whose_name_cannot_be_written_down_is_refused(tmp_path: Path, 
 
 
 def test_a_fit_finishes_while_another_program_holds_its_checkpoint(tmp_path: Path, capture: Capture,
-                                                                    monkeypatch: pytest.MonkeyPatch) -> None:
+                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
     unlink = Path.unlink
 
     def held(path: Path, missing_ok: bool = False) -> None:

@@ -199,7 +199,7 @@ def flare_error(capture: Capture, run: Run) -> float:
 
 @pytest.mark.parametrize("mode", ["default", "split"])
 def test_a_fit_uses_measured_exposures(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, mode: str,
-                            monkeypatch: pytest.MonkeyPatch) -> None:
+                                       monkeypatch: pytest.MonkeyPatch) -> None:
     capture, exposures = drifting
     monkeypatch.setattr(metering, "measure_exposures", lambda *_: exposures)
     fixed = fit(capture, quick(400, mode=mode, exposure="fixed"), tmp_path / "fixed")
@@ -213,7 +213,7 @@ def test_a_fit_uses_measured_exposures(drifting: tuple[Capture, dict[str, float]
 
 @pytest.mark.parametrize("blend", ["add", "over"])
 def test_a_view_is_rendered_at_its_exposure(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, blend: str,
-                                              monkeypatch: pytest.MonkeyPatch) -> None:
+                                            monkeypatch: pytest.MonkeyPatch) -> None:
     capture, exposures = drifting
     monkeypatch.setattr(metering, "measure_exposures", lambda *_: exposures)
     run = Run.open(fit(capture, quick(20, blend=blend), tmp_path / "run").folder)
@@ -230,7 +230,7 @@ def test_a_view_is_rendered_at_its_exposure(drifting: tuple[Capture, dict[str, f
 
 
 def test_a_resumed_fit_keeps_its_exposures(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
-                                                  monkeypatch: pytest.MonkeyPatch) -> None:
+                                           monkeypatch: pytest.MonkeyPatch) -> None:
     capture, exposures = drifting
     monkeypatch.setattr(metering, "measure_exposures", lambda *_: exposures)
     whole = fit(capture, quick(30), tmp_path / "whole")
@@ -241,7 +241,7 @@ def test_a_resumed_fit_keeps_its_exposures(drifting: tuple[Capture, dict[str, fl
 
 
 def test_a_fit_stops_while_exposures_are_measured(drifting: tuple[Capture, dict[str, float]],
-                                                        tmp_path: Path) -> None:
+                                                  tmp_path: Path) -> None:
     with pytest.raises(Cancelled, match="look at exposures"):
         fit(drifting[0], quick(10), tmp_path / "run", StopAt(3, "look at exposures"))
     assert not (tmp_path / "run").exists()

@@ -66,7 +66,7 @@ def test_white_is_raised_for_float_frames_above_1(lit: int | None, mode: str, wh
 ])
 @pytest.mark.parametrize("number", [0, 3])
 def test_one_clipped_file_keeps_white_at_1(folder: str, mode: str, white: float, number: int,
-                                             tmp_path: Path) -> None:
+                                           tmp_path: Path) -> None:
     where = flared_capture(tmp_path / "c", 6, float_gain=GAIN)
     path = where / folder / f"{number:04d}.exr"
     write_png(path.with_suffix(".png"), np.full((40, 64, 3), 0.5))

@@ -48,7 +48,7 @@ def test_a_scene_is_restored_exactly(tmp_path: Path, n: int) -> None:
         ("comment white nan", 1.0))),
 ])
 def test_near_white_and_pixel_grid_are_restored(kept: str, number: float, said: str, read: float,
-                                               tmp_path: Path) -> None:
+                                                tmp_path: Path) -> None:
     """Near depth and white."""
     first = scene()
     setattr(first, kept, number)

@@ -343,7 +343,7 @@ def test_a_form_out_of_bounds_raises_in_all_readers(name: str, tmp_path: Path) -
 
 @pytest.mark.parametrize("changed", [{"latent": 0}, {"latent": 3}, {"levels": 5}])
 def test_a_network_that_does_not_fit_its_form_raises_on_reading(changed: dict[str, int],
-                                                                         tmp_path: Path) -> None:
+                                                                tmp_path: Path) -> None:
     """Not when it is first asked for a view: by then it stands in a library or a scene."""
     saved(tmp_path / "a.flare", OURS, 1)
     _, metadata = read_tensors(tmp_path / "a.flare")

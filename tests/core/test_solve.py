@@ -163,7 +163,7 @@ def test_a_solved_shot_is_not_solved_again(solved: tuple[Path, list[Camera], dic
 
 
 def test_lights_of_an_earlier_solve_are_refused(solved: tuple[Path, list[Camera], dict[str, Any]],
-                                                            tmp_path: Path) -> None:
+                                                tmp_path: Path) -> None:
     shutil.copytree(solved[0], tmp_path / "out")
     (tmp_path / "out" / "lights.json").write_text('{"lights": []}')
     assert solve(solved[0].parent / "frames", tmp_path / "out", QUICK) == solved[2]
@@ -264,7 +264,7 @@ class Failing(Progress):
 
 @pytest.mark.parametrize("count", [1, 5])
 def test_a_failure_during_mapping_is_raised_and_no_model_recorded(stopped: Path, tmp_path: Path,
-                                                                       count: int) -> None:
+                                                                  count: int) -> None:
     """At the first pair, and at the last frame, when there is a model already."""
     out, heard = tmp_path / "out", Stopping()
     shutil.copytree(stopped / "out", out)
@@ -277,7 +277,7 @@ def test_a_failure_during_mapping_is_raised_and_no_model_recorded(stopped: Path,
 
 
 def test_a_mapping_that_ends_with_a_failure_is_not_recorded(stopped: Path, tmp_path: Path,
-                                                                  monkeypatch: pytest.MonkeyPatch) -> None:
+                                                            monkeypatch: pytest.MonkeyPatch) -> None:
     """pycolmap looks at its token between steps, so that it may come back with what it has."""
     import pycolmap
 
@@ -329,7 +329,7 @@ def test_squeezed_frames_keep_their_pixel_aspect(tmp_path: Path) -> None:
     ("a.png", np.uint8, 1.0, ".png"), ("a.png", np.uint16, 1.0, ".png"), ("a.tif", np.uint8, 1.0, ".png"),
     ("a.tif", np.uint16, 1.0, ".png"), ("a.tif", np.float32, 1e5, ".exr")])
 def test_undistorted_frames_keep_the_depth_of_their_files(name: str, kind: type, top: float, suffix: str,
-                                                        tmp_path: Path) -> None:
+                                                          tmp_path: Path) -> None:
     full = 1 if kind is np.float32 else np.iinfo(kind).max
     stored = np.zeros((48, 64, 3), kind)
     stored[:, :] = kind(0.1 * full)

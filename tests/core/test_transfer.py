@@ -128,7 +128,7 @@ def test_the_flare_of_a_picture_lies_at_its_light(look: Look, tmp_path: Path) ->
 @pytest.mark.parametrize(("size", "expected"), [((96, 54), 70 * 96 / 64), ((54, 96), 70 * 96 / 64),
                                                 ((128, 32), 140.0), ((60, 60), 70 * 60 / 64)])
 def test_a_portrait_picture_has_the_turned_field_of_view(look: Look, tmp_path: Path, size: tuple[int, int],
-                                                           expected: float) -> None:
+                                                         expected: float) -> None:
     """Its focal length is that of the picture that lies, not that of its narrow side."""
     write_png(tmp_path / "a.png", np.full((size[1], size[0], 3), 0.2))
     found = picture_target([tmp_path / "a.png"], look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
@@ -288,7 +288,7 @@ def test_blend_averages_training_views_and_changes_smoothly(flare: Path, look: L
 
 @pytest.mark.parametrize("query", ["target", "blend"])
 def test_a_slightly_displaced_light_is_in_the_same_world(query: Any, flare: Path,
-                                                                           look: Look) -> None:
+                                                         look: Look) -> None:
     """Lights are found to a hundredth of their distance or so: the camera is where it is, and nothing is mixed."""
     light, seen, camera = look.lights[0], queries.training_views(flare, look.lights)[name(look)], cameras(6)[2]
     aside = np.array([0.0, np.linalg.norm(camera.position - light.xyz), 0.0])
@@ -343,7 +343,7 @@ def plate_target(path: Path, look: Look) -> Target:
 
 @pytest.mark.parametrize("half", [True, False])
 def test_an_acescg_plate_is_unchanged_outside_the_flare(flare: Path, look: Look, tmp_path: Path,
-                                                            half: bool) -> None:
+                                                        half: bool) -> None:
     random = np.random.default_rng(3)
     values = (random.standard_normal((90, 160, 3)) * 3).astype(np.float16 if half else np.float32)  # below 0, above 1
     aces = colour_space("acescg")
@@ -408,7 +408,7 @@ def lies_at(path: Path) -> tuple[tuple[int, int], ...]:
 
 @pytest.mark.parametrize(("size", "origin"), [((120, 80), (-10, -10)), ((100, 30), (0, 20)), ((60, 40), (13, 5))])
 def test_the_flare_lies_on_the_frame_for_any_data_window(flare: Path, look: Look, tmp_path: Path,
-                                                              size: tuple[int, int], origin: tuple[int, int]) -> None:
+                                                         size: tuple[int, int], origin: tuple[int, int]) -> None:
     """Overscan, and frames of which a part was left out: to the camera of a picture, and of a shot."""
     whole = plate_exr(tmp_path / "whole.0001.exr", (100, 60), (0, 0), (100, 60))
     (tmp_path / "plates").mkdir()
@@ -446,7 +446,7 @@ def test_an_overscan_plate_of_another_frame_size_raises(flare: Path, look: Look,
 
 
 def test_plates_may_differ_from_the_shot_in_size_and_not_in_aspect(flare: Path, look: Look,
-                                                                              tmp_path: Path) -> None:
+                                                                   tmp_path: Path) -> None:
     one, plate = shot(flare, look, [cameras(3)[1]]), tmp_path / "plate.0001.png"
     write_png(plate, np.full((80, 128, 3), 0.2))
     assert shot_target(one, look, {}, plates=tmp_path).frames[0].plate == plate
@@ -556,7 +556,7 @@ def test_a_capture_is_rendered_in_chunks(flare: Path, look: Look, tmp_path: Path
 
 @pytest.mark.parametrize(("model", "params"), [("PINHOLE", None), ("OPENCV", (57.6, 57.6, 32, 24, 0.02, 0, 0, 0))])
 def test_the_plate_space_setting_overrides_the_file(model: str, params: Any, flare: Path, look: Look,
-                                                        tmp_path: Path) -> None:
+                                                    tmp_path: Path) -> None:
     """With a lens that distorts as well, whose frames are straightened first."""
     folder = make_capture(tmp_path / "capture", views=3, model=model, params=params)
     (folder / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
@@ -636,7 +636,7 @@ def from_ten_times_as_far(camera: Camera, centre: np.ndarray, xyz: np.ndarray) -
 
 @pytest.mark.parametrize("times", [1, 10])
 def test_a_scaled_world_is_queried_at_the_source_s_distance(times: int, flare: Path,
-                                                                             look: Look) -> None:
+                                                            look: Look) -> None:
     light, camera = look.lights[0], cameras(3)[1]
     xyz = times * light.xyz
     pose, seen = from_ten_times_as_far(camera, light.xyz, xyz), queries.training_views(flare, look.lights)[light.name]

@@ -244,7 +244,7 @@ def looped() -> RuntimeError:
 ])
 def test_every_error_has_its_status_and_message(problem: BaseException, status: int, sentence: str,
                                                 monkeypatch: pytest.MonkeyPatch,
-                             capfd: pytest.CaptureFixture[str]) -> None:
+                                                capfd: pytest.CaptureFixture[str]) -> None:
     ending_with(problem, monkeypatch)
     assert cli.main(["try", "--progress=json"]) == status
     output = capfd.readouterr()

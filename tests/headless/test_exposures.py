@@ -98,7 +98,7 @@ def test_intensities_of_a_preset_have_the_exposure_of_the_frame(runs: tuple[Path
 
 
 def test_a_preset_does_not_replace_its_flare(runs: tuple[Path, Path], tmp_path: Path,
-                                              capsys: pytest.CaptureFixture[str]) -> None:
+                                             capsys: pytest.CaptureFixture[str]) -> None:
     flare = tmp_path / "sun.flare"
     shutil.copy(runs[0] / "flare.flare", flare)
     before = flare.read_bytes()

@@ -96,7 +96,7 @@ def test_three_chunks_make_what_one_command_makes(capture: Path, made: Path, who
 
 
 def test_a_task_that_is_killed_and_run_again_leaves_the_same_files(capture: Path, made: Path, whole: Path,
-                                                                  tmp_path: Path) -> None:
+                                                                   tmp_path: Path) -> None:
     out = tmp_path / "out"
     args = [sys.executable, RUN, "bake", made, "--capture", capture, "--out", out, "--set", "*.intensity=1",
              "--frames", FRAMES, "--progress", "openjd"]

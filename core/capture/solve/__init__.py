@@ -112,7 +112,7 @@ def _solve(source: Path, out: Path, request: dict[str, Any], settings: SolveSett
     _prepare_output(source, out, request, progress)
     work = out / WORK_FOLDER
     chosen, left_out = source_frames.prepare_frames(source, work, settings.frames, settings.size, progress,
-                                                     (settings.plate_space, settings.ocio))
+                                                    (settings.plate_space, settings.ocio))
     try:
         solved = run_in_child(mapping.solve, chosen, work, settings, is_video(source), progress=progress)
     except ChildDied as problem:  # pycolmap aborts where its database cannot be written

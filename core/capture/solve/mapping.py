@@ -45,7 +45,7 @@ MIN_CORNERS = 800
 MIN_MATCHES = 15
 """Number of verified matches from which two frames count as matched."""
 MIN_MOTION_PX = 1.0
-"""Median motion of features, in pixels of the small pictures, below which the camera counts as source."""
+"""Median motion of features, in pixels of the small pictures, below which the camera counts as still."""
 
 
 @dataclass(eq=False)
@@ -225,7 +225,7 @@ def _make_camera(pycolmap: Any, size: tuple[int, int], focal: float | None, mode
 
 
 def _match_frames(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, database: Path, matching: Any,
-           settings: SolveSettings, progress: Progress) -> int:
+                  settings: SolveSettings, progress: Progress) -> int:
     """Match and verify the chosen pairs that are missing in the database; returns how many were chosen."""
     with _open_database(pycolmap, database) as db:
         ids = [db.read_image_with_name(source.name).image_id for source in sources]
@@ -249,7 +249,7 @@ def _match_frames(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, dat
 
 
 def _run_mapper(pycolmap: Any, work: Path, database: Path, frames: int, settings: SolveSettings,
-         progress: Progress) -> list[Any]:
+                progress: Progress) -> list[Any]:
     """Run incremental mapping; returns all models, of this run or an earlier one."""
     finished = _model_folders(work)
     if finished is not None:

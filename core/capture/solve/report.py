@@ -19,7 +19,7 @@ INK, PATH, PAPER = (0.15, 0.15, 0.15), (0.85, 0.2, 0.1), 1.0
 
 
 def make_report(sources: Sequence[SourceFrame], solved: Solved, left_out: list[str], request: dict[str, Any],
-            seconds: float) -> dict[str, Any]:
+                seconds: float) -> dict[str, Any]:
     """Return the report, JSON-able. Errors are in pixels of the small pictures."""
     registered = {frame.index for frame in solved.frames}
     model = solved.model

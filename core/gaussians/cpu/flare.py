@@ -388,7 +388,7 @@ def _needle_backward(state, records, at, left, top, first, end):
 
 @inlined
 def _plain_backward(state, records, at, left, top, first, end, start):
-    """Return the same gradient row by the recurrence and three sums a lane (see `raster_backward`)."""
+    """Return the same gradient row by the recurrence and three sums per lane (see `raster_backward`)."""
     step, one, run = load_scalar(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)
     m0, m1, m2, colours = zero, zero, zero, (zero, zero, zero)

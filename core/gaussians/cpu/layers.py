@@ -88,6 +88,8 @@ def _gather_rows(plane, length, r, factor, height, row, pad):
 
 @inlined
 def _gather_pixels(row, pad, channels, factor, small_width, out, at):
+    """Write the tent-weighted sums along a row of `_gather_rows` to `small_width` pixels of `out`, from index `at` on.
+    """
     for x in range(small_width):
         first = pad + ((x - 1) * factor - factor // 2) * channels
         for c in range(channels):
@@ -156,7 +158,7 @@ def composite_backward_kernel(counter, gradient, t, behind, d_t, d_behind):
 class _Upsample(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, colour: Tensor, t: Tensor, factor: int, width: int, height: int
+                ctx: Any, colour: Tensor, t: Tensor, factor: int, width: int, height: int
     ) -> tuple[Tensor, Tensor]:
         small_height, small_width = t.shape
         ctx.sizes = small_width, small_height, factor, width, height

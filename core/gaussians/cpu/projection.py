@@ -377,7 +377,7 @@ def project(
     on the number of its tiles, and the tiles of small ones (`small_footprints`).
 
     firsts, chunk_bounds: sums of the bounds within and over chunks (`binning`). d_centres: set to zero.
-    slopes: gradients of the colours by the means, 9 vectors a block of 16; empty without gradients.
+    slopes: gradients of the colours by the means, 9 vectors per block of 16; empty without gradients.
     raw: scales are logarithms and opacities logits."""
     n = opacities.size
     transposed, basis = scratch[:TRANSPOSED], scratch[TRANSPOSED : TRANSPOSED + SQUARE]
@@ -428,7 +428,7 @@ def _sum_rows(gradients, first_slot, count):
 
 @inlined
 def _gather_gradients(gradients, slots, counts, first, rows):
-    """Return the summed gradient rows of 16 Gaussians, one vector a field."""
+    """Return the summed gradient rows of 16 Gaussians, one vector per field."""
     for i in range(LANES):
         store(rows, i * LANES, _sum_rows(gradients, load_scalar(slots, first + i), load_scalar(counts, first + i)))
     return transpose(load_rows(rows, 0, LANES))

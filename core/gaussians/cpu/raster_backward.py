@@ -10,7 +10,7 @@ Gaussians up to this one:
     g = dL / d ln alpha = w vc - S' alpha / (1 - alpha)
 
 The projection needs only sums of g times 1, u, d_y and their products over the pixels. In each lane u depends on the
-row through k d_y alone, so three sums a lane suffice, combined after the last row (`moments`). Needles (see
+row through k d_y alone, so three sums per lane suffice, combined after the last row (`moments`). Needles (see
 `raster_forward`) sum the products themselves, which would cancel otherwise.
 
 Every pair of Gaussian and tile writes its own row: no two threads write to the same memory, and the sums do not depend
@@ -162,7 +162,7 @@ def moments(records, at, left, m0, m1, m2):
 
 @inlined
 def _recurrence_sums(state, records, at, left, top, first, end, start, with_depth):
-    """Return the same sums by the recurrence and three running sums a lane: of g over the rows, of the values of the
+    """Return the same sums by the recurrence and three running sums per lane: of g over the rows, of the values of the
     first sum, and of those of the second. A row j rows above the end counts 1, j and j (j + 1) / 2 times in them."""
     step, one, run = load_scalar(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)

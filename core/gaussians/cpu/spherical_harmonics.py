@@ -3,8 +3,8 @@
 
     colour_c = sum_k b_k(x, y, z) sh_kc + 1/2
 
-with the basis b of `..spherical_harmonics`. Coefficients are transposed to 48 rows (k, c) of 16 Gaussians, one vector a
-row (`gather`). In the backward pass, with the gradient v_c of the colours:
+with the basis b of `..spherical_harmonics`. Coefficients are transposed to 48 rows (k, c) of 16 Gaussians, one vector
+per row (`gather`). In the backward pass, with the gradient v_c of the colours:
 
     d sh_kc = b_k v_c        d direction = sum_c v_c slope_c,   slope_c = sum_k sh_kc grad b_k
 

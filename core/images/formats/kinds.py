@@ -26,8 +26,7 @@ _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b
 
 
 def kind_of(head: bytes, suffix: str) -> Kind:
-    """Return the format of a file by its first HEAD_BYTES and its suffix, with which formats without a signature are
-    told from each other."""
+    """Return the format of a file by its first HEAD_BYTES, and by its suffix where a format has no signature."""
     named = SUFFIXES.get(suffix.lower(), "")
     if head[:4] in _TIFFS or named == "raw":
         return "raw" if named == "raw" else "tiff"

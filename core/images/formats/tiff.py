@@ -20,7 +20,7 @@ X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT, XMP, COLOUR_PROFILE = 282, 283, 296
 UPRIGHT = 1
 """Orientation: rows from the top, columns from the left."""
 WHITE_IS_0, SEPARATED, LAB = 0, 5, (8, 9, 10)
-"""Photometric interpretation: 0 is white; CMYK inks; lightness and two colour differences, of three kinds."""
+"""Photometric interpretation: 0 is white; CMYK inks; the three kinds of Lab."""
 UNSUPPORTED_COMPRESSIONS = {34712: "JPEG 2000", 34887: "LERC", 34925: "LZMA", 50000: "Zstandard",
                             50001: "WebP", 50002: "JPEG XL"}
 """Compressions that the library in OpenCV is mostly built without."""

@@ -171,7 +171,7 @@ def read_rank(path: Path | str) -> int:
 @torch.no_grad()
 def _embed_prompt(tokenizer: Any, text: Any) -> Tensor:
     tokens = tokenizer(PROMPT, padding="max_length", max_length=tokenizer.model_max_length, truncation=True,
-                      return_tensors="pt")
+                       return_tensors="pt")
     embedded: Tensor = text(tokens.input_ids)[0]
     return embedded
 

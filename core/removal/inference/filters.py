@@ -7,7 +7,7 @@ import numpy as np
 from ...colour.srgb import Pixels
 
 DOWNSAMPLING = 2
-"""Pixels of a frame a side of one pixel of its flow."""
+"""Side of one pixel of the flow, pixels of the frame."""
 
 
 def downsample(values: Pixels) -> Pixels:

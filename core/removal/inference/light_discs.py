@@ -25,41 +25,43 @@ from numpy.typing import NDArray
 from ...colour.srgb import Pixels
 
 MIN_DISC_BRIGHTNESS = 0.9
-"""Smallest mean of the three display values of a pixel of a light disc."""
+"""Smallest brightness (mean of the three display values) of a pixel of a light disc."""
 RIM_RAMP = (0.8, 0.95)
-"""The same mean, as filmed, at which nothing and all of what belongs to a light disc is kept."""
+"""Brightness of a pixel as filmed at which none and all of the flare that belongs to its light disc is kept."""
 DISC_AREA_RAMP = (0.01, 0.02)
-"""Share of the frame up to which a bright region may be a light disc, and from which on it is none."""
+"""Area of a bright region, share of the frame, up to which it may be a light disc, and from which on it is none."""
 MIN_DISC_PIXELS = 3
 """Smallest number of pixels of a light disc, at the working size."""
 CONTRAST_RAMP = (0.15, 0.3)
-"""Contrast of a region to its surroundings without the flare, display values, at which it is no light disc and is one.
-"""
+"""Contrast of a region to its surroundings, display values without the flare, at which its certainty of being a light
+disc is 0 and 1."""
 RIM_SIZE, SURROUND_SIZE = 3, 7
-"""Sides of the squares that a region is dilated by to its rim and to its surroundings, pixels."""
+"""Sides of the squares that dilate a region by its rim, and by its surroundings, pixels."""
 BRIGHTNESS_EXPONENT = 4
-"""Power of a pixel's brightness, relative to the brightest of its light disc, by which it is kept."""
+"""The share of the flare that a pixel keeps is its brightness, relative to the brightest pixel of its light disc, to
+this power."""
 SURROUND_GLOW_RAMP = (0.5, 0.8)
-"""Fraction of glow in the flare about a region at which the glow is no evidence of a light disc, and at which it proves
-one in the region's centre. The centre is the pixels at least half as far from the region's edge as its innermost."""
+"""Fraction of glow in the flare about a region at which the certainty of a light disc in the region's centre is 0 and
+1. The centre is the pixels at least half as far from the region's edge as its innermost pixel."""
 OBSERVED_CONTRAST_RAMP = (0.05, 0.15)
-"""Contrast of such a region to its surroundings as filmed, display values, at which it is no light disc and is one."""
+"""Contrast of such a region to its surroundings, display values as filmed, at which that certainty is 0 and 1."""
 MAX_GLOW_KEPT, GLOW_FALLOFF = 0.5, 0.05
-"""Fraction of the glow that is kept at a light disc, and the distance, relative to the frame's long side, at which it
-has fallen to 1 / e of that."""
+"""Fraction of the glow that is kept at a light disc, and the distance, relative to the frame's long side, over which
+that fraction falls to 1 / e."""
 DARK_SCENE_RAMP = (0.2, 0.3)
-"""Median display value of the frame without the flare at which glow is kept and is not."""
+"""Median brightness of the frame without the flare at which all and none of that fraction is kept."""
 DISC_PEAK_RAMP = (0.9, 0.97)
-"""Display value of the brightest pixel of a light disc at which it keeps no glow and all of its share."""
+"""Brightness of the brightest pixel of a light disc at which none and all of that fraction is kept."""
 DISTANCE_LEVELS = 4
-"""Levels in which a region's certainty of being a light disc counts for the glow about it."""
+"""Number of steps in which a region's certainty of being a light disc weights the glow about it."""
 
 
 class _LightDiscs(NamedTuple):
     """Bright regions that may be light discs.
 
-    labels: (h, w), 0 outside. The others have one value a label, (count,): how far the region is a light disc by its
-    contrast and by the glow about it, 0..1, and its greatest brightness, as filmed and without the flare.
+    labels: (h, w), 0 outside. The others have one value per label, (count,). by_contrast, by_glow: certainty that the
+    region is a light disc, 0..1, by its contrast and by the glow about it. peak_observed, peak_clean: greatest
+    brightness of the region, as filmed and without the flare.
     """
 
     labels: NDArray[np.int32]
@@ -108,7 +110,10 @@ def _retained_glow(discs: _LightDiscs, clean: Pixels) -> NDArray[Any]:
 
 
 def _find_light_discs(observed: Pixels, clean: Pixels, flare: Pixels, glow: Pixels) -> _LightDiscs:
-    """Find light discs by the brightness as filmed and without the flare, and by the flare and its glow; each (h, w).
+    """Find the bright regions that may be light discs.
+
+    observed, clean: brightness as filmed and without the flare. flare, glow: brightness of the flare and of its glow.
+    All (h, w).
     """
     import cv2
 
@@ -131,8 +136,7 @@ def _find_light_discs(observed: Pixels, clean: Pixels, flare: Pixels, glow: Pixe
 
 
 def _centre_weight(labels: NDArray[np.int32]) -> Pixels:
-    """Return the distance of each pixel from its region's edge, relative to half of the greatest there, 0..1, (h, w).
-    """
+    """Return each pixel's distance from its region's edge, relative to half of the region's greatest, 0..1, (h, w)."""
     import cv2
 
     depth = cv2.distanceTransform((labels > 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tells the clean frames in a capture's removed/ that a person made from estimates that `remove` made.
+"""Distinguishes the clean frames in a capture's removed/ that a person made from estimates that `remove` made.
 
 It uses the manifest there, which also shows whether the frames have changed since.
 """

@@ -24,7 +24,7 @@ import torch.nn.functional as F  # noqa: N812 - its name everywhere
 from torch import Tensor, nn
 
 SHUFFLE_FACTOR = 2
-"""Pixels a side of a position of the finest level (pixel unshuffle)."""
+"""Side in pixels of a position of the finest level (pixel unshuffle)."""
 LEVELS = 5
 SIZE_MULTIPLE = SHUFFLE_FACTOR * 2 ** (LEVELS - 1)
 """The network's input has a height and a width that are multiples of this, in pixels."""

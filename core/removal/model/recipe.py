@@ -49,7 +49,7 @@ class Recipe:
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
     blocks: tuple[int, ...] = (0, 1, 4, 8, 6)
     attention: tuple[int, ...] = (3, 2)  # layers between the blocks of the two coarsest levels
-    canvas_size: int = 384               # pixels a side of the canvas of a flare
+    canvas_size: int = 384               # side of the canvas of a flare, pixels
     bank_size: int = 400                 # flares in the bank, 2.7 MB each; an iteration draws from a sixteenth of them
     renew_every: int = 6                 # iterations until one flare of the bank is replaced
     coloured_share: float = 0.15         # of the synthesised flares: of a light of one colour

@@ -20,7 +20,7 @@ from .canvas import Array, Point, Random, canvas_grid, log_uniform, random_tint
 TEXTURE_SIZE = 256
 """Samples across the stop's texture."""
 CHANNEL_OFFSETS = np.array([-1.0, 0.0, 1.0])
-"""Of red, green and blue: what depends on wavelength varies about evenly by channel."""
+"""Offsets of red, green and blue from the mean wavelength, in even steps, for aberrations that depend on it."""
 STOP_SAMPLES = (64, 640)
 """Smallest and largest number of samples across the stop; between them, two per pixel of the ghost."""
 MAX_CAUSTIC = 6.0

@@ -31,9 +31,9 @@ from .pairs import WHITE, FlareLayers, FlareSource
 
 Random = np.random.Generator
 PROBED_FLARES = 50
-"""About as many of the user's flares are read before a training, to report those that cannot be."""
+"""Approximate number of the user's flares that are read before a training, to report unreadable ones."""
 MAX_UNREADABLE_DRAWS = 20
-"""Unreadable flares of the user's in a row, after which the training fails."""
+"""Number of successive unreadable flares of the user after which the training fails."""
 
 
 class SynthesisBank:
@@ -47,7 +47,7 @@ class SynthesisBank:
 
     def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription], coloured: float = 0,
                  aspheric: float = 0, part_count: int = 1) -> None:
-        """count: flares. size: pixels a side of the canvas. part_count: parts of the bank."""
+        """count: number of flares. size: side of the canvas, pixels. part_count: number of parts of the bank."""
         self._seed, self._size, self._lenses = seed, size, lenses
         self._coloured, self._aspheric = coloured, aspheric
         self._entries: list[tuple[int, FlareLayers] | None] = [None] * count
@@ -131,13 +131,13 @@ class UserFlares:
         if not self._files:
             raise SettingsError(f"{folder} holds no flare layers; give pictures or videos of flares on black.")
         self.unreadable: list[str] = []
-        """What is wrong with those that cannot be read, a sentence each, among about `LOOKED_AT` that are looked at."""
+        """A sentence about each unreadable file among the about PROBED_FLARES that are checked."""
         self._drop_unreadable()
         if not self._files:
             raise SettingsError(f"None of the flares in {folder} can be read; {self.unreadable[0]}")
         compound = {beside for beside, _ in lights}
         self.missing_light = [path for path, light in self._files if light is None and path.parent.parent in compound]
-        """Those whose folder has the others' lights beside it but not theirs: their lights are taken for flare."""
+        """Flares without a light's picture in a folder whose other flares have one: their lights count as flare."""
 
     def __len__(self) -> int:
         return len(self._files)

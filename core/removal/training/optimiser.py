@@ -92,8 +92,8 @@ class MuonAdamW:
 
 
 def _group_same_shapes(matrices: Sequence[Tensor], numbers: Iterable[int]) -> Iterable[list[int]]:
-    """Return the numbers in groups to compute together: each alone on a CPU; on a GPU, which one does not keep busy,
-    those of the same shape."""
+    """Group the numbers of the matrices to compute together: each alone on a CPU; on a GPU, which a single matrix does
+    not keep busy, those of the same shape."""
     result: dict[object, list[int]] = {}
     for number in numbers:
         matrix = matrices[number]

@@ -42,7 +42,7 @@ class FlareLayers(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Pixels a side of the canvas."""
+        """Side of the canvas, pixels."""
         return int(self.rest.shape[0])
 
 

@@ -21,7 +21,8 @@ SECOND_FLARE_SHARE = 0.15
 DEVELOPED_SHARE = 0.35
 """Share of the frames with a camera's own curve and saturation."""
 PLACEMENTS = 12
-"""Placements of a flare, of which the one with its light in the brightest place is taken."""
+"""Number of placements that are drawn for a flare against a bright scene; the one whose light is in the brightest place
+is used."""
 EXPOSURE_LIMITS = (0.3, 3.0)
 """Smallest and largest factor by which a scene's exposure is changed to reach `draw_target_light`."""
 
@@ -107,7 +108,8 @@ def draw_appearance(random: Random, strength: float) -> FlareAppearance:
 
 def draw_placement(random: Random, canvas: int, width: int, height: int,
                    count_shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-    """Draw affine matrices (*count_shape, 2, 3) from a canvas of `canvas` pixels a side to a frame in pixels.
+    """Draw affine matrices (*count_shape, 2, 3) from a square canvas with sides of `canvas` pixels to a frame in
+    pixels.
 
     The canvas is rotated, mirrored, sheared a little, and scaled by at least what lets its inner circle pass through
     the frame's corners; its middle is the frame's in four of five.

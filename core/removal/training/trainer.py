@@ -34,7 +34,7 @@ the start, pictures without flare have the larger part of the gradients, and pre
 with the rest."""
 
 PATCH_SIZE = 48
-"""Pixels a side of the patches whose own gain counts beside the picture's, by the recipe's share."""
+"""Side in pixels of the patches whose own gain counts beside the picture's, by the recipe's share."""
 
 ZERO_INITIALISED = (".conv2.", ".proj.")
 """Parts of the names of the last convolutions of blocks and attention layers, which are zero before training."""

@@ -45,7 +45,7 @@ class FlareBatch(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Pixels a side of the canvas."""
+        """Side of the canvas, pixels."""
         return self.layers.shape[-1]
 
 

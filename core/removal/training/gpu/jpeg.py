@@ -8,7 +8,7 @@ import torch.nn.functional as F  # noqa: N812 - its name everywhere
 from torch import Tensor
 
 BLOCK_SIZE = 8
-"""Pixels a side of a DCT block."""
+"""Side of a DCT block, pixels."""
 SIZE_MULTIPLE = 2 * BLOCK_SIZE
 """Height and width must be multiples of this."""
 _LUMA = (16, 11, 10, 16, 24, 40, 51, 61, 12, 12, 14, 19, 26, 58, 60, 55, 14, 13, 16, 24, 40, 57, 69, 56,

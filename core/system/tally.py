@@ -61,7 +61,7 @@ class Tally:
         if not self.skipped:
             return f"{start}, none left out."
         reasons = sorted(self.skipped.items(), key=lambda item: -len(item[1]))
-        parts = [f"{_enumerate(names)} ({reason})" for reason, names in reasons[:MAX_REASONS]]
+        parts = [f"{list_first(names)} ({reason})" for reason, names in reasons[:MAX_REASONS]]
         more = len({name for _, names in reasons[MAX_REASONS:] for name in names})
         rest = f", and {more} for other reasons" if more else ""
         return f"{start}; {self.left_out} left out: {', '.join(parts)}{rest}."
@@ -73,7 +73,7 @@ class Tally:
         return {"used": self.used, "left_out": self.left_out, "skipped": names[:MAX_RESULT_NAMES]}
 
 
-def _enumerate(names: list[str]) -> str:
+def list_first(names: list[str]) -> str:
     """Return the first names in natural order, and how many more there are."""
     ordered = sorted(names, key=natural_key)
     more = len(ordered) - MAX_NAMES

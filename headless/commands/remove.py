@@ -41,6 +41,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "removed as well")
     plate_space.add_option(parser)
     glow.add_options(parser)
+    parser.add_argument("--amount", type=float, metavar="FACTOR",
+                        help="factor on the flare that is removed, 0 to 1.5 (default 1): 0.8 leaves a part of it, 1.2 "
+                             "removes more than the network predicts")
+    parser.add_argument("--sensitivity", choices=("low", "normal", "high"),
+                        help="how much evidence the removal needs (default normal). high: the plates are known to "
+                             "have flares, so faint and doubtful ones are removed too; low: only plain ones")
     parser.add_argument("--stills", action="store_true",
                         help="clean each plate by itself, without the plates before and after it")
     parser.add_argument("--working-size", type=int, metavar="PIXELS",
@@ -52,6 +58,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="network: the one that comes with the program. diffusion: a base model with a LoRA from "
                              "`train-removal`; needs diffusers, transformers and peft (default network)")
     parser.add_argument("--base", metavar="FOLDER_OR_NAME", help="the base model, for diffusion")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda", "mps"), default="auto",
+                        help="where the network runs (default auto: a GPU that torch finds, else the processor)")
     jobs.add_option(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace existing clean plates")
 
@@ -121,8 +129,8 @@ def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[s
     from ...core.fit import Run
     from ...core.removal.jobs.fitted import remove_fitted_flare
 
-    network = (args.weights, args.working_size, args.matte, args.stills, args.base)
-    if args.jobs != 1 or args.model != "network" or glow.is_set(args) or any(network):
+    network = (args.weights, args.working_size, args.matte, args.stills, args.base, args.sensitivity)
+    if args.jobs != 1 or args.model != "network" or glow.is_set(args) or any(network) or args.amount is not None:
         raise SettingsError("--run subtracts the fitted flare; only --out, --frames, --flare, --capture and "
                             "--overwrite go with it.")
     fitted = Run.open(args.run)
@@ -145,6 +153,8 @@ def _make_remover(args: argparse.Namespace) -> Remover:
     from ...core.removal.inference.remover import WORKING_SIZE
 
     remover = _make_model(args, WORKING_SIZE if args.working_size is None else args.working_size)
+    remover.use_device(args.device)
+    remover.use_controls(1.0 if args.amount is None else args.amount, args.sensitivity or "normal")
     space = plate_space.named_space(args)
     if space is not None:
         remover.use_plate_space(space)

@@ -92,7 +92,8 @@ def test_the_log_says_that_a_flare_may_be_a_grade(flare_everywhere: Path, tmp_pa
     plates = [tmp_path / name / f"{name}.png" for name in ("grade", "veil")]
     heard = RecordingProgress()
     remove_all(plates, tmp_path / "clean", Remover(flare_everywhere), heard)
-    assert [said for said in heard.texts if said.startswith("In 1 of them") and "all-white matte" in said]
+    assert [said for said in heard.texts if said.startswith("In 1 of them") and "all-white matte" in said
+            and "grade.png (0.00)" in said]
     codes = [cv2.imread(str(path)) for path in (plates[0], tmp_path / "clean" / "grade.png")]
     np.testing.assert_array_equal(*codes)
 

@@ -39,6 +39,21 @@ LOG_ODDS_RAMP = (-0.25, 0.25)
 """Log odds at which the confidence is 0 and 1; linear in between."""
 
 
+class Sensitivity(NamedTuple):
+    """How much evidence the removal of a flare needs.
+
+    log_odds_bias: added to the log odds of a flare before they become the confidence. gate: factor on the mean of a
+    predicted flare up to which it counts as none (`gate_by_mean`).
+    """
+
+    log_odds_bias: float
+    gate: float
+
+
+SENSITIVITIES = {"low": Sensitivity(-1.0, 2.0), "normal": Sensitivity(0.0, 1.0), "high": Sensitivity(2.0, 0.25)}
+"""The artist's choices by name. "high" is for plates that are known to have a flare."""
+
+
 class FlareFeatures(NamedTuple):
     """Five features of a predicted flare.
 
@@ -89,7 +104,7 @@ def stretch_black_point(display: Pixels) -> Pixels:
 
 
 def confidence_from_log_odds(log_odds: float) -> np.float32:
-    """Return the confidence, 0..1."""
+    """Return the confidence, 0..1, of log odds that include the bias of the `Sensitivity`."""
     return np.float32(np.interp(log_odds, LOG_ODDS_RAMP, (0, 1)))
 
 

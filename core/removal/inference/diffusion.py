@@ -212,13 +212,17 @@ class DiffusionRemover(Remover):
         self.model.eval()
         self.cache_key = compute_cache_key("diffusion", lora, str(base), working_size)
 
+    @property
+    def _module(self) -> nn.Module:
+        return self.model
+
     @torch.inference_mode()
     def predict_with_tta(self, display: Pixels) -> TtaPrediction:
         """Predict the flare of display values (h, w, 3), h and w multiples of SIZE_MULTIPLE, in one pass without
         augmentation."""
-        frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
+        frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None].to(self.device)
         flare = (frame - self.model(frame).clamp(0, 1)).clamp(min=0)
-        return single_prediction(np.ascontiguousarray(flare[0].permute(1, 2, 0).numpy()))
+        return single_prediction(np.ascontiguousarray(flare[0].permute(1, 2, 0).cpu().numpy()))
 
 
 def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[[int], tuple[Pixels, Pixels]],

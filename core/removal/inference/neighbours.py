@@ -70,7 +70,8 @@ class ShotPredictor:
         return plate, filter_in_time(frame, [
             Neighbour(self._predict_frame(neighbour, theirs), weight, self._flow(path, neighbour),
                       self._flow(neighbour, path))
-            for side in (before[::-1], after) for neighbour, theirs, weight in self._follow_shot(features, side)])
+            for side in (before[::-1], after) for neighbour, theirs, weight in self._follow_shot(features, side)],
+            self._remover.sensitivity.log_odds_bias)
 
     def _follow_shot(self, features: FrameFeatures,
                      side: Sequence[Path]) -> Iterator[tuple[Path, FrameFeatures, np.float32]]:

@@ -23,7 +23,8 @@ from ...system.reading import read_bytes
 from ..model.image_formation import flare_to_linear
 from ..model.network import RemovalNetwork
 from ..model.weights import IN_THE_BOX, load
-from .confidence import gate_by_mean
+from .confidence import SENSITIVITIES, Sensitivity, gate_by_mean
+from .device import select_device
 from .framing import (
     fill_hidden,
     input_size,
@@ -58,6 +59,8 @@ REVISION = 4
 Glow = Literal["keep", "keep at lights", "remove"]
 """What to do with the glow about lights: keep all of it; keep the part that lights at night have with a clean lens too
 (`light_discs`); or remove all of it, as for a fit, which learns it as flare."""
+MAX_AMOUNT = 1.5
+"""Greatest factor on a removed flare."""
 _GLOW_IN_CACHE_KEY = {"keep": "kept", "keep at lights": "kept at lamps", "remove": "taken"}
 """Text of each mode in cache keys. It never changes, so that existing results stay valid."""
 
@@ -82,12 +85,43 @@ class Remover:
 
     plate_space: ColourSpace | None = None
     """Space of the plates, in place of what their files declare."""
+    amount: float = 1.0
+    """Factor on the flare that is removed, 0..MAX_AMOUNT."""
+    sensitivity: Sensitivity = SENSITIVITIES["normal"]
+    """How much evidence the removal of a flare needs."""
+
+    def use_controls(self, amount: float = 1.0, sensitivity: str = "normal") -> None:
+        """Set how much of a flare is removed, 0..MAX_AMOUNT, and how much evidence that needs, a key of
+        SENSITIVITIES; results of other choices are made again. Raises SettingsError."""
+        if not 0 <= amount <= MAX_AMOUNT:  # also false for NaN
+            raise SettingsError(f"An amount of {amount} is outside 0 to {MAX_AMOUNT}.")
+        if sensitivity not in SENSITIVITIES:
+            raise SettingsError(f"There is no sensitivity {sensitivity}; choose one of {', '.join(SENSITIVITIES)}.")
+        self.amount, self.sensitivity = amount, SENSITIVITIES[sensitivity]
+        if (amount, sensitivity) != (1, "normal"):
+            self.cache_key = f"{self.cache_key} {amount:g} {sensitivity}"
 
     def use_plate_space(self, space: ColourSpace) -> None:
         """Read plates in this space, in place of what their files declare; results of others are made again."""
         if self.plate_space is None:
             self.cache_key = f"{self.cache_key} {space.fingerprint}"
         self.plate_space = space
+
+    device = torch.device("cpu")
+    """Where the network runs."""
+
+    @property
+    def _module(self) -> torch.nn.Module:
+        """The model that runs on the device."""
+        return self.network
+
+    def use_device(self, name: str) -> None:
+        """Run the network on a device (`device.DEVICES`); its results differ from the processor's by rounding, and are
+        made again. Raises SettingsError where this machine has none of that name."""
+        self.device = select_device(name)
+        self._module.to(self.device)
+        if self.device.type != "cpu":
+            self.cache_key = f"{self.cache_key} {self.device.type}"
 
     def remove(self, plate: Plate, matte: Pixels | None = None, prediction: FlarePrediction | None = None
                ) -> tuple[NDArray[Any], NDArray[np.float16]]:
@@ -152,7 +186,8 @@ class Remover:
     def predict(self, display: Pixels) -> FlarePrediction:
         """Predict the flare of a network input by itself, without neighbouring frames."""
         prediction = self.predict_with_tta(display)
-        return FlarePrediction(display, merge_flare(prediction), shot_confidence([(prediction, 1.0)]),
+        return FlarePrediction(display, merge_flare(prediction),
+                               shot_confidence([(prediction, 1.0)], self.sensitivity.log_odds_bias),
                                prediction.glow_fraction)
 
     def predict_with_tta(self, display: Pixels) -> TtaPrediction:
@@ -161,9 +196,13 @@ class Remover:
 
     @torch.inference_mode()
     def _forward(self, display: Pixels) -> Pixels:
-        """Run the network once (`test_time_augmentation.PredictFn`); glow that is kept is left out."""
-        output = self.network(torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None])
-        flare, without_glow = output.flare[0].clamp(min=0), output.flare_without_glow[0].clamp(min=0)
+        """Run the network once (`test_time_augmentation.PredictFn`), in half precision on a GPU; glow that is kept is
+        left out."""
+        frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None].to(self.device)
+        with torch.autocast(self.device.type, torch.float16, enabled=self.device.type != "cpu"):
+            output = self.network(frame)
+        flare, without_glow = (part[0].float().clamp(min=0).cpu()
+                               for part in (output.flare, output.flare_without_glow))
         parts = ([without_glow, torch.zeros_like(without_glow)] if self.glow == "keep"
                  else [flare, flare - without_glow])
         return np.asarray(torch.cat(parts).permute(1, 2, 0).numpy())
@@ -177,11 +216,11 @@ class Remover:
         if not inside_matte:
             # A ramp from nothing to the whole, so that a faint flare has no visible edge.
             flare = flare * np.clip((flare - MIN_FLARE) / MIN_FLARE, 0, 1)
-            flare = gate_by_mean(flare, self.min_mean_flare) * prediction.confidence
+            flare = gate_by_mean(flare, self.min_mean_flare * self.sensitivity.gate) * prediction.confidence
         keep_glow = self.glow == "keep at lights" and not inside_matte
         flare = flare * (1 - retained_fraction(prediction.display, flare, prediction.glow_fraction,
                                                keep_glow=keep_glow))
-        return np.where(flare > 0, flare_to_linear(prediction.display, flare), np.float32(0))
+        return np.where(flare > 0, self.amount * flare_to_linear(prediction.display, flare), np.float32(0))
 
 
 def compute_cache_key(model: str, weights: Path | str, *settings: Any) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ from ...images.plates import clean_name, is_plate_error
 from ...images.views import split_views, write_view_results
 from ...system.files import check_no_overwrite, real_path
 from ...system.progress import Progress
-from ...system.tally import Tally
+from ...system.tally import Tally, list_first
 from ..inference.neighbours import ShotPredictor, shot_sort_key
 from ..inference.remover import Remover
-from .clean_frames import CleanFrame, write_clean_frames
+from .clean_frames import CleanFrame, WriteFn, write_clean_frames
 from .manifest import MANIFEST, Manifest, digest_inputs
 from .mattes import Mattes
 
@@ -124,7 +124,8 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
                flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
                only: Container[Path] | None = None, independent: bool = False,
                failed_inputs: Sequence[str] = ()) -> dict[str, Any]:
-    """Clean every plate into `folder` and return the counts; the events of `remove` have the same keys.
+    """Clean every plate into `folder`; return the counts, and the confidence of each plate's flare, 0..1, by name. The
+    events of `remove` have the same keys.
 
     A result is kept if it was made from the same plate, neighbours and matte by the same remover, or if it was edited
     since it was made from the same plate (`Manifest`).
@@ -151,25 +152,24 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     if only is not None:
         plates = [(path, name) for path, name in plates if name in only]
     progress.stage("remove", len(plates))
-    failed, failed_names, unsure = list(failed_inputs), list[str](), list[Path]()
+    failed, failed_names = list(failed_inputs), list[str]()
 
     def digest(frame: CleanFrame) -> str:
         matte = [mattes.path(frame.name)] if mattes else []
         return digest_inputs(remover.cache_key, [frame.source, *predictor.dependencies(frame.source), *matte])
 
-    def clean(frame: CleanFrame) -> Callable[[], None]:
+    def clean(frame: CleanFrame) -> WriteFn:
         """Predict a plate's flare; return the function that writes its results."""
         plate, prediction = predictor.predict(frame.source)
         matte = mattes.read(frame.name, read_data_window(frame.source), read_exif(frame.source)[0]) if mattes else None
 
-        def write() -> None:
+        def write() -> float | None:
             (_, first), *others = split_views(plate)  # the eyes of a stereo picture; the first one is predicted above
             cleaned = [remover.remove(first, matte, prediction), *(remover.remove(view, matte) for _, view in others)]
             write_view_results(frame.results, plate, cleaned)
             if plate.warning:
                 progress.say(plate.warning)
-            if matte is None and prediction.confidence < MIN_CONFIDENCE:
-                unsure.append(frame.name)
+            return float(prediction.confidence) if matte is None else None
 
         return write
 
@@ -199,9 +199,12 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         progress.say(tally.sentence())
         raise FrameError(f"{len(failed)} of {len(plates) + len(failed_inputs)} plates could not be cleaned: "
                          f"{join_failures(failed)}")
+    confidence = manifest.confidence(name for _, name in plates)
+    unsure = [f"{name} ({value:.2f})" for name, value in confidence.items() if value < MIN_CONFIDENCE]
     if unsure:
         progress.say(f"In {len(unsure)} of them a possible flare was kept, because it may be part of the scene or of "
-                     "its grade; an all-white matte removes it.")
+                     f"its grade: {list_first(unsure)}. --sensitivity high or an all-white matte removes it.")
     progress.say(f"{written + kept.total()} clean frames are in {folder}.")
     progress.say(tally.sentence())
-    return {"plates": str(folder), "made": written, "kept": kept.total(), **tally.as_result()}
+    return {"plates": str(folder), "made": written, "kept": kept.total(), "confidence": confidence,
+            **tally.as_result()}

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 from ...capture import REMOVED, Capture
@@ -17,7 +16,7 @@ from ...system.files import retry_while_locked, safe_join
 from ...system.progress import Progress
 from ..inference.neighbours import ShotPredictor, shot_sort_key
 from ..inference.remover import Remover
-from .clean_frames import CleanFrame, write_clean_frames
+from .clean_frames import CleanFrame, WriteFn, write_clean_frames
 from .manifest import Manifest, digest_inputs
 
 UNFINISHED_FOLDER = "removed.unfinished"
@@ -48,7 +47,7 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress) -> Pat
     def digest(frame: CleanFrame) -> str:
         return digest_inputs(remover.cache_key, [frame.source, *predictor.dependencies(frame.source)])
 
-    def clean(frame: CleanFrame) -> Callable[[], None]:
+    def clean(frame: CleanFrame) -> WriteFn:
         plate, prediction = predictor.predict(frame.source)
         (_, first), *others = split_views(plate)
         return lambda: write_view_results(frame.results, plate, [

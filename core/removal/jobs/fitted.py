@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from ...images.views import split_views
 from ...system.files import check_no_overwrite, safe_join
 from ...system.progress import Progress
 from ..inference.plate_light import CLIPPING_LEVEL
-from .clean_frames import CleanFrame, write_clean_frames
+from .clean_frames import CleanFrame, WriteFn, write_clean_frames
 from .manifest import Manifest, digest_inputs
 
 Floats = NDArray[np.float64]
@@ -79,7 +79,7 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
         camera = views_by_name[frame.name].camera
         return digest_inputs(repr((fit_digest, camera.numbers, lights)), [frame.source])
 
-    def clean(frame: CleanFrame) -> Callable[[], None]:
+    def clean(frame: CleanFrame) -> WriteFn:
         plate, codes, flare, gains = _clean_view(renderer, capture, views_by_name[frame.name], above_white)
 
         def write() -> None:

@@ -22,10 +22,10 @@ MANIFEST = "remove.json"
 LOCK = ".remove.lock"
 KeepReason = Literal["up to date", "edited"]
 _Tables = dict[str, dict[str, str]]
-TABLES = ("plates", "flares", "flares_made", "sources", "written")
+TABLES = ("plates", "flares", "flares_made", "sources", "written", "confidence")
 """By frame: digest of the clean frame; path of its flare relative to the folder; digest of the flare, since the frame
 may have been made again without one; content hash of the frame as filmed. By path: content hash of each file as it was
-written."""
+written. By frame: confidence of the network that its flare is a flare, 0..1."""
 
 
 def digest_inputs(maker: str, sources: Iterable[Path]) -> str:
@@ -95,18 +95,31 @@ class Manifest:
                                  "now; choose another folder, or replace it with --overwrite.")
             for path in results:
                 new["written"].pop(_relative_path(self._folder, path), None)
+            new["confidence"].pop(key, None)
             for path, table in zip(results, ("plates", "flares_made"), strict=False):
                 if old[table].get(key) != digest:
                     remove_file(path)
             if new != old:
                 self._write(new)
 
-    def finish(self, results: Sequence[Path]) -> None:
-        """Enter the content of a frame's files after they were written."""
+    def finish(self, results: Sequence[Path], confidence: dict[Path, float] | None = None) -> None:
+        """Enter the content of a frame's files after they were written; confidence: of its flare, by the frame."""
         with file_lock(self._folder / LOCK):
             tables = self._read()
             tables["written"] |= {_relative_path(self._folder, path): content_hash(path) for path in results}
+            for name, value in (confidence or {}).items():
+                tables["confidence"][name.as_posix()] = f"{value:.2f}"
             self._write(tables)
+
+    def confidence(self, names: Iterable[Path]) -> dict[str, float]:
+        """Return the confidence that each frame's flare is one, 0..1, by the frame's name; without those of frames
+        that have none, such as those with a matte or of a fit."""
+        table = self._read()["confidence"]
+        values: dict[str, float] = {}
+        for name in names:
+            with contextlib.suppress(KeyError, ValueError):  # edited by hand
+                values[name.as_posix()] = float(table[name.as_posix()])
+        return values
 
     def report_kept(self, counts: Mapping[KeepReason, int], progress: Progress) -> None:
         """Say how many frames were kept, and why."""

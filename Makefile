@@ -17,7 +17,7 @@ pictures: demo
 	.venv/bin/python sample_scenes/make_library.py --sheet docs/library.jpg
 
 test: setup check
-	.venv/bin/python -m pytest
+	.venv/bin/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
 check: .venv/.ready
 	.venv/bin/ruff check .

@@ -5,7 +5,6 @@ Pictures are (height, width, 3) or (height, width), numpy. Display scores take s
 """
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Callable
 from typing import Any, Literal
@@ -98,25 +97,14 @@ def _blur(picture: NDArray[np.float64], borders: Borders) -> NDArray[np.float64]
     return picture
 
 
-def has_flip() -> bool:
-    """True if NVIDIA's `flip-evaluator` is installed."""
-    return importlib.util.find_spec("flip_evaluator") is not None
+def flip(image: Array, target: Array, mask: Array | None = None) -> float:
+    """Return the mean LDR-FLIP (Andersson et al. 2020), 0 for equal pictures, up to 1, at 67 pixels a degree.
 
-
-def flip(image: Array, target: Array, mask: Array | None = None) -> float | None:
-    """Return the mean LDR-FLIP (Andersson et al. 2020), 0 for equal pictures, up to 1, at the default 67 pixels a
-    degree.
-
-    mask: as in `psnr`. None if `flip-evaluator` is not installed.
+    mask: as in `psnr`.
     """
-    _check_same_size(image, target)
-    if not has_flip():
-        return None
-    import flip_evaluator
+    from .flip import flip_map
 
-    pictures = (np.ascontiguousarray(np.clip(picture, 0, 1), np.float32) for picture in (target, image))
-    errors, mean, _ = flip_evaluator.evaluate(*pictures, "LDR", applyMagma=False)
-    if mask is None:
-        return float(mean)
-    counted = np.asarray(errors).reshape(*image.shape[:2], -1)[mask]
-    return float(counted.mean()) if counted.size else math.nan
+    _check_same_size(image, target)
+    errors = flip_map(image, target)
+    counted = errors if mask is None else errors[mask]
+    return float(counted.mean(dtype=np.float64)) if counted.size else math.nan

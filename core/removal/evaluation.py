@@ -122,8 +122,7 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
     clean: removes the flare from display values (height, width, 3). gain_db: PSNR minus that of the untouched input;
     where two pictures are identical, IDENTICAL_PSNR counts, in means too. made_worse: share of pictures with a gain
     below -0.5 dB. failed: messages about pairs that cannot be read, which are left out. masked_psnr: over the pixels of
-    the mask. lpips is null without weights for it, FLIP where its package is not installed. Raises FrameError where no
-    pair can be read.
+    the mask. lpips is null without weights for it. Raises FrameError where no pair can be read.
     """
     progress = progress or Progress()
     progress.stage("eval-removal", len(cases))

@@ -69,10 +69,10 @@ def score_run(folder: Path, progress: Progress, *, view_set: str = "held-out",
 
 COMMAND = Command(
     "eval", "Scores a run: composite, scene and flare against reference frames.",
-    """Writes RUN/eval.json and shows its means: PSNR, SSIM (11x11 window, sigma 1.5, inside the picture), FLIP where
-the flip-evaluator package is installed, LPIPS where --lpips names its weights. Scene and flare are scored against
-truth/ where the capture has it, else against removed/. "empty" is the score of an empty flare. Views without flare are
-left out of the flare's PSNR, "empty" and relative error, and are listed.
+    """Writes RUN/eval.json and shows its means: PSNR, SSIM (11x11 window, sigma 1.5, inside the picture), FLIP, and
+LPIPS where --lpips names its weights. Scene and flare are scored against truth/ where the capture has it, else against
+removed/. "empty" is the score of an empty flare. Views without flare are left out of the flare's PSNR, "empty" and
+relative error, and are listed.
 
   run.py eval build/desk""",
     arguments, (Step("eval", "engine", run),))

@@ -6,6 +6,7 @@ import json
 import math
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,7 +21,9 @@ from core.metrics.evaluation import (
     summarise,
     unscored_mask,
 )
-from core.metrics.pictures import flip, has_flip, psnr, relative_l2, ssim
+from core.metrics.flip import flip_map
+from core.metrics.pictures import flip, psnr, relative_l2, ssim
+from tests.core import flared
 
 
 @pytest.fixture
@@ -109,14 +112,43 @@ def test_ssim_needs_a_window() -> None:
         ssim(np.zeros((10, 30)), np.zeros((10, 30)))
 
 
-def test_flip_is_a_number_or_none_if_not_installed(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    if not has_flip():
-        assert flip(*pair) is None
-        return
-    assert flip(pair[0], pair[0]) == pytest.approx(0, abs=1e-6)
-    score = flip(*pair)
-    assert score is not None
-    assert 0.02 < score < 1
+@pytest.mark.parametrize("kind", ["noise", "smooth", "filmed", "opposite", "green and blue"])
+@pytest.mark.parametrize("size", [(24, 90), (120, 160)])
+def test_flip_agrees_with_its_reference(kind: str, size: tuple[int, int]) -> None:
+    reference = pytest.importorskip("flip_evaluator")
+    random = np.random.default_rng(0)
+    noise = random.random((*size, 3), np.float32)
+    target = cv2.resize(random.random((5, 7, 3), np.float32), size[::-1], interpolation=cv2.INTER_CUBIC).clip(0, 1)
+    image = np.clip(target + 0.08 * random.standard_normal(target.shape), 0, 1).astype(np.float32)
+    if kind == "noise":
+        image, target = noise, noise[::-1]
+    elif kind == "filmed":
+        target = flared_frame(size)
+        image = np.roll(target, 3, 1) * np.float32(0.9)
+    elif kind == "opposite":
+        image, target = np.zeros_like(noise), np.ones_like(noise)
+    elif kind == "green and blue":
+        image, target = np.broadcast_to(np.eye(3, dtype=np.float32)[1:, None, None], (2, *size, 3))
+    image, target = np.ascontiguousarray(image), np.ascontiguousarray(target)
+    expected = np.squeeze(reference.evaluate(target, image, "LDR", applyMagma=False)[0])
+    np.testing.assert_allclose(flip_map(image, target), expected, atol=1e-4)
+    # Not the reference's own mean: it adds up in single precision.
+    assert flip(image, target) == pytest.approx(expected.mean(dtype=np.float64), abs=1e-5)
+
+
+def flared_frame(size: tuple[int, int]) -> np.ndarray:
+    """A frame of the tests' capture: dots, and a flare."""
+    camera = flared.cameras(3)[1]
+    dots = cv2.resize(np.random.default_rng(1).random((20, 30, 3), np.float32), size[::-1],
+                      interpolation=cv2.INTER_NEAREST)
+    return np.clip(srgb_from_linear(0.3 * dots + cv2.resize(flared.flare(camera), size[::-1])), 0, 1)
+
+
+def test_flip_of_equal_pictures_is_zero(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    assert flip(pair[0], pair[0]) == 0
+    assert 0.02 < flip(*pair) < 1
+    with pytest.raises(SettingsError):
+        flip(pair[0], pair[1][:-1])
 
 
 # ---- evaluation -----------------------------------------------------------------------------------

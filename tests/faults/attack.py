@@ -6,13 +6,15 @@ Each attempt runs a command with one fault, looks at what it left, and runs it a
 the command ends; it reports a failure in a sentence, or its result is that of an unbroken run; no file under a final
 name is cut short; the second run succeeds, gives the unbroken result and leaves nothing hidden behind. Files that
 differ between two unbroken runs (logs with times) are checked for being whole only. Prints a table by command; the exit
-status is 1 where anything failed.
+status is 1 where anything failed. With --folder an attack that was cut off goes on: attempts that passed are not
+repeated.
 """
 from __future__ import annotations
 
 import argparse
 import importlib
 import importlib.util
+import json
 import random
 import shutil
 import sys
@@ -36,12 +38,16 @@ if injection.is_preloaded():  # before the modules of the program
     _run.register_package()
     importlib.import_module("fit_flare.headless.cli")
 
+from core.system.files import write_json  # noqa: E402
 from tests.faults.cases import Case, Inputs, Snapshot, cases, fit_argv, leftovers, snapshot, why_not_whole  # noqa: E402
 
 UNBROKEN = Fault("none", 0)
+LIMIT_S = 300.0
+"""Time after which a command counts as hanging."""
 WARM = ("core.fit.run_loop", "core.bake.bake", "core.transfer.transfer", "core.transfer.export",
-        "core.removal.jobs.batch", "core.removal.jobs.fitted", "core.metrics.evaluation", "core.capture.solve",
-        "headless.targets")
+        "core.removal.jobs.batch", "core.removal.jobs.fitted", "core.removal.jobs.clean_video",
+        "core.removal.evaluation", "core.removal.training.run", "core.metrics.evaluation", "core.capture.solve",
+        "core.lights", "core.fit.traced_flare", "headless.targets")
 """Modules that are loaded once, before the forks."""
 STAYS_HIDDEN = (".solve", ".held")
 """Hidden files that are kept on purpose: the work of a solve; an empty lock file that could not be removed, which the
@@ -49,87 +55,134 @@ next process locks again."""
 
 
 def make_inputs(folder: Path, injector: Injector) -> Inputs:
-    """Make what the commands read: a capture, a run and its layers, weights, and frames to solve."""
+    """Make what the commands read, unless an earlier attack in the same folder has made it."""
+    from core.images.write import write_png
     from tests.core.captures import orbit
     from tests.core.flared import flared_capture
-    from tests.core.removal_cases import network_file
+    from tests.core.removal_cases import network_file, picture
+    from tests.core.test_lights import lit_capture
     from tests.core.test_solve import SIZE, shoot
+    from tests.core.videos import stripes, write_video
 
-    inputs = Inputs(flared_capture(folder / "capture", count=7, dots=60), folder / "run", folder / "layers",
-                    network_file(folder / "weights.safetensors", bias=0.2),
-                    shoot(folder / "shot", orbit(8, size=SIZE, arc=0.7)))
+    inputs, whole = Inputs(folder), folder / "whole"
+    if whole.exists():
+        return inputs
+    shutil.rmtree(folder, ignore_errors=True)
+    flared_capture(inputs.capture, count=7, dots=60)
+    lit_capture(inputs.lit, 6, [(0.4, -0.5, 0.3)])
+    (inputs.lit / "lights.json").unlink(missing_ok=True)
+    network_file(inputs.weights, bias=0.2)
+    shoot(inputs.shot, orbit(8, size=SIZE, arc=0.7))
+    write_video(inputs.clip, "ffv1", "yuv444p", [stripes(64) * gain for gain in (1.0, 0.8)], tags=(1, 1, 1))
+    for place in (inputs.backgrounds, inputs.pairs / "gt", inputs.pairs / "input"):
+        for name in ("a.png", "b.png"):
+            write_png(place / name, picture(80, 120).astype("float32") / (300 if place.name == "input" else 400))
     for argv in (fit_argv(inputs.capture, inputs.run),
                  ["bake", str(inputs.run), "--out", str(inputs.layers), "--frames", "1-3"]):
         done = injector.run(argv, folder, UNBROKEN, 600)
         if done.status:
             raise RuntimeError(done.text)
+    whole.touch()
     return inputs
+
+
+class Journal:
+    """Attempts of this attack and of earlier ones in the same folder: one line of JSON each."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.failures: dict[tuple[str, str], list[str]] = {}
+        self.outcomes: dict[tuple[str, str], str] = {}
+        if path.exists():
+            for line in path.read_text(encoding="utf-8").splitlines():
+                self._enter(**json.loads(line))
+
+    def add(self, case: str, fault: Fault, outcome: str, failures: list[str]) -> None:
+        """Note an attempt and what did not hold; it replaces an earlier one with the same fault."""
+        entry = {"case": case, "fault": str(fault), "outcome": outcome, "failures": failures}
+        self._enter(**entry)
+        with open(self._path, "a", encoding="utf-8") as stream:
+            stream.write(json.dumps(entry) + "\n")
+
+    def has_passed(self, case: str, fault: Fault) -> bool:
+        """True if the attempt was made and everything held."""
+        return self.failures.get((case, str(fault))) == []
+
+    def _enter(self, case: str, fault: str, outcome: str, failures: list[str]) -> None:
+        self.failures[case, fault], self.outcomes[case, fault] = failures, outcome
 
 
 class Attack:
     """The attempts on one command, below `folder`."""
 
-    def __init__(self, case: Case, folder: Path, injector: Injector) -> None:
-        self.case, self._folder, self._injector = case, folder, injector
+    def __init__(self, case: Case, folder: Path, injector: Injector, journal: Journal) -> None:
+        self.case, self._folder, self._injector, self._journal = case, folder, injector, journal
         self.out = folder / "out"
-        first, _ = self._unbroken()
-        second, outcome = self._unbroken()
-        self._calls = outcome.counts
-        self.reference: Snapshot = second
-        self.varying = {name for name in second if first.get(name) != second[name]}
-        if first.keys() != second.keys():
-            raise RuntimeError(f"{case.name} writes other files each time")
-        self.failures: list[str] = []
-        self.counts: Counter[str] = Counter()
+        self._failures: list[str] = []
+        stored = folder / "unbroken.json"
+        if not stored.exists():
+            first, _ = self._unbroken()
+            second, outcome = self._unbroken()
+            if first.keys() != second.keys():
+                raise RuntimeError(f"{case.name} writes other files each time")
+            varying = [name for name in second if first[name] != second[name]]
+            write_json(stored, {"files": second, "varying": varying, "calls": outcome.counts})
+        read = json.loads(stored.read_text(encoding="utf-8"))
+        self.reference: Snapshot = read["files"]
+        self.varying = set(read["varying"])
+        self._calls: dict[str, int] = read["calls"]
 
     def faults(self, number: int, kill: bool) -> list[Fault]:
-        """Spread `number` faults over the calls that an unbroken run makes."""
-        totals = self._calls
-        used = [call for call in CALLS if totals[call]]
-        if not used:
-            return []
-        faults = []
-        for index in range(number):
-            call = used[index % len(used)]
-            turn, turns = index // len(used), -(-number // len(used))
-            at = 1 + turn * (totals[call] - 1) // max(turns - 1, 1)
-            error = "kill" if kill else ERRORS[index // len(used) % len(ERRORS)]
-            faults.append(Fault(call, at, error, sticky=error == "ENOSPC" and call == "write" and turn % 2 == 1))
-        return faults
+        """Spread `number` different faults evenly over the kinds of calls and over the calls of each kind."""
+        chance = random.Random(f"{self.case.name} {kill}")
+        used = [call for call in CALLS if self._calls[call]]
+        faults: dict[Fault, None] = {}
+        for index in range(20 * number):
+            call, turn = used[index % len(used)], index // len(used)
+            turns = max(-(-number // len(used)), 1)
+            at = 1 + int((turn % turns + chance.random()) / turns * self._calls[call])
+            error = "kill" if kill else chance.choice(ERRORS)
+            sticky = error == "ENOSPC" and call == "write" and chance.random() < 0.5
+            faults.setdefault(Fault(call, at, error, sticky))
+            if len(faults) == number:
+                break
+        return list(faults)
 
     def try_one(self, fault: Fault) -> None:
         """Run with the fault, then without; note what does not hold."""
-        self.counts["kills" if fault.error == "kill" else "faults"] += 1
+        self._failures = []
         self._reset()
-        argv = self.case.argv(self.out)
+        outcome = "hangs"
         try:
-            outcome = self._injector.run(argv, self.out, fault)
+            outcome = self._run_twice(fault)
         except TimeoutError as problem:
             self._fail(fault, str(problem))
-            return
-        self._check_broken(fault, outcome)
-        try:
-            again = self._injector.run(argv, self.out, UNBROKEN)
-        except TimeoutError as problem:
-            self._fail(fault, f"the second run: {problem}")
-            return
+        self._journal.add(self.case.name, fault, outcome, self._failures)
+
+    def _run_twice(self, fault: Fault) -> str:
+        """Return how the run with the fault ended."""
+        argv = self.case.argv(self.out)
+        ending = self._check_broken(fault, self._injector.run(argv, self.out, fault, LIMIT_S))
+        again = self._injector.run(argv, self.out, UNBROKEN, LIMIT_S)
         if again.status:
             self._fail(fault, f"the second run ends with {again.status}: {again.text[-600:]}")
-            return
-        self._compare(fault, "the second run")
+            return ending
+        self._compare(fault, "the second run", self.varying | self.case.resumed)
         left = [name for name in leftovers(self.out) if not any(part in name for part in STAYS_HIDDEN)]
         if left:
             self._fail(fault, f"the second run leaves {left}")
+        return ending
 
-    def _check_broken(self, fault: Fault, outcome: Outcome) -> None:
+    def _check_broken(self, fault: Fault, outcome: Outcome) -> str:
         killed = fault.error == "kill"
+        ending = "other"
         if outcome.status == 0:
-            self.counts["harmless"] += 1
-            self._compare(fault, "success told")
+            ending = "harmless"
+            self._compare(fault, "success told", self.varying)
         elif killed and outcome.status == -9:
-            self.counts["killed"] += 1
+            ending = "killed"
         elif outcome.status in (1, 2):
-            self.counts["refused in a sentence"] += 1
+            ending = "refused in a sentence"
             if "Traceback" in outcome.text or "defect of Fit Flare" in outcome.text or "error:" not in outcome.text:
                 self._fail(fault, f"no sentence: {outcome.text[-1200:]}")
         else:
@@ -138,17 +191,19 @@ class Attack:
             reason = why_not_whole(self.out / name)
             if reason:
                 self._fail(fault, f"{name} is not whole: {reason}")
+        return ending
 
-    def _compare(self, fault: Fault, what: str) -> None:
+    def _compare(self, fault: Fault, what: str, may_vary: set[str] | frozenset[str]) -> None:
         now = snapshot(self.out)
-        other = [name for name in sorted({*now, *self.reference} - self.varying)
-                 if now.get(name) != self.reference.get(name)] + [name for name in self.varying if name not in now]
+        other = [name for name in sorted({*now, *self.reference} - may_vary)
+                 if now.get(name) != self.reference.get(name)]
+        other += [name for name in sorted(may_vary & self.reference.keys()) if name not in now]
         if other:
             self._fail(fault, f"{what}, but other than unbroken: {other[:6]}")
 
     def _fail(self, fault: Fault, text: str) -> None:
-        self.failures.append(f"{self.case.name}, {fault}: {text}")
-        print(f"FAILED {self.failures[-1]}", flush=True)
+        self._failures.append(text)
+        print(f"FAILED {self.case.name}, {fault}: {text}", flush=True)
 
     def _reset(self) -> None:
         shutil.rmtree(self.out, ignore_errors=True)
@@ -172,29 +227,36 @@ def attack(folder: Path, faults: int, kills: int, only: list[str], limit_s: floa
     torch.set_num_threads(1)
     for name in WARM:
         importlib.import_module(f"fit_flare.{name}")
-    injector = Injector(folder / "log")
-    inputs = make_inputs(folder / "inputs", injector)
-    chosen = [case for case in cases(inputs) if not only or case.name in only]
+    injector, journal = Injector(folder / "log"), Journal(folder / "attempts.jsonl")
+    chosen = [case for case in cases(make_inputs(folder / "inputs", injector)) if not only or case.name in only]
     attacks: list[Attack] = []
     for case in chosen:
         try:
-            attacks.append(Attack(case, folder / case.name.replace(" ", "_"), injector))
+            attacks.append(Attack(case, folder / case.name.replace(" ", "_"), injector, journal))
             print(f"{case.name}: {len(attacks[-1].reference)} files", flush=True)
         except (RuntimeError, TimeoutError) as problem:
             print(f"FAILED {case.name} without a fault: {problem}", flush=True)
     planned = []
-    for one in attacks:
-        part = one.case.weight / sum(other.case.weight for other in attacks)
-        plan = [*one.faults(round(faults * part), kill=False), *one.faults(round(kills * part), kill=True)]
+    plans: dict[str, list[Fault]] = {}
+    for index, one in enumerate(attacks):
+        plan = [*one.faults(_part(faults, index, len(attacks)), kill=False),
+                *one.faults(_part(kills, index, len(attacks)), kill=True)]
+        plans[one.case.name] = plan
         # In turn over all commands, so that an attack that is cut off has been on each.
-        planned += [((index + 0.5) / len(plan), one, fault) for index, fault in enumerate(_shuffled(plan))]
+        planned += [((place + 0.5) / len(plan), one, fault) for place, fault in enumerate(_shuffled(plan))
+                    if not journal.has_passed(one.case.name, fault)]
     for _, one, fault in sorted(planned, key=lambda entry: entry[0]):
         if time.monotonic() > end:
             print("The time is over.")
             break
         one.try_one(fault)
-    _print_table(attacks)
-    return int(len(attacks) < len(chosen) or any(one.failures for one in attacks))
+    failed = _print_table(attacks, plans, journal)
+    return int(len(attacks) < len(chosen) or failed)
+
+
+def _part(total: int, index: int, parts: int) -> int:
+    """Return the share of part `index` where `total` is divided evenly."""
+    return total * (index + 1) // parts - total * index // parts
 
 
 def _shuffled(plan: list[Fault]) -> list[Fault]:
@@ -202,15 +264,23 @@ def _shuffled(plan: list[Fault]) -> list[Fault]:
     return random.Random(0).sample(plan, len(plan))
 
 
-def _print_table(attacks: list[Attack]) -> None:
-    columns = ("faults", "kills", "refused in a sentence", "harmless", "killed")
-    print(f"| command | {' | '.join(columns)} | failed | files that vary |\n|{' --- |' * (len(columns) + 3)}")
+def _print_table(attacks: list[Attack], plans: dict[str, list[Fault]], journal: Journal) -> bool:
+    """Print the attempts by command; return whether any failed."""
+    columns = ("faults", "kills", "refused in a sentence", "harmless", "killed", "failed")
+    print(f"| command | {' | '.join(columns)} | files that vary |\n|{' --- |' * (len(columns) + 2)}")
     total: Counter[str] = Counter()
     for one in attacks:
-        total += Counter({**one.counts, "failed": len(one.failures)})
-        print(f"| {one.case.name} | {' | '.join(str(one.counts[name]) for name in columns)} | {len(one.failures)} | "
-              f"{', '.join(sorted(one.varying))} |")
-    print(f"| all | {' | '.join(str(total[name]) for name in columns)} | {total['failed']} | |", flush=True)
+        name, counts = one.case.name, Counter[str]()
+        for fault in plans[name]:
+            if (name, str(fault)) in journal.outcomes:
+                counts["kills" if fault.error == "kill" else "faults"] += 1
+                counts[journal.outcomes[name, str(fault)]] += 1
+                counts["failed"] += bool(journal.failures[name, str(fault)])
+        total += counts
+        print(f"| {name} | {' | '.join(str(counts[column]) for column in columns)} | "
+              f"{', '.join(sorted(one.varying | one.case.resumed))} |")
+    print(f"| all | {' | '.join(str(total[column]) for column in columns)} | |", flush=True)
+    return total["failed"] > 0
 
 
 def main(argv: list[str]) -> int:
@@ -220,7 +290,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--only", nargs="*", default=[], help="names of commands")
     parser.add_argument("--minutes", type=float, default=600.0, help="time after which it ends")
-    parser.add_argument("--folder", type=Path, help="folder for the work, which is kept")
+    parser.add_argument("--folder", type=Path, help="folder for the work, which is kept; an attack goes on there")
     args = parser.parse_args(argv)
     if not injection.is_preloaded():
         if reason := injection.reason_to_skip():

@@ -6,6 +6,7 @@ own matrix, range and curve, so what does not change keeps its codes up to the e
 """
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -92,11 +93,13 @@ def check_target(target: Path, codec: str | None) -> None:
 
 
 def rewrite_video(source: Path, target: Path, codec: str, change: Change, *,
-                  on_frame: Callable[[], None] = lambda: None) -> list[str]:
+                  on_frame: Callable[[], None] = lambda: None,
+                  on_written: Callable[[Path], None] = lambda _: None) -> list[str]:
     """Write `source` to `target` with changed frames, and return sentences about what was left out.
 
-    on_frame: called after each frame, and may raise to stop. Raises FrameError where the source cannot be decoded or
-    the target not be encoded.
+    on_frame: called after each frame, and may raise to stop. on_written: called with the whole file before it is
+    renamed to `target`. Raises FrameError where the source cannot be decoded or the target not be encoded, OSError
+    where the target cannot be written.
     """
     av = import_av()
     encoder = CODECS[codec]
@@ -115,6 +118,8 @@ def rewrite_video(source: Path, target: Path, codec: str, change: Change, *,
                 _copy_chapters(other, out)
                 _encode(out, stream, encoder, video, change, sound, on_frame)
         except (av.error.FFmpegError, ValueError) as problem:
+            if isinstance(problem, OSError) and problem.errno:
+                raise OSError(problem.errno, os.strerror(problem.errno), str(target)) from problem
             raise FrameError(f"{target} cannot be written as {codec}: {problem}; choose another --codec or another "
                              "suffix.") from problem
         if video.has_alpha and encoder.alpha is None:
@@ -122,6 +127,7 @@ def rewrite_video(source: Path, target: Path, codec: str, change: Change, *,
         if encoder.name == "ffv1" and video.aspect != 1:
             left_out.append(f"FFV1 in .mkv is written without the pixel aspect of {source}, {video.aspect:.4g}; set it "
                             "where it is used, or write another codec.")
+        on_written(temporary)
         return left_out + video.problems
 
 

@@ -2,9 +2,11 @@
 """Videos in `remove`: their frames are extracted once, and what is missing is said."""
 from __future__ import annotations
 
+import errno
 import shutil
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -195,6 +197,33 @@ def test_a_clean_video_waits_for_its_frames_and_is_kept(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"out\.mkv exists and was not made from these frames"):
         write_clean_video(film, target, None, heard)
     assert write_clean_video(film, target, None, heard, overwrite=True) and target.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("fails", ["core.removal.jobs.clean_video.write_json", "core.system.files.retry_while_locked"])
+def test_a_clean_video_that_could_not_be_finished_is_written_again(fails: str, tmp_path: Path,
+                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
+    film, target = clip_of(tmp_path / "film.mp4"), tmp_path / "out.mkv"
+    filmed = extract_frames(film, frames_folder(target), Progress())
+    for number in (1, 2, 3):
+        shutil.copy(filmed / f"film.{number:06d}.png", frames_folder(target))
+    for level in (0.0, 0.5):  # the first video, and another in its place
+        write_png(frames_folder(target) / "film.000003.png", np.full((64, 192, 3), level))
+        before = target.read_bytes() if target.exists() else None
+        with monkeypatch.context() as patch:
+            patch.setattr(fails, full_disk)
+            with pytest.raises(OSError):
+                write_clean_video(film, target, None, Progress())
+        assert (target.read_bytes() if target.exists() else None) == before
+        assert write_clean_video(film, target, None, Progress())
+        assert abs(frames_of(target)[2].picture().pixels.mean() - level) < 0.02
+
+
+def full_disk(first: Any, second: Any) -> None:
+    """Fail as the `write_json` of a record, or as the rename of a video but not of a record."""
+    if isinstance(second, Path) and second.suffix == ".json":
+        first(second)
+        return
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.mark.parametrize(("given", "name", "codec", "sentence"), [

@@ -27,6 +27,7 @@ from ..inference.remover import Remover
 from .clean_frames import CleanFrame, WriteFn, write_clean_frames
 from .manifest import MANIFEST, Manifest, digest_inputs
 from .mattes import Mattes
+from .video_frames import VIDEO_MANIFEST
 
 MIN_CONFIDENCE = 0.5
 """Confidence of a prediction below which a message names the plate: a possible flare was kept."""
@@ -109,7 +110,7 @@ def left_out(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) -> dic
             for reason, names in passed_over(folder, subfolders=False):
                 skipped.setdefault(reason, []).extend(
                     (inside / name).as_posix() for name in names
-                    if name != MANIFEST and real_path(folder / name) not in excluded_paths)
+                    if name not in (MANIFEST, VIDEO_MANIFEST) and real_path(folder / name) not in excluded_paths)
     return {reason: names for reason, names in skipped.items() if names}
 
 

@@ -59,10 +59,11 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
     digest = digest_inputs(name, [source, *clean.values()])
     record = read_json(folder / RECORD, SettingsError) if (folder / RECORD).is_file() else {}
     if target.exists() and not overwrite:
-        if record.get("written") != content_hash(target):
+        present = content_hash(target)
+        if present not in (record.get("written"), record.get("replaced")):
             raise SettingsError(f"{target} exists and was not made from these frames, so it may be someone's work; "
                                 "choose another name, or replace it with --overwrite.")
-        if record.get("from") == digest:
+        if record.get("from") == digest and record.get("written") == present:
             progress.say(f"{target} is up to date; --overwrite makes it again.")
             return True
 
@@ -74,9 +75,13 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
         before, after = read_picture(filmed[stem]), read_picture(clean[stem])
         return None if np.array_equal(before.pixels, after.pixels) else (before.pixels, after.pixels)
 
+    def note(whole: Path) -> None:
+        # Before the video has its name: an end between the two must leave no video that looks like someone's work.
+        replaced = {"replaced": content_hash(target)} if target.exists() else {}
+        write_json(folder / RECORD, {"from": digest, "written": content_hash(whole), **replaced})
+
     progress.stage(f"write {target.name}", len(clean))
-    for sentence in rewrite_video(source, target, name, change, on_frame=progress.advance):
+    for sentence in rewrite_video(source, target, name, change, on_frame=progress.advance, on_written=note):
         progress.say(sentence)
-    write_json(folder / RECORD, {"from": digest, "written": content_hash(target)})
     progress.say(f"The clean video is {target}.")
     return True

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.capture.solve import solve
+from core.capture.solve import SolveSettings, solve
 from core.errors import Cancelled, CaptureError
 from core.system.child import ChildDied, run_in_child
 from core.system.progress import Progress
@@ -101,6 +101,23 @@ def test_a_solve_whose_library_aborts_says_so(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr("core.capture.solve.mapping.solve", abort_instead)
     with pytest.raises(CaptureError, match=r"disk of .* is full or fails"):
         solve(shoot(tmp_path / "frames", orbit(4, size=SIZE, arc=0.4)), tmp_path / "out")
+
+
+def test_an_error_of_the_library_is_a_sentence(tmp_path: Path) -> None:
+    from core.capture.solve import mapping
+
+    pycolmap, progress, database = mapping.load_pycolmap(), Progress(), tmp_path / "database.db"
+    progress.stage("match frames", 1)
+    database.write_bytes(b"no database" * 1000)
+    with (pytest.raises(CaptureError, match=r'failed at the step "match frames" \(.*\); mostly the disk of .* is full'),
+          mapping._report_library_errors(tmp_path, progress), mapping._open_database(pycolmap, database)):
+        pass
+    (tmp_path / mapping.MODELS_FILE).write_text('["0"]')
+    with (pytest.raises(CaptureError, match=r"\(\[reconstruction\.cc"),
+          mapping._report_library_errors(tmp_path, progress)):
+        mapping._run_mapper(pycolmap, tmp_path, database, 4, SolveSettings(), progress)
+    with pytest.raises(ValueError, match="not a colour"), mapping._report_library_errors(tmp_path, progress):
+        raise ValueError("not a colour")
 
 
 def abort_instead(*_: object) -> None:

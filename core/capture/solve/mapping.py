@@ -6,10 +6,12 @@ Features and matches go into a database batch by batch; a resumed solve does not
 from __future__ import annotations
 
 import contextlib
+import re
 import shutil
 import signal
 import sqlite3
 import threading
+import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import CaptureError, EngineError
+from ...errors import CaptureError, EngineError, is_out_of_memory
 from ...images.read import decode
 from ...images.size import picture_size
 from ...system.files import read_json, write_json, write_text
@@ -46,6 +48,9 @@ MIN_MATCHES = 15
 """Number of verified matches from which two frames count as matched."""
 MIN_MOTION_PX = 1.0
 """Median motion of features, in pixels of the small pictures, below which the camera counts as still."""
+
+_SOURCE_LINE = re.compile(r"\[\w+\.(cc|h):\d+\]")
+"""Start of the messages of pycolmap's checks."""
 
 
 @dataclass(eq=False)
@@ -91,6 +96,13 @@ def solve(sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, v
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     pycolmap.set_random_seed(settings.seed)
+    with _report_library_errors(work, progress):
+        return _solve(pycolmap, sources, work, settings, video, progress)
+
+
+def _solve(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, video: bool,
+           progress: Progress) -> Solved:
+    """Carry out `solve`."""
     database = work / DATABASE
     _check_frames_differ(sources, work)
     _extract_features(pycolmap, sources, work, database, settings, progress)
@@ -109,6 +121,22 @@ def solve(sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, v
     names = {source.name: index for index, source in enumerate(sources)}
     sizes = sorted((model.num_reg_images() for model in models), reverse=True)
     return Solved(_to_model(largest, names), sizes, matching, pairs)
+
+
+@contextlib.contextmanager
+def _report_library_errors(work: Path, progress: Progress) -> Iterator[None]:
+    """Raise CaptureError in place of what pycolmap raises, which is RuntimeError or ValueError with a line of C++."""
+    try:
+        yield
+    except (RuntimeError, ValueError) as problem:
+        *_, (frame, _) = traceback.walk_tb(problem.__traceback__)
+        is_library = frame.f_code.co_filename == __file__  # Python code that fails has a frame of its own
+        if not is_library or is_out_of_memory(problem) or (
+                isinstance(problem, ValueError) and not _SOURCE_LINE.match(str(problem))):
+            raise
+        raise CaptureError(f"COLMAP failed at the step \"{progress.stage_name}\" ({' '.join(str(problem).split())}); "
+                           f"mostly the disk of {work} is full or fails: make room and solve again, finished steps are "
+                           "kept.") from problem
 
 
 def check_intermediate_files(work: Path) -> None:

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Casts rays at textured rectangles by numpy: the scenes of the sample shots, which need no Blender.
+
+World axes are those of a camera: x right, y down, z forward. Surfaces are matt; lamps light them without shadows, by
+the cosine and the square of the distance. Pictures are scene-linear and averaged over 2 x 2 rays a pixel.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .description import Array, Pinhole
+
+Pixels = NDArray[np.float32]
+
+RAYS_PER_SIDE = 2
+"""Rays of a pixel along each side."""
+SHARE_SAMPLES = 128
+"""Points on a lamp's disc whose visibility is tested."""
+
+
+@dataclass(frozen=True, eq=False)
+class Quad:
+    """A rectangle: corner (3,), edges u and v (3,), perpendicular; texture (h, w, 3), linear reflectance.
+
+    radiance: factor by which the texture emits, whatever lights it.
+    """
+
+    corner: Array
+    u: Array
+    v: Array
+    texture: Pixels
+    radiance: float = 0.0
+
+    def moved(self, offset: Array) -> Quad:
+        """Return the rectangle, moved."""
+        return Quad(self.corner + offset, self.u, self.v, self.texture, self.radiance)
+
+
+@dataclass(frozen=True, eq=False)
+class Lamp:
+    """A bright sphere: xyz (3,), radius, colour (3,) linear, radiance of its disc, power by which it lights surfaces.
+
+    beam: (3,) the direction into which a headlight shines, or None for all.
+    """
+
+    xyz: Array
+    radius: float
+    colour: Array
+    radiance: float
+    power: float
+    beam: Array | None = None
+
+
+def quad(corner: Sequence[float], u: Sequence[float], v: Sequence[float], texture: Pixels, radiance: float = 0.0
+         ) -> Quad:
+    """Make a rectangle from plain numbers."""
+    return Quad(np.array(corner, float), np.array(u, float), np.array(v, float), texture, radiance)
+
+
+def box(low: Sequence[float], high: Sequence[float], texture: Pixels) -> list[Quad]:
+    """Return the five sides of a box that a camera above its bottom may see."""
+    (x0, y0, z0), (x1, y1, z1) = low, high
+    return [quad((x0, y0, z0), (x1 - x0, 0, 0), (0, y1 - y0, 0), texture),
+            quad((x0, y0, z1), (x1 - x0, 0, 0), (0, y1 - y0, 0), texture),
+            quad((x0, y0, z0), (0, 0, z1 - z0), (0, y1 - y0, 0), texture),
+            quad((x1, y0, z0), (0, 0, z1 - z0), (0, y1 - y0, 0), texture),
+            quad((x0, y0, z0), (x1 - x0, 0, 0), (0, 0, z1 - z0), texture)]
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """The nearest surface of each ray: distance (n,) along it, albedo (n, 3), emission (n, 3), normal (n, 3)."""
+
+    distance: NDArray[np.float32]
+    albedo: Pixels
+    emission: Pixels
+    normal: Pixels
+
+    def nearer(self, other: Hits) -> Hits:
+        """Return the nearer of two hits of the same rays."""
+        closer = (self.distance <= other.distance)[:, None]
+        return Hits(np.minimum(self.distance, other.distance), np.where(closer, self.albedo, other.albedo),
+                    np.where(closer, self.emission, other.emission), np.where(closer, self.normal, other.normal))
+
+
+def camera_rays(camera: Pinhole, rotation: Array) -> Pixels:
+    """Return unit directions (n, 3) in the world of the rays of all pixels, in rows. rotation: (3, 3) world to camera.
+    """
+    width, height = camera.width * RAYS_PER_SIDE, camera.height * RAYS_PER_SIDE
+    x, y = np.meshgrid(((np.arange(width) + 0.5) / RAYS_PER_SIDE - camera.cx) / camera.fx,
+                       ((np.arange(height) + 0.5) / RAYS_PER_SIDE - camera.cy) / camera.fy)
+    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ rotation
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True), np.float32)
+
+
+def cast(quads: Sequence[Quad], eye: Array, rays: Pixels) -> Hits:
+    """Return the nearest hits of rays (n, 3) from `eye`."""
+    count = len(rays)
+    hits = Hits(np.full(count, np.inf, np.float32), *(np.zeros((count, 3), np.float32) for _ in range(3)))
+    for item in quads:
+        distance, a, b = _intersect(item, eye, rays)
+        index = np.flatnonzero((distance < hits.distance) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1))
+        if not len(index):
+            continue
+        height, width = item.texture.shape[:2]
+        columns, rows = a[index] * (width - 1), b[index] * (height - 1)
+        colour = cv2.remap(item.texture, columns.reshape(-1, 1), rows.reshape(-1, 1), cv2.INTER_LINEAR).reshape(-1, 3) \
+            if len(index) < 32000 else _sample(item.texture, columns, rows)
+        normal = np.cross(item.u, item.v)
+        normal = normal / np.linalg.norm(normal) * (-np.sign(normal @ (item.corner - eye)) or 1.0)
+        hits.distance[index] = distance[index]
+        hits.albedo[index] = 0.0 if item.radiance else colour
+        hits.emission[index] = colour * np.float32(item.radiance)
+        hits.normal[index] = normal
+    return hits
+
+
+def _sample(texture: Pixels, columns: Pixels, rows: Pixels) -> Pixels:
+    """Sample a texture bilinearly at many points; OpenCV takes fewer than 32768 rows at once."""
+    parts = [cv2.remap(texture, columns[start:start + 32000].reshape(-1, 1), rows[start:start + 32000].reshape(-1, 1),
+                       cv2.INTER_LINEAR).reshape(-1, 3) for start in range(0, len(columns), 32000)]
+    return np.concatenate(parts).astype(np.float32)
+
+
+def _intersect(item: Quad, eye: Array, rays: Pixels) -> tuple[Pixels, Pixels, Pixels]:
+    """Return distance (infinite behind the eye) and the two coordinates on the rectangle, each (n,)."""
+    normal = np.cross(item.u, item.v)
+    # Projecting onto the two edges beforehand saves the hit points.
+    along = rays @ normal.astype(np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.float32((item.corner - eye) @ normal) / along
+        distance = np.where(distance > 1e-4, distance, np.float32(np.inf))
+        coordinates = [
+            distance * (rays @ (edge / (edge @ edge)).astype(np.float32))
+            - np.float32((item.corner - eye) @ edge / (edge @ edge)) for edge in (item.u, item.v)]
+    return distance, np.nan_to_num(coordinates[0], nan=-1), np.nan_to_num(coordinates[1], nan=-1)
+
+
+def shade(hits: Hits, eye: Array, rays: Pixels, lamps: Sequence[Lamp], ambient: Array) -> Pixels:
+    """Return the radiance (n, 3) of hits: emission, ambient light, and the light of the lamps; discs in front."""
+    seen = np.isfinite(hits.distance)
+    points = eye.astype(np.float32) + np.where(seen, hits.distance, 0)[:, None] * rays
+    light = np.broadcast_to(ambient.astype(np.float32), hits.albedo.shape).copy()
+    for lamp in lamps:
+        if not lamp.power:
+            continue
+        towards = lamp.xyz.astype(np.float32) - points
+        squared = (towards * towards).sum(1) + np.float32(0.02)
+        distance = np.sqrt(squared)
+        cosine = np.maximum((towards * hits.normal).sum(1) / distance, 0)
+        strength = lamp.power * cosine / squared
+        if lamp.beam is not None:
+            strength *= np.maximum(-(towards @ lamp.beam.astype(np.float32)) / distance, 0) ** 3
+        light += strength[:, None] * lamp.colour.astype(np.float32)
+    radiance = hits.emission + hits.albedo * light
+    for lamp in lamps:
+        if lamp.radiance:
+            covered = _disc(lamp, eye, rays, hits.distance)
+            radiance[covered] = lamp.colour.astype(np.float32) * np.float32(lamp.radiance)
+    return radiance
+
+
+def _disc(lamp: Lamp, eye: Array, rays: Pixels, distance: Pixels) -> NDArray[np.bool_]:
+    """Return (n,), which rays meet a lamp before anything else."""
+    towards = lamp.xyz - eye
+    along = rays @ towards.astype(np.float32)
+    off = np.float32(towards @ towards) - along * along
+    return np.asarray((along > 0) & (off < lamp.radius**2) & (along - lamp.radius < distance))
+
+
+def average(radiance: Pixels, camera: Pinhole) -> Pixels:
+    """Average the rays of each pixel: (n, 3) to (height, width, 3)."""
+    side = RAYS_PER_SIDE
+    grid = radiance.reshape(camera.height, side, camera.width, side, 3)
+    return np.asarray(grid.mean((1, 3)), np.float32)
+
+
+def visible_share(lamp: Lamp, eye: Array, quads: Sequence[Quad]) -> float:
+    """Return the share of a lamp's disc that no rectangle hides from `eye`, 0..1."""
+    towards = lamp.xyz - eye
+    distance = float(np.linalg.norm(towards))
+    axis = towards / distance
+    side = np.cross(axis, (0.0, 1.0, 0.0))
+    side /= np.linalg.norm(side)
+    up = np.cross(side, axis)
+    index = np.arange(SHARE_SAMPLES) + 0.5
+    radius = lamp.radius * np.sqrt(index / SHARE_SAMPLES)
+    angle = index * np.pi * (3 - math.sqrt(5))
+    points = lamp.xyz + radius[:, None] * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * up)
+    rays = np.asarray((points - eye) / np.linalg.norm(points - eye, axis=1, keepdims=True), np.float32)
+    return float((cast(quads, eye, rays).distance >= distance - lamp.radius).mean())

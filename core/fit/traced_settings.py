@@ -25,6 +25,13 @@ are given: 27 mm on a sensor of 36 mm. They scale with the frame."""
 MIN_CORE = 0.6
 """Smallest softening radius of the starburst, pixels of the traced pictures: these are sampled at pixel centres, and a
 smaller core would flicker as the light moves between them."""
+F_NUMBER_TOLERANCE = 0.97
+"""Ratio of a requested f-number to the lens's widest down to which it counts as the widest: prescriptions are rounded.
+"""
+HOOD = (0.7, 1.5)
+"""Tangents of the field angles at which the lens hood begins to shade and lets no light in, at REFERENCE_REACH."""
+LIGHT_SIZE = 0.0014
+"""Standard deviation (tan) of the blur of ghosts by the extent of the light, at REFERENCE_REACH."""
 ASPECT = 9 / 16
 """Height of the traced pictures over their width."""
 
@@ -153,20 +160,20 @@ class TracedFlareSettings:
         return self.sensor / 2 / self.used_focal_length
 
     def lens_setup(self) -> LensSetup:
-        """Return the setup of the tracer, with a ghost gain of 1. Raises SettingsError for a lens that cannot be used
-        so."""
+        """Return the setup of the tracer, with a ghost gain of 1. Raises SettingsError for a lens that forms no
+        picture, and for an f-number that it does not reach."""
         scale = self.reach / REFERENCE_REACH
         widest = find_lens(self.lens).widest_f_number()
         f_number = self.iris.f_number or 2 * widest
-        if f_number < 0.97 * widest:
+        if f_number < F_NUMBER_TOLERANCE * widest:
             raise SettingsError(f"The lens {self.lens} opens to f/{widest:.2g} at most; give an f-number of that or "
                                 "more, or 0.")
         return LensSetup(
             lens=self.lens, stop_down=min(widest / f_number, 1.0), blades=self.iris.blades, turn=self.iris.rotation,
             curved=self.iris.roundness, uneven=self.iris.unevenness, seed=self.glass.seed, squeeze=self.squeeze,
             coating=self.glass.coating, focal_length=self.focal_length, dust=self.glass.dust,
-            scratches=self.glass.scratches, hood=(0.7 * scale, 1.5 * scale),
-            ghosts=GhostSettings(count=self.ghosts.count, gain=1.0, rim=self.ghosts.rim, size=0.0014 * scale,
+            scratches=self.glass.scratches, hood=(HOOD[0] * scale, HOOD[1] * scale),
+            ghosts=GhostSettings(count=self.ghosts.count, gain=1.0, rim=self.ghosts.rim, size=LIGHT_SIZE * scale,
                                  bands=self.tracing.bands if self.ghosts.dispersion else 1,
                                  supersample=self.tracing.supersample),
             starburst=replace(self.starburst, extent=self.starburst.extent * scale,

@@ -305,7 +305,7 @@ def tables(results: Results) -> str:
         scores = {name: [row[capture] for capture in names] for name, row in rows.items()}
         all_scores = [scored for row in scores.values() for scored in row]
         columns = [(layer, key, title) for layer, key, title in COLUMNS
-                 if any(scored.get(layer, {}).get(key) is not None for scored in all_scores)]
+                   if any(scored.get(layer, {}).get(key) is not None for scored in all_scores)]
         lines = []
         for name, row in scores.items():
             cells = [_cell((scored.get(layer, {}).get(key) for scored in row), 2 if key == "psnr" else 3)

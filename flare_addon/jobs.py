@@ -158,6 +158,7 @@ class Job:
             self._apply_event(event["type"], event)
 
     def _apply_event(self, kind: str, event: Mapping[str, Any]) -> None:
+        """Update the state from an event. Raises KeyError, TypeError or ValueError where its values are invalid."""
         if kind == "stage":
             name, done, total = str(event["name"]), int(event["done"]), int(event["total"])
             self.stage, self.done, self.total, self.eta_s = name, done, total, None

@@ -352,8 +352,8 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
         column.prop(state, "over")
         box.operator("fit_flare.set_up_baked", icon="NODE_COMPOSITING")
         if node is not None and node.node_tree is not None:
-            sliders = [node.inputs[name] for name in ("Intensity",
-                                                      "Tint") if name in node.inputs]  # an artist may have renamed them
+            # An artist may have renamed the inputs.
+            sliders = [node.inputs[name] for name in ("Intensity", "Tint") if name in node.inputs]
             slider_drivers = drivers.node_drivers(scene)
             if not drivers.is_complete(scene):
                 label_lines(box, "Some sliders of the panel Look do not act on it any more: set it up again.", "ERROR")

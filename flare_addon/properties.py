@@ -79,19 +79,16 @@ class Edits:
         default=1.0, min=0.0, soft_max=3.0, max=100.0, update=redraw_viewports)
     rotation: FloatProperty(  # type: ignore[valid-type]
         name="Rotation", description="Angle by which each ghost, glow and streak is turned about its own centre",
-        default=0.0,
-        subtype="ANGLE", update=redraw_viewports)
+        default=0.0, subtype="ANGLE", update=redraw_viewports)
     tint: FloatVectorProperty(  # type: ignore[valid-type]
         name="Tint", description="Colour that multiplies the flare; white leaves it as filmed", default=(1.0, 1.0, 1.0),
         size=3, subtype="COLOR", min=0.0, soft_max=1.0, max=100.0, update=redraw_viewports)
     saturation: FloatProperty(  # type: ignore[valid-type]
         name="Saturation", description="Colour saturation of the flare: 0 is grey, 1 as filmed", default=1.0, min=0.0,
-        soft_max=2.0, max=10.0,
-        update=redraw_viewports)
+        soft_max=2.0, max=10.0, update=redraw_viewports)
     streak: FloatProperty(  # type: ignore[valid-type]
         name="Streak Length", description="Length of the streaks along their direction", default=1.0, min=0.0,
-        soft_max=4.0,
-        max=100.0, update=redraw_viewports)
+        soft_max=4.0, max=100.0, update=redraw_viewports)
     mute: BoolProperty(  # type: ignore[valid-type]
         name="Mute", description="Hide this flare or element", default=False, update=redraw_viewports)
     solo: BoolProperty(  # type: ignore[valid-type]
@@ -156,20 +153,18 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     known_lights: StringProperty()  # type: ignore[valid-type]
     footage: EnumProperty(  # type: ignore[valid-type]
         name="Footage", description="Which frames are shown behind the cameras",
-        items=(("images", "As Filmed", "The frames with their own flare"),
-               ("removed", "Clean", "The clean frames of removed/, to see the flare without the one in the footage")),
+        items=(("images", "As Filmed", "The frames as filmed, with their flare"),
+               ("removed", "Clean", "The clean frames of removed/, so that only the fitted flare is visible")),
         update=_update_footage)
 
     matte: StringProperty(  # type: ignore[valid-type]
         name="Matte", description="Where the flares are, roughly painted in white on black: one picture for all "
-                                  "frames, or a "
-        "folder with one of the same name for each. In white areas faint flares are removed too; in black areas, "
-        "nothing. Empty: "
-        "the network finds the flares", subtype="FILE_PATH", options=PATH_OPTIONS)
+        "frames, or a folder with one of the same name for each. In white areas, faint flares are removed too; in "
+        "black areas, nothing is removed. Without a matte, the network finds the flares", subtype="FILE_PATH",
+        options=PATH_OPTIONS)
     keep_glow: BoolProperty(  # type: ignore[valid-type]
-        name="Keep Glow", description="Keep the glow around the lights in the clean frames: it stays in the scene, and "
-                                      "the "
-        "flare is learned without it", default=False)
+        name="Keep Glow", description="Keep the glow around the lights in the clean frames: it becomes part of the "
+        "scene, and the fit learns the flare without it", default=False)
     run: StringProperty(  # type: ignore[valid-type]
         name="Run", description="Folder of the fit: settings, checkpoint, preview and result", subtype="DIR_PATH",
         options=PATH_OPTIONS)
@@ -179,17 +174,16 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         name="Supervision", description="Which clean frames supervise the scene in the fit",
         items=MODES)
     width: IntProperty(  # type: ignore[valid-type]
-        name="Width", description="Width in pixels to fit at, at most; 0 uses the width of the frames", default=0,
-        min=0,
-        max=16384)
+        name="Width", description="Largest width in pixels of the frames in the fit; 0 uses the width of the frames",
+        default=0, min=0, max=16384)
 
     flare: StringProperty(  # type: ignore[valid-type]
         name="Flare", description="The .flare file that the scene shows", subtype="FILE_PATH",
         options=PATH_OPTIONS, update=redraw_viewports)
     native: BoolProperty(  # type: ignore[valid-type]
         name="Of This Capture", description="The flare was learned from the imported capture, so its appearance "
-                                            "follows the camera; in "
-        "another scene it keeps the appearance of one training view", default=False, update=redraw_viewports)
+        "follows the camera; in another scene it keeps the appearance of one training view", default=False,
+        update=redraw_viewports)
     lights: CollectionProperty(type=FITFLARE_PG_light)  # type: ignore[valid-type]
     light: IntProperty(name="Light", description="The light whose sliders are shown", default=0)  # type: ignore[valid-type]
     master: PointerProperty(type=FITFLARE_PG_master)  # type: ignore[valid-type]
@@ -210,15 +204,13 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     bake_first: IntProperty(name="First", description="First frame to bake", default=1)  # type: ignore[valid-type]
     bake_last: IntProperty(name="Last", description="Last frame to bake", default=1)  # type: ignore[valid-type]
     bake_scene: BoolProperty(  # type: ignore[valid-type]
-        name="Fitted Scene Too", description="Also render the scene of the fit as a layer; without it there are layers "
-                                             "of the "
-        "flare alone", default=False)
+        name="Fitted Scene Too", description="Also render the scene of the fit as a layer; without it, there are only "
+        "layers of the flare", default=False)
     bake_live: BoolProperty(  # type: ignore[valid-type]
         name="Keep Colours Live", description="Do not bake Intensity, Tint, Mute and Solo of lights into the layers; "
-                                              "the "
-        "compositor applies them, so you can change them without baking again", default=True)
+        "the compositor applies them, so you can change them without baking again", default=True)
     over: EnumProperty(  # type: ignore[valid-type]
-        name="Over", description="What the compositor puts the flare over",
+        name="Over", description="The picture that the compositor adds the flare to",
         items=(("present", "Present Image", "The present output of the compositor, or the render"),
                ("plate", "Footage", "The frames behind the camera"),
                ("scene", "Baked Scene", "The fitted scene in the layers")))

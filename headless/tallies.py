@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.images.listing import passed_over, pictures_in
+from ..core.images.listing import pictures_in, unlisted_entries
 from ..core.system.progress import Progress
 from ..core.system.tally import Tally
 
@@ -40,7 +40,7 @@ def tally_solve(report: Mapping[str, Any], source: Path) -> Tally:
         problem = sentence.removeprefix(f"{source / name} ").partition(";")[0].partition(" (")[0].rstrip(".")
         tally.skip(problem, name or source.name)
     if source.is_dir():
-        tally.merge(passed_over(source))
+        tally.merge(unlisted_entries(source))
     return tally
 
 

@@ -176,12 +176,12 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
 
 def left_out(options: TargetOptions, target: Target) -> list[tuple[str, list[str]]]:
     """Return what is in the folder of pictures that --to names and gets no flare, by reason."""
-    from ..core.images.listing import passed_over
+    from ..core.images.listing import unlisted_entries
 
     folder = options.to[0]
     is_folder = len(options.to) == 1 and folder.is_dir() and _is_plate_folder(folder)
     dark = [frame.plate.name for frame in target.frames if frame.plate is not None and not frame.shot.lights]
-    return [*(passed_over(folder) if is_folder else ()), ("shows no light, so it has no flare", dark)]
+    return [*(unlisted_entries(folder) if is_folder else ()), ("shows no light, so it has no flare", dark)]
 
 
 def _is_plate_folder(folder: Path) -> bool:

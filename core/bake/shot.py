@@ -116,7 +116,7 @@ def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool
     """
     folders = shot.folders
     frame_of_view = {f"{shot_frame.name}/{shot_frame.frame}": shot_frame for shot_frame in shot.frames
-             if frame_numbers is None or shot_frame.frame in frame_numbers}
+                     if frame_numbers is None or shot_frame.frame in frame_numbers}
     frames = [NumberedFrame(view, shot_frame.frame, layers_file(folders[shot_frame.name], shot_frame.frame))
               for view, shot_frame in frame_of_view.items()]
     cameras = {view: shot_frame.camera for view, shot_frame in frame_of_view.items()}

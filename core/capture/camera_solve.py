@@ -124,6 +124,7 @@ def _index(root: Path, folders: list[Path]) -> PictureIndex:
 
 def _describe(solve: CameraSolve, files: dict[str, Path], missing: list[str], unposed: list[str],
               renamed: list[str]) -> list[str]:
+    """Return sentences for the user on frames without a pose, poses without a frame, and frames of another name."""
     sentences = []
     if files and (missing or unposed):
         text = f"{len(files)} of {len(files) + len(unposed)} frames in {solve.root} have a pose"
@@ -142,11 +143,12 @@ def list_names(names: list[str]) -> str:
 
 
 def check_geometry(solve: CameraSolve) -> list[str]:
-    """Return sentences on points that no camera has before it, and on lenses that cannot be."""
+    """Return sentences for the user on points that no camera sees, and on impossible focal lengths."""
     return [*_check_points(solve), *_check_lenses(solve)]
 
 
 def _check_points(solve: CameraSolve) -> list[str]:
+    """Return a sentence if most sampled points are in no view, or behind the cameras."""
     points = solve.points.xyz[::max(len(solve.points) // SAMPLED_POINTS, 1)].astype(np.float64)
     if not len(points):
         return []
@@ -169,6 +171,7 @@ def _check_points(solve: CameraSolve) -> list[str]:
 
 
 def _check_lenses(solve: CameraSolve) -> list[str]:
+    """Return a sentence if a focal length gives a field of view that no lens has."""
     wrong = []
     for frame in solve.frames:
         lens = frame.lens

@@ -407,6 +407,7 @@ class Capture:
         return self._picture(paths[view.name], view, size, space) if view.name in paths else None
 
     def _read_held_out_names(self, path: Path) -> set[str]:
+        """Read the names of the held-out views from a split file. Raises CaptureError."""
         data = read_json(path, CaptureError)
         names = data.get("test") if isinstance(data, dict) else None
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):

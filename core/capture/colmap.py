@@ -158,6 +158,7 @@ def _file_path(folder: Path, name: str) -> Path:
 
 
 def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Any:
+    """Read a part of a model by its binary or text reader; None without points3D. Raises CaptureError."""
     path = _file_path(folder, name)
     if not path.is_file():
         if name == "points3D":

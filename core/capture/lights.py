@@ -125,6 +125,7 @@ def read_lights(path: Path) -> tuple[Light, ...]:
 
 
 def _parse_light(entry: Mapping[str, Any], name: str, where: str) -> Light:
+    """Parse an entry of lights.json; `where` begins the message of a CaptureError."""
     frames = entry.get("frames")
     if frames is not None and not (isinstance(frames, dict) and frames):
         raise CaptureError(f'{where}: frames should read {{"0001.png": {{"xy": [x, y]}}, …}}.')
@@ -145,6 +146,7 @@ def _parse_light(entry: Mapping[str, Any], name: str, where: str) -> Light:
 
 
 def _parse_key(key: Any, where: str) -> LightKey:
+    """Parse a light's key at one frame. Raises CaptureError."""
     if not isinstance(key, dict) or not {"xyz", "xy", "on"} & key.keys():
         raise CaptureError(f"{where}: give its place (xyz or xy), its brightness (on), or both.")
     on, confidence = key.get("on"), key.get("confidence", 1.0)

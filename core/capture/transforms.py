@@ -167,6 +167,7 @@ def _parse_number(meta: dict[str, Any], key: str, where: str, default: float | N
 
 
 def _read_lens(meta: dict[str, Any], folder: Path, name: str, where: str) -> Lens:
+    """Read the lens of the frame `name` from the values of its file. Raises CaptureError, with `where` in front."""
     if "w" in meta or "h" in meta:
         width, height = int(_parse_number(meta, "w", where)), int(_parse_number(meta, "h", where))
     else:

@@ -60,6 +60,7 @@ def space_of_profile(profile: bytes) -> ColourSpace:
 
 
 def _space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> ColourSpace:
+    """Make the space of a profile's curves, one per channel, and its matrix (3, 3) to linear Rec. 709."""
     ramp = np.linspace(0, 1, _SAMPLES, dtype=np.float32)
     decoded = np.stack([curve(ramp) for curve in curves])
     is_709 = np.abs(matrix - np.eye(3)).max() < SRGB_TOLERANCE

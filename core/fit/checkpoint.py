@@ -142,6 +142,7 @@ class FitInputs:
                            "ones back, or begin the fit anew in another folder.")
 
     def _digest(self, view: View) -> str:
+        """Hash the camera and the files of a view: frame, mask and, with `removed`, clean frame."""
         capture, camera = self._capture, view.camera
         mask = capture.mask_path(view)
         files = [capture.frame_path(view), *([capture.removed_path(view)] if self._removed else []),

@@ -210,7 +210,7 @@ class Trainer:
         if self.flare is None or visibility is None or not self.fits_scene or bool((self.flare.clear > 0).all()):
             return None
         visible = [light for light in self.flare.positions[self.flare.clear <= 0]
-                 if light_disc_mask(targets.frame.numpy(), targets.camera, light[None].numpy()).any()]
+                   if light_disc_mask(targets.frame.numpy(), targets.camera, light[None].numpy()).any()]
         eye = torch.from_numpy(targets.camera.position)
         return occlusion_loss(self.scene, eye, visible, visibility, self.settings.kernels)
 
@@ -266,6 +266,7 @@ class Trainer:
 
     def _parallax_loss(self, targets: Targets, scene: Tensor, flare: Splats | None,
                        light_discs: Tensor | None) -> Tensor:
+        """Return the loss of a scene without exact clean frames (`parallax_losses`). flare: its splats, if any."""
         settings = self.settings
         if self.flare is None or self._is_scene_only(targets):
             return quantile_loss(scene, targets.frame, settings.split.excess_weight)

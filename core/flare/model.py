@@ -215,7 +215,7 @@ class FlareModel(nn.Module):
             for name, view in zip(self.names, self.views(pose), strict=True):
                 if view.depth > 0:
                     views_by_light[name].append([round_for_text(value)
-                                       for value in (*view.camera.tolist(), *view.light.tolist())])
+                                                 for value in (*view.camera.tolist(), *view.light.tolist())])
         return views_by_light
 
     def light_corrections(self, world_to_camera: Tensor) -> Tensor:
@@ -225,7 +225,7 @@ class FlareModel(nn.Module):
         a hidden light touches would move by full steps because of it.
         """
         corrections = [flare.network.light_correction(flare.network.view_features(view.camera, view.light).detach())
-                 for flare, view in zip(self.lights, self.views(world_to_camera), strict=True) if view.depth > 0]
+                       for flare, view in zip(self.lights, self.views(world_to_camera), strict=True) if view.depth > 0]
         return torch.stack(corrections) if corrections else torch.zeros(0, 2)
 
     def forward(self, world_to_camera: Tensor,

@@ -114,6 +114,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
             raise FlareFileError(f"{path} is not a PLY file of Gaussians: the property {name} is missing.")
 
     def columns(names: tuple[str, ...]) -> torch.Tensor:
+        """Return (n, names) of these properties, with legal infinities replaced."""
         values: NDArray[np.float32] = np.empty((n, len(names)), np.float32)
         for column, name in enumerate(names):
             values[:, column] = table[name]

@@ -156,6 +156,7 @@ def open_oiio(path: Path) -> Any:
 
 
 def _describe_by_oiio(path: Path, kind: Kind) -> Description:
+    """Read the header of a file with OpenImageIO. Raises FrameError."""
     opened = open_oiio(path)
     try:
         spec = opened.spec()
@@ -197,6 +198,7 @@ def _check_stated_size(path: Path, kind: Kind) -> None:
 
 
 def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
+    """Decode a file with OpenImageIO; see `decode_foreign`. Raises FrameError."""
     _check_stated_size(path, kind)
     opened = open_oiio(path)
     try:
@@ -233,6 +235,7 @@ def _guarded(decode: Callable[..., NDArray[Any]], path: Path) -> NDArray[Any]:
 
 
 def _decode_by_opencv(path: Path, _progress: Progress | None = None) -> NDArray[Any]:
+    """Decode a file with OpenCV; see `decode_foreign`. Raises FrameError."""
     import cv2
 
     data = np.frombuffer(read_bytes(path, MAX_BYTES), np.uint8)

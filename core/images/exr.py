@@ -185,7 +185,7 @@ def read_data_window(path: Path | str) -> DataWindow:
         return DataWindow(size, (0, 0), size)
     headers = _exr_headers(path)
     return window_from_header(path, main_part([(header, [channel.name for channel in header["channels"]])
-                                                for header in headers]))
+                                               for header in headers]))
 
 
 def read_exr(path: Path | str) -> dict[str, Pixels]:

@@ -31,8 +31,8 @@ def pictures_below(folder: Path) -> list[Path]:
             and not any(part.startswith(".") for part in path.relative_to(folder).parts)]
 
 
-def passed_over(folder: Path, *, subfolders: bool = True) -> list[tuple[str, list[str]]]:
-    """Return the reasons for which entries of a folder are not among `pictures_in`, with their names.
+def unlisted_entries(folder: Path, *, subfolders: bool = True) -> list[tuple[str, list[str]]]:
+    """Return the names of a folder's entries that `pictures_in` leaves out, by reason: (reason, names).
 
     Hidden files and the systems' own (Thumbs.db, desktop.ini) are not mentioned. subfolders: mention those that hold
     pictures or videos, with their number.

@@ -216,6 +216,7 @@ def read_plate(path: Path | str, space: ColourSpace | None = None) -> Plate:
 
 
 def _read_codes(path: Path, space: ColourSpace | None) -> Plate:
+    """Read a plate of any format but EXR. Raises FrameError."""
     with open_regular(path) as stream:
         pages = tiff.page_count(stream)
     if pages > 1:
@@ -265,6 +266,7 @@ def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
 
 
 def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
+    """Read an EXR plate of one part, with its header and all channels. Raises FrameError."""
     parts = read_exr_parts(path)
     header, channels = parts[0]
     if len(parts) > 1:
@@ -354,6 +356,7 @@ def write_results(results: Sequence[Path], plate: Plate, codes: NDArray[Any], fl
 
 
 def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
+    """Write codes with the header and the other channels of an EXR plate, as scanlines without loss."""
     import OpenEXR
 
     channels = dict(plate.extras["channels"])

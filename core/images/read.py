@@ -63,6 +63,7 @@ def read_picture(path: Path | str, *, keep_primaries: bool = False, space: Colou
 
 
 def _read_exr_picture(path: Path, keep_primaries: bool, space: ColourSpace | None) -> Picture:
+    """Read an EXR as `read_picture` does. Raises FrameError."""
     picture_size(path)
     header, channels = main_part([(part, part[1]) for part in read_exr_parts(path)])
     stored = rgb_channels(path, channels)

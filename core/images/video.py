@@ -186,7 +186,7 @@ class Video:
         self.orientation = orientation_from_matrix(self.matrix)
         self.stored_size = int(first.width), int(first.height)
         """(width, height) of frames before they are turned upright."""
-        self.length = self._promised_length()
+        self.length = self._declared_length()
         ratio = Fraction(self.stream.sample_aspect_ratio or 0)
         aspect = float(ratio) if ratio > 0 else 1.0
         self.aspect = 1 / aspect if self.orientation.transposed else aspect
@@ -336,7 +336,7 @@ class Video:
             return None
         return sorted(times)
 
-    def _promised_length(self) -> int:
+    def _declared_length(self) -> int:
         """Return the number of frames by the header; those that an edit list hides do not count."""
         stream = self.stream
         if not stream.frames:

@@ -273,6 +273,7 @@ class _OtherStreams:
 
 def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Change, sound: _OtherStreams,
             on_frame: Callable[[], None]) -> None:
+    """Encode every frame with its change, and write the other streams up to LEAD_S ahead of it."""
     planar = plane_format(stream.pix_fmt)
     assert planar is not None
     context, time_base = stream.codec_context, stream.codec_context.time_base

@@ -108,7 +108,7 @@ def write_findings(capture: Capture, findings: Findings, keep: bool = False) -> 
         "views": [{"name": view.name, "detections": [
             {"xy": detection.xy.round(3).tolist(), "radius": round(detection.radius, 2),
              "score": round(detection.score, 3), "cut": detection.is_cut} for detection in in_view]}
-            for view, in_view in zip(capture.views, findings.detections, strict=True)],
+                  for view, in_view in zip(capture.views, findings.detections, strict=True)],
         "sheets": [str(path.relative_to(capture.folder)) for path in sheets],
     }
     write_json(capture.folder / SHEETS / REPORT, report)

@@ -288,7 +288,7 @@ def remove(scene: Any) -> None:
         if ours is not None and not (name == RENDER and any(one.is_linked for one in ours.outputs)):
             tree.nodes.remove(ours)
     if not state["tree"] and all(one.bl_idname in (_OUTPUT_TYPE, "CompositorNodeViewer") or one.name == RENDER
-                                for one in tree.nodes):
+                                 for one in tree.nodes):
         _discard_tree(scene, tree, bool(state["use_nodes"]))
     elif state["tree"]:
         if state.get("nodes") is not None:

@@ -93,7 +93,7 @@ def build(scene: SceneDescription) -> None:
                                                 (1.7, -0.82, 8, 0.32), (-2.7, -0.6, 33, 0.44))):
         sides = [s.picture_material(f"cube {index} {face}", p.framed(
             p.poster(rng, 300, 300, (p.WARM, p.SEA, p.MOSS, p.PLUM)[(index + face) % 4], 9), 0.1), 0.7)
-            for face in range(5)]
+                 for face in range(5)]
         s.box(f"cube {index}", (side, side, side), (x, y, 0.36 if index == 2 else 0), sides, turn)
     for index, (x, y, turn) in enumerate(((0.35, -1.25, -12), (-1.15, -1.35, 17), (2.6, 0.0, -20))):
         page = p.writing(rng, 700, 520, (238, 232, 216), (40, 44, 66), 30)

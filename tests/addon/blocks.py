@@ -91,7 +91,7 @@ def blocks_for(keys: set[str], blocks: dict[str, set[str]]) -> dict[str, set[str
     """Return for each key the blocks that hold it."""
     return {key: {name for name, written in blocks.items() if any(
         fnmatch.fnmatchcase(key, _pattern(other)) or fnmatch.fnmatchcase(other, _pattern(key)) for other in written)}
-        for key in keys}
+            for key in keys}
 
 
 def _pattern(key: str) -> str:

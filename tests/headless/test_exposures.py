@@ -46,7 +46,7 @@ def test_baked_layers_have_the_exposure_of_each_frame(runs: tuple[Path, Path], t
     for run in runs:
         assert cli.main(["bake", str(run), "--out", str(tmp_path / run.name), "--frames", "1-2", "--float"]) == 0
     plain, exposed = ([read_layers(tmp_path / run.name / f"layers.000{number}.exr").flare for number in (1, 2)]
-                   for run in runs)
+                      for run in runs)
     assert plain[0].max() > 1e-3
     np.testing.assert_allclose(exposed[0] * TIMES, plain[0], rtol=1e-4, atol=1e-6)
     np.testing.assert_array_equal(exposed[1], plain[1])
@@ -70,7 +70,7 @@ def test_removed_flares_have_the_exposure_of_each_frame(runs: tuple[Path, Path],
                  str(tmp_path / run.name / "flares")]
         assert cli.main(args) == 0
     plain, exposed = ([read_picture(tmp_path / run.name / "flares" / f"000{number}.exr").pixels for number in (1, 2)]
-                   for run in runs)
+                      for run in runs)
     assert np.abs(exposed[0] - plain[0]).max() > 1e-3
     np.testing.assert_array_equal(exposed[1], plain[1])
 
@@ -125,6 +125,6 @@ def test_a_transfer_to_a_run_has_the_exposure_of_each_frame(runs: tuple[Path, Pa
         assert cli.main(["transfer", str(runs[0] / "flare.flare"), "--to", str(run), "--out", str(tmp_path / run.name),
                          "--frames", "1-2", "--float"]) == 0
     plain, exposed = ([read_layers(tmp_path / run.name / f"layers.000{number}.exr").scene for number in (1, 2)]
-                   for run in runs)
+                      for run in runs)
     assert 1.2 < plain[0].mean() / exposed[0].mean() < 1.8
     np.testing.assert_array_equal(exposed[1], plain[1])

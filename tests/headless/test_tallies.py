@@ -13,7 +13,7 @@ import numpy as np
 from fit_flare.headless.tallies import tally_capture, tally_solve
 
 from core.capture import Capture
-from core.images.listing import passed_over
+from core.images.listing import unlisted_entries
 from tests.core.captures import make_transforms, picture
 from tests.core.flared import flared_capture
 
@@ -36,7 +36,7 @@ def test_what_is_passed_over_in_a_folder_has_a_reason(tmp_path: Path) -> None:
         (tmp_path / name).write_text("")
     (tmp_path / "empty").mkdir()
     (tmp_path / "gone.png").symlink_to("nowhere.png")
-    assert sorted(passed_over(tmp_path)) == sorted([
+    assert sorted(unlisted_entries(tmp_path)) == sorted([
         ("a subfolder with 1 picture", ["a"]), ("MOV is not read here", ["cut.mov"]),
         ("a link to a missing file", ["gone.png"]), ("TXT is not read here", ["notes.txt"]),
         ("not a picture", ["README"]), ("XMP is not read here", ["sidecar.xmp"])])

@@ -194,7 +194,7 @@ def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path,
     """Extract features of every frame that has none yet; one camera for all frames of one size and focal length."""
     with _open_database(pycolmap, database) as db:
         extracted = {image.name for image in db.read_all_images()
-                if db.num_keypoints_for_image(image.image_id) or db.exists_descriptors(image.image_id)}
+                     if db.num_keypoints_for_image(image.image_id) or db.exists_descriptors(image.image_id)}
         cameras: dict[tuple[int, int, float | None], int] = {}
         known = {(c.width, c.height, round(c.params[0], 6)): c.camera_id for c in db.read_all_cameras()}
         groups: dict[tuple[int, bool], list[str]] = {}

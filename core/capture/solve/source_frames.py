@@ -142,6 +142,7 @@ def _to_upright(picture: Picture, orientation: int) -> Picture:
 
 def _from_folder(source: Path, work: Path, number: int, size: int,
                  progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
+    """Prepare the frames of a folder; see `prepare_frames`."""
     named = colour_space(*space) if space[0] else None
     files = pictures_in(source)
     if not files:

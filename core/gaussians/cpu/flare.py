@@ -203,6 +203,7 @@ def prepare_records(
 
 @inlined
 def _write_shape(shapes, i, r0, w, cutoff, k, arcs):
+    """Write the shape of ring or arc i: radius, width, cutoff (log2), and the arc in the units of the record."""
     at = i * SHAPE
     shapes[at + R0], shapes[at + WIDTH] = r0, w
     shapes[at + SHARPNESS] = 0.5 / (math.log(2.0) * w * w)

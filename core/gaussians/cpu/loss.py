@@ -282,6 +282,7 @@ class _TargetMoments:
         self._entries: dict[int, tuple[weakref.ref[Tensor], int, Array]] = {}
 
     def __call__(self, target: Tensor) -> Array:
+        """Return the moments (2, values) of a target, from the cache while the tensor is unchanged."""
         key = id(target)
         entry = self._entries.pop(key, None)
         if entry is not None and entry[0]() is target and entry[1] == target._version:

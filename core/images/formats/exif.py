@@ -37,7 +37,7 @@ def _exif_block(stream: BinaryIO) -> BinaryIO:
         return stream
     if magic[:2] == b"\xff\xd8":
         blocks = (content[6:] for marker, content in jpeg.segments(stream)
-                 if marker == jpeg.APP1 and content.startswith(b"Exif\0\0"))
+                  if marker == jpeg.APP1 and content.startswith(b"Exif\0\0"))
     else:
         blocks = (content for _, content in png.chunks(stream, (png.EXIF,)))
     return io.BytesIO(next(blocks, b""))

@@ -189,7 +189,7 @@ class DiffusionTrainer:
         """Run one iteration and return its losses. frame, scene: with and without flare, display values (h, w, 3)."""
         device = next(self.model.parameters()).device
         source, target = (torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1)))[None].to(device)
-                       for picture in (frame, scene))
+                          for picture in (frame, scene))
         prediction = self.model(source)
         squared = F.mse_loss(prediction, target)
         loss = squared if self._perceptual is None else squared + self._perceptual(prediction, target)

@@ -92,7 +92,7 @@ def upsample_flare(maps: GuidedFilterMaps, codes: NDArray[Any], encoding: Encodi
             cv2.remap(np.ascontiguousarray(part[low:high]), np.ascontiguousarray(map_x[:, left:left + REMAP_COLUMNS]),
                       np.ascontiguousarray(map_y[:, left:left + REMAP_COLUMNS]), cv2.INTER_LINEAR,
                       borderMode=cv2.BORDER_REPLICATE) for left in range(0, width, REMAP_COLUMNS)], 1)
-            for part in (maps.gain, maps.offset))
+                        for part in (maps.gain, maps.offset))
         light = to_linear(codes[rows], encoding, max_code)
         display = codes[rows].astype(np.float32) / np.float32(max_code) if encoding == "srgb" else to_display(light)
         flare = gain * display + offset

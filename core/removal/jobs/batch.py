@@ -16,7 +16,7 @@ from typing import Any
 from ...errors import DISK_FULL, FrameError, SettingsError, join_failures, os_error_message
 from ...images.exr import read_data_window
 from ...images.formats.exif import read_exif
-from ...images.listing import passed_over, pictures_below, pictures_in
+from ...images.listing import pictures_below, pictures_in, unlisted_entries
 from ...images.plates import clean_name, is_plate_error
 from ...images.views import split_views, write_view_results
 from ...system.files import check_no_overwrite, real_path
@@ -107,7 +107,7 @@ def left_out(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) -> dic
             if any(part.startswith(".") for part in inside.parts) or not excluded_paths.isdisjoint(
                     _self_and_parents(folder)):
                 continue
-            for reason, names in passed_over(folder, subfolders=False):
+            for reason, names in unlisted_entries(folder, subfolders=False):
                 skipped.setdefault(reason, []).extend(
                     (inside / name).as_posix() for name in names
                     if name not in (MANIFEST, VIDEO_MANIFEST) and real_path(folder / name) not in excluded_paths)

@@ -62,6 +62,7 @@ class Recipe:
     lifted_black_share: float = 0.25     # of the frames: graded so that black is grey
 
     def __post_init__(self) -> None:
+        """Check every number. Raises SettingsError."""
         if min(self.iterations, self.pixels_per_iteration, self.bank_size, self.renew_every,
                self.warmup_iterations) < 1:
             raise SettingsError("A recipe needs at least one iteration, pixel and flare.")

@@ -48,6 +48,7 @@ class Batches:
             self._bank = MixedBank(self._synthesis_bank, user_flares, recipe.user_flare_share)
 
     def __getitem__(self, iteration: int) -> Batch:
+        """Return the worker's frames of an iteration."""
         random = np.random.default_rng((self.recipe.seed, iteration))
         count, width, height = self.recipe.draw_batch_shape(random, iteration)
         pairs = [self.draw_pair(iteration, number, width, height)

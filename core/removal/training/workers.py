@@ -169,6 +169,7 @@ def initialise_process() -> None:
 
 def _worker_main(rank: int, count: int, folder: str, barrier: Barrier, threads: int, run_worker: Callable[..., None],
                  args: tuple[Any, ...]) -> None:
+    """Run a worker in a process of its own, until it or the first worker ends; the target of `worker_group`."""
     initialise_process()
     first = multiprocessing.parent_process()
     if first is not None:

@@ -57,7 +57,7 @@ area.type = "CLIP_EDITOR"
 area.spaces.active.clip = clip
 tracking.objects[0].keyframe_a, tracking.objects[0].keyframe_b = 1, FRAMES
 with bpy.context.temp_override(window=window, area=area, region=next(one for one in area.regions
-                                                                    if one.type == "WINDOW")):
+                                                                     if one.type == "WINDOW")):
     bpy.ops.clip.solve_camera()
 facts["solve error"] = tracking.reconstruction.average_error
 

@@ -10,7 +10,8 @@
     lights.py           light objects                            objects.py         matrices of objects
     looks.py            the look of a scene, its flares          occlusion.py       visibility of lights
     overlay.py          the flare in the viewport                points.py          the point cloud in the viewport
-    shots.py            bakes                                    compositor/        the layers in the compositor
+    shots.py            scenes as shots                          baking.py          bakes
+    views.py            3D views                                 compositor/        the layers in the compositor
     library.py          the library of flares                    paths.py           paths of a .blend that moves
     fcurves.py          animation of list items                  render_settings.py   rendering and saving
     images.py           pictures loaded from disk

@@ -102,6 +102,12 @@ def run(kind: str, folder: Path, args: Sequence[object]) -> Job:
     return jobs.start(kind, folder, command(*args), child_environment(), args=args)
 
 
+def run_without(kind: str, folder: Path, args: Sequence[object]) -> Job:
+    """Start a command of run.py that needs numpy alone in Blender's own Python; see `jobs.start`."""
+    command_line = [sys.executable, *bpy.app.python_args, str(RUN_SCRIPT), *map(str, args), "--progress", "json"]
+    return jobs.start(kind, folder, command_line, child_environment(), args=args)
+
+
 # ---- test, set-up and removal ------------------------------------------------------------------------------------
 
 

@@ -71,7 +71,8 @@ class Origin:
 
 
 class Job:
-    """One command of the engine. done, total: steps of `stage`. eta_s: remaining seconds, None where unknown."""
+    """One command of the engine. done, total: steps of `stage`. eta_s: remaining seconds, None where unknown. warnings:
+    of what was done with its result."""
 
     def __init__(self, kind: str, folder: Path, origin: Origin, args: Sequence[str] = (),
                  process: subprocess.Popen[bytes] | None = None) -> None:
@@ -82,6 +83,7 @@ class Job:
         self.eta_s: float | None = None
         self.figures: dict[str, float] = {}
         self.messages: list[str] = []
+        self.warnings: list[str] = []
         self.result: dict[str, Any] = {}
         self.error = ""
         self._process, self._was_seen_running, self._has_result = process, process is not None, False
@@ -355,7 +357,7 @@ def _tick() -> float | None:
     """Poll the running jobs; return the seconds to the next call, None to stop the timer."""
     changes = [_poll_safely(job) for job in running()]
     if any(changes):
-        _redraw_bars()
+        redraw_bars()
     return POLL_INTERVAL_S if running() else None
 
 
@@ -374,7 +376,7 @@ def _poll_safely(job: Job) -> bool:
         return True
 
 
-def _redraw_bars() -> None:
+def redraw_bars() -> None:
     """Redraw what shows progress: the sidebars with our tab, and the preferences.
 
     The 3D views are left out, since they are expensive to draw; properties that change them redraw them.

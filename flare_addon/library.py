@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The library: .flare files with thumbnails, which the panel Transfer shows as previews.
+"""The library: .flare files with thumbnails, which the panel Library shows as previews.
 
 The looks that come with the extension are in library_looks/ (`sample_scenes/make_library.py` makes them); those of the
 user are in a folder of their own.
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.colour.srgb import linear_from_srgb, srgb_from_linear
 from ..core.errors import FitFlareError, FlareFileError
-from ..core.look import Look, draw, read
+from ..core.look import Look, LookEdits, draw, read
 from ..core.look.look import ViewOfLight, write_annotated
 from ..core.system.files import atomic_path, avoid_device_name
 from .user_settings import library_path
@@ -28,6 +28,7 @@ BOX = Path(__file__).parent / "library_looks"
 
 _previews: Any = None
 _items: list[tuple[str, str, str, int, int]] = []
+_notes: dict[str, str] = {}  # by path
 _stamps: tuple[tuple[str, float], ...] | None = None
 _chosen = 0  # number of the chosen item
 
@@ -60,29 +61,34 @@ def _flares_of(place: Path) -> list[Path]:
         return []
 
 
-def save(look: Look, name: str, notes: str, licence: str) -> Path:
-    """Save a look to the library; return its file. Raises FlareFileError where the name is taken or not valid."""
+def save(look: Look, edits: LookEdits, name: str, notes: str, licence: str) -> Path:
+    """Save a look with edits of its lights to the library; return its file.
+
+    Raises FlareFileError where the name is taken or not valid.
+    """
     safe = "".join(letter for letter in name if letter.isalnum() or letter in " -_()").strip()
     if not safe:
         raise FlareFileError(f"{name!r} is not a valid file name; use letters and digits.")
     path = folder(create=True) / f"{avoid_device_name(safe)}.flare"
     if path.exists():
         raise FlareFileError(f"The library has {safe!r} already; choose another name.")
-    write_annotated(look.path, path, notes=notes, licence=licence)
-    write_png(path.with_suffix(".png"), thumbnail(look))
+    write_annotated(look.path, path, notes=notes, licence=licence, edits=edits)
+    write_png(path.with_suffix(".png"), thumbnail(read(path)))
     return path
 
 
 def thumbnail(look: Look) -> NDArray[np.float32]:
     """Return display values (THUMBNAIL_SIZE, THUMBNAIL_SIZE, 3): all flares for the middle of their training cameras,
-    with the light at the upper left."""
+    with the edits of the file and the light at the upper left."""
     k = np.array([[1.1 * THUMBNAIL_SIZE, 0, THUMBNAIL_SIZE / 2], [0, 1.1 * THUMBNAIL_SIZE, THUMBNAIL_SIZE / 2], [0, 0,
                                                                                                                  1]])
     total = np.zeros((THUMBNAIL_SIZE, THUMBNAIL_SIZE, 3), np.float32)
     for light in look.lights:
+        if not look.edits.is_visible(light.name, look.names):
+            continue
         middle = (light.query_range.camera_low + light.query_range.camera_high) / 2
         _, place = light.query_range.clip(middle, np.array([-0.24, -0.2], np.float32))
-        gaussians = light.evaluate(ViewOfLight(middle, np.eye(3, dtype=np.float32), place, 1.0))
+        gaussians = light.evaluate(ViewOfLight(middle, np.eye(3, dtype=np.float32), place, 1.0), edits=look.edits)
         if gaussians is not None:
             picture = draw([gaussians], k, THUMBNAIL_SIZE, THUMBNAIL_SIZE, look.blend, look.pixel_grid)
             total += picture if look.blend == "add" else linear_from_srgb(picture)
@@ -129,12 +135,18 @@ def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, 
             if not path.with_suffix(".png").is_file() and path.parent != BOX:
                 write_png(path.with_suffix(".png"), thumbnail(look))
             icon = _previews.load(name, str(path.with_suffix(".png")), "IMAGE").icon_id
-            notes = f"{len(look.lights)} lights, {look.count} Gaussians. {look.notes}".strip()
+            _notes[name] = look.notes.partition(". ")[0]
+            tip = f"{len(look.lights)} lights, {look.count} Gaussians. {look.notes}".strip()
         except (FitFlareError, OSError) as problem:
-            icon, notes = 0, str(problem)
-        entries.append((name, path.stem, notes, icon, number))
+            icon, tip, _notes[name] = 0, str(problem), str(problem)
+        entries.append((name, path.stem, tip, icon, number))
     _items, _stamps = entries or [("", "Empty", "Save a flare to the library first", 0, 0)], tuple(stamps)
     return _items
+
+
+def notes(path: str) -> str:
+    """Return the first sentence of the notes of an entry."""
+    return _notes.get(path, "")
 
 
 def chosen(_self: Any = None) -> int:

@@ -2,6 +2,7 @@
 """The look of a scene: its .flare, the flares with their light objects and edits, and their evaluation for a camera."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, FlareFileError
-from ..core.look import Edit, Look, LookEdits, PlacedLight, PlaneGaussians, read
+from ..core.look import Edit, LightLook, Look, LookEdits, PlacedLight, PlaneGaussians, read
 from ..core.look.look import Query
 from . import cameras, fcurves, occlusion
 from .compositor import drivers
-from .lights import capture_position, light_name, light_position, scene_lights
+from .lights import capture_position, free_name, light_name, light_position, scene_lights
 from .objects import depsgraph_of, world_matrix
 from .paths import absolute, blend_relative
-from .properties import edit_of
+from .properties import EDIT_NAMES, edit_of, set_slider
 
 _cache: dict[str, tuple[tuple[float, int], Look | str]] = {}
 
@@ -53,32 +54,117 @@ def is_placed(item: Any, scene: Any) -> bool:
     return item.target is not None and scene.objects.get(item.target.name) == item.target
 
 
-def show_look(scene: Any, path: Path | str) -> Look:
-    """Show a .flare in the scene: one flare for each of its lights, at the light object of the same name.
+def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add: bool = False) -> Look:
+    """Show a .flare in the scene, at its flares, at light objects with the names of the look's lights, at `targets`.
 
-    Flares that were there keep their edits. Returns the look. Raises FlareFileError.
+    A flare that is there keeps its light object and its sliders. Where the look has no light of its name, it shows the
+    light with the same number, counted over the lights of the earlier look. A light of the look without a flare gets
+    one where a light object has its name, or where the scene had no flare at all. Sliders that the artist has not moved
+    follow the edits in the file. Flares without a light object are placed at `targets`; with `add`, each remaining
+    target gets a flare of its own. A target that has a flare gets no second one. Returns the look. Raises
+    FlareFileError.
     """
     path = Path(path)
     look = read(path)
     state = scene.fit_flare
-    before = state.flare
+    is_first = not state.lights
+    _change_look(scene, _stored_edits(scene), look)
     state.flare = blend_relative(path)
     objects = {light_name(item): item for item in scene_lights(scene)}
-    if before != state.flare:
-        for index in reversed(range(len(state.lights))):
-            if state.lights[index].source not in look.names:
-                remove_flare(scene, index)
     for light in look.lights:
         item = next((entry for entry in state.lights if entry.source == light.name), None)
-        if item is None:
-            item = state.lights.add()
-            item.name = item.source = light.name
-        if item.target is None and light.name in objects:
-            item.target = objects[light.name]
-        _sync_elements(item, light)
+        if item is None and (is_first or light.name in objects):
+            item = _new_flare(state, look, light)
+            item.name = free_name(light.name, {entry.name for entry in state.lights})
+        if item is not None and item.target is None and objects.get(light.name) not in _targets(state):
+            item.target = objects.get(light.name)
+    _place_at(scene, look, targets, add)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
     state.native = _was_learned_here(look, state, objects, depsgraph_of(scene))
     return look
+
+
+def _targets(state: Any) -> list[Any]:
+    """Return the light objects of all flares."""
+    return [item.target for item in state.lights if item.target is not None]
+
+
+def _place_at(scene: Any, look: Look, targets: Sequence[Any], add: bool) -> None:
+    """Place flares without a light object at these targets; with `add`, add a flare at each of the remaining ones."""
+    state = scene.fit_flare
+    remaining = [target for target in targets if target not in _targets(state)]
+    for item in [item for item in state.lights if item.target is None][:len(remaining)]:
+        item.target = remaining.pop(0)
+    for target in remaining if add else ():
+        add_flare(scene, target, look.names[0])
+
+
+def _stored_edits(scene: Any) -> LookEdits:
+    """Return the edits in the scene's .flare; none where it cannot be read."""
+    try:
+        return look_of(scene).edits
+    except FlareFileError:
+        return LookEdits()
+
+
+def _change_look(scene: Any, before: LookEdits, look: Look) -> None:
+    """Give each flare a light of the look: the one of the same name, else the one with the same number.
+
+    before: the edits in the earlier file. Sliders that still have these values get the values of the look's file. A
+    flare without a light object is removed where another flare has the look of its light.
+    """
+    state, neutral, after = scene.fit_flare, Edit(), look.edits
+    earlier = list(dict.fromkeys(item.source for item in state.lights))
+    _follow_edit(state.master, before.master, after.master)
+    for item in state.lights:
+        old = item.source
+        if old not in look.names:
+            item.source = look.names[earlier.index(old) % len(look.names)]
+        _follow_edit(item, before.lights.get(old, neutral), after.lights.get(item.source, neutral))
+        for element in item.elements:
+            _follow_edit(element, before.elements.get((old, element.name), neutral),
+                         after.elements.get((item.source, element.name), neutral))
+        _sync_elements(item, look, next(light for light in look.lights if light.name == item.source))
+    for index in reversed(range(len(state.lights))):
+        sources = [item.source for item in state.lights]
+        if sources.count(sources[index]) > 1 and not is_placed(state.lights[index], scene):
+            remove_flare(scene, index)
+
+
+def _follow_edit(sliders: Any, before: Edit, after: Edit) -> None:
+    """Set each slider that has the value of `before` to that of `after`."""
+    present = edit_of(sliders)
+    for name in EDIT_NAMES:
+        if np.allclose(getattr(present, name), getattr(before, name), rtol=1e-5, atol=1e-6):
+            set_slider(sliders, name, getattr(after, name))
+
+
+def _new_flare(state: Any, look: Look, light: LightLook) -> Any:
+    """Add a flare with the look of `light` and the edits in the look's file; return it."""
+    item = state.lights.add()
+    item.source = light.name
+    _follow_edit(item, Edit(), look.edits.lights.get(light.name, Edit()))
+    _sync_elements(item, look, light)
+    return item
+
+
+def edits_to_store(state: Any, look: Look) -> LookEdits:
+    """Return the edits of the scene by the names of the look's lights, as a file of the library stores them.
+
+    Where several flares have the look of one light, those of the chosen flare count, else those of the first one.
+    """
+    edits, sources = edits_of(state), {item.source: item.name for item in reversed(state.lights)}
+    if 0 <= state.light < len(state.lights):
+        sources[state.lights[state.light].source] = state.lights[state.light].name
+    names = {name: source for source, name in sources.items() if source in look.names}
+    return LookEdits(edits.master, {names[name]: edit for name, edit in edits.lights.items() if name in names},
+                     {(names[name], part): edit for (name, part), edit in edits.elements.items() if name in names})
+
+
+def lost_flares(scene: Any) -> list[int]:
+    """Return the indices of the flares whose light object was deleted from the scene."""
+    return [index for index, item in enumerate(scene.fit_flare.lights)
+            if item.target is not None and not is_placed(item, scene)]
 
 
 def remove_flare(scene: Any, number: int) -> None:
@@ -122,15 +208,15 @@ def add_flare(scene: Any, target: Any, source: str) -> Any:
     name, number = target.name, 2
     while name in used_names:
         name, number = f"{target.name} {number}", number + 1
-    item = state.lights.add()
-    item.name, item.source, item.target = name, source, target
-    _sync_elements(item, light)
+    item = _new_flare(state, look, light)
+    item.name, item.target = name, target
     state.light = len(state.lights) - 1
     return item
 
 
-def _sync_elements(item: Any, light: Any) -> None:
-    """Update the elements of a flare to those of its look; elements that stay keep their sliders."""
+def _sync_elements(item: Any, look: Look, light: LightLook) -> None:
+    """Update the elements of a flare to those of its look's light; elements that stay keep their sliders, others start
+    with the edits in the look's file."""
     kinds = {element.name: element.kind for element in light.elements}
     for index in reversed(range(len(item.elements))):
         if item.elements[index].name not in kinds:
@@ -138,7 +224,9 @@ def _sync_elements(item: Any, light: Any) -> None:
     existing = {element.name for element in item.elements}
     for name, kind in kinds.items():
         if name not in existing:
-            item.elements.add().name = name
+            added = item.elements.add()
+            added.name = name
+            _follow_edit(added, Edit(), look.edits.elements.get((light.name, name), Edit()))
         next(element for element in item.elements if element.name == name).kind = kind
 
 

@@ -4,7 +4,9 @@
 Each Gaussian is a quad. With the blend "add" it is drawn into the coarsest of five buffers (full size to 1/16) in which
 its narrow side still has four texels, so the cost does not grow with the size of a glow. With "over" all are drawn back
 to front at full size over black, as they are baked. The buffers are half float and linear. A last pass adds them to the
-viewport's overlay, which Blender blends in display-linear light, so light adds as in the baked layers.
+viewport's picture in scene-linear light, before Blender applies the view transform, as the compositor does in a render.
+Blender draws footage behind the camera after the view transform, unless the image is viewed as a render. Over such
+footage the pass adds to the viewport's overlay, which Blender blends in display-linear light.
 
 Only the visible part of the frame is drawn, at the pixels of the region, so zooming in costs nothing.
 """
@@ -21,7 +23,8 @@ from ..core.errors import FitFlareError
 from ..core.look import Look, PlaneGaussians, to_pixels
 from ..core.look.drawing import OPACITY_MAX, extent
 from ..core.look.plane import arc_log_peak, arcs_to_pixels, concatenate
-from . import cameras, looks
+from . import baking, cameras, looks
+from .compositor.flare_node import find_node
 
 LEVELS = (1, 2, 4, 8, 16)
 MIN_TEXELS = 4.0  # standard deviation of the narrow side of a Gaussian, in the level that it is drawn in
@@ -31,7 +34,8 @@ Floats = NDArray[np.float32]
 last_error = ""
 """Why the last drawing failed, for the panel; "" after a success."""
 
-_handle: Any = None
+_handles: list[Any] = []
+_scene_buffer: Any = None  # the framebuffer with the scene-linear picture of the region that is being drawn
 _shaders: dict[str, Any] = {}
 _offscreens: dict[tuple[int, int, int], Any] = {}
 
@@ -343,8 +347,17 @@ def composite(drawn: list[Any], box: tuple[float, float, float, float], blend: s
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
     gpu.state.blend_set("ADDITIVE")
     gpu.state.depth_test_set("NONE")
-    batch_for_shader(shader, "TRI_FAN", {"corner": corners}).draw(shader)
+    batch_for_shader(shader, "TRIS", {"corner": corners}, indices=((0, 1, 2), (0, 2, 3))).draw(shader)
     gpu.state.blend_set("NONE")
+
+
+def _remember_buffer() -> None:
+    """Remember the framebuffer that Blender draws the scene of this region into; while it draws overlays, it is not
+    bound."""
+    global _scene_buffer
+    import gpu
+
+    _scene_buffer = gpu.state.active_framebuffer_get()
 
 
 def _draw() -> None:
@@ -356,7 +369,8 @@ def _draw() -> None:
         return
     state = scene.fit_flare
     camera = space.camera if space.use_local_camera and space.camera else scene.camera
-    is_shown = state.show and state.flare and space.overlay.show_overlays
+    is_shown = (state.show and state.flare and space.overlay.show_overlays and baking.preparation() is None
+                and not is_composited(space, scene))
     if not is_shown or camera is None or camera.type != "CAMERA":
         return
     try:
@@ -364,6 +378,15 @@ def _draw() -> None:
         last_error = ""
     except FitFlareError as error:
         last_error = str(error)
+
+
+def is_composited(space: Any, scene: Any) -> bool:
+    """Return whether a 3D view shows the baked flare already, by Blender's compositing of viewports."""
+    shading = space.shading
+    if shading.type not in ("MATERIAL", "RENDERED") or shading.use_compositor == "DISABLED":
+        return False
+    node = find_node(scene)
+    return node is not None and not node.mute
 
 
 def draw_region(context: Any, scene: Any, camera: Any) -> None:
@@ -384,9 +407,26 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
         return
     drawn = render(gaussians, window, look)
     viewport = gpu.state.viewport_get()
-    composite(drawn, (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
-                (window.y + window.height) / region[1]), look.blend, window)
+    box = (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
+           (window.y + window.height) / region[1])
+    if _scene_buffer is None or has_display_footage(camera):
+        composite(drawn, box, look.blend, window)
+    else:
+        with _scene_buffer.bind():
+            gpu.state.viewport_set(*viewport)
+            composite(drawn, box, look.blend, window)
     gpu.state.viewport_set(*viewport)
+
+
+def has_display_footage(camera: Any) -> bool:
+    """Return whether footage is shown behind or before a camera that Blender does not put through the view transform.
+    """
+    if not camera.data.show_background_images:
+        return False
+    return any(back.alpha > 0 and not (back.source == "IMAGE" and back.image is not None
+                                       and back.image.use_view_as_render)
+               for back in camera.data.background_images
+               if (back.image if back.source == "IMAGE" else back.clip) is not None)
 
 
 def render_picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> Floats:
@@ -414,16 +454,17 @@ def render_picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: 
 
 
 def register() -> None:
-    global _handle
     if not bpy.app.background:
-        _handle = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
+        for function, when in ((_remember_buffer, "PRE_VIEW"), (_draw, "POST_VIEW")):
+            _handles.append(bpy.types.SpaceView3D.draw_handler_add(function, (), "WINDOW", when))
 
 
 def unregister() -> None:
-    global _handle, last_error
-    if _handle is not None:
-        bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")
-        _handle = None
+    global _scene_buffer, last_error
+    for handle in _handles:
+        bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
+    _handles.clear()
+    _scene_buffer = None
     for offscreen in _offscreens.values():
         offscreen.free()
     _offscreens.clear()

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The tab "Fit Flare" of the sidebar, in the order of the work: Capture, Lights, Fit, Look, Bake, Transfer.
+"""The tab "Fit Flare" of the sidebar: the library, then the order of the work: Capture, Lights, Fit, Look, Bake,
+Transfer.
 
 Each panel shows what is missing and offers the next step; the buttons are in `operators`.
 """
@@ -12,7 +13,7 @@ import bpy
 from ..core.capture import REMOVED
 from ..core.conventions.run_files import FLARE
 from ..core.errors import FitFlareError
-from . import engine, fits, jobs, library, lights, looks, overlay, shots
+from . import baking, engine, fits, jobs, library, lights, looks, overlay, shots
 from .compositor import drivers, flare_node
 from .layouts import draw_progress, label_lines
 from .paths import is_folder
@@ -32,6 +33,15 @@ def _settings_column(layout: Any) -> Any:
     column.use_property_split = True
     column.use_property_decorate = False
     return column
+
+
+class _FitPanel(_SidebarPanel):
+    """Mixin for panels of a fit, which are out of the way in a scene that only shows a look."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        state = context.scene.fit_flare
+        return bool(not state.flare or state.capture or state.run or lights.scene_lights(context.scene))
 
 
 class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
@@ -57,7 +67,7 @@ class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
         column.operator("fit_flare.capture_from_camera", icon="CAMERA_DATA")
 
 
-class FITFLARE_PT_lights(_SidebarPanel, bpy.types.Panel):
+class FITFLARE_PT_lights(_FitPanel, bpy.types.Panel):
     bl_label = "Lights"
     bl_idname = "FITFLARE_PT_lights"
 
@@ -87,7 +97,7 @@ class FITFLARE_PT_lights(_SidebarPanel, bpy.types.Panel):
         row.operator("fit_flare.lights_from_selected", icon="RESTRICT_SELECT_OFF")
 
 
-class FITFLARE_PT_fit(_SidebarPanel, bpy.types.Panel):
+class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
     bl_label = "Fit"
     bl_idname = "FITFLARE_PT_fit"
 
@@ -230,7 +240,7 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
         layout, scene = self.layout, context.scene
         state = scene.fit_flare
         if not state.flare:
-            label_lines(layout, "No flare yet: fit one above, or open a .flare.", "INFO")
+            label_lines(layout, "No flare yet: add one of the library, fit one, or open a .flare.", "INFO")
             layout.operator("fit_flare.open_flare", icon="FILE_FOLDER")
             return
         try:
@@ -245,6 +255,10 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
             label_lines(layout, "The scene has no camera; add one to see the flare.", "ERROR")
         elif not _looks_through_camera(context):
             layout.operator("view3d.view_camera", text="Look through the Camera", icon="VIEW_CAMERA")
+        elif context.space_data is not None and not context.space_data.overlay.show_overlays:
+            label_lines(layout, "Overlays are switched off in this view, and the flare with them.", "INFO")
+        elif context.space_data is not None and overlay.is_composited(context.space_data, scene):
+            label_lines(layout, "This view is composited: it shows the flare as it was baked.", "INFO")
         elif state.show and state.native and state.footage == "images" and fits.has_clean_frames(scene):
             label_lines(layout, "The frames behind the camera contain their own flare, and this one is drawn over it: "
                                 "choose "
@@ -263,6 +277,9 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
         column = row.column(align=True)
         column.operator("fit_flare.add_flare", text="", icon="ADD")
         column.operator("fit_flare.remove_flare", text="", icon="REMOVE")
+        if lost := looks.lost_flares(scene):
+            layout.operator("fit_flare.remove_lost_flares", text=f"Remove Flares of Deleted Lights ({len(lost)})",
+                            icon="TRASH")
         if 0 <= state.light < len(state.lights):
             _draw_flare(layout, scene, state.lights[state.light])
         row = layout.row(align=True)
@@ -320,7 +337,12 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
         if not state.flare:
             label_lines(layout, "Nothing to bake yet: fit or open a flare first.", "INFO")
         job = jobs.find(shots.layers_folder(scene)) if state.layers else None
-        if job is not None and job.running:
+        reading = baking.preparation()
+        if reading is not None:
+            row = layout.row(align=True)
+            row.progress(factor=reading.fraction_done, text=f"Reading the scene: {reading.fraction_done:.0%}")
+            row.operator("fit_flare.cancel_bake", text="", icon="X")
+        elif job is not None and job.running:
             draw_progress(layout, job, "Bake")
             _draw_bake_log(layout, job)
         else:
@@ -332,10 +354,18 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
             column.prop(state, "layers")
             column.prop(state, "bake_live")
             column.prop(state, "bake_scene")
-            if job is not None and job.error:
+            column.prop(state, "bake_composite")
+            if state.flare and engine.find_engine() is None:
+                label_lines(layout, "Without an engine, Blender's own Python draws the layers: some seconds a frame.",
+                            "INFO")
+            if error := baking.last_error(scene):
+                label_lines(layout, error, "ERROR")
+            elif job is not None and job.error:
                 label_lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
             elif job is not None and job.state == "done":
                 label_lines(layout, f"Layers of {job.result.get('frames', 0)} frames are baked.", "CHECKMARK")
+                for warning in job.warnings:
+                    label_lines(layout, warning, "ERROR")
             row = layout.row(align=True)
             row.scale_y = 1.3
             row.operator("fit_flare.bake", icon="RENDER_ANIMATION").selected = False
@@ -382,14 +412,6 @@ class FITFLARE_PT_transfer(_SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, state = self.layout, context.scene.fit_flare
-        if library.files():
-            layout.template_icon_view(context.window_manager, "fit_flare_library", show_labels=True, scale=6.0,
-                                      scale_popup=5.0)
-            label_lines(layout, "Select the objects that get the flare, then apply.")
-            layout.operator("fit_flare.apply_flare", icon="LIGHT_SUN")
-        else:
-            label_lines(layout, "The library is empty. Save a flare, then apply it to other cameras and lights.",
-                        "INFO")
         column = layout.column(align=True)
         column.operator("fit_flare.save_flare", icon="FILE_TICK")
         column.operator("fit_flare.shot_from_picture", icon="IMAGE_DATA")
@@ -399,8 +421,29 @@ class FITFLARE_PT_transfer(_SidebarPanel, bpy.types.Panel):
                                 "not follow the camera.", "INFO")
 
 
-_CLASSES = (FITFLARE_PT_capture, FITFLARE_PT_lights, FITFLARE_PT_fit, FITFLARE_PT_look, FITFLARE_PT_bake,
-            FITFLARE_PT_transfer)
+class FITFLARE_PT_library(_SidebarPanel, bpy.types.Panel):
+    bl_label = "Library"
+    bl_idname = "FITFLARE_PT_library"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, state, manager = self.layout, context.scene.fit_flare, context.window_manager
+        if not library.files():
+            label_lines(layout, "The library is empty: open a flare, then save it here.", "INFO")
+            return
+        layout.template_icon_view(manager, "fit_flare_library", show_labels=True, scale=6.0, scale_popup=5.0)
+        if notes := library.notes(manager.fit_flare_library):
+            label_lines(layout, notes)
+        row = layout.row()
+        row.scale_y = 1.3
+        if not state.flare:
+            row.operator("fit_flare.add_library_flare", icon="LIGHT_SUN")
+            return
+        row.operator("fit_flare.apply_flare", text="Use This Look", icon="LIGHT_SUN")
+        row.operator("fit_flare.add_library_flare", text="Add Flare", icon="ADD")
+
+
+_CLASSES = (FITFLARE_PT_library, FITFLARE_PT_capture, FITFLARE_PT_lights, FITFLARE_PT_fit, FITFLARE_PT_look,
+            FITFLARE_PT_bake, FITFLARE_PT_transfer)
 
 
 register, unregister = bpy.utils.register_classes_factory(_CLASSES)

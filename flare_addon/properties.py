@@ -107,6 +107,11 @@ def edit_of(sliders: Any) -> Edit:
                 streak=sliders.streak, mute=sliders.mute, solo=sliders.solo)
 
 
+def set_slider(sliders: Any, name: str, value: Any) -> None:
+    """Set a slider to the value that an edit has for it; a rotation is in degrees."""
+    setattr(sliders, name, math.radians(value) if name == "rotation" else value)
+
+
 class FITFLARE_PG_master(Edits, bpy.types.PropertyGroup):
     """The sliders of all lights together."""
 
@@ -209,6 +214,9 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     bake_live: BoolProperty(  # type: ignore[valid-type]
         name="Keep Colours Live", description="Do not bake Intensity, Tint, Mute and Solo of lights into the layers; "
         "the compositor applies them, so you can change them without baking again", default=True)
+    bake_composite: BoolProperty(  # type: ignore[valid-type]
+        name="Composite after It", description="Set the compositor up when the layers are baked, so that renders show "
+        "the flare over the picture of Over", default=True)
     over: EnumProperty(  # type: ignore[valid-type]
         name="Over", description="The picture that the compositor adds the flare to",
         items=(("present", "Present Image", "The present output of the compositor, or the render"),
@@ -227,6 +235,7 @@ class FITFLARE_PG_object(bpy.types.PropertyGroup):
     is_points: BoolProperty()  # type: ignore[valid-type]
     is_root: BoolProperty()  # type: ignore[valid-type]
     is_made: BoolProperty()  # type: ignore[valid-type]
+    is_placeholder: BoolProperty()  # type: ignore[valid-type]  # a new light of Add Flare that Pick Light may move
     view: StringProperty(name="Frame", description="Name of the capture's frame that this camera belongs to")  # type: ignore[valid-type]
     exposure: FloatProperty(  # type: ignore[valid-type]
         name="Exposure", description="Exposure of this camera relative to the median frame: a factor on its flare. A "

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bakes: writes the cameras, lights and sliders of a scene frame by frame as a shot, which the engine bakes."""
+"""Shots of scenes: reads cameras, lights and sliders frame by frame, chooses the folder of their layers, finds layers.
+
+`baking` bakes them.
+"""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +20,9 @@ from ..core.conventions.run_files import FLARE, SCENE
 from ..core.errors import CaptureError, FrameError, RunError, SettingsError
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
-from ..core.system.files import hash_files, remove_file, write_json
+from ..core.system.files import hash_files
 from ..core.system.reading import parse_json, read_text
-from . import cameras, engine, fits, jobs, library, looks
-from .images import reload_images
+from . import cameras, fits, jobs, library, looks
 from .jobs import Job
 from .objects import view_layer_of
 from .paths import absolute, blend_relative
@@ -36,35 +38,75 @@ def frames_to_bake(scene: Any) -> list[int]:
         return [scene.frame_current]
     if state.bake_range == "custom":
         return list(range(state.bake_first, max(state.bake_last, state.bake_first) + 1))
-    return list(range(scene.frame_start, scene.frame_end + 1))
+    return list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
 
 
-def scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int], flare: Path, run: Path | None,
-               done: Callable[[int], None] = lambda _frame: None) -> Shot:
-    """Return the shot of these camera objects at these frames; the scene's current frame is restored.
+class ShotReading:
+    """Reads the cameras, lights and sliders of a scene as a shot, one frame a step; each step moves the timeline.
 
-    Without camera objects it is the scene's camera, which markers on the timeline may change, under the name of the
-    first one. Raises CaptureError for a camera that is not a perspective camera and for a disabled light that is
-    animated, FlareFileError for a bad .flare, SettingsError for negative frames, which layers cannot be named after.
+    Without camera objects it reads the scene's camera, which markers on the timeline may change, under the name of the
+    first one. It refers to the scene and to the cameras by name, since an undo replaces them. total, done: frames.
     """
-    if min(frames, default=0) < 0:
-        raise SettingsError(f"Frame {min(frames)} cannot be baked, since layers have no negative numbers; start at "
-                            "frame 0 or later.")
-    view_layer = view_layer_of(scene)
-    before, subframe = scene.frame_current, scene.frame_subframe
-    shot_frames: list[ShotFrame] = []
+
+    def __init__(self, scene: Any, camera_objects: Sequence[Any], frames: Sequence[int]) -> None:
+        """Raises SettingsError for negative frames, which layers cannot be named after."""
+        if min(frames, default=0) < 0:
+            raise SettingsError(f"Frame {min(frames)} cannot be baked, since layers have no negative numbers; start at "
+                                "frame 0 or later.")
+        self.scene_name, self._cameras = scene.name, [camera.name for camera in camera_objects]
+        self._frames, self._before = list(frames), (scene.frame_current, scene.frame_subframe)
+        self._read: list[ShotFrame] = []
+        self.total, self.done = len(self._frames), 0
+
+    @property
+    def scene(self) -> Any:
+        """The scene. Raises RunError where it was deleted."""
+        scene = bpy.data.scenes.get(self.scene_name)
+        if scene is None:
+            raise RunError(f"The scene {self.scene_name!r} was deleted or renamed while it was read; bake again.")
+        return scene
+
+    def step(self) -> None:
+        """Read the next frame.
+
+        Raises CaptureError for a camera that is not a perspective camera or was deleted and for a disabled light that
+        is animated, FlareFileError for a bad .flare.
+        """
+        scene, frame = self.scene, self._frames[self.done]
+        missing = next((name for name in self._cameras if name not in scene.objects), None)
+        if missing is not None or scene.camera is None:
+            raise CaptureError(f"The camera {missing or 'of the scene'} was deleted while the scene was read; bake "
+                               "again.")
+        scene.frame_set(frame)
+        depsgraph = view_layer_of(scene).depsgraph
+        if self._cameras:
+            self._read += [shot_frame(scene, depsgraph, scene.objects[name], frame) for name in self._cameras]
+        else:
+            current = shot_frame(scene, depsgraph, scene.camera, frame)
+            self._read.append(replace(current, name=self._read[0].name if self._read else current.name))
+        self.done += 1
+
+    def restore(self) -> None:
+        """Move the timeline back to where it was."""
+        if self.scene_name in bpy.data.scenes:
+            self.scene.frame_set(self._before[0], subframe=self._before[1])
+
+    def shot(self, flare: Path, run: Path | None) -> Shot:
+        """Return the shot of the frames that were read."""
+        state = self.scene.fit_flare
+        return Shot(flare, tuple(self._read), looks.query_of(state), run, state.bake_live)
+
+
+def scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int], flare: Path, run: Path | None) -> Shot:
+    """Return the shot of these camera objects at these frames, as `ShotReading` reads it; the scene's current frame is
+    restored."""
+    reading = ShotReading(scene, camera_objects, frames)
     try:
-        for frame in frames:
-            scene.frame_set(frame)
-            depsgraph = view_layer.depsgraph
-            shot_frames += [shot_frame(scene, depsgraph, camera, frame) for camera in camera_objects]
-            if not camera_objects:
-                current = shot_frame(scene, depsgraph, scene.camera, frame)
-                shot_frames.append(replace(current, name=shot_frames[0].name if shot_frames else current.name))
-            done(frame)
+        while reading.done < reading.total:
+            reading.step()
     finally:
-        scene.frame_set(before, subframe=subframe)
-    return Shot(flare, tuple(shot_frames), looks.query_of(scene.fit_flare), run, scene.fit_flare.bake_live)
+        reading.restore()
+    return reading.shot(flare, run)
 
 
 def shot_frame(scene: Any, depsgraph: Any, camera: Any, frame: int) -> ShotFrame:
@@ -131,17 +173,20 @@ def layers_folder(scene: Any) -> Path:
 def choose_layers_folder(scene: Any) -> Path:
     """Set the folder of the scene's layers where none is set: a new one beside the .blend, else beside the flare.
 
-    Returns the folder. Raises RunError without a flare, and where it would be in the library.
+    For a .blend that is not saved and a flare of the library, it is in Blender's user folder. Returns the folder.
+    Raises RunError without a flare.
     """
     state = scene.fit_flare
     if not state.layers:
         path = looks.path_of(scene)
         if path is None:
             raise RunError("There is no flare to bake; fit one, or open a .flare.")
-        base = Path(bpy.data.filepath).parent if bpy.data.filepath else path.parent
-        if base.resolve() == library.folder().resolve():
-            raise RunError("Layers cannot be written to the library of flares; save the .blend first, or choose a "
-                           "folder for Layers.")
+        if bpy.data.filepath:
+            base = Path(bpy.data.filepath).parent
+        elif path.parent.resolve() in (library.folder().resolve(), library.BOX.resolve()):
+            base = Path(bpy.utils.user_resource("DATAFILES", path="fit_flare/layers"))
+        else:
+            base = path.parent
         folder, number = base / "layers", 1
         while folder.exists():
             number += 1
@@ -205,11 +250,11 @@ def replacement_warning(folder: Path, frames: Sequence[int]) -> str:
 
 def _panel_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int]) -> Shot:
     """Return the shot that the panel is set to bake, at these frames."""
-    shot = scene_shot(scene, camera_objects, frames, looks.look_of(scene).path.resolve(), _run_to_bake(scene))
+    shot = scene_shot(scene, camera_objects, frames, looks.look_of(scene).path.resolve(), run_to_bake(scene))
     return replace(shot, own_folder=bool(camera_objects))
 
 
-def _run_to_bake(scene: Any) -> Path | None:
+def run_to_bake(scene: Any) -> Path | None:
     """Return the run whose scene is baked as well; None where this is off. Raises RunError where there is no run."""
     if not scene.fit_flare.bake_scene:
         return None
@@ -217,6 +262,17 @@ def _run_to_bake(scene: Any) -> Path | None:
     if run is None or not (run / SCENE).is_file():
         raise RunError("There is no fitted scene to bake; switch Fitted Scene Too off, or finish a fit.")
     return run.resolve()
+
+
+def check_bake(scene: Any, camera_objects: Sequence[Any]) -> None:
+    """Raise CaptureError or RunError where the scene has nothing to bake."""
+    if not camera_objects and scene.camera is None:
+        raise CaptureError("The scene has no camera to bake from; add one, or import a capture.")
+    state = scene.fit_flare
+    if not any(looks.is_placed(item, scene) for item in state.lights):
+        raise RunError("No flare has a light object; choose one for each in the panel Look.")
+    if looks.duplicate_name(state):
+        raise RunError(f"Two flares have the name {looks.duplicate_name(state)!r}; rename one in the panel Look.")
 
 
 def running_jobs(scene: Any) -> list[Job]:
@@ -230,35 +286,3 @@ def orphaned_jobs() -> list[Job]:
     candidates = [job for job in jobs.running() if job.kind in ("fit", "bake")]
     known = [job for scene in bpy.data.scenes for job in running_jobs(scene)] if candidates else []
     return [job for job in candidates if job not in known]
-
-
-def bake(scene: Any, camera_objects: Sequence[Any], *, replace_others: bool = False) -> Job:
-    """Start a bake of these cameras, or of the scene's camera.
-
-    replace_others: delete layers that `frames_to_replace` returns; without it they are an error. Raises FitFlareError.
-    """
-    if not camera_objects and scene.camera is None:
-        raise CaptureError("The scene has no camera to bake from; add one, or import a capture.")
-    engine.command()
-    state = scene.fit_flare
-    if not any(looks.is_placed(item, scene) for item in state.lights):
-        raise RunError("No flare has a light object; choose one for each in the panel Look.")
-    if looks.duplicate_name(state):
-        raise RunError(f"Two flares have the name {looks.duplicate_name(state)!r}; rename one in the panel Look.")
-    if not replace_others and (replaced := frames_to_replace(scene, camera_objects)):
-        raise RunError(replacement_warning(layers_folder(scene), replaced))
-    shot, folder = _panel_shot(scene, camera_objects, frames_to_bake(scene)), choose_layers_folder(scene)
-    shot.write(folder / SHOT_FILE)
-    if state.bake_live:
-        write_json(folder / LIVE_FILE, live_record(state, shot.lights))
-    else:
-        remove_file(folder / LIVE_FILE)
-    return engine.run("bake", folder, ["bake", folder / SHOT_FILE, "--out", folder, "--overwrite"])
-
-
-def on_bake_finished(job: Job) -> None:
-    """Reload the baked layers that Blender shows."""
-    reload_images(job.folder)
-
-
-jobs.ON_FINISHED["bake"] = on_bake_finished

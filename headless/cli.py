@@ -269,7 +269,7 @@ def _run_step(step: Step, arguments: argparse.Namespace, argv: Sequence[str], pr
                               "X11, on a server too: install the one that is missing (see README.md), or name a "
                               "Blender with --blender.") from problem
     elsewhere = step.side == "engine" and arguments.engine is not None and not arguments.step
-    if hand_off.current_side() == step.side and not elsewhere:
+    if step.side == "any" or (hand_off.current_side() == step.side and not elsewhere):
         with _silence_stdout() if step.side == "blender" else _report_torch_load_errors():
             return step.run(arguments, progress)
     if arguments.step:

@@ -2,8 +2,9 @@
 """The parts of a command: its arguments on the command line, and its steps with the side that each one runs on.
 
 A step of the "engine" side needs torch, one of the "blender" side needs bpy, and no process ever has both (see
-`hand_off`). Steps pass data on through files. What a step returns (paths and figures, serialisable as JSON) becomes
-part of the command's result. The modules in `commands` build a `Command` each; `cli` runs them.
+`hand_off`). One of the side "any" needs numpy alone and runs where the command was started. Steps pass data on through
+files. What a step returns (paths and figures, serialisable as JSON) becomes part of the command's result. The modules
+in `commands` build a `Command` each; `cli` runs them.
 """
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from ..core.errors import SettingsError
 from ..core.system.progress import Progress
 from ..core.typed import MAX_SEED
 
-Side = Literal["engine", "blender"]
+Side = Literal["engine", "blender", "any"]
 ResumeRule = Literal["starts over", "resumes", "resumes with --resume"]
 StepFunction = Callable[[argparse.Namespace, Progress], dict[str, Any]]
 

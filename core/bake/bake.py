@@ -20,10 +20,12 @@ from ..capture.renderer import RenderedLayers
 from ..colour import ColourSpace, colour_space
 from ..conventions.frame_numbers import NumberedFrame
 from ..errors import FrameError, RunError
-from ..images.exr import is_exr_truncated, read_data_window
+from ..images.exr import is_exr_truncated
+from ..images.formats import exr_header
 from ..look import KeyedEdits, LookEdits
 from ..system.files import file_lock, read_json, remove_file, safe_join, write_json
 from ..system.progress import Progress
+from ..system.reading import open_regular
 from ..typed import parse_value
 from .exr import read_description, write_layers
 from .layers import FrameLayers, layer_names, to_layers
@@ -256,7 +258,8 @@ def _is_up_to_date(path: Path, expected: Mapping[str, Any]) -> bool:
 
 
 def _entry(out: Path, frame: NumberedFrame, extra_files: Sequence[Path]) -> dict[str, Any]:
-    width, height = read_data_window(out / frame.file).size
+    with open_regular(out / frame.file) as stream:
+        width, height = exr_header.windows(stream)["dataWindow"]
     beside = {"rest": [path.relative_to(out).as_posix() for path in extra_files]} if extra_files else {}
     return {"file": frame.file, "frame": frame.number, "view": frame.view, "width": width, "height": height, **beside}
 

@@ -16,8 +16,10 @@ from typing import Any
 from ..colour import REC_709, Chromaticities
 from ..colour.srgb import Pixels
 from ..errors import FrameError
-from ..images.exr import read_data_window, read_exr, read_exr_header
+from ..images.exr import read_data_window, read_exr
+from ..images.formats import exr_header
 from ..images.write import write_exr
+from ..system.reading import open_regular, parse_json
 from .layers import FrameLayers, layer_names
 
 HEADER_ATTRIBUTE = "fitFlare"
@@ -45,9 +47,15 @@ def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
 
 def read_description(path: Path | str) -> dict[str, Any]:
     """Return the header entries that `write_layers` wrote. Raises FrameError if the file is not a baked one."""
-    text = read_exr_header(path).get(HEADER_ATTRIBUTE)
     try:
-        description = json.loads(text) if text else None
+        with open_regular(path) as stream:
+            if stream.read(4) != exr_header.MAGIC or exr_header.is_truncated(stream):
+                raise FrameError(f"{path} is damaged or truncated; bake it again.")
+            text = exr_header.string_places(stream).get(HEADER_ATTRIBUTE, (0, b""))[1]
+    except OSError as problem:
+        raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
+    try:
+        description = parse_json(text) if text else None
     except (TypeError, ValueError, RecursionError) as problem:
         raise FrameError(f"{path} has a damaged header ({problem}); bake it again.") from problem
     if not isinstance(description, dict) or not isinstance(description.get("lights"), dict):

@@ -6,43 +6,31 @@ add-on's bakes come here.
 """
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..capture.camera import Camera
-from ..conventions.frame_numbers import NumberedFrame, layers_file
 from ..fit.rendering import render_scene, splat_look
 from ..fit.run import Run, ViewLayers
 from ..flare.compositing import linear_layers as linear_layers
 from ..flare.visibility import visibility_from
-from ..look import LookEdits, PlacedLight, read
+from ..look import LookEdits, PlacedLight
 from ..look.shot import Shot, ShotFrame
 from ..system.progress import Progress
-from .bake import BakeSettings, bake_frames
-from .layers import FrameLayers
+from .shot_frames import ShotSource, bake_shot_frames
 
 
-class ShotRenderer:
-    """Renders the frames of a shot, for `bake_frames`."""
+class ShotRenderer(ShotSource):
+    """Renders the frames of a shot in the engine, with the scene of its run."""
 
     def __init__(self, shot: Shot) -> None:
-        self.shot, self.look = shot, read(shot.flare)
+        super().__init__(shot)
         self.run = Run.open(shot.run) if shot.run else None
-        self.lights = shot.lights
         model = self.run.flare.model if self.run is not None and self.run.flare is not None else None
         self._clear = dict(zip(model.names, model.clear.tolist(), strict=True)) if model is not None else {}
-
-    @property
-    def elements(self) -> Mapping[str, list[str]]:
-        """Names of each placed light's elements."""
-        of_source = self.look.element_names
-        return {light.name: of_source.get(light.source, [])
-                for shot_frame in self.shot.frames for light in shot_frame.lights}
 
     @property
     def fingerprint(self) -> str:
@@ -81,31 +69,6 @@ class ShotRenderer:
         return PlacedLight(light.name, light.source, light.xyz, light.visibility * visibility)
 
 
-@dataclass(frozen=True)
-class _ShotFrameRenderer:
-    """The renderer of one frame of a shot."""
-
-    renderer: ShotRenderer
-    shot_frame: ShotFrame
-    extra_files = ()
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of the frame's camera, lights and edits."""
-        return hashlib.sha256(self.shot_frame.cache_key().encode()).hexdigest()[:16]
-
-    @property
-    def edit_texts(self) -> Sequence[str]:
-        """The shot's own edits."""
-        return self.shot_frame.edits
-
-    def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
-        return self.renderer.render(self.shot_frame, camera, edits)
-
-    def finish(self, layers: FrameLayers, camera: Camera) -> FrameLayers:  # noqa: ARG002 - nothing to add
-        return layers
-
-
 def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool = False,
               progress: Progress | None = None, frame_numbers: Container[int] | None = None, space: str = "linear",
               config: str | None = None) -> dict[str, Any]:
@@ -114,14 +77,5 @@ def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool
     frame_numbers: None for all. space, config: see `BakeSettings`. Returns the content of bake.json. Raises what `bake`
     raises, and FlareFileError.
     """
-    folders = shot.folders
-    frame_of_view = {f"{shot_frame.name}/{shot_frame.frame}": shot_frame for shot_frame in shot.frames
-                     if frame_numbers is None or shot_frame.frame in frame_numbers}
-    frames = [NumberedFrame(view, shot_frame.frame, layers_file(folders[shot_frame.name], shot_frame.frame))
-              for view, shot_frame in frame_of_view.items()]
-    cameras = {view: shot_frame.camera for view, shot_frame in frame_of_view.items()}
-    renderer = ShotRenderer(shot)
-    settings = BakeSettings(half=half, space=space, config=config)
-    return bake_frames(renderer, frames, cameras, out,
-                       lambda frame: _ShotFrameRenderer(renderer, frame_of_view[frame.view]), settings, progress,
-                       overwrite=overwrite)
+    return bake_shot_frames(ShotRenderer(shot), out, half=half, overwrite=overwrite, progress=progress,
+                            frame_numbers=frame_numbers, space=space, config=config)

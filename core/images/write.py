@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writes picture files: PNG by OpenCV, EXR by OpenEXR; each is whole or absent."""
+"""Writes picture files: PNG by OpenCV, EXR by OpenEXR or, where that is missing, by numpy; each is whole or absent."""
 from __future__ import annotations
 
 import errno
+import importlib.util
 import os
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -16,7 +17,7 @@ from ..errors import FrameError
 from ..system.files import atomic_path
 from ..typed import is_utf8
 from .exr import is_exr_truncated
-from .formats import exr_header
+from .formats import exr_header, exr_writer
 
 
 def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: bool = True,
@@ -26,15 +27,20 @@ def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: b
     half: store 16 bit floats; channels that end in ".Z" stay 32 bit, since depth needs the range. commit_lock: see
     `atomic_path`.
     """
-    import OpenEXR
-
     def stored(name: str, pixels: NDArray[Any]) -> NDArray[Any]:
         if half and not name.endswith(".Z") and name != "Z":
             return np.ascontiguousarray(np.clip(pixels, -65504, 65504), np.float16)
         return np.ascontiguousarray(pixels, np.float32)
 
+    stored_channels = {name: stored(name, pixels) for name, pixels in channels.items()}
+    if importlib.util.find_spec("OpenEXR") is None:  # Blender's own Python
+        with atomic_path(path, commit_lock) as temporary:
+            exr_writer.write_scanlines(temporary, stored_channels, header or {})
+        return
+    import OpenEXR
+
     attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
-    save_exr(path, attributes, {name: stored(name, pixels) for name, pixels in channels.items()}, commit_lock)
+    save_exr(path, attributes, stored_channels, commit_lock)
 
 
 def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]],

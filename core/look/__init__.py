@@ -14,7 +14,8 @@
     keyed.py       edits by frame
     look.py        the lights of a .flare: reading and evaluation
     shot.py        cameras and placed lights by frame, as a JSON file that `bake` renders
-    drawing.py     rasterization of Gaussians, for thumbnails and checks
+    drawing.py     rasterization of Gaussians: the definition
+    pyramid.py     the same picture drawn faster, for bakes without an engine
 """
 from __future__ import annotations
 

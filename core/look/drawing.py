@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rasterizes plane Gaussians in numpy, for thumbnails and checks.
+"""Rasterizes plane Gaussians in numpy, for thumbnails, checks and `pyramid`.
 
 The definition is core/gaussians/reference.py. Not fast: each Gaussian is drawn over its bounding box.
 """
@@ -17,6 +17,9 @@ from ..conventions.pixel_grid import PixelGrid
 from ..conventions.splatting import ALPHA_MIN, PROFILE_MIN
 from ..conventions.splatting import OPACITY_MAX as OPACITY_MAX
 from .plane import Floats, PlaneGaussians, arc_log_peak, arc_strengths, arcs_to_pixels, concatenate, to_pixels
+
+Box = tuple[int, int, int, int]
+"""Left, top, right, bottom of a rectangle of pixels; the last two are outside."""
 
 
 def extent(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
@@ -38,20 +41,26 @@ def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, he
 
     blend "add": scene-linear light; "over": display colour, premultiplied, over black. pixel_grid: of the fit.
     """
+    return draw_with_transmittance(flares, intrinsics, width, height, blend, pixel_grid)[0]
+
+
+def draw_with_transmittance(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, height: int,
+                            blend: Blend = "add", pixel_grid: PixelGrid | None = None) -> tuple[Floats, Floats]:
+    """Return the picture of `draw` and its transmittance (height, width), 1 everywhere for "add"."""
     picture = np.zeros((height, width, 3), np.float32)
+    transmittance = np.ones((height, width), np.float32)
     gaussians = concatenate(list(flares))
     if gaussians is None:
-        return picture
-    transmittance = np.ones((height, width), np.float32)
+        return picture, transmittance
     centres, covariances = to_pixels(gaussians, intrinsics, pixel_grid)
     arcs = arcs_to_pixels(gaussians, intrinsics)
     radii = extent(gaussians, blend)
     for number in range(len(gaussians)):
-        box = _box(centres[number], covariances[number], float(radii[number]), width, height)
+        box = bounding_box(centres[number], covariances[number], float(radii[number]), width, height)
         if box is None:
             continue
         ring = None if gaussians.rings is None else gaussians.rings[number]
-        profile = _profile(centres[number], covariances[number], ring, arcs[number], box)
+        profile = profile_in(box, centres[number], covariances[number], ring, arcs[number])
         rows, columns = slice(box[1], box[3]), slice(box[0], box[2])
         if blend == "add":
             profile = np.where(profile >= PROFILE_MIN, profile, 0) * gaussians.opacities[number]
@@ -61,12 +70,11 @@ def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, he
             in_front = transmittance[rows, columns]
             profile, transmittance[rows, columns] = profile * in_front, in_front * (1 - profile)
         picture[rows, columns] += profile[..., None] * gaussians.colours[number]
-    return picture
+    return picture, transmittance
 
 
-def _box(centre: Floats, covariance: Floats, radius: float, width: int,
-         height: int) -> tuple[int, int, int, int] | None:
-    """Return the bounding box of a Gaussian in the picture as left, top, right, bottom; None if it is outside."""
+def bounding_box(centre: Floats, covariance: Floats, radius: float, width: int, height: int) -> Box | None:
+    """Return the bounding box of a Gaussian in the picture; None if it is outside."""
     xx, xy, yy = (float(value) for value in covariance)
     if not xx * yy - xy * xy > 0:
         return None
@@ -79,9 +87,9 @@ def _box(centre: Floats, covariance: Floats, radius: float, width: int,
     return box if box[0] < box[2] and box[1] < box[3] else None
 
 
-def _profile(centre: Floats, covariance: Floats, ring: NDArray[Any] | None, pixel_arc: Floats,
-             box: tuple[int, int, int, int]) -> Floats:
-    """Return the profile (rows, columns) of a Gaussian in a box, 1 at its peak; ring (2,): r0 and w, or None."""
+def profile_in(box: Box, centre: Floats, covariance: Floats, ring: NDArray[Any] | None, pixel_arc: Floats) -> Floats:
+    """Return the profile (rows, columns) of a Gaussian in a box of pixels, 1 at its peak; ring (2,): r0 and w, or None.
+    """
     xx, xy, yy = covariance
     dx = np.arange(box[0], box[2], dtype=np.float32) + 0.5 - centre[0]
     dy = (np.arange(box[1], box[3], dtype=np.float32) + 0.5 - centre[1])[:, None]

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..choices import Blend
 from ..conventions.pixel_grid import PixelGrid
-from ..errors import FlareFileError
+from ..errors import FlareFileError, SettingsError
 from ..system.reading import parse_json
 from ..typed import parse_table
 from . import container, elements
@@ -188,8 +188,11 @@ class Look:
     """The lights of a .flare; created by `read`."""
 
     def __init__(self, path: Path, lights: tuple[LightLook, ...], blend: Blend, camera: TrainedCamera,
-                 licence: str = "", notes: str = "", pixel_grid: PixelGrid | None = None) -> None:
+                 licence: str = "", notes: str = "", pixel_grid: PixelGrid | None = None,
+                 edit_texts: Sequence[str] = ()) -> None:
+        """edit_texts: the edits that the file stores, see `edits`."""
         self.path, self.lights, self.blend, self.camera = path, lights, blend, camera
+        self._edit_texts = tuple(edit_texts)
         self.pixel_grid = pixel_grid
         self.licence, self.notes = licence, notes
 
@@ -202,6 +205,19 @@ class Look:
     def element_names(self) -> dict[str, list[str]]:
         """Names of the elements by light, an argument of `LookEdits.parse`."""
         return {light.name: [element.name for element in light.elements] for light in self.lights}
+
+    @cached_property
+    def edits(self) -> LookEdits:
+        """The edits that the file stores, which an artist's sliders start from; neutral in a file of a fit.
+
+        No method applies them by itself. Raises FlareFileError for edits of lights or elements that the look lacks.
+        """
+        if not self._edit_texts:
+            return LookEdits()
+        try:
+            return LookEdits.parse(self._edit_texts, self.names, self.element_names)
+        except SettingsError as problem:
+            raise FlareFileError(f"{self.path} is damaged: {problem}") from problem
 
     @property
     def count(self) -> int:
@@ -290,10 +306,15 @@ def store_elements(path: Path | str) -> None:
     container.rewrite_metadata(path, path, {**metadata, METADATA_KEY: json.dumps(description)})
 
 
-def write_annotated(source: Path | str, target: Path | str, *, notes: str, licence: str) -> None:
-    """Write a copy of a .flare with other notes and licence. Raises FlareFileError if `source` is not a flare."""
+def write_annotated(source: Path | str, target: Path | str, *, notes: str, licence: str,
+                    edits: LookEdits | None = None) -> None:
+    """Write a copy of a .flare with other notes, licence and edits (`Look.edits`).
+
+    Raises FlareFileError if `source` is not a flare."""
     _, metadata = container.read_tensors(source)
     description = {**_parse_json(Path(source), metadata), "notes": notes, "licence": licence}
+    if edits is not None:
+        description["edits"] = edits.texts()
     container.rewrite_metadata(source, target, {**metadata, METADATA_KEY: json.dumps(description)})
 
 
@@ -326,6 +347,8 @@ def parse_description(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]
         if min(camera.width, camera.height, camera.fx, camera.fy) <= 0:
             raise ValueError("its camera is not valid")
         PixelGrid.read(description.get("sampling"))
+        if not all(isinstance(text, str) for text in description.get("edits", [])):
+            raise ValueError("edits are a list of texts")
         for rows in description.get("seen", {}).values():
             if any(len([float(value) for value in row]) != 5 for row in rows):
                 raise ValueError("a training view is not valid")
@@ -369,7 +392,7 @@ def read(path: Path | str) -> Look:
         raise FlareFileError(f"{path} is damaged: its tensors do not fit its description ({problem}).") from problem
     return Look(path, lights, blend, parse_table(TrainedCamera, description["camera"]),
                 str(description.get("licence", "")), str(description.get("notes", "")),
-                PixelGrid.read(description.get("sampling")))
+                PixelGrid.read(description.get("sampling")), description.get("edits", []))
 
 
 def _read_light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: Blend,

@@ -102,6 +102,8 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     root.fit_flare.is_root = True
     state.capture, state.root, state.footage = blend_relative(folder), root, "images"
     state.known_lights = "\n".join(light.name for light in capture.lights)
+    if settings.frames:
+        state.over = "plate"
     state.mode = "default" if has_exact_clean_frames(capture) else "estimated"
     scene.camera = made[0]
     if settings.match_scene:
@@ -312,6 +314,7 @@ def _add_background(camera: Any, image: Any) -> Any:
     camera.data.show_background_images = True
     background = camera.data.background_images.new()
     background.image, background.alpha = image, 1.0
+    image.use_view_as_render = True  # through the view transform, as in a render
     background.frame_method, background.display_depth = "STRETCH", "BACK"
     return background
 

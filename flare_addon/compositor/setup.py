@@ -174,6 +174,25 @@ def footage_behind_camera(scene: Any) -> tuple[Any, int, int, int]:
     raise FrameError("The camera has no footage behind it; put the flare over the present image instead.")
 
 
+def show_plate(scene: Any) -> bool:
+    """Make renders show the footage behind the scene's camera, until layers are set up over it.
+
+    Returns whether it was done: nodes of the artist stay as they are. Raises FrameError without footage.
+    """
+    plate = footage_behind_camera(scene)
+    tree, state = tree_of(scene), _scene_state(scene)
+    if state["tree"] if tree is None else not any(map(_is_ours, tree.nodes)):
+        return False
+    if tree is None:
+        tree = _new_tree(scene, keep_image=False)
+        scene[STATE_PROPERTY] = {**state, **_tree_state(tree)}
+    footage = _footage_node(tree, plate)
+    if find_node(scene) is None:
+        size = tree.nodes.get(SIZE) or _set_name(scale_to_render_size(tree, footage.outputs["Image"], -3, 1), SIZE)
+        tree.links.new(size.outputs[0], _output_input(tree))
+    return True
+
+
 def _feeding_socket(socket: Any) -> Any:
     """Return the output socket that feeds an input; None where nothing does."""
     return socket.links[0].from_socket if socket is not None and socket.is_linked else None

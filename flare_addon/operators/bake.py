@@ -2,21 +2,22 @@
 """Operators that bake layers and set the compositor up for them."""
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ...core.bake.folder import LayerFolder
-from ...core.errors import CaptureError
-from .. import engine, jobs, render_settings, shots
+from ...core.errors import CaptureError, FitFlareError
+from .. import baking, jobs, render_settings, shots
 from ..compositor import drivers, flare_node, setup, warnings
 from ..paths import absolute, is_folder
 from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator, report_errors
 
 
 class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
-    """Render the flares to EXR layers in the engine, for the frames and the camera of the scene"""
+    """Render the flares to EXR layers, for the frames and the camera of the scene: in the engine, or slower without"""
 
     bl_idname = "fit_flare.bake"
     bl_label = "Bake Layers"
@@ -36,9 +37,7 @@ class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
             return NO_FLARE
         if scene.camera is None:
             return NO_CAMERA
-        if missing := engine.missing_reason():
-            return missing
-        return "A bake is running" if _is_baking(scene) else ""
+        return baking.why_not(scene)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         replaced: list[int] = []
@@ -54,7 +53,7 @@ class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
             message=shots.replacement_warning(shots.layers_folder(context.scene), replaced))
 
     def act(self, context: bpy.types.Context) -> None:
-        shots.bake(context.scene, self._chosen(context), replace_others=self.replace)
+        baking.start(context.scene, self._chosen(context), replace_others=self.replace)
 
     def _chosen(self, context: bpy.types.Context) -> list[Any]:
         """Return the selected cameras; [] for the scene's camera. Raises CaptureError where none is selected."""
@@ -66,10 +65,15 @@ class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
         return cameras
 
 
-def _is_baking(scene: Any) -> bool:
-    """Return whether a bake of this scene's layers is running."""
-    job = jobs.find(shots.layers_folder(scene)) if scene.fit_flare.layers else None
-    return job is not None and job.running
+class FITFLARE_OT_cancel_bake(bpy.types.Operator):
+    """Stop reading the scene for the bake"""
+
+    bl_idname = "fit_flare.cancel_bake"
+    bl_label = "Cancel"
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        baking.cancel()
+        return {"FINISHED"}
 
 
 def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: bool, match: bool = False) -> None:
@@ -167,11 +171,38 @@ class FITFLARE_OT_set_up_baked(GuardedOperator, bpy.types.Operator):
         state = context.scene.fit_flare
         if not state.layers:
             return "Bake layers first, or choose their folder"
-        return "The bake is still running" if _is_baking(context.scene) else ""
+        return "The bake is still running" if baking.is_baking(context.scene) else ""
 
     def act(self, context: bpy.types.Context) -> None:
         state = context.scene.fit_flare
         set_up(self, context.scene, state.layers, keep_image=state.over == "present", plate=state.over == "plate")
+
+
+class _Notes:
+    """Takes the reports of `set_up` for a bake that has ended, whose operator is gone: warnings go to the panel."""
+
+    def __init__(self, job: jobs.Job) -> None:
+        self._job = job
+
+    def report(self, kinds: set[str], text: str) -> None:
+        """Store a warning."""
+        if kinds != {"INFO"}:
+            self._job.warnings.append(text)
+
+
+def _set_up_after_bake(job: jobs.Job, scene: Any) -> None:
+    """Set the compositor of a scene up for new layers, if the panel says so and it is not set up already."""
+    state = scene.fit_flare
+    if not state.bake_composite or scene.library is not None or flare_node.find_node(scene) is not None:
+        return
+    notes = _Notes(job)
+    try:
+        set_up(notes, scene, state.layers, keep_image=state.over == "present", plate=state.over == "plate")
+    except FitFlareError as problem:
+        notes.report({"ERROR"}, f"The compositor was not set up: {problem}")
+        return
+    with contextlib.suppress(RuntimeError):  # without a window there are no undo steps
+        bpy.ops.ed.undo_push(message="Set Up Compositor")
 
 
 class FITFLARE_OT_open_folder(bpy.types.Operator):
@@ -191,7 +222,17 @@ class FITFLARE_OT_open_folder(bpy.types.Operator):
 
 
 _CLASSES = (FITFLARE_OT_bake, FITFLARE_OT_set_up_compositor, FITFLARE_OT_set_up_baked, FITFLARE_OT_remove_compositor,
-            FITFLARE_OT_open_folder)
+            FITFLARE_OT_cancel_bake, FITFLARE_OT_open_folder)
 
 
-register, unregister = bpy.utils.register_classes_factory(_CLASSES)
+def register() -> None:
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+    baking.ON_BAKED.append(_set_up_after_bake)
+
+
+def unregister() -> None:
+    baking.ON_BAKED.remove(_set_up_after_bake)
+    baking.unregister()
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -9,8 +9,12 @@ import bpy
 from mathutils import Vector
 
 from ...core.errors import FlareFileError
-from .. import cameras, library, lights, looks, overlay
+from .. import cameras, library, lights, looks, overlay, render_settings
+from ..compositor import setup
 from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator
+from ..views import look_through_camera
+
+SENSOR = 36.0  # mm, width of the sensor of a picture's camera
 
 
 class FITFLARE_OT_save_flare(GuardedOperator, bpy.types.Operator):
@@ -38,8 +42,10 @@ class FITFLARE_OT_save_flare(GuardedOperator, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         look = looks.look_of(context.scene)
-        path = library.save(look, self.name, self.notes or look.notes, self.licence or look.licence)
-        self.report({"INFO"}, f"{path.stem} is in the library")
+        edits = looks.edits_to_store(context.scene.fit_flare, look)
+        path = library.save(look, edits, self.name, self.notes or look.notes, self.licence or look.licence)
+        sliders = "" if edits.is_neutral else ", with the sliders of the panel Look as they are now"
+        self.report({"INFO"}, f"{path.stem} is in the library{sliders}")
 
 
 class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
@@ -61,14 +67,8 @@ class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
         path = self.filepath or context.window_manager.fit_flare_library
         if not path:
             raise FlareFileError("Choose a flare of the library first.")
-        look = looks.show_look(context.scene, Path(path))
-        free = [item for item in context.scene.fit_flare.lights if item.target is None]
         chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
-        for item, target in zip(free, chosen, strict=False):
-            item.target = target
-        for target in chosen[len(free):]:
-            if all(item.target != target for item in context.scene.fit_flare.lights):
-                looks.add_flare(context.scene, target, look.names[0])
+        looks.show_look(context.scene, Path(path), chosen, add=True)
         missing = [item.name for item in context.scene.fit_flare.lights if item.target is None]
         if missing:
             self.report({"WARNING"}, f"{', '.join(missing)}: choose the light object in the panel Look")
@@ -154,6 +154,12 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         if not hit:
             position = eye + ray * (self.distance or 10.0 * max(camera.matrix_world.to_scale()))
         look, state = looks.look_of(scene), scene.fit_flare
+        placeholder = next((flare.target for flare in state.lights if looks.is_placed(flare, scene)
+                            and flare.target.fit_flare.is_placeholder), None)
+        if placeholder is not None:
+            placeholder.location, placeholder.fit_flare.is_placeholder = position, False
+            placeholder.empty_display_size = 0.02 * (position - eye).length
+            return
         item = next((flare for flare in state.lights if flare.target is None), None)
         light = lights.add_to_scene(scene, position, item.name if item is not None else "light1")
         light.fit_flare.is_light = state.root is not None
@@ -165,7 +171,7 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
 
 
 class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):
-    """Set the scene up for a single picture: a camera of its size, with the picture as its background"""
+    """Set the scene up for a single picture: a camera of its size, the picture behind it and in renders"""
 
     bl_idname = "fit_flare.shot_from_picture"
     bl_label = "Single Picture"
@@ -187,22 +193,36 @@ class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):
             raise FlareFileError(f"{self.filepath} is not a picture that Blender can open.") from problem
         if 0 in image.size:
             raise FlareFileError(f"{self.filepath} is not a picture that Blender can open.")
-        data = bpy.data.cameras.new(Path(self.filepath).stem)
-        data.sensor_fit, data.sensor_width = "HORIZONTAL", 36.0
-        data.lens = 36.0
+        lens = None
         if scene.fit_flare.flare:  # the lens of the flare, to which its shapes belong
             filmed = looks.look_of(scene).camera
-            data.lens = 36.0 * filmed.fx * filmed.pixel_ratio(*image.size) / image.size[0]
-        camera = bpy.data.objects.new(data.name, data)
-        scene.collection.objects.link(camera)
-        camera.rotation_euler = (1.5707963, 0, 0)
-        data.show_background_images = True
-        background = data.background_images.new()
-        background.image, background.alpha, background.frame_method = image, 1.0, "STRETCH"
-        scene.camera = camera
+            lens = SENSOR * filmed.fx * filmed.pixel_ratio(*image.size) / image.size[0]
+        scene.camera = _add_camera(scene, Path(self.filepath).stem, image, lens)
         scene.render.resolution_x, scene.render.resolution_y = image.size
         scene.render.resolution_percentage = 100
         scene.render.pixel_aspect_x = scene.render.pixel_aspect_y = 1.0
+        scene.frame_start = scene.frame_end = scene.frame_current
+        scene.fit_flare.over = "plate"
+        if note := render_settings.show_as_filmed(scene):
+            self.report({"WARNING"}, note)
+        if not setup.show_plate(scene):
+            self.report({"WARNING"}, "The scene has a compositor of its own: renders show the picture when layers are "
+                        "set up over Footage")
+        look_through_camera(context)
+
+
+def _add_camera(scene: Any, name: str, image: Any, lens: float | None) -> Any:
+    """Add a camera with a picture behind it; return it. lens: mm on a sensor 36 mm wide, None for the default."""
+    data = bpy.data.cameras.new(name)
+    data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", SENSOR, lens or SENSOR
+    camera = bpy.data.objects.new(name, data)
+    scene.collection.objects.link(camera)
+    camera.rotation_euler = (1.5707963, 0, 0)
+    data.show_background_images = True
+    background = data.background_images.new()
+    background.image, background.alpha, background.frame_method = image, 1.0, "STRETCH"
+    image.use_view_as_render = True  # through the view transform, as in a render
+    return camera
 
 
 _CLASSES = (FITFLARE_OT_save_flare, FITFLARE_OT_apply_flare, FITFLARE_OT_pick_light, FITFLARE_OT_shot_from_picture)

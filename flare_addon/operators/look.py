@@ -46,11 +46,8 @@ class FITFLARE_OT_open_flare(GuardedOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def act(self, context: bpy.types.Context) -> None:
-        look = looks.show_look(context.scene, Path(bpy.path.abspath(self.filepath)))
-        free = [item for item in context.scene.fit_flare.lights if item.target is None]
         chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
-        for item, target in zip(free, chosen, strict=False):
-            item.target = target
+        look = looks.show_look(context.scene, Path(bpy.path.abspath(self.filepath)), chosen)
         self.report({"INFO"}, f"{Path(self.filepath).name}: {len(look.lights)} lights, {look.count} Gaussians")
 
 
@@ -102,6 +99,25 @@ class FITFLARE_OT_remove_flare(GuardedOperator, bpy.types.Operator):
         looks.remove_flare(context.scene, state.light)
         state.light = max(min(state.light, len(state.lights) - 1), 0)
         return {"FINISHED"}
+
+
+class FITFLARE_OT_remove_lost_flares(GuardedOperator, bpy.types.Operator):
+    """Remove every flare whose light object was deleted from the scene"""
+
+    bl_idname = "fit_flare.remove_lost_flares"
+    bl_label = "Remove Flares of Deleted Lights"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return "" if looks.lost_flares(context.scene) else "Every flare has its light object"
+
+    def act(self, context: bpy.types.Context) -> None:
+        state, lost = context.scene.fit_flare, looks.lost_flares(context.scene)
+        for index in reversed(lost):
+            looks.remove_flare(context.scene, index)
+        state.light = max(min(state.light, len(state.lights) - 1), 0)
+        self.report({"INFO"}, f"{len(lost)} flares removed; their layers stay as they were baked")
 
 
 class FITFLARE_OT_reset_look(bpy.types.Operator):
@@ -157,7 +173,8 @@ class FITFLARE_UL_elements(bpy.types.UIList):
         row.prop(item, "mute", text="", icon="HIDE_ON" if item.mute else "HIDE_OFF", emboss=False)
 
 
-_CLASSES = (FITFLARE_OT_open_flare, FITFLARE_OT_add_flare, FITFLARE_OT_remove_flare, FITFLARE_OT_reset_look,
+_CLASSES = (FITFLARE_OT_open_flare, FITFLARE_OT_add_flare, FITFLARE_OT_remove_flare, FITFLARE_OT_remove_lost_flares,
+            FITFLARE_OT_reset_look,
             FITFLARE_FH_flare, FITFLARE_UL_lights, FITFLARE_UL_elements)
 
 

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.errors import RunError, SettingsError
 from ...core.system.progress import Progress
 from .. import frames, jobs, layers, targets
 from ..command import Command, Step
 from . import transfer
+
+if TYPE_CHECKING:
+    from ...core.bake.shot_frames import ShotSource
+    from ...core.look.shot import Shot
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,8 +40,19 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="for a .flare: a .blend whose camera and lights to use, with the objects that hide them")
     parser.add_argument("--scene", type=Path, metavar="PLY", help="for a .flare: a 3DGS scene that hides its lights")
     parser.add_argument("--lights", metavar="NAMES", help="objects of the .blend that are lights (default: its lamps)")
+    parser.add_argument("--without-engine", action="store_true",
+                        help="for a shot: draw it with numpy in this Python, slower, and without the scene of a fit")
     parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)
     jobs.add_option(parser)
+
+
+def draw_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Bake a shot without an engine."""
+    from ...core.bake.shot_frames import LookRenderer
+
+    if args.run.suffix.lower() != ".json":
+        raise SettingsError("--without-engine is for a shot; leave it out.")
+    return _bake_frames(args, progress, "draw", LookRenderer)
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -101,8 +117,16 @@ def _target_options(args: argparse.Namespace) -> targets.TargetOptions:
 
 
 def run_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Bake a shot, whose file holds its edits."""
-    from ...core.bake.shot import bake_shot
+    """Bake a shot, whose file holds its edits, in the engine."""
+    from ...core.bake.shot import ShotRenderer
+
+    return _bake_frames(args, progress, "bake", ShotRenderer)
+
+
+def _bake_frames(args: argparse.Namespace, progress: Progress, step: str,
+                 renderer: Callable[[Shot], ShotSource]) -> dict[str, Any]:
+    """Bake the selected frames of a shot with this renderer; step: the name of the command's step, for --jobs."""
+    from ...core.bake.shot_frames import bake_shot_frames
     from ...core.conventions.frame_numbers import NumberedFrame
     from ...core.look.shot import Shot
 
@@ -118,9 +142,10 @@ def run_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if not selected:
         return layers.report_nothing(args.out)
     if args.jobs != 1:
-        jobs.run_jobs(args, "bake", [frame.number for frame in selected], progress)
-    record = bake_shot(shot, args.out, half=not args.float, overwrite=args.overwrite, progress=progress,
-                       frame_numbers={frame.number for frame in selected}, space=args.space, config=args.ocio)
+        jobs.run_jobs(args, step, [frame.number for frame in selected], progress)
+    record = bake_shot_frames(renderer(shot), args.out, half=not args.float, overwrite=args.overwrite,
+                              progress=progress, frame_numbers={frame.number for frame in selected}, space=args.space,
+                              config=args.ocio)
     return layers.report_layers(selected, args.out, len(record["frames"]), progress)
 
 
@@ -132,4 +157,5 @@ Frames that exist with the same settings are kept.
 
   run.py bake build/desk --out build/layers --frames 1-20 --set lamp.intensity=2""",
     arguments, (Step("look", "blender", read_blend, is_needed=lambda args: args.blend is not None),
-                Step("bake", "engine", run)), resume_rule="resumes")
+                Step("draw", "any", draw_shot, is_needed=lambda args: args.without_engine),
+                Step("bake", "engine", run, is_needed=lambda args: not args.without_engine)), resume_rule="resumes")

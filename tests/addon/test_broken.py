@@ -70,13 +70,13 @@ def test_without_an_engine_the_button_says_so(said: Any) -> None:
 
 def test_every_panel_says_what_is_missing(said: Any) -> None:
     """Blocks of broken.py: "nothing there yet", "engines that are none, or die", "cameras and scenes"."""
-    capture, lights, fit, look, bake, transfer = said["panels of an empty scene"]
+    capture, lights, fit, look, bake, _, library = said["panels of an empty scene"]
     assert "Footage with a camera solve" in capture
     assert "No lights yet" in lights
     assert "No engine is set up" in fit
     assert "No flare yet" in look
     assert "Nothing to bake yet" in bake
-    assert "The library is empty" in transfer
+    assert "The library is empty" in library
     assert "The engine named by the preferences is missing: " in said["panel without an engine"]
     assert "no camera" in said["panel without a camera"]
 

@@ -36,7 +36,8 @@ def test_the_package_holds_the_program_and_nothing_else(package: Path) -> None:
     assert {"__init__.py", "blender_manifest.toml", "LICENSE", "core/errors.py", "headless/run.py",
             "headless/set_up.py", "constraints.txt", "pyproject.toml"} <= set(names)
     strangers = [name for name in names if name.split("/")[0].startswith(".") or "__pycache__" in name
-                 or name.split("/")[0] in ("tests", "benchmarks", "sample_scenes", "build", "tmp", "docs")]
+                 or name.split("/")[0] in ("tests", "benchmarks", "sample_scenes", "build", "tmp", "docs", "Makefile",
+                                           "ARCHITECTURE.md", "CONTRIBUTING.md")]
     assert strangers == []
 
 

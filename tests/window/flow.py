@@ -313,7 +313,7 @@ def transfer():
     if ui.area().spaces.active.region_3d.view_perspective != "CAMERA":
         ui.point(view.x + 0.35 * view.width, view.y + 0.5 * view.height)
         ui.press("NUMPAD_0")
-    yield from ui.press_button("fit_flare.apply_flare", panel())
+    yield from ui.press_button("fit_flare.add_library_flare", panel())
     yield 1
     assert [item.target.name for item in other.fit_flare.lights if item.target] == ["Sun lamp"]
     shot("08_transferred")

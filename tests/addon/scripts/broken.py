@@ -78,7 +78,7 @@ def shown(name: str) -> str:
     return " ".join(layout.labels)
 
 
-PANELS = ("capture", "lights", "fit", "look", "bake", "transfer")
+PANELS = ("capture", "lights", "fit", "look", "bake", "transfer", "library")
 
 # ---- nothing there yet ------------------------------------------------------------------------------
 scene = empty()

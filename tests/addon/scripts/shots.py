@@ -99,9 +99,9 @@ folder, state = out / "layers", scene.fit_flare
 folder.mkdir(parents=True)
 state.layers = str(folder)
 begun: list[list[object]] = []
-shots.engine.run = lambda _kind, _folder, words: begun.append(words)
-shots.engine.command = lambda *_words: []
-part("flare_addon.operators.bake").engine.find_engine = lambda: Path("python")
+engine = part("flare_addon.engine")
+engine.run = lambda _kind, _folder, words: begun.append(words)
+engine.find_engine = lambda: Path("python")
 recorded(shots.scene_shot(scene, [], [0, 1, 2], flare, None), range(5))
 state.bake_range = "current"
 facts["as it was baked"] = [refusal(ops.bake), len(begun)]

@@ -412,10 +412,9 @@ bpy.context.view_layer.update()
 lamp.select_set(True)
 facts["applied"] = list(ops.apply_flare(filepath=str(library.user_files()[0])))
 state = other.fit_flare
-try:
-    shots.choose_layers_folder(other)  # the .blend is not saved, so they would go beside the flare
-except part("core.errors").RunError as problem:
-    facts["layers beside a flare of the library"] = [str(problem), other.fit_flare.layers]
+place = shots.choose_layers_folder(other)  # the .blend is not saved, and beside the flare is the library
+facts["layers of a flare of the library"] = [library.folder() in place.parents,
+                                             Path(bpy.utils.user_resource("DATAFILES")) in place.parents]
 facts["applied to"] = [item.target.name if item.target else "" for item in state.lights]
 seen = looks.evaluate_flares(other, bpy.context.evaluated_depsgraph_get(), camera)
 facts["transferred"] = [state.native, len(seen), float(drawing.draw(seen.values(), cameras.core_camera(

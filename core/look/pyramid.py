@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Draws flares that add light quickly in numpy: each Gaussian on the coarsest grid that still resolves it.
+
+The grids halve the size of the picture from one to the next. Their sum is taken from the coarsest to the finest, by
+cubic interpolation. `drawing.draw` is the definition. A bake without an engine calls `draw_layers`; the overlay uses
+`level_indices`.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..colour.srgb import linear_from_srgb
+from ..conventions.splatting import PROFILE_MIN
+from .drawing import Box, bounding_box, draw_with_transmittance, extent, profile_in
+from .look import Look
+from .plane import Floats, PlaneGaussians, arcs_to_pixels, to_pixels
+
+LEVELS = (1, 2, 4, 8, 16, 32, 64)
+"""Divisors of the picture's size."""
+MIN_TEXELS = 4.0
+"""Smallest standard deviation of the narrow side of a Gaussian, in texels of the grid that it is drawn on."""
+_MARGIN = 4
+"""Texels around a grid, which the interpolation at the edge of the picture needs."""
+_LARGE_BOX = 1 << 14
+"""Texels of a bounding box from which a thin ellipse is drawn in bands."""
+_BANDS = 24
+"""Bands of a thin ellipse."""
+_FULL_SHARE = 0.35
+"""Share of its bounding box from which an ellipse is drawn in one piece."""
+_WEIGHTS = (-0.0703125, 0.8671875, 0.2265625, -0.0234375)
+"""Weights of Catmull-Rom interpolation a quarter of a texel after the second of four; reversed for three quarters."""
+
+
+def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, ...] = LEVELS,
+                  min_texels: float = MIN_TEXELS) -> NDArray[np.int64]:
+    """Return the index in `levels` (n,) of the grid for each Gaussian, by its narrow side; covariances (n, 3) in px².
+    """
+    xx, xy, yy = covariances.T
+    half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    narrow = np.sqrt(np.maximum(half - root, 0))
+    if rings is not None:
+        narrow = narrow * np.minimum(rings[:, 1], 1)
+    return np.clip(np.searchsorted(np.array(levels), narrow / min_texels, side="right") - 1, 0, len(levels) - 1)
+
+
+def draw_added(gaussians: PlaneGaussians, look: Look, intrinsics: ArrayLike, width: int, height: int) -> Floats:
+    """Return the scene-linear light (height, width, 3) of Gaussians of a look whose light adds."""
+    centres, covariances = to_pixels(gaussians, intrinsics, look.pixel_grid)
+    arcs, radii = arcs_to_pixels(gaussians, intrinsics), extent(gaussians)
+    indices = level_indices(covariances, gaussians.rings)
+    picture: Floats | None = None
+    for index in reversed(range(len(LEVELS))):
+        divisor = LEVELS[index]
+        rows = np.flatnonzero(indices == index)
+        if picture is None and not len(rows) and index:
+            continue
+        size = -(-height // divisor) + 2 * _MARGIN, -(-width // divisor) + 2 * _MARGIN
+        grid = np.zeros((*size, 3), np.float32) if picture is None else _enlarge(picture, size)
+        for row in rows.tolist():
+            ring = None if gaussians.rings is None else gaussians.rings[row]
+            light = gaussians.colours[row] * gaussians.opacities[row]
+            _add(grid, centres[row] / divisor + _MARGIN, covariances[row] / divisor**2, float(radii[row]), ring,
+                 arcs[row] / divisor, light)
+        picture = grid
+    assert picture is not None
+    return np.maximum(picture[_MARGIN:_MARGIN + height, _MARGIN:_MARGIN + width], 0)
+
+
+def _add(grid: Floats, centre: Floats, covariance: Floats, radius: float, ring: Floats | None, arc: Floats,
+         light: Floats) -> None:
+    """Add one Gaussian to a grid (rows, columns, 3), in texels of the grid."""
+    box = bounding_box(centre, covariance, radius, grid.shape[1], grid.shape[0])
+    for part in () if box is None else _bands(box, centre, covariance, radius):
+        profile = profile_in(part, centre, covariance, ring, arc)
+        profile[profile < PROFILE_MIN] = 0
+        target = grid[part[1]:part[3], part[0]:part[2]]
+        for channel in range(3):
+            target[..., channel] += profile * light[channel]
+
+
+def _bands(box: Box, centre: Floats, covariance: Floats, radius: float) -> Iterator[Box]:
+    """Yield rectangles inside `box` that cover the ellipse of this radius."""
+    left, top, right, bottom = box
+    xx, xy, yy = (float(value) for value in covariance)
+    share = math.pi / 4 * math.sqrt(max(xx * yy - xy * xy, 0) / (xx * yy))
+    if (right - left) * (bottom - top) < _LARGE_BOX or share > _FULL_SHARE:
+        yield box
+        return
+    step = max((bottom - top) // _BANDS, 4)
+    reach = radius * math.sqrt(xx)
+    extreme = radius * xy / math.sqrt(xx)  # how far below the centre the ellipse reaches farthest to the right
+    for start in range(top, bottom, step):
+        end = min(start + step, bottom)
+        low, high = start + 0.5 - float(centre[1]), end - 0.5 - float(centre[1])
+        reaches = [_row_reach(dy, xx, xy, yy, radius) for dy in (low, high)]
+        lowest, highest = (min(pair[0] for pair in reaches), max(pair[1] for pair in reaches))
+        if low <= extreme <= high:
+            highest = max(highest, reach)
+        if low <= -extreme <= high:
+            lowest = min(lowest, -reach)
+        first = max(math.floor(float(centre[0]) + lowest) - 1, left)
+        last = min(math.ceil(float(centre[0]) + highest) + 1, right)
+        if first < last:
+            yield first, start, last, end
+
+
+def _row_reach(dy: float, xx: float, xy: float, yy: float, radius: float) -> tuple[float, float]:
+    """Return from where to where the ellipse reaches in the row `dy` below its centre; its tip beyond its end."""
+    inside = min(max(dy, -radius * math.sqrt(yy)), radius * math.sqrt(yy))
+    half = math.sqrt(max((radius * radius - inside * inside / yy) * (xx - xy * xy / yy), 0))
+    return xy / yy * inside - half, xy / yy * inside + half
+
+
+def _enlarge(grid: Floats, size: tuple[int, int]) -> Floats:
+    """Return a grid with its margin at twice the resolution, (rows, columns, 3) of `size` with its own margin."""
+    return _double(_double(grid, size[0]).swapaxes(0, 1), size[1]).swapaxes(0, 1)
+
+
+def _double(grid: Floats, count: int) -> Floats:
+    """Interpolate along the first axis: `count` rows, the first of which lies `_MARGIN` rows before the picture."""
+    first = (np.arange(count) - _MARGIN) // 2 + _MARGIN  # the coarse row that holds each fine one
+    odd = (np.arange(count) - _MARGIN) % 2 == 1
+    result = np.zeros((count, *grid.shape[1:]), np.float32)
+    for is_odd, weights, offset in ((False, _WEIGHTS[::-1], -2), (True, _WEIGHTS, -1)):
+        rows = first[odd == is_odd]
+        result[odd == is_odd] = sum(np.float32(weights[tap]) * grid[np.clip(rows + offset + tap, 0, len(grid) - 1)]
+                                    for tap in range(4))
+    return result
+
+
+def draw_layers(look: Look, flares: Mapping[str, PlaneGaussians], intrinsics: ArrayLike, width: int,
+                height: int) -> dict[str, Floats]:
+    """Return the scene-linear light (height, width, 3) of each light's flare over black; the layers add up.
+
+    With the blend "over" a light's layer is the increase of the picture when that light is put before those that follow
+    it, as in `core.flare.compositing.linear_layers`.
+    """
+    if look.blend == "add":
+        return {name: draw_added(gaussians, look, intrinsics, width, height) for name, gaussians in flares.items()}
+    layers: dict[str, Floats] = {}
+    below = display = np.zeros((height, width, 3), np.float32)
+    for name, gaussians in reversed(list(flares.items())):  # the first light lies in front
+        colour, transmittance = draw_with_transmittance([gaussians], intrinsics, width, height, look.blend,
+                                                        look.pixel_grid)
+        display = colour + transmittance[..., None] * display
+        above = np.asarray(linear_from_srgb(np.maximum(display, 0)), np.float32)
+        layers[name], below = above - below, above
+    return {name: np.maximum(layers[name], 0) for name in flares}

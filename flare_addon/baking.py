@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bakes a scene: reads it in short steps, so that the window stays responsive, then starts the process that draws.
+
+The process is the engine. Without one it is Blender's own Python, which draws with numpy, slower. `operators.bake`
+starts a bake; the panel Bake shows it.
+"""
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..core.errors import FitFlareError, RunError, os_error_message
+from ..core.system.files import remove_file, write_json
+from ..core.system.processes import available_cores
+from . import engine, jobs, looks, shots
+from .properties import redraw_viewports
+from .shots import ShotReading
+
+STEP_S = 0.02
+"""Time for which the reading of a scene holds the window in one go; a frame that takes longer is not interrupted."""
+INTERVAL_S = 0.005
+"""Pause between two such times."""
+MAX_PROCESSES = 8
+"""Most processes that draw without an engine; each needs about a gigabyte for frames of 4K."""
+
+
+class Preparation:
+    """A scene that is being read for a bake. error: why it ended early; "" else."""
+
+    def __init__(self, reading: ShotReading, own_folder: bool, folder: Path) -> None:
+        self.reading, self.error = reading, ""
+        self._own_folder, self._folder = own_folder, folder
+
+    @property
+    def fraction_done(self) -> float:
+        """The part of the frames that is read, 0..1."""
+        return self.reading.done / max(self.reading.total, 1)
+
+    def step(self) -> bool:
+        """Read one frame; after the last one, start the bake. Returns whether more is to be done."""
+        if self.reading.done < self.reading.total:
+            self.reading.step()
+            return True
+        self.reading.restore()
+        scene = self.reading.scene
+        shot = self.reading.shot(looks.look_of(scene).path.resolve(), shots.run_to_bake(scene))
+        shot = replace(shot, own_folder=self._own_folder)
+        shot.write(self._folder / shots.SHOT_FILE)
+        if scene.fit_flare.bake_live:
+            write_json(self._folder / shots.LIVE_FILE, shots.live_record(scene.fit_flare, shot.lights))
+        else:
+            remove_file(self._folder / shots.LIVE_FILE)
+        _start_process(self._folder, len(shot.frames))
+        return False
+
+
+_preparation: Preparation | None = None
+_last_error = ""
+
+
+def preparation() -> Preparation | None:
+    """Return the scene that is being read now; None without one."""
+    return _preparation
+
+
+def last_error(scene: Any) -> str:
+    """Return why the last reading of this scene ended early; "" where it did not."""
+    return _last_error if _preparation is None and _last_error and scene.name == _last_scene else ""
+
+
+_last_scene = ""
+
+
+def is_baking(scene: Any) -> bool:
+    """Return whether this scene is read for a bake, or its layers are being baked."""
+    if _preparation is not None and _preparation.reading.scene_name == scene.name:
+        return True
+    job = jobs.find(shots.layers_folder(scene)) if scene.fit_flare.layers else None
+    return job is not None and job.running
+
+
+def why_not(scene: Any) -> str:
+    """Return why the scene cannot be baked now, for the tooltip; "" where it can."""
+    if is_baking(scene) or _preparation is not None:
+        return "A bake is running"
+    if scene.fit_flare.bake_scene and engine.find_engine() is None:
+        return f"Fitted Scene Too needs the engine. {engine.missing_reason()}"
+    return engine.missing_reason() if engine.configured_engine()[1] else ""
+
+
+def start(scene: Any, camera_objects: Sequence[Any], *, replace_others: bool = False) -> None:
+    """Start a bake of these cameras, or of the scene's camera. Without a window it has ended on return.
+
+    replace_others: delete layers that `shots.frames_to_replace` returns; without it they are an error. Raises
+    FitFlareError.
+    """
+    global _preparation, _last_error, _last_scene
+    shots.check_bake(scene, camera_objects)
+    if not replace_others and (replaced := shots.frames_to_replace(scene, camera_objects)):
+        raise RunError(shots.replacement_warning(shots.layers_folder(scene), replaced))
+    reading = ShotReading(scene, camera_objects, shots.frames_to_bake(scene))
+    folder = shots.choose_layers_folder(scene)
+    shots.live_record(scene.fit_flare, ())  # gives each flare its id inside the operator's undo step
+    prepared = Preparation(reading, bool(camera_objects), folder)
+    _last_error, _last_scene = "", scene.name
+    if bpy.app.background:
+        try:
+            while prepared.step():
+                pass
+        finally:
+            reading.restore()
+        return
+    _preparation = prepared
+    bpy.app.timers.register(_tick, first_interval=INTERVAL_S)
+
+
+def cancel() -> None:
+    """Stop reading the scene."""
+    if _preparation is not None:
+        _end("Stopped before it began.")
+
+
+def _tick() -> float | None:
+    """Read frames for `STEP_S`; return the seconds to the next call, None to stop the timer."""
+    if _preparation is None:
+        return None
+    began = time.perf_counter()
+    try:
+        while _preparation.step():
+            if time.perf_counter() - began > STEP_S:
+                jobs.redraw_bars()
+                return INTERVAL_S
+        _end("")
+    except FitFlareError as problem:
+        _end(str(problem))
+    except OSError as problem:
+        _end(os_error_message(problem))
+    return None
+
+
+def _end(error: str) -> None:
+    """End the reading of a scene, with the reason where it ended early."""
+    global _preparation, _last_error
+    assert _preparation is not None
+    ended, _preparation, _last_error = _preparation, None, error
+    ended.reading.restore()
+    jobs.redraw_bars()
+    redraw_viewports()
+
+
+def _start_process(folder: Path, frames: int) -> None:
+    """Start the process that bakes the shot in a folder."""
+    args = ["bake", folder / shots.SHOT_FILE, "--out", folder, "--overwrite"]
+    if engine.find_engine() is not None or engine.configured_engine()[1]:
+        engine.run("bake", folder, args)
+        return
+    processes = min(max(available_cores() - 1, 1), MAX_PROCESSES, frames)
+    several = ["--jobs", str(processes)] if processes > 1 else []
+    engine.run_without("bake", folder, [*args, "--without-engine", *several])
+
+
+ON_BAKED: list[Callable[[jobs.Job, Any], None]] = []
+"""Functions to call with the job and the scene when the layers of a scene are baked."""
+
+
+def _on_finished(job: jobs.Job) -> None:
+    """Reload the layers that Blender shows, and hand the scenes with these layers on."""
+    from .images import reload_images
+
+    reload_images(job.folder)
+    folder = os.path.normcase(job.folder.absolute())
+    for scene in bpy.data.scenes if job.state == "done" else ():
+        if scene.fit_flare.layers and os.path.normcase(shots.layers_folder(scene).absolute()) == folder:
+            for function in ON_BAKED:
+                function(job, scene)
+
+
+jobs.ON_FINISHED["bake"] = _on_finished
+
+
+def unregister() -> None:
+    """Stop reading a scene."""
+    global _preparation
+    _preparation = None
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)

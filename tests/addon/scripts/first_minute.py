@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside Blender: an artist's first minutes with the library, without a capture and without an engine. Arguments: the
+zip, a .flare with one light, one with two, a folder to write."""
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import bpy
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+from start import empty, install, leave, part, refusal
+
+package, flare, two, out = sys.argv[1:5]
+install(package)
+sys.path.remove(str(Path(__file__).parent))
+ops = bpy.ops.fit_flare
+looks, library, panels, core_look = (
+    part(name) for name in ("flare_addon.looks", "flare_addon.library", "flare_addon.panels", "core.look"))
+facts: dict[str, object] = {}
+names = [item[1] for item in library.items()]
+path_of = {item[1]: item[0] for item in library.items()}
+
+
+def object_in(scene, name, data, place):
+    item = bpy.data.objects.new(name, data)
+    scene.collection.objects.link(item)
+    item.location = place
+    return item
+
+
+def scene_with(*lamps):
+    """An empty file with a camera that looks along +y, and lamps at these places."""
+    scene = empty()
+    scene.camera = object_in(scene, "Camera", bpy.data.cameras.new("Camera"), (0, 0, 0))
+    scene.camera.rotation_euler = (np.pi / 2, 0, 0)
+    made = [object_in(scene, f"Lamp {number}", bpy.data.lights.new("Lamp", "POINT"), place)
+            for number, place in enumerate(lamps, 1)]
+    bpy.context.view_layer.update()
+    return scene, made
+
+
+def rows(scene):
+    return [[item.name, item.source, item.target.name if item.target else ""] for item in scene.fit_flare.lights]
+
+
+def select(scene, *objects):
+    for item in scene.objects:
+        item.select_set(item in objects)
+
+
+def brightness(scene):
+    """The sum of the flare over a small picture, as numpy draws it."""
+    gaussians = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera)
+    k = np.array([[48.0, 0, 24], [0, 48.0, 13.5], [0, 0, 1]])
+    return float(core_look.draw(gaussians.values(), k, 48, 27).sum())
+
+
+# ---- add flare ------------------------------------------------------------------------------------------
+facts["in the box"] = len(names)
+scene, (near, far) = scene_with((0.4, 8, 0.3), (3, 8, 1))
+facts["added"] = list(ops.add_library_flare())
+facts["added rows"] = rows(scene)
+facts["is lit"] = brightness(scene) > 0.01
+ops.add_library_flare()
+ops.add_library_flare()
+facts["added again"] = rows(scene)
+select(scene, far)
+ops.add_library_flare()
+facts["added at another"] = rows(scene)
+
+scene, _ = scene_with((0, -8, 0), (60, 8, 0))  # behind the camera, and far outside of the frame
+ops.add_library_flare(look=path_of["Anamorphic Blue"])
+facts["none in view"] = [rows(scene)[0][2], Path(scene.fit_flare.flare).stem, brightness(scene) > 0.01]
+
+scene, (lamp,) = scene_with((0.5, 8, 0.4))
+cube = object_in(scene, "Cube", bpy.data.meshes.new("Cube"), (0, 5, 0))
+select(scene, cube)
+ops.add_library_flare()
+facts["beside a selected mesh"] = rows(scene)
+ops.add_library_flare(light="new")
+facts["a new one"] = [row[2] for row in rows(scene)]
+
+scene = empty()
+ops.add_library_flare()
+facts["without a camera"] = [scene.camera is not None, [row[2] for row in rows(scene)], brightness(scene) > 0.01]
+layout = MagicMock()
+bpy.types.VIEW3D_MT_light_add.draw(SimpleNamespace(layout=layout), bpy.context)
+facts["in the menu"] = [function.__name__ for function in bpy.types.VIEW3D_MT_light_add._dyn_ui_initialize()
+                        if "fit_flare" in function.__module__]
+
+# ---- another look ---------------------------------------------------------------------------------------
+scene, (near, far) = scene_with((0.4, 8, 0.3), (3, 8, 1))
+select(scene, near)
+ops.apply_flare(filepath=two)
+facts["two lights, one lamp"] = rows(scene)
+ops.apply_flare(filepath=two)
+facts["applied twice"] = rows(scene)
+select(scene, near, far)
+ops.open_flare(filepath=two)
+ops.open_flare(filepath=two)
+facts["opened twice"] = rows(scene)
+state = scene.fit_flare
+state.lights[0].intensity, state.lights[1].rotation, state.master.tint = 0.25, 0.5, (1, 0.5, 0.25)
+state.lights[0].elements[0].scale = 2.0
+element = state.lights[0].elements[0].name
+ops.apply_flare(filepath=flare)
+facts["another look"] = [rows(scene), state.lights[0].intensity, round(state.lights[1].rotation, 5),
+                         [round(value, 5) for value in state.master.tint]]
+ops.apply_flare(filepath=path_of["Clean Prime"])
+ops.apply_flare(filepath=two)
+facts["back again"] = [rows(scene), state.lights[0].intensity, round(state.lights[1].rotation, 5)]
+
+# ---- the library keeps edits ----------------------------------------------------------------------------
+scene, (near, far) = scene_with((0.4, 8, 0.3), (3, 8, 1))
+select(scene, near, far)
+ops.open_flare(filepath=two)
+state = scene.fit_flare
+state.master.intensity, state.lights[0].spread, state.lights[1].mute = 2.0, 1.5, True
+state.lights[0].elements[0].tint, state.lights[0].elements[-1].mute = (1, 0.5, 0.25), True
+state.lights[0].rotation = 0.5
+edited = looks.edits_of(state)
+lit = brightness(scene)
+ops.save_flare(name="Mine")
+(saved,) = library.user_files()
+scene, (near, far) = scene_with((0.4, 8, 0.3), (3, 8, 1))
+select(scene, near, far)
+ops.apply_flare(filepath=str(saved))
+state = scene.fit_flare
+facts["edits"] = [sorted(edited.texts()) == sorted(looks.edits_of(state).texts()), len(edited.texts()),
+                  brightness(scene) / lit]
+state.master.intensity = 3.0  # chosen by the artist
+state.lights[1].mute = False
+ops.apply_flare(filepath=str(saved))
+facts["chosen"] = [state.master.intensity, state.lights[1].mute, state.lights[0].spread]
+ops.apply_flare(filepath=two)
+facts["as fitted"] = [state.master.intensity, state.lights[0].spread, state.lights[0].elements[0].tint[1]]
+neutral = library.thumbnail(core_look.read(two))
+facts["thumbnail differs"] = float(np.abs(library.thumbnail(core_look.read(saved)) - neutral).max()) > 0.01
+
+# ---- bake without an engine -----------------------------------------------------------------------------
+def rendered(scene):
+    """The picture that a render gives, scene-linear, row 0 on top."""
+    files = {}
+    render_settings.render_frames(scene, [scene.frame_current],
+                                  lambda _number, suffix: files.setdefault(suffix, Path(out) / f"rendered{suffix}"))
+    image = bpy.data.images.load(str(files[".exr"]))
+    pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(pixels)
+    width, height = image.size
+    bpy.data.images.remove(image)
+    return pixels.reshape(height, width, 4)[::-1, :, :3]
+
+
+def small(scene):
+    scene.render.resolution_x, scene.render.resolution_y = 64, 36
+    scene.render.engine = "BLENDER_WORKBENCH"
+    scene.render.film_transparent = True
+    scene.render.image_settings.color_mode = "RGB"
+
+
+def drawn(scene):
+    """The flare over the scene's picture, scene-linear, by the definition."""
+    gaussians = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera)
+    camera = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    core = part("flare_addon.cameras").core_camera(camera.data, camera.matrix_world, scene.render)
+    look = looks.look_of(scene)
+    return core_look.draw(gaussians.values(), core.intrinsics, 64, 36, look.blend, look.pixel_grid)
+
+
+render_settings, flare_node, shots, baking, engine = (
+    part(f"flare_addon.{name}") for name in ("render_settings", "compositor.flare_node", "shots", "baking", "engine"))
+facts["no engine"] = engine.find_engine() is None
+scene, (lamp,) = scene_with((0.5, 8, 0.4))
+small(scene)
+ops.add_library_flare(look=path_of["Anamorphic Blue"])
+lamp.keyframe_insert("location", frame=1)
+lamp.location.x = -1
+lamp.keyframe_insert("location", frame=7)
+scene.frame_start, scene.frame_end, scene.frame_step = 1, 7, 3
+scene.frame_set(4)
+scene.fit_flare.lights[0].scale = 1.5
+facts["baked"] = list(ops.bake())
+folder = shots.layers_folder(scene)
+facts["in the user's folder"] = Path(bpy.utils.user_resource("DATAFILES")) in folder.parents
+facts["frames"] = [sorted(path.name for path in folder.glob("*.exr")), scene.frame_current]
+facts["set up by itself"] = flare_node.find_node(scene) is not None
+errors = []
+for number in (1, 4):
+    scene.frame_set(number)
+    exact = drawn(scene)
+    errors.append(float(np.abs(rendered(scene) - exact).max() / exact.max()))
+    facts["is seen"] = float(exact.max()) > 0.1
+facts["first render"] = errors
+scene.fit_flare.lights[0].intensity = 0.5
+scene.frame_set(1)
+facts["live"] = float(rendered(scene).sum() / drawn(scene).sum())
+written = [path.stat().st_mtime_ns for path in sorted(folder.glob("*.exr"))]
+ops.bake()
+facts["kept"] = written == [path.stat().st_mtime_ns for path in sorted(folder.glob("*.exr"))]
+scene.fit_flare.bake_scene = True
+facts["scene of a fit"] = refusal(ops.bake)
+scene.fit_flare.bake_scene, scene.fit_flare.bake_composite = False, False
+ops.remove_compositor()
+ops.bake()
+facts["left alone"] = flare_node.find_node(scene) is None
+
+# ---- reading a scene in steps ---------------------------------------------------------------------------
+reading = shots.ShotReading(scene, [], range(1, 4))
+reading.step()
+facts["read one"] = [reading.done, reading.total, scene.frame_current]
+reading.restore()
+facts["restored"] = scene.frame_current
+lens, scene.camera = scene.camera, None
+try:
+    reading.step()
+except part("core.errors").FitFlareError as problem:
+    facts["camera deleted while it reads"] = str(problem)
+scene.camera = lens
+
+# ---- a single picture -----------------------------------------------------------------------------------
+photo = bpy.data.images.new("photo", 64, 36, float_buffer=False)
+photo.filepath_raw, photo.file_format = str(Path(out) / "photo.png"), "PNG"
+photo.pixels.foreach_set(np.tile(np.float32([0.25, 0.5, 0.75, 1]), 64 * 36))
+photo.save()
+bpy.data.images.remove(photo)
+scene = empty()
+scene.view_settings.view_transform = "AgX"
+ops.shot_from_picture(filepath=str(Path(out) / "photo.png"))
+facts["picture"] = [scene.frame_start, scene.frame_end, scene.view_settings.view_transform, scene.fit_flare.over,
+                    scene.render.resolution_x]
+if hasattr(scene.render, "compositor_device"):
+    scene.render.compositor_device = "CPU"
+plain = rendered(scene)
+facts["picture is rendered"] = plain[18, 32].tolist()
+ops.add_library_flare(look=path_of["Vintage Ring"])
+ops.bake()
+facts["picture with its flare"] = float(np.abs(rendered(scene) - plain - drawn(scene)).max() / drawn(scene).max())
+scene.fit_flare.native = False
+for x in (0.75, 0.25):
+    ops.pick_light(x=x, y=0.5)
+bpy.context.view_layer.update()
+facts["picked"] = [[item.target.name, item.target.location.x > 0] for item in scene.fit_flare.lights]
+ops.remove_compositor()
+facts["picture removed"] = flare_node.tree_of(scene) is None
+
+# ---- deleted lamps --------------------------------------------------------------------------------------
+scene, lamps = scene_with((0.4, 8, 0.3), (3, 8, 1), (-2, 8, 0), (1, 8, 1))
+select(scene, *lamps)
+ops.apply_flare(filepath=flare)
+state = scene.fit_flare
+state.lights[2].intensity = 0.5
+for lamp in (lamps[0], lamps[1], lamps[3]):
+    scene.collection.objects.unlink(lamp)
+layout = MagicMock()
+panels.FITFLARE_PT_look.draw(SimpleNamespace(layout=layout), bpy.context)
+facts["offered"] = [call.kwargs["text"] for call in layout.mock_calls
+                    if call[0] == "operator" and "remove_lost" in call.args[0]]
+ops.remove_lost_flares()
+facts["left"] = [rows(scene), state.lights[0].intensity]
+facts["none is lost"] = refusal(ops.remove_lost_flares)
+
+leave(facts)

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""An artist's first minutes with the library, without a capture and without an engine."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blenders import Blender
+from test_work import a_flare
+
+SCRIPT = Path(__file__).parent / "scripts" / "first_minute.py"
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("first_minute")
+    return blender.run(SCRIPT, package, a_flare(base / "lamp.flare"), a_flare(base / "two.flare", "sun", "moon"), base,
+                       user=base / "user")
+
+
+def test_one_button_shows_a_look_of_the_library(facts: Any) -> None:
+    """Block of first_minute.py: "add flare"."""
+    assert facts["in the box"] >= 12
+    assert facts["added"] == ["FINISHED"]
+    assert facts["added rows"] == [["light", "light", "Lamp 1"]]
+    assert facts["is lit"]
+    assert facts["in the menu"] == ["_draw_menu"]
+
+
+def test_a_flare_is_added_once_for_each_light(facts: Any) -> None:
+    """Block of first_minute.py: "add flare"."""
+    assert facts["added again"] == [["light", "light", "Lamp 1"]]
+    assert facts["added at another"] == [["light", "light", "Lamp 1"], ["Lamp 2", "light", "Lamp 2"]]
+
+
+def test_a_scene_without_a_light_in_view_gets_one(facts: Any) -> None:
+    """Block of first_minute.py: "add flare"."""
+    assert facts["none in view"] == ["Flare", "Anamorphic Blue", True]
+    assert facts["beside a selected mesh"] == [["light", "light", "Lamp 1"]]
+    assert facts["a new one"] == ["Lamp 1", "Flare"]
+    assert facts["without a camera"] == [True, ["Flare"], True]
+
+
+def test_a_look_that_is_applied_again_doubles_nothing(facts: Any) -> None:
+    """Block of first_minute.py: "another look"."""
+    assert facts["two lights, one lamp"] == [["sun", "sun", "Lamp 1"], ["moon", "moon", ""]]
+    assert facts["applied twice"] == facts["two lights, one lamp"]
+    assert facts["opened twice"] == [["sun", "sun", "Lamp 1"], ["moon", "moon", "Lamp 2"]]
+
+
+def test_another_look_keeps_lamps_and_sliders(facts: Any) -> None:
+    """Block of first_minute.py: "another look"."""
+    placed = [["sun", "lamp", "Lamp 1"], ["moon", "lamp", "Lamp 2"]]
+    assert facts["another look"] == [placed, 0.25, 0.5, [1, 0.5, 0.25]]
+    rows, intensity, rotation = facts["back again"]
+    assert [row[2] for row in rows] == ["Lamp 1", "Lamp 2"]
+    assert (intensity, rotation) == (0.25, 0.5)
+
+
+def test_an_entry_of_the_library_keeps_its_edits(facts: Any) -> None:
+    """Block of first_minute.py: "the library keeps edits"."""
+    same, count, brightness = facts["edits"]
+    assert same and count == 6
+    assert brightness == pytest.approx(1, abs=1e-3)
+    assert facts["thumbnail differs"]
+
+
+def test_applying_an_entry_keeps_what_the_artist_has_chosen(facts: Any) -> None:
+    """Block of first_minute.py: "the library keeps edits"."""
+    assert facts["chosen"] == [3, False, 1.5]
+    assert facts["as fitted"] == [3, 1, 1]
+
+
+def test_flares_of_deleted_lamps_are_removed_together(facts: Any) -> None:
+    """Block of first_minute.py: "deleted lamps"."""
+    assert facts["offered"] == ["Remove Flares of Deleted Lights (3)"]
+    assert facts["left"] == [[["Lamp 3", "lamp", "Lamp 3"]], 0.5]
+    assert "has its light object" in facts["none is lost"]
+
+
+def test_layers_are_baked_without_an_engine(facts: Any) -> None:
+    """Block of first_minute.py: "bake without an engine"."""
+    assert facts["no engine"]
+    assert facts["baked"] == ["FINISHED"]
+    assert facts["in the user's folder"], "the .blend is not saved, and the look is in the extension's folder"
+    assert facts["frames"] == [["layers.0001.exr", "layers.0004.exr", "layers.0007.exr"], 4], "the frame step counts"
+    assert facts["kept"]
+    assert "needs the engine" in facts["scene of a fit"]
+
+
+def test_the_first_render_shows_the_flare(facts: Any) -> None:
+    """Block of first_minute.py: "bake without an engine"."""
+    assert facts["set up by itself"] and facts["is seen"]
+    assert max(facts["first render"]) < 2e-3
+    assert facts["live"] == pytest.approx(1, abs=2e-3)
+    assert facts["left alone"], "with Composite after It switched off"
+
+
+def test_a_scene_is_read_a_frame_at_a_time(facts: Any) -> None:
+    """Block of first_minute.py: "reading a scene in steps"."""
+    assert facts["read one"] == [1, 3, 1]
+    assert facts["restored"] == 1
+    assert "was deleted while" in facts["camera deleted while it reads"]
+
+
+def test_a_single_picture_is_rendered_with_its_flare(facts: Any) -> None:
+    """Block of first_minute.py: "a single picture"."""
+    assert facts["picture"] == [1, 1, "Standard", "plate", 64]
+    assert facts["picture is rendered"] == pytest.approx([0.0509, 0.214, 0.5225], abs=2e-3)
+    assert facts["picture with its flare"] < 2e-3
+    assert facts["picked"] == [["Flare", True], ["light1", False]], "the new light is moved first"
+    assert facts["picture removed"]

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The flare in the camera view against the one in a render, in Blender's real window: display codes of both, under view
+transforms and render engines, over a scene and over footage.
+
+Started by tests/window/run.py --engine "" --script tests/window/agreement.py. Writes agreement.json: for each case the
+largest and the mean difference in codes, where neither clips, and the share of pixels within two codes.
+"""
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import driver as ui
+import flow
+from flow import done, wait
+from measure import module
+
+WIDTH, HEIGHT = 480, 270
+MARGIN = 2  # pixels at the edge of the frame, where the camera's border is drawn
+
+
+def steps():
+    settings = bpy.context.preferences
+    settings.view.show_splash = False
+    yield 1
+    bpy.ops.extensions.package_install_files(filepath=flow.ZIP, repo="user_default", enable_on_install=True,
+                                             overwrite=True)
+    yield 1
+    results = {}
+    for over in ("present", "plate"):
+        scene = yield from prepare(over)
+        for engine in ("CYCLES", "BLENDER_WORKBENCH"):
+            if over == "plate" and engine != "CYCLES":
+                continue
+            yield from compare(scene, engine, over, results)
+    (flow.out / "agreement.json").write_text(json.dumps(results, indent=1))
+    done("agreement", **{key: value["within_2"] for key, value in results.items()})
+
+
+def prepare(over: str):
+    """A scene of flat greys, or a photograph, with a flare and its layers in the compositor."""
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    yield 1
+    scene = bpy.context.scene
+    for item in [item for item in scene.objects if item.type != "CAMERA"]:
+        bpy.data.objects.remove(item)
+    if over == "plate":
+        photo = bpy.data.images.new("photo", WIDTH, HEIGHT)
+        ramp = np.ones((HEIGHT, WIDTH, 4), np.float32)
+        ramp[..., :3] = np.linspace(0.05, 0.7, WIDTH, dtype=np.float32)[None, :, None]
+        photo.pixels.foreach_set(ramp.ravel())
+        photo.filepath_raw, photo.file_format = str(flow.out / "photo.png"), "PNG"
+        photo.save()
+        bpy.ops.fit_flare.shot_from_picture(filepath=photo.filepath_raw)
+    else:
+        for place, value in ((-1.5, 0.05), (0.5, 0.3), (2.5, 0.9)):
+            add_grey(scene, place, value)
+    scene.render.resolution_x, scene.render.resolution_y = WIDTH, HEIGHT
+    scene.render.dither_intensity = 0
+    scene.frame_end = 1
+    library = {item[1]: item[0] for item in module("library").items()}
+    bpy.ops.fit_flare.add_library_flare(look=library["Vintage Ring"], light="new")
+    with ui.override():
+        bpy.ops.fit_flare.bake("EXEC_DEFAULT")
+    jobs, shots, flare_node = module("jobs"), module("shots"), module("compositor.flare_node")
+    yield from wait(lambda: flare_node.find_node(scene) is not None, 120)
+    assert jobs.find(shots.layers_folder(scene)).state == "done"
+    return scene
+
+
+def add_grey(scene, x: float, value: float) -> None:
+    """A square of constant light before the camera."""
+    mesh = bpy.data.meshes.new("Grey")
+    mesh.from_pydata([(-1, -1, -8), (1, -1, -8), (1, 1, -8), (-1, 1, -8)], [], [(0, 1, 2, 3)])
+    item = bpy.data.objects.new("Grey", mesh)
+    scene.collection.objects.link(item)
+    item.parent, item.location = scene.camera, (x, 0, 0)
+    item.color = (value, value, value, 1)
+    material = bpy.data.materials.new("Grey")
+    if not material.node_tree:
+        material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    emission, out = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeOutputMaterial")
+    emission.inputs["Color"].default_value = (value, value, value, 1)
+    tree.links.new(emission.outputs[0], out.inputs[0])
+    mesh.materials.append(material)
+
+
+def compare(scene, engine: str, over: str, results) -> None:
+    """The view and the render of one engine under each view transform."""
+    scene.render.engine = engine
+    if engine == "CYCLES":
+        scene.cycles.samples = scene.cycles.preview_samples = 8
+        scene.cycles.use_denoising = scene.cycles.use_preview_denoising = False
+    else:
+        scene.display.shading.light, scene.display.shading.color_type = "FLAT", "OBJECT"
+        scene.display.render_aa = scene.display.viewport_aa = "OFF"
+    space = ui.area().spaces.active
+    space.shading.type = "RENDERED"
+    space.show_region_ui = space.show_region_toolbar = False
+    space.show_gizmo = False
+    for name in ("show_floor", "show_axis_x", "show_axis_y", "show_text", "show_cursor", "show_extras",
+                 "show_object_origins", "show_outline_selected", "show_relationship_lines"):
+        setattr(space.overlay, name, False)
+    scene.camera.data.passepartout_alpha = 0
+    if engine == "BLENDER_WORKBENCH":
+        space.shading.light, space.shading.color_type = "FLAT", "OBJECT"
+    space.region_3d.view_perspective = "CAMERA"
+    with ui.override():
+        bpy.ops.view3d.zoom_camera_1_to_1()
+    for item in scene.objects:
+        item.select_set(False)
+    yield 1
+    for transform in ("Standard", "AgX", "Filmic"):
+        scene.view_settings.view_transform = transform
+        bpy.ops.render.render(scene=scene.name)
+        rendered = saved(scene, flow.out / f"{over}_{engine}_{transform}_render.png")
+        yield 4
+        path = flow.out / f"{over}_{engine}_{transform}_view.png"
+        ui.screenshot(str(path))
+        yield 0.5
+        with ui.override():
+            frame = module("overlay").camera_frame(bpy.context, scene, scene.camera)
+        region = ui.region("WINDOW")
+        left, bottom = round(region.x + frame.left), round(region.y + frame.bottom)
+        assert (round(frame.width), round(frame.height)) == (WIDTH, HEIGHT), frame
+        window = pixels(path)
+        view = window[bottom:bottom + HEIGHT, left:left + WIDTH]
+        inner = slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN)
+        best = None
+        for y in (-1, 0, 1):  # the frame's corner is rounded
+            for x in (-1, 0, 1):
+                moved = np.roll(rendered, (y, x), (0, 1))[inner]
+                away = np.abs(moved - view[inner])[(moved < 254) & (view[inner] < 254)]
+                if best is None or away.mean() < best.mean():
+                    best = away
+        results[f"{over} {engine} {transform}"] = {
+            "largest": float(best.max()), "mean": round(float(best.mean()), 3),
+            "within_2": round(float((best <= 2).mean()), 5), "brightest": float(rendered.max())}
+        print(over, engine, transform, results[f"{over} {engine} {transform}"], flush=True)
+
+
+def saved(scene, path: Path):
+    """Codes of the last render as its view transform shows it, row 0 at the bottom."""
+    settings = scene.render.image_settings
+    settings.file_format, settings.color_mode, settings.color_depth = "PNG", "RGB", "8"
+    bpy.data.images["Render Result"].save_render(str(path), scene=scene)
+    return pixels(path)
+
+
+def pixels(path: Path):
+    """Codes (height, width, 3) of a PNG, row 0 at the bottom."""
+    image = bpy.data.images.load(str(path))
+    width, height = image.size
+    values = np.empty(4 * width * height, np.float32)
+    image.pixels.foreach_get(values)
+    bpy.data.images.remove(image)
+    return np.round(values.reshape(height, width, 4)[..., :3] * 255)
+
+
+if __name__ == "__main__":
+    ui.FAILED = str(flow.out / "failed.png")
+    ui.run(steps)

@@ -14,7 +14,7 @@ from ..core.conventions.run_files import CONFIG, FLARE, SMALL_PREVIEW
 from ..core.errors import CaptureError, FitFlareError, RunError
 from ..core.look import Look, read
 from ..core.system.reading import MAX_PATH_BYTES, read_text
-from . import engine, jobs, lights, looks
+from . import engine, jobs, lights, looks, plate_space
 from .capture.importer import set_exposures
 from .images import reload_images
 from .jobs import Job
@@ -138,6 +138,7 @@ def _run_fit(scene: Any, capture: Path, folder: Path) -> Job:
                           state.mode, "--holdout", 0]
     if state.width:
         args += ["--size", state.width]
+    args += plate_space.command_words(scene)
     return engine.run("fit", folder, args)
 
 
@@ -232,7 +233,8 @@ def find_lights(scene: Any) -> Job:
     if lights.scene_lights(scene):
         lights.write_to_capture(scene, capture)
     lights.remember_names(scene)
-    return engine.run("lights", capture / "lights", ["lights", capture, "--keep"])
+    return engine.run("lights", capture / "lights", ["lights", capture, "--keep",
+                                                        *plate_space.command_words(scene)])
 
 
 def clean_frames(scene: Any) -> Job:
@@ -261,14 +263,14 @@ def _cleaning_folder(capture: Path) -> Path:
 def cleaning_args(scene: Any, capture: Path) -> list[object]:
     """Return the arguments of the command `remove`: with the run where the fit is finished, else with the network and
     the matte."""
-    folder = run_folder(scene)
+    folder, space = run_folder(scene), plate_space.command_words(scene)
     if folder is not None and fit_state(scene) == "finished" and _may_belong_to(folder, capture):
         moved_capture = ["--capture", capture] if _capture_has_moved(folder, capture) else []
-        return ["remove", "--run", folder, *moved_capture, "--out", capture / REMOVED]
+        return ["remove", "--run", folder, *moved_capture, "--out", capture / REMOVED, *space]
     path = scene.fit_flare.matte
     matte = ["--matte", absolute(path, scene.library)] if path else []
     glow = "--keep-glow" if scene.fit_flare.keep_glow else "--all-glow"
-    return ["remove", capture / "images", "--out", capture / REMOVED, *matte, glow]
+    return ["remove", capture / "images", "--out", capture / REMOVED, *matte, glow, *space]
 
 
 def on_cleaning_finished(job: Job) -> None:

@@ -61,6 +61,7 @@ class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
         row.operator("fit_flare.import_capture", icon="IMPORT")
         if folder is not None:
             layout.prop(state, "capture", text="")
+            _settings_column(layout).prop(state, "plate_space")
             if fits.has_clean_frames(context.scene):
                 layout.row().prop(state, "footage", expand=True)
         column = layout.column()

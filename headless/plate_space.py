@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..core.colour import ColourSpace, colour_space
 from ..core.errors import SettingsError
+from ..core.system.progress import Progress
+
+_MAX_FOLDERS = 4
+"""Folders above a plate that may be its capture: CAPTURE/images/camera/plate.dpx."""
 
 
 def add_option(parser: argparse.ArgumentParser | argparse._ArgumentGroup, *, ocio: bool = True) -> None:
@@ -29,6 +34,36 @@ def named_space(args: argparse.Namespace) -> ColourSpace | None:
     if args.plate_space is None or args.plate_space == "auto":
         return None
     return colour_space(args.plate_space, args.ocio)
+
+
+def space_of_plates(args: argparse.Namespace, plates: Sequence[Path], progress: Progress) -> ColourSpace | None:
+    """Return the space to read plates in: the one that the option names, else that which their capture keeps; None for
+    what the files declare, as with auto.
+
+    Raises SettingsError where plates belong to captures that keep different spaces, and CaptureError for a damaged
+    record.
+    """
+    from ..core.capture.plate_space import FILE, read_plate_space
+
+    if args.plate_space is not None or args.ocio is not None:
+        return named_space(args)
+    folders = [_capture_with_space(path, FILE) for path in plates]
+    spaces = {folder: None if folder is None else read_plate_space(folder) for folder in folders}
+    if len({None if space is None else space.fingerprint for space in spaces.values()}) > 1:
+        named = next(folder for folder in folders if folder is not None)
+        raise SettingsError(f"{named / FILE} names the colour space of some of the plates only; clean them in separate "
+                            "runs, or name one space with --plate-space.")
+    folder, space = next(iter(spaces.items()))
+    if folder is not None and space is not None:
+        progress.say(f"The plates are read in the colour space {space.name}, which {folder / FILE} names.")
+    return space
+
+
+def _capture_with_space(plate: Path, file: str) -> Path | None:
+    """Return the nearest folder, from a plate or a folder of plates upwards, that keeps a colour space; None without
+    one."""
+    resolved = plate.resolve()
+    return next((folder for folder in (resolved, *resolved.parents)[:_MAX_FOLDERS] if (folder / file).is_file()), None)
 
 
 def record(args: argparse.Namespace, capture: Path) -> None:

@@ -53,6 +53,7 @@ class TargetOptions:
     centre: str | None = None
     plates: Path | None = None
     plate_space: str = "auto"
+    ocio: str | None = None
 
     @classmethod
     def of_transfer(cls, args: argparse.Namespace) -> TargetOptions:
@@ -124,6 +125,7 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
     Raises SettingsError, CaptureError, FrameError and RunError.
     """
     from ..core.capture import Capture
+    from ..core.colour import colour_space
     from ..core.conventions.frame_numbers import NumberedFrame, select_task_frames
     from ..core.conventions.run_files import SCENE
     from ..core.fit.run import Run
@@ -150,8 +152,9 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
         distances = {light.name: _median_distance(light, views.get(light.name)) for light in look.lights}
         detector: Detector | None = None if options.light else ExposureDetector()
         centre = _parse_point(options.centre) if options.centre else None
+        space = None if options.plate_space == "auto" else colour_space(options.plate_space, options.ocio)
         return picture_target(to, look, _parse_lights(options.light), sources, distances, detector=detector,
-                              focal=options.focal, centre=centre, training=views)
+                              focal=options.focal, centre=centre, space=space, training=views)
     if kind in (".blend", ".json"):
         path = shot_path(options) if kind == ".blend" else to[0]
         shot = Shot.read(path)

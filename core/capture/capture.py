@@ -19,6 +19,7 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -85,7 +86,6 @@ class Capture:
         self.focal_source = "solved"
         """Source of the focal length, a noun phrase."""
         self.cache_bytes = cache_bytes
-        self.plate_space = read_plate_space(folder)
         self._frames = frames or {}
         self._pictures = PictureCache(cache_bytes)
         names = [view.name for view in self.views]
@@ -224,6 +224,12 @@ class Capture:
 
     # What was filmed.
 
+    @cached_property
+    def plate_space(self) -> ColourSpace | None:
+        """The space of the frames by the capture's record; None where their files decide. Raises CaptureError,
+        SettingsError and EngineError."""
+        return read_plate_space(self.folder)
+
     def frame(self, view: View, size: tuple[int, int] | None = None) -> Picture:
         """The view's frame, undistorted, at its camera's size or at `size` (width, height).
 
@@ -233,11 +239,11 @@ class Capture:
             raise FrameError(f"{self.folder} has no frame for {view.name}.")
         return self._picture(self._frames[view.name], view, size, self.plate_space)
 
-    def frame_in_file_primaries(self, view: View) -> Picture:
-        """Return the view's frame, undistorted, at its file's size, without conversion to Rec. 709. Raises FrameError.
-        """
+    def frame_in_space(self, view: View, space: ColourSpace) -> Picture:
+        """Return the view's frame, undistorted, at its file's size, read in a space in place of the capture's. Raises
+        FrameError."""
         path = self.frame_path(view)
-        stored = self._pictures.upright(read_picture(path, keep_primaries=True, space=self.plate_space), view, path)
+        stored = self._pictures.upright(read_picture(path, space=space), view, path)
         return self._pictures.undistorted(stored, view, path) if view.lens else stored
 
     def frame_path(self, view: View) -> Path:

@@ -22,14 +22,29 @@ def read_plate_space(folder: Path) -> ColourSpace | None:
 
     Raises CaptureError for a damaged record, SettingsError for an unknown space, EngineError without OpenColorIO.
     """
-    path = folder / FILE
+    record = _read(folder / FILE)
+    return None if record is None else colour_space(*record)
+
+
+def recorded_name(folder: Path) -> str:
+    """Return the name of the space of a capture's frames, without a look at OpenColorIO; "" where their files decide,
+    or where the record is damaged."""
+    try:
+        record = _read(folder / FILE)
+    except CaptureError:
+        return ""
+    return "" if record is None else record[0]
+
+
+def _read(path: Path) -> tuple[str, str | None] | None:
+    """Return the name of the space and its configuration; None without a record. Raises CaptureError."""
     if not path.is_file():
         return None
     data = read_json(path, CaptureError)
     name, config = (data.get(key) for key in ("space", "ocio")) if isinstance(data, dict) else (None, None)
     if not isinstance(name, str) or not isinstance(config, str | None):
         raise CaptureError(f'{path} should read {{"space": "logc4"}}; name the space again with --plate-space.')
-    return colour_space(name, config)
+    return name, config
 
 
 def record_plate_space(folder: Path, name: str, config: str | None) -> None:

@@ -174,6 +174,11 @@ def plate_names() -> list[str]:
     return list(dict.fromkeys([*_BUILT_IN, *_CURVED, *_CAMERAS.values()]))
 
 
+def is_plate_name(name: str) -> bool:
+    """True if `colour_space` knows a name without a configuration, however people write it."""
+    return _plain(name) in _ALIASES or _plain(name) in _CAMERAS
+
+
 def _plain(name: str) -> str:
     """Return a name as the tables below have it: without what people write differently."""
     return "".join(character for character in name.lower() if character.isalnum())

@@ -26,12 +26,12 @@ from .unsupported import needs_openimageio, unsupported_file, unsupported_reason
 from .window import crop_to_display_window
 
 
-def read_picture(path: Path | str, *, keep_primaries: bool = False, space: ColourSpace | None = None) -> Picture:
+def read_picture(path: Path | str, *, space: ColourSpace | None = None) -> Picture:
     """Decode a picture of any format (docs/file_formats.md) to display values, or to scene-linear light where its codes
     hold light above white; alpha is dropped.
 
     What the file declares (profile, curve, primaries) is converted to Rec. 709; `space` is used instead where it is not
-    None. `keep_primaries` leaves an EXR's primaries. An EXR with more pixels than the frame (overscan), or fewer, is
+    None. An EXR with more pixels than the frame (overscan), or fewer, is
     cropped to the frame, and black where it has none.
 
     Raises FrameError where the file is missing, damaged or of another kind, or holds NaN or infinity.
@@ -42,7 +42,7 @@ def read_picture(path: Path | str, *, keep_primaries: bool = False, space: Colou
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     if path.suffix.lower() == ".exr":
-        return _read_exr_picture(path, keep_primaries, space)
+        return _read_exr_picture(path, space)
     stored = read_stored_pixels(path)
     if stored.ndim == 2:
         stored = np.repeat(stored[..., None], 3, axis=2)
@@ -62,15 +62,12 @@ def read_picture(path: Path | str, *, keep_primaries: bool = False, space: Colou
     return Picture(light, "linear") if space.has_headroom else Picture(np.clip(srgb_from_linear(light), 0, 1), "srgb")
 
 
-def _read_exr_picture(path: Path, keep_primaries: bool, space: ColourSpace | None) -> Picture:
+def _read_exr_picture(path: Path, space: ColourSpace | None) -> Picture:
     """Read an EXR as `read_picture` does. Raises FrameError."""
     picture_size(path)
     header, channels = main_part([(part, part[1]) for part in read_exr_parts(path)])
     stored = rgb_channels(path, channels)
-    if space is not None:
-        pixels = space.to_linear(stored)
-    else:
-        pixels = stored if keep_primaries else rec709_pixels(path, stored, header)
+    pixels = rec709_pixels(path, stored, header) if space is None else space.to_linear(stored)
     return Picture(crop_to_display_window(pixels, window_from_header(path, header)), "linear")
 
 

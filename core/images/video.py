@@ -235,6 +235,14 @@ class Video:
             self.problems.append(f"The header of {self.path} promises {self.length} frames, and {number} could be read"
                                  "; if it is cut off, copy it again.")
 
+    def check_named_space(self, name: str) -> None:
+        """Raise FrameError where the video's tags name light or wide primaries, so that its frames are converted and
+        their codes cannot be read in the space that a user names."""
+        if self.colour.is_light or self.colour.is_wide:
+            named = self.colour.transfer if self.colour.is_light else "wide primaries"
+            raise FrameError(f"{self.path} names its own colours ({named}), and --plate-space {name} others; leave the "
+                             "option out, or correct the tags of the video.")
+
     def seek(self, number: int) -> None:
         """Let the next iteration begin at frame `number`, counted from 0."""
         self._start = max(number, 0)

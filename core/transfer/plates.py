@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..colour import ColourSpace, colour_space
+from ..colour import ColourSpace
 from ..colour.srgb import Pixels, srgb_from_linear
 from ..images.formats.exif import apply_orientation, undo_orientation
 from ..images.formats.tiff import UPRIGHT
@@ -34,14 +34,13 @@ class ColouredPlate:
     orientation: int = UPRIGHT
 
     @classmethod
-    def read(cls, path: Path, space: str = AUTO, config: str | None = None,
-             orientation: int = UPRIGHT) -> ColouredPlate:
-        """Read a plate. space: a name, or "auto" for that which its file declares.
+    def read(cls, path: Path, space: ColourSpace | None = None, orientation: int = UPRIGHT) -> ColouredPlate:
+        """Read a plate. space: None for that which its file declares.
 
-        Raises FrameError for an unreadable file, SettingsError for an unknown space.
+        Raises FrameError for an unreadable file.
         """
-        plate = read_plate(path)
-        return cls(plate, plate.space if space == AUTO else colour_space(space, config), orientation)
+        plate = read_plate(path, space)
+        return cls(plate, plate.space, orientation)
 
     @property
     def values(self) -> Pixels:
@@ -128,11 +127,12 @@ def alpha_with_light(alpha: Pixels, lit: Pixels) -> Pixels:
     return np.asarray(np.maximum(alpha, np.clip(lit.max(-1), 0, 1)), np.float32)
 
 
-def upright_picture(path: Path, orientation: int = UPRIGHT) -> Picture:
-    """Read a picture as viewers show it: upright, and black where its alpha hides it. Raises FrameError."""
-    picture = read_picture(path)
+def upright_picture(path: Path, orientation: int = UPRIGHT, space: ColourSpace | None = None) -> Picture:
+    """Read a picture as viewers show it: upright, and black where its alpha hides it. space: in place of what the file
+    declares. Raises FrameError."""
+    picture = read_picture(path, space=space)
     pixels = picture.pixels
-    alpha = read_plate(path).straight_alpha if path.suffix.lower() not in _OPAQUE else None
+    alpha = read_plate(path, space).straight_alpha if path.suffix.lower() not in _OPAQUE else None
     if alpha is not None and (alpha < 1).any():
         light = picture.linear() * alpha[..., None]
         pixels = srgb_from_linear(light) if picture.encoding == "srgb" else light

@@ -46,18 +46,19 @@ class TargetFrame:
     """One frame of a target. frame: its number and the file of its layers. shot: camera and lights. plate: its picture,
     or None.
 
-    undistorted: reads the plate's undistorted picture, if the file is distorted; its argument is True for the file's
-    own numbers, without conversion from the file's colour space. window: where the layers lie on the plate's frame,
-    which they hold all of; None if the camera has another size than the plate. orientation: the plate's in Exif, by
-    which the camera and the layers are upright.
+    undistorted: reads the plate's undistorted picture, if the file is distorted; its argument is the space to read it
+    in, None for the capture's. window: where the layers lie on the plate's frame, which they hold all of; None if the
+    camera has another size than the plate. orientation: the plate's in Exif, by which the camera and the layers are
+    upright. space: the plate's, where its capture names one (`plate_space.json`).
     """
 
     frame: NumberedFrame
     shot: ShotFrame
     plate: Path | None = None
-    undistorted: Callable[[bool], Picture] | None = None
+    undistorted: Callable[[ColourSpace | None], Picture] | None = None
     window: DataWindow | None = None
     orientation: int = UPRIGHT
+    space: ColourSpace | None = None
 
     def plate_with_flare_path(self, folder: Path) -> Path | None:
         """Return the path below `folder` of the plate with its flare: in the layers' subfolder, with the plate's name.
@@ -77,6 +78,8 @@ class TargetFrame:
             text += f"orientation {self.orientation}"
         if self.plate is not None and self.plate.suffix.lower() in _WITH_ALPHA:
             text += "over black"  # layers of an earlier version show the colours under alpha
+        if self.space is not None:
+            text += f"in {self.space.fingerprint}"
         return text
 
 
@@ -109,13 +112,15 @@ class Target:
 
 def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[float, float]], requested: SourceNames,
                    distances: Mapping[str, float], *, detector: Detector | None = None, focal: float | None = None,
-                   centre: tuple[float, float] | None = None,
+                   centre: tuple[float, float] | None = None, space: ColourSpace | None = None,
                    training: Mapping[str, TrainingViews] | None = None) -> Target:
     """Return a target of pictures with lights in 2D: `lights`, px, by name, else those that `detector` finds.
 
     focal: px (default: the training camera's field of view, turned for a picture of the other orientation); centre:
     principal point, px (default: the middle). distances: distance of each source at which its flare has the brightness
-    of the fit. training: training views by source; a detected light shows the source with the most similar view.
+    of the fit. space: of the pictures, None for what their files declare. training: training views by source; a
+    detected light shows the source with the most similar view.
+
     Raises SettingsError if no picture has a light, and for two pictures of one name.
     """
     paths = list(dict.fromkeys(paths))
@@ -135,7 +140,7 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
         fy = (focal or look.camera.fy * larger) * window.aspect
         cx, cy = centre or (width / 2, height / 2)
         camera = Camera(width, height, fx, fy, cx, cy, np.eye(4))
-        positions = dict(lights) or _detected(path, detector, orientation)
+        positions = dict(lights) or _detected(path, detector, orientation, space)
         if not positions:
             unlit.append(path.name)
         sources_by_light = {name: source for name, source in requested.items() if name in positions}
@@ -159,10 +164,11 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
     return target
 
 
-def _detected(path: Path, detector: Detector | None, orientation: int) -> dict[str, tuple[float, float]]:
+def _detected(path: Path, detector: Detector | None, orientation: int,
+              space: ColourSpace | None) -> dict[str, tuple[float, float]]:
     if detector is None:
         return {}
-    detections = detector.detect(upright_picture(path, orientation))
+    detections = detector.detect(upright_picture(path, orientation, space))
     return {f"found{number}": (float(detection.xy[0]), float(detection.xy[1]))
             for number, detection in enumerate(detections, 1)}
 
@@ -213,12 +219,12 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
         placed = tuple(PlacedLight(state.name, sources[state.name], state.xyz, 1.0 if state.on is None else state.on)
                        for state in states)
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)
-        frames.append(TargetFrame(frame, shot, path, undistorted, window))
+        frames.append(TargetFrame(frame, shot, path, undistorted, window, space=capture.plate_space))
     return Target(_share_windows(frames), read_ply(scene) if scene else None, shown)
 
 
-def _undistorted(capture: Capture, view: View) -> Callable[[bool], Picture]:
-    return lambda in_file_primaries: capture.frame_in_file_primaries(view) if in_file_primaries else capture.frame(view)
+def _undistorted(capture: Capture, view: View) -> Callable[[ColourSpace | None], Picture]:
+    return lambda space: capture.frame(view) if space is None else capture.frame_in_space(view, space)
 
 
 def cameras_target(capture: Capture, look: Look, scene: Path | None = None) -> Target:
@@ -344,10 +350,7 @@ def resized(target: Target, width: int | None, height: int | None) -> Target:
 
 def background(frame: TargetFrame, size: tuple[int, int], space: ColourSpace | None) -> NDArray[np.float32] | None:
     """Return the undistorted plate in linear Rec. 709 at `size`; None if the plate's file is not distorted. space: the
-    plate's colour space, None to use that of its file."""
+    plate's colour space, None to use that of its capture or file."""
     if frame.undistorted is None:
         return None
-    picture = frame.undistorted(space is not None)
-    if space is not None:
-        picture = Picture(space.to_linear(picture.pixels), "linear")
-    return np.asarray(picture.resized(*size).linear(), np.float32)
+    return np.asarray(frame.undistorted(space).resized(*size).linear(), np.float32)

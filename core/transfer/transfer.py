@@ -54,7 +54,8 @@ PLATES_FOLDER = "frames"
 class TransferSettings:
     """Settings of a transfer. query: view that the appearance follows (see `query`). scale: units of the target's world
     for one of the source's. smooth: frames on either side over which visibility is smoothed, 0 for none. plate_space:
-    colour space of the plates, "auto" for that of their files. visibility: how the target's scene hides lights."""
+    colour space of the plates, "auto" for that of their capture or files. visibility: how the target's scene hides
+    lights."""
 
     query: Follows = "blend"
     scale: float = 1.0
@@ -86,8 +87,7 @@ class Transfer:
         """A hash that changes whenever all pictures would; a frame renderer's fingerprint covers the single frame."""
         digest = hashlib.sha256(read_bytes(self.flare))
         digest.update(self.target.fingerprint().encode())
-        plates = self.settings.plate_space
-        meaning = "" if plates == AUTO else colour_space(plates, self.config).fingerprint
+        meaning = self.plate_space.fingerprint if self.plate_space is not None else ""
         digest.update(repr((self.settings, self.config, meaning, sorted(self.training_views))).encode())
         return digest.hexdigest()[:16]
 
@@ -213,7 +213,14 @@ class Transfer:
     def plate(self, frame: TargetFrame) -> ColouredPlate:
         """The frame's plate in its own space."""
         assert frame.plate is not None
-        return ColouredPlate.read(frame.plate, self.settings.plate_space, self.config, frame.orientation)
+        return ColouredPlate.read(frame.plate, self.plate_space or frame.space, frame.orientation)
+
+    @property
+    def plate_space(self) -> ColourSpace | None:
+        """The space that the settings name for the plates; None for that of the capture or file. Raises SettingsError.
+        """
+        name = self.settings.plate_space
+        return None if name == AUTO else colour_space(name, self.config)
 
 
 class _FrameRenderer:
@@ -257,9 +264,7 @@ class _FrameRenderer:
         target, frame = self._transfer.target, self._frame
         no_depth = np.zeros((camera.height, camera.width), np.float32)
         if frame.plate is not None:
-            space = self._transfer.settings.plate_space
-            undistorted = background(frame, camera.size,
-                                     None if space == AUTO else colour_space(space, self._transfer.config))
+            undistorted = background(frame, camera.size, self._transfer.plate_space)
             if undistorted is not None:
                 return undistorted, no_depth
             plate = self._transfer.plate(frame)

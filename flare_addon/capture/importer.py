@@ -27,6 +27,7 @@ from ..cameras import FLIP_YZ
 from ..compositor.setup import footage_nodes
 from ..images import load_image
 from ..paths import absolute, blend_relative
+from ..plate_space import show_recorded
 from ..render_settings import show_as_filmed
 
 SENSOR = 36.0  # mm
@@ -101,6 +102,7 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
         state.root.fit_flare.is_root = True  # earlier versions did not store it
     root.fit_flare.is_root = True
     state.capture, state.root, state.footage = blend_relative(folder), root, "images"
+    show_recorded(scene, folder)
     state.known_lights = "\n".join(light.name for light in capture.lights)
     if settings.frames:
         state.over = "plate"

@@ -100,7 +100,8 @@ def _clean_plates(args: argparse.Namespace, progress: Progress) -> dict[str, Any
     from ...core.removal.jobs.mattes import Mattes
     from ...core.removal.jobs.video_frames import expand_videos
 
-    inputs, left_out = expand_videos(args.plates, args.out, progress)
+    named = plate_space.named_space(args)
+    inputs, left_out = expand_videos(args.plates, args.out, progress, None if named is None else named.name)
     for sentence in left_out:
         progress.say(f"Left out: {sentence}")
     failed = left_out if args.frames is None else []  # a video without frames fails the whole command only
@@ -118,7 +119,7 @@ def _clean_plates(args: argparse.Namespace, progress: Progress) -> dict[str, Any
                 raise FrameError(f"The other clean plates are in {args.out}. {join_failures(failed)}")
             progress.say(f"The clean plates are in {args.out}.")
             return {"plates": str(args.out)}
-    return remove_all(inputs, args.out, _make_remover(args), progress, flare_folder=args.flare,
+    return remove_all(inputs, args.out, _make_remover(args, progress), progress, flare_folder=args.flare,
                       mattes=Mattes(args.matte) if args.matte else None, overwrite=args.overwrite, only=selected_paths,
                       independent=args.stills, failed_inputs=failed)
 
@@ -148,14 +149,14 @@ def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[s
                                above_white=fitted.settings.display_white > 1)
 
 
-def _make_remover(args: argparse.Namespace) -> Remover:
-    """Return the remover that the options select. Raises SettingsError."""
+def _make_remover(args: argparse.Namespace, progress: Progress) -> Remover:
+    """Return the remover that the options select. Raises SettingsError and CaptureError."""
     from ...core.removal.inference.remover import WORKING_SIZE
 
     remover = _make_model(args, WORKING_SIZE if args.working_size is None else args.working_size)
     remover.use_device(args.device)
     remover.use_controls(1.0 if args.amount is None else args.amount, args.sensitivity or "normal")
-    space = plate_space.named_space(args)
+    space = plate_space.space_of_plates(args, args.plates, progress)
     if space is not None:
         remover.use_plate_space(space)
     return remover

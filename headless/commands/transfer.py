@@ -67,8 +67,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     plates.add_argument("--plates", type=Path, metavar="DIR", help="pictures for the frames of a .blend or a shot")
     plates.add_argument("--plate-space", default="auto", metavar="NAME",
                         help="colour space of the plates: srgb, rec709, linear, acescg, … or one of an OpenColorIO "
-                             "configuration (default: for EXR by its chromaticities, linear for float TIFF, sRGB for "
-                             "other files)")
+                             "configuration (default: the one that the capture's plate_space.json names, else the one "
+                             "that each file declares)")
     layers.add_options(plates, half="unless a plate has more", producer="transfer",
                        edits="an edit, as for `bake`, by the lights of the target; repeatable")
     parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)

@@ -77,6 +77,17 @@ def test_frames_are_cleaned_by_a_matte_and_otherwise_again(made: tuple[Any, Path
     assert not first and not stopped
 
 
+def test_the_colour_space_of_the_frames_is_passed_to_the_commands(facts: Any) -> None:
+    """A camera's by its name alone, one of Blender's with its configuration."""
+    assert facts["spaces offered"][0] == ["logc3", "logc4"] and facts["spaces offered"][1]
+    by_camera, cleaned, by_blender, _, by_files, _ = facts["spaces passed"]
+    assert by_camera[-2:] == cleaned[-2:] == ["--plate-space", "LogC4"]
+    assert by_blender[-4:-1] == ["--plate-space", "AgX Log", "--ocio"] and Path(by_blender[-1]).is_file()
+    assert by_files[-1] == "--keep"
+    assert facts["space shown"] == "logc4"
+    assert not facts["space kept"]
+
+
 def test_a_moved_project_resumes_with_its_moved_capture(made: tuple[Any, Path]) -> None:
     """Block of work.py: "a project that was moved, its capture with it"."""
     facts, base = made

@@ -509,4 +509,4 @@ def test_a_flare_is_transferred_to_photographs_as_they_were_solved(tmp_path: Pat
     target = capture_target(capture, look, {}, lights=tmp_path / "lights.json")  # type: ignore[arg-type]
     undistorted = target.frames[2].undistorted
     assert undistorted is not None
-    np.testing.assert_array_equal(undistorted(False).pixels, capture.frame(capture.views[2]).pixels)
+    np.testing.assert_array_equal(undistorted(None).pixels, capture.frame(capture.views[2]).pixels)

@@ -584,7 +584,7 @@ def test_a_distorted_exr_is_converted_once(space: str, look: Look, tmp_path: Pat
     assert one.plate is not None
     straight = background(one, one.shot.camera.size, None if space == "auto" else colour_space(space))
     assert straight is not None
-    expected = ColouredPlate.read(one.plate, space).linear[0, 0]
+    expected = ColouredPlate.read(one.plate, None if space == "auto" else colour_space(space)).linear[0, 0]
     np.testing.assert_allclose(straight, np.broadcast_to(expected, straight.shape), atol=1e-5)
 
 

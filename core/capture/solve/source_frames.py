@@ -109,7 +109,7 @@ def prepare_frames(source: Path, work: Path, number: int, size: int,
     if source.is_dir():
         frames, left_out = _from_folder(source, work, number, size, progress, space)
     elif source.is_file() and is_video(source):
-        frames, left_out = _from_video(source, work, number or 150, size, progress)
+        frames, left_out = _from_video(source, work, number or 150, size, progress, space)
     else:
         raise CaptureError(f"{source} is neither a folder of frames nor a video.")
     if len(frames) < 3:
@@ -182,9 +182,12 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
 
 
 def _from_video(source: Path, work: Path, number: int, size: int,
-                progress: Progress) -> tuple[list[SourceFrame], list[str]]:
+                progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
     """Read the video twice: for the sharpness of every frame, then for the chosen ones."""
+    named = colour_space(*space) if space[0] else None
     with Video(source) as video:
+        if named is not None:
+            video.check_named_space(named.name)
         progress.stage("choose frames", video.estimated_length)
         scores = []
         for frame in video:
@@ -200,9 +203,9 @@ def _from_video(source: Path, work: Path, number: int, size: int,
     with Video(source) as video:
         for frame in video:
             if frame.number in chosen:
-                picture = frame.picture()
                 file = write_frame(work / "full" / f"{frame.number:06d}", frame)
-                frames.append(SourceFrame(f"{file.stem}.png", str(file.resolve()), *picture.size, None, 1))
+                picture = frame.picture() if named is None else read_picture(file, space=named)
+                frames.append(SourceFrame(f"{file.stem}.png", str(file.resolve()), *picture.size, None, 1, *space))
                 _write_small(picture, video.aspect, work, frames[-1].name, size)
                 interlaced.append(is_interlaced(picture))
                 progress.advance()

@@ -18,13 +18,17 @@ VIDEO_MANIFEST = "video.json"
 """The file in the folder of a video's frames that says which video they are of, and what is wrong with it."""
 
 
-def expand_videos(inputs: Iterable[Path], folder: Path, progress: Progress) -> tuple[list[Path], list[str]]:
+def expand_videos(inputs: Iterable[Path], folder: Path, progress: Progress,
+                  space: str | None = None) -> tuple[list[Path], list[str]]:
     """Return `inputs` with each video replaced by the folder of its frames below `folder`, and messages about videos
-    that cannot be read. Raises FrameError if no input is left."""
+    that cannot be read. space: the colour space that the user names for the plates; None for what they declare.
+
+    Raises FrameError if no input is left.
+    """
     paths, failures = list[Path](), list[str]()
     for path in inputs:
         try:
-            paths.append(extract_frames(path, folder, progress) if path.is_file() and is_video(path) else path)
+            paths.append(extract_frames(path, folder, progress, space) if path.is_file() and is_video(path) else path)
         except FrameError as problem:
             failures.append(str(problem))
     if failures and not paths:
@@ -32,14 +36,17 @@ def expand_videos(inputs: Iterable[Path], folder: Path, progress: Progress) -> t
     return paths, failures
 
 
-def extract_frames(video: Path, folder: Path, progress: Progress) -> Path:
+def extract_frames(video: Path, folder: Path, progress: Progress, space: str | None = None) -> Path:
     """Return the folder NAME.frames below `folder` with a video's frames, STEM.000001 and on: PNGs of 8 bits, or of 16
     where it has more, in the colours that players show; EXRs of linear light for PQ and HLG. Alpha is kept. Frames that
     exist already are kept.
 
-    Raises FrameError for a video without a readable frame, SettingsError where the folder holds frames of another
-    video.
+    Raises FrameError for a video without a readable frame and for one whose own colours exclude the named space,
+    SettingsError where the folder holds frames of another video.
     """
+    if space is not None:
+        with Video(video) as reader:
+            reader.check_named_space(space)
     frames, content = folder / f"{video.name}.frames", content_hash(video)
     if not frames.exists():
         try:

@@ -105,6 +105,22 @@ facts["cleaned by a matte"] = [str(word) for word in fits.cleaning_args(scene, P
 scene.fit_flare.keep_glow = True
 facts["cleaned, glow kept"] = [str(word) for word in fits.cleaning_args(scene, Path("capture"))]
 given, again = [str(word) for word in fits.cleaning_args(scene, fits.capture_folder(scene))], []
+chosen_space, record = part("flare_addon.plate_space"), fits.capture_folder(scene) / "plate_space.json"
+facts["spaces offered"] = [chosen_space.search_names(None, None, "log")[:2],
+                           "AgX Log" in chosen_space.search_names(None, None, "LOG")]
+spaces, run_command = [], fits.engine.run
+fits.engine.run = lambda _kind, _folder, words: spaces.append(list(map(str, words)))
+for space in ("LogC4", "AgX Log", ""):
+    scene.fit_flare.plate_space = space
+    fits.find_lights(scene)
+    spaces.append(list(map(str, fits.cleaning_args(scene, Path("capture")))))
+facts["spaces passed"] = spaces
+fits.engine.run = run_command
+record.write_text('{"space": "logc4", "ocio": null}')
+chosen_space.show_recorded(scene, record.parent)
+facts["space shown"] = scene.fit_flare.plate_space
+scene.fit_flare.plate_space = ""
+facts["space kept"] = record.exists()
 find, start = fits.jobs.find, fits.engine.run
 fits.engine.run = lambda _kind, _folder, words: again.append(words[-1] == "--overwrite")
 for state, words in (("none", None), ("done", given), ("stopped", given), ("stopped", given[:-1])):

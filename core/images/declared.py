@@ -6,9 +6,9 @@
 """
 from __future__ import annotations
 
-import io
 import zlib
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -38,7 +38,7 @@ def declared_space(path: Path) -> ColourSpace | None:
         return _png_space(path)
     if kind == "jpeg":
         with open_regular(path) as stream:
-            return profile_space(path, jpeg_profile(stream.read(MAX_PROFILE_BYTES)))
+            return profile_space(path, jpeg_profile(stream))
     if kind == "tiff":
         with open_regular(path) as stream:
             if stream.read(4) in tiff.BIG_TIFF:
@@ -49,11 +49,11 @@ def declared_space(path: Path) -> ColourSpace | None:
     return describe(path, kind).space
 
 
-def jpeg_profile(data: bytes) -> bytes:
+def jpeg_profile(stream: BinaryIO) -> bytes:
     """Join the ICC profile of a JPEG from its segments (ICC.1:2022, annex B.4); empty where it has none or a part is
     missing."""
     parts: dict[int, bytes] = {}
-    for marker, content in jpeg.segments(io.BytesIO(data)):
+    for marker, content in jpeg.segments(stream):
         if marker == jpeg.APP2 and content.startswith(b"ICC_PROFILE\0") and len(content) > 14:
             parts[content[12]] = content[14:]
     numbers = sorted(parts)
@@ -63,7 +63,7 @@ def jpeg_profile(data: bytes) -> bytes:
 def _png_space(path: Path) -> ColourSpace | None:
     """Return the space of a PNG, by the order of its specification (third edition, 4.3): cICP, iCCP, sRGB, gAMA."""
     with open_regular(path) as stream:
-        found = dict(png.chunks(stream, (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM")))
+        found = dict(png.chunks(stream, (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM"), before_pixels=True))
     points = found.get(b"cICP", b"")
     if len(points) == 4 and (space := space_of_code_points(points[0], points[1])) is not None:
         return space

@@ -32,7 +32,7 @@ from .listing import SUFFIXES
 from .metadata import copy_metadata, dropped_parts, with_colour_chunks
 from .oiio_writer import OIIO_FORMATS, needs_oiio_writer, write_by_oiio
 from .picture import Encoding
-from .read import read_stored_pixels
+from .read import read_stored_pixels, rgb_codes
 from .size import picture_size
 from .unsupported import unsupported_file
 from .write import save_exr, write_exr
@@ -226,12 +226,10 @@ def _read_codes(path: Path, space: ColourSpace | None) -> Plate:
         raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
     if _is_animated(path):
         raise FrameError(f"{path} is an animated PNG; export its frames as files of their own.")
-    grey, alpha = stored.ndim == 2 or _is_grey_with_alpha(path), None
-    if stored.ndim == 2:
-        codes, alpha = np.repeat(stored[..., None], 3, axis=2), _transparency(path, stored)
-    else:
-        alpha = stored[..., 3].copy() if stored.shape[2] == 4 else None
-        codes = np.ascontiguousarray(stored[..., 2::-1])
+    grey, codes = stored.ndim == 2 or _is_grey_with_alpha(path), rgb_codes(stored)
+    alpha = _transparency(path, stored) if stored.ndim == 2 else None
+    if stored.ndim == 3 and stored.shape[2] == 4:
+        alpha = stored[..., 3].copy()
     encoding: Encoding = "linear" if stored.dtype.kind == "f" else "srgb"
     return Plate(path, codes, encoding, grey, alpha, declared=space or declared_space(path))
 
@@ -247,7 +245,8 @@ def _is_animated(path: Path) -> bool:
     """True for a PNG of several frames (PNG specification, third edition, 11.3.6.1), of which OpenCV reads the first.
     """
     with open_regular(path) as stream:
-        return any(int.from_bytes(content[:4], "big") > 1 for _, content in png.chunks(stream, (b"acTL",)))
+        return any(int.from_bytes(content[:4], "big") > 1
+                   for _, content in png.chunks(stream, (b"acTL",), before_pixels=True))
 
 
 def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
@@ -257,7 +256,8 @@ def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
     """
     with open_regular(path) as stream:
         depth = stream.read(25)[24:]
-        key = next((content for _, content in png.chunks(stream, (b"tRNS",)) if len(content) == 2), None)
+        key = next((content for _, content in png.chunks(stream, (b"tRNS",), before_pixels=True)
+                    if len(content) == 2), None)
     if key is None:
         return None
     top = np.iinfo(stored.dtype).max

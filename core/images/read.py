@@ -5,6 +5,7 @@ Libraries are imported where they are used, because Blender's own Python has few
 """
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -44,17 +45,16 @@ def read_picture(path: Path | str, *, space: ColourSpace | None = None) -> Pictu
     if path.suffix.lower() == ".exr":
         return _read_exr_picture(path, space)
     stored = read_stored_pixels(path)
-    if stored.ndim == 2:
-        stored = np.repeat(stored[..., None], 3, axis=2)
-    colour = stored[..., 2::-1]  # B G R (A)
+    colour = rgb_codes(stored)
     if stored.dtype.kind == "f":
-        pixels = np.ascontiguousarray(colour, np.float32)
+        pixels = colour.astype(np.float32, copy=False)
         if not np.isfinite(pixels).all():
             raise FrameError(f"{path} holds pixels that are not finite numbers; clean it before it is used.")
         return Picture((space or declared_space(path) or colour_space("linear")).to_linear(pixels), "linear")
     if stored.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
-    values = colour.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+    values = colour.astype(np.float32)
+    values /= np.float32(np.iinfo(stored.dtype).max)
     space = space or declared_space(path)
     if space is None or space.name == "srgb":
         return Picture(values, "srgb")
@@ -69,6 +69,20 @@ def _read_exr_picture(path: Path, space: ColourSpace | None) -> Picture:
     stored = rgb_channels(path, channels)
     pixels = rec709_pixels(path, stored, header) if space is None else space.to_linear(stored)
     return Picture(crop_to_display_window(pixels, window_from_header(path, header)), "linear")
+
+
+def rgb_codes(stored: NDArray[Any]) -> NDArray[Any]:
+    """Return the colours of `read_stored_pixels` as R G B (height, width, 3), contiguous.
+
+    By OpenCV, which takes a fifth of the time of numpy's reversed slices.
+    """
+    import cv2
+
+    if stored.dtype not in (np.uint8, np.uint16, np.float32):
+        return np.ascontiguousarray(np.repeat(stored[..., None], 3, axis=2) if stored.ndim == 2 else stored[..., 2::-1])
+    if stored.ndim == 2:
+        return np.asarray(cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB))
+    return np.asarray(cv2.cvtColor(stored, cv2.COLOR_BGRA2RGB if stored.shape[2] == 4 else cv2.COLOR_BGR2RGB))
 
 
 def has_float_pixels(path: Path, space: ColourSpace | None = None) -> bool:
@@ -147,13 +161,12 @@ def decode(path: Path, flags: int) -> NDArray[Any] | None:
     """
     import cv2
 
-    with open_regular(path) as stream:
-        if png.is_truncated(stream):
-            return None
-    data = np.frombuffer(read_bytes(path), np.uint8)
-    if data[:4].tobytes() in (b"II*\0", b"MM\0*"):
-        data = np.frombuffer(tiff.without_reader_changes(data.tobytes()), np.uint8)
+    data = read_bytes(path)
+    if png.is_truncated(io.BytesIO(data)):
+        return None
+    if data[:4] in (b"II*\0", b"MM\0*"):
+        data = tiff.without_reader_changes(data)
     try:
-        return cv2.imdecode(data, flags) if data.size else None
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error:
         return None

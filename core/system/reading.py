@@ -73,7 +73,9 @@ def read_bytes(path: Path | str, limit: int | None = None) -> bytes:
         if limit is None:
             limit = max(size, _MAX_UNSIZED_BYTES)
         if size <= limit:
-            data = stream.read(limit + 1 if limit < 1 << 32 else size + _MAX_UNSIZED_BYTES) or b""
+            data = stream.read(size + 1) or b""
+            if len(data) > size:  # it grows, or states no size
+                data += stream.read(min(limit, size + _MAX_UNSIZED_BYTES) + 1 - len(data)) or b""
             if len(data) <= limit:
                 return data
     raise OSError(errno.EFBIG, f"it has more than {limit} bytes", str(path))

@@ -11,10 +11,16 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 EXIF = b"eXIf"
 
 
-def chunks(stream: BinaryIO, names: Container[bytes]) -> Iterator[tuple[bytes, bytes]]:
+def chunks(stream: BinaryIO, names: Container[bytes], *, before_pixels: bool = False) -> Iterator[tuple[bytes, bytes]]:
     """Yield (name, content) of the chunks of these names, in the file's order, without damaged ones; none of other
-    files."""
+    files.
+
+    before_pixels: look no further than the pixels, of which a large picture has a thousand chunks. Chunks that say how
+    pixels are decoded stand before them.
+    """
     for name, length in _chunk_headers(stream):
+        if before_pixels and name == b"IDAT":
+            return
         if name not in names:
             continue
         content, checksum = stream.read(length), stream.read(4)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..colour import ColourSpace
 from ..errors import CaptureError, FrameError
-from ..images.formats.exif import read_exif
+from ..images.formats.exif import SWAPS_SIDES, read_exif
 from ..images.listing import SUFFIXES
 from ..images.picture import Picture, same_aspect
 from ..images.read import has_float_pixels, read_picture
@@ -42,7 +42,7 @@ from .colmap import PointCloud, PosedFrame
 from .frame_files import mask_pictures, matching_pictures
 from .lens import PINHOLES, Lens
 from .lights import Light, LightState, check_places, paths_of, read_lights
-from .orientation import SWAPS_SIDES, TurnedFrame, find_upright
+from .orientation import TurnedFrame, find_upright
 from .pictures import PictureCache
 from .plate_space import read_plate_space
 from .unsolved import cameras_without_solve

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..colour.srgb import Pixels
 from ..errors import FrameError
-from ..images.formats.exif import apply_orientation
+from ..images.formats.exif import SWAPS_SIDES, apply_orientation
 from ..images.picture import same_aspect
 from ..images.read import read_picture
 from .colmap import PointCloud, PosedFrame
@@ -28,8 +28,6 @@ MIN_POINTS = 30
 """Number of points on a frame from which their colours count."""
 MAX_ERROR_RATIO = 0.9
 """Ratio of the colour errors of the two readings below which the smaller one decides."""
-SWAPS_SIDES = frozenset({5, 6, 7, 8})
-"""Exif orientations that exchange width and height."""
 
 
 @dataclass(frozen=True)

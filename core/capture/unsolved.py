@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import CaptureError, FrameError
-from ..images.formats.exif import read_exif
+from ..images.formats.exif import SWAPS_SIDES, read_exif
 from ..images.listing import pictures_below, pictures_in
 from ..images.size import picture_size
 from ..system.file_names import find_entry
@@ -23,7 +23,6 @@ from .camera_solve import CameraSolve
 from .colmap import PointCloud, PosedFrame
 from .lens import Lens
 from .lights import is_finite
-from .orientation import SWAPS_SIDES
 
 CAMERA = "camera.json"
 """Name of the file in a capture's folder that records the focal length."""

@@ -3,7 +3,7 @@
 
 | library | reads |
 | --- | --- |
-| OpenImageIO | WebP, DPX, Cineon, PSD, BMP, Radiance HDR, Targa; BigTIFF, TIFF of 16 bit floats, planes, Zstandard |
+| OpenImageIO | WebP, DPX, Cineon, PSD, BMP, Radiance HDR, Targa; BigTIFF, TIFF of 16 bit floats, planes |
 | OpenCV | JPEG 2000, in up to 16 bits |
 | Pillow | GIF, AVIF; HEIC with pillow-heif |
 | pillow-jxl-plugin | JPEG XL, which OpenImageIO's wheels for numpy 1.26 lack |
@@ -29,6 +29,8 @@ from ..errors import FrameError
 from ..system.child import ChildDied, run_in_child
 from ..system.progress import Progress
 from ..system.reading import check_regular, open_regular, read_bytes
+from .formats import tiff
+from .formats.exif import SWAPS_SIDES, apply_orientation
 from .formats.kinds import HEAD_BYTES, Kind, kind_of
 
 OIIO_KINDS = frozenset({"webp", "dpx", "cineon", "psd", "bmp", "hdr", "tga"})
@@ -77,6 +79,8 @@ def describe(path: Path, kind: Kind) -> Description:
         profile = picture.info.get("icc_profile") or b""
         nclx = picture.info.get("nclx_profile")
         points = (int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])) if nclx else None
+        if kind == "avif" and _avif_orientation(picture) in SWAPS_SIDES:
+            width, height = height, width
         space = profile_space(path, profile) or (space_of_code_points(*points) if points else None)
         return Description(width, height, space, 1, profile, points)
 
@@ -97,12 +101,23 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
     with _open_by_pillow(path, kind) as picture:
         if getattr(picture, "n_frames", 1) > 1:
             raise FrameError(f"{path} has {picture.n_frames} frames; export them as files of their own.")
+        orientation = _avif_orientation(picture) if kind == "avif" else 1
         mode = picture.mode if picture.mode in ("L", "RGB", "RGBA") else "RGBA" if "A" in picture.mode else "RGB"
         try:
             pixels = np.asarray(picture.convert(mode))
         except Exception as problem:  # the plug-ins raise what their libraries do
             raise _damaged(path, problem) from problem
-    return _bgr(pixels)
+    return _bgr(apply_orientation(pixels, orientation))
+
+
+def _avif_orientation(picture: Any) -> int:
+    """Return the orientation of an AVIF as Exif numbers it: Pillow states its rotation and mirroring so, and does not
+    apply them."""
+    try:
+        orientation = int(picture.getexif().get(tiff.ORIENTATION, 1))
+    except Exception:  # a damaged block
+        return 1
+    return orientation if 1 <= orientation <= 8 else 1
 
 
 def profile_space(path: Path, profile: bytes) -> ColourSpace | None:
@@ -215,6 +230,11 @@ def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
         name = {"uint8": "uint8", "uint16": "uint16", "half": "half"}.get(str(spec.format), "float")
         pixels = opened.read_image(0, 0, 0, channels, name)
         problem = opened.geterror()
+        if "not configured" in problem:
+            number = spec.get_int_attribute("tiff:Compression")
+            name = tiff.UNSUPPORTED_COMPRESSIONS.get(number, f"the method {number}")
+            raise FrameError(f"{path} is compressed with {name}, which the TIFF library here is built without; save "
+                             "it with LZW or ZIP compression.")
         if pixels is None or problem:
             raise _damaged(path, problem)
         pixels = np.asarray(pixels).reshape(spec.height, spec.width, channels)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import FrameError
 from ..system.reading import open_regular
-from .formats import jpeg, tiff
+from .formats import jpeg, tiff, webp
 from .video import is_video
 
 
@@ -38,6 +38,8 @@ def unsupported_reason(path: Path) -> str:
             if header is not None and header.bits > 8:
                 return f"holds {header.bits} bits a colour; save it with 8, or as PNG or TIFF with 16"
             return _CMYK if header is not None and header.components == 4 else ""
+        if webp.is_animated(stream):
+            return "is an animation; export its frames as files of their own"
         tags = _tags(stream)
     if not tags:
         return ""

@@ -8,9 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image, features
 
 from core.images.formats import tiff
 from core.images.formats.exif import apply_orientation, read_exif, undo_orientation
+from core.images.plates import clean_name, read_plate, write_plate
+from core.images.size import picture_size
 
 
 def exif_segment(order: str, orientation: int, focal: int) -> bytes:
@@ -55,6 +58,28 @@ def test_orientation_of_pngs_and_tiffs(suffix: str, tmp_path: Path) -> None:
     assert read_exif(tmp_path / f"turned{suffix}") == (6, 0.75 if suffix == ".png" else None)
     (tmp_path / f"cut{suffix}").write_bytes(turned[:60])
     assert read_exif(tmp_path / f"cut{suffix}")[1] is None
+
+
+@pytest.mark.parametrize("orientation", [1, 6, 8, 3, 5])
+@pytest.mark.parametrize("suffix", [".webp", ".avif", ".jpg", ".png", ".tif"])
+def test_a_picture_of_each_format_is_turned_as_viewers_show_it(suffix: str, orientation: int, tmp_path: Path) -> None:
+    """By the Exif block, or by the rotation that the format itself states, which Pillow writes into an AVIF."""
+    if suffix == ".avif" and not features.check("avif"):
+        pytest.skip("Pillow is built without AVIF")
+    shown = np.full((40, 60, 3), 60, np.uint8)
+    shown[:12, 36:] = (250, 120, 30)
+    exif = Image.Exif()
+    exif[tiff.ORIENTATION] = orientation
+    path = tmp_path / f"phone{suffix}"
+    Image.fromarray(undo_orientation(shown, orientation)).save(path, exif=exif, quality=95)
+    codes = read_plate(path).codes
+    assert picture_size(path) == codes.shape[1::-1]
+    seen = apply_orientation(codes, read_exif(path)[0]).astype(int)
+    assert seen.shape == shown.shape and np.abs(seen - shown).mean() < 4
+    written = clean_name(tmp_path / f"clean{suffix}")
+    write_plate(written, read_plate(path), codes // 2)
+    again = apply_orientation(read_plate(written).codes, read_exif(written)[0]).astype(int)
+    assert again.shape == shown.shape and np.abs(again - seen // 2).mean() < 3
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

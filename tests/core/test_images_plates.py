@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
 
 from core.errors import FrameError
 from core.images.exr import read_exr
@@ -138,6 +139,14 @@ def test_unsupported_pictures_are_refused_by_name(tmp_path: Path) -> None:
     assert read_plate(tmp_path / "1.png").codes.shape == codes.shape
     with pytest.raises(FrameError, match=r"2\.png is an animated PNG; export its frames"):
         read_plate(tmp_path / "2.png")
+    Image.fromarray(codes).save(tmp_path / "moving.webp", save_all=True, append_images=[Image.fromarray(255 - codes)])
+    with pytest.raises(FrameError, match=r"moving\.webp is an animation; export its frames"):
+        read_plate(tmp_path / "moving.webp")
+    Image.fromarray(codes).save(tmp_path / "packed.tif", compression="zstd")
+    try:  # some builds of the library have it
+        assert np.array_equal(read_plate(tmp_path / "packed.tif").codes, codes)
+    except FrameError as problem:
+        assert "is compressed with Zstandard, which the TIFF library here is built without" in str(problem)
     _, pages = cv2.imencodemulti(".tif", [codes, codes, codes])
     (tmp_path / "pages.tif").write_bytes(pages.tobytes())
     with pytest.raises(FrameError, match="3 pages"):

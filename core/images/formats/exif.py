@@ -10,15 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...system.reading import open_regular
-from . import jpeg, png, tiff
+from . import jpeg, png, tiff, webp
 
 EXIF, FOCAL_35MM = 0x8769, 0xA405
+SWAPS_SIDES = (5, 6, 7, 8)
+"""Orientations that swap width and height."""
 WIDTH_35MM = 36.0
 """Long side of 35 mm film in millimetres."""
 
 
 def read_exif(path: Path) -> tuple[int, float | None]:
-    """Return (orientation 1..8, focal length as a multiple of the long side or None) of a JPEG, PNG or TIFF.
+    """Return (orientation 1..8, focal length as a multiple of the long side or None) of a JPEG, PNG, TIFF or WebP.
 
     (1, None) for other files, and where the tags are missing.
     """
@@ -38,6 +40,8 @@ def _exif_block(stream: BinaryIO) -> BinaryIO:
     if magic[:2] == b"\xff\xd8":
         blocks = (content[6:] for marker, content in jpeg.segments(stream)
                   if marker == jpeg.APP1 and content.startswith(b"Exif\0\0"))
+    elif magic[:4] == b"RIFF":
+        blocks = (content.removeprefix(b"Exif\0\0") for name, content in webp.chunks(stream) if name == b"EXIF")
     else:
         blocks = (content for _, content in png.chunks(stream, (png.EXIF,)))
     return io.BytesIO(next(blocks, b""))
@@ -45,7 +49,7 @@ def _exif_block(stream: BinaryIO) -> BinaryIO:
 
 def apply_orientation(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     """Rotate and mirror stored pixels (height, width, ...) by an Exif orientation, as viewers show them."""
-    if orientation in (5, 6, 7, 8):
+    if orientation in SWAPS_SIDES:
         pixels = np.swapaxes(pixels, 0, 1)
     if orientation in (3, 4, 7, 8):
         pixels = pixels[::-1]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writes clean plates of the formats that OpenCV and OpenEXR do not write, by OpenImageIO: lossless, with the header of
-the plate.
+"""Writes clean plates of the formats that OpenCV and OpenEXR do not write: lossless, with the header of the plate.
 
-`plates.write_plate` calls it.
+OpenImageIO writes them but WebP, whose profile, Exif and XMP only Pillow writes. `plates.write_plate` calls it.
 """
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError
 from ..system.files import atomic_path
+from ..system.reading import check_regular
 from .decoders import file_kind, open_oiio
 from .unsupported import needs_openimageio
 
@@ -30,6 +31,9 @@ def needs_oiio_writer(path: Path) -> bool:
 def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[Any] | None) -> None:
     """Write codes (height, width, 1 or 3), with alpha (height, width), with the header of `source`. Raises FrameError.
     """
+    if path.suffix.lower() == ".webp":
+        _write_webp(path, source, codes, alpha)
+        return
     import OpenImageIO as oiio  # noqa: N813 - as its own documents do
 
     pixels = codes if alpha is None else np.concatenate([codes, alpha[..., None]], -1)
@@ -46,8 +50,6 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
     spec.set_format(types.get(codes.dtype.name, oiio.FLOAT))
     spec.channelformats = ()
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    if name == "webp":
-        spec.attribute("compression", "lossless")
     if name == "dpx" and file_kind(source) == "cineon":
         spec.attribute("dpx:Transfer", "Printing density")
         spec.attribute("oiio:BitsPerSample", 10)
@@ -63,3 +65,21 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
         if not done:
             raise FrameError(f"{path} could not be encoded as {path.suffix[1:].upper()} "
                              f"({output.geterror() if output is not None else oiio.geterror()}).")
+
+
+def _write_webp(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[Any] | None) -> None:
+    """Write a lossless WebP with the profile, Exif and XMP of `source`. Raises FrameError."""
+    from PIL import Image
+
+    check_regular(source)
+    try:
+        with Image.open(source) as stored:
+            kept = {name: stored.info[name] for name in ("icc_profile", "exif", "xmp") if stored.info.get(name)}
+        colours = np.repeat(codes, 3, -1) if codes.shape[2] == 1 else codes
+        pixels = colours if alpha is None else np.concatenate([colours, alpha[..., None]], -1)
+        encoded = io.BytesIO()
+        Image.fromarray(np.ascontiguousarray(pixels)).save(encoded, "WEBP", lossless=True, exact=True, **kept)
+    except (OSError, ValueError) as problem:
+        raise FrameError(f"{path} could not be encoded as WebP ({problem}).") from problem
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded.getvalue())

@@ -25,9 +25,10 @@ if TYPE_CHECKING:
     from ..core.transfer.query import TrainingViews
     from ..core.transfer.target import Target
 
-TARGET_OPTIONS = {"picture": ("light", "focal", "centre"), ".blend": ("lights", "scene", "plates", "radius"),
-           ".json": ("scene", "plates"), ".ply": ("lights", "cameras"), "run": ("lights", "scene", "cameras"),
-           "capture": ("lights", "scene")}
+TARGET_OPTIONS = {"picture": ("light", "focal", "centre"),
+                  ".blend": ("lights", "scene", "plates", "radius", "fall_off"),
+                  ".json": ("scene", "plates", "fall_off"), ".ply": ("lights", "cameras", "fall_off"),
+                  "run": ("lights", "scene", "cameras", "fall_off"), "capture": ("lights", "scene", "fall_off")}
 """The options that apply to a kind of target only, by that kind."""
 
 
@@ -46,6 +47,7 @@ class TargetOptions:
     lights: str | None = None
     smooth: int = 1
     radius: float = 0.0
+    fall_off: float | None = None
     scale: float = 1.0
     cameras: Path | None = None
     scene: Path | None = None
@@ -95,8 +97,9 @@ def _target_kind(target: Path) -> str:
 def check_options(options: TargetOptions, kind: str) -> None:
     """Raise SettingsError for an option that has no effect on this kind of target."""
     for name in dict.fromkeys(name for names in TARGET_OPTIONS.values() for name in names):
-        if getattr(options, name) and name not in TARGET_OPTIONS[kind]:
-            raise SettingsError(f"--{name} does not apply to a {kind} as the target; leave it out.")
+        value = getattr(options, name)
+        if (value or (value == 0.0 and name == "fall_off")) and name not in TARGET_OPTIONS[kind]:
+            raise SettingsError(f"--{name.replace('_', '-')} does not apply to a {kind} as the target; leave it out.")
 
 
 def find_flare(args: argparse.Namespace) -> tuple[Path, list[Floats] | None]:

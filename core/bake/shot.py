@@ -7,6 +7,7 @@ add-on's bakes come here.
 from __future__ import annotations
 
 from collections.abc import Container
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ..capture.camera import Camera
 from ..fit.rendering import render_scene, splat_look
 from ..fit.run import Run, ViewLayers
 from ..flare.compositing import linear_layers as linear_layers
-from ..flare.visibility import visibility_from
+from ..flare.visibility import visibility_behind
 from ..look import LookEdits, PlacedLight
 from ..look.shot import Shot, ShotFrame
 from ..system.progress import Progress
@@ -64,9 +65,9 @@ class ShotRenderer(ShotSource):
         settings = self.run.settings.flare.active_visibility if self.run is not None else None
         if self.run is None or settings is None:
             return light
-        clear = self._clear.get(light.source, 1.0)
-        visibility = visibility_from(self.run.scene, camera.position, light.xyz, settings, clear)
-        return PlacedLight(light.name, light.source, light.xyz, light.visibility * visibility)
+        visibility, shares = visibility_behind(self.run.scene, camera.world_to_camera, light, settings,
+                                               self._clear.get(light.source, 1.0))
+        return replace(light, visibility=light.visibility * visibility, shares=shares)
 
 
 def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool = False,

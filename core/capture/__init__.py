@@ -11,7 +11,8 @@ from .capture import LIGHTS, REMOVED, Capture, View
 from .colmap import PointCloud
 from .frame_files import PictureIndex
 from .lens import Lens
+from .light_extent import LightExtent, sample_curve, sample_surface
 from .lights import Light, LightKey, LightState, read_lights
 
-__all__ = ["LIGHTS", "REMOVED", "Camera", "Capture", "Lens", "Light", "LightKey", "LightState", "PictureIndex",
-           "PointCloud", "View", "read_lights"]
+__all__ = ["LIGHTS", "REMOVED", "Camera", "Capture", "Lens", "Light", "LightExtent", "LightKey", "LightState",
+           "PictureIndex", "PointCloud", "View", "read_lights", "sample_curve", "sample_surface"]

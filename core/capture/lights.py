@@ -8,10 +8,12 @@
     {"name": "car", "frames": {"0001.png": {"xyz": [x, y, z]}}}                   a path in the world
     {"name": "torch", "frames": {"0001.png": {"xy": [px, py], "on": 0.8, "confidence": 0.9}}}   a path on the picture
     {"name": "lamp", "xy": [px, py]}                                              one place on the picture
+    {"name": "tube", "xyz": [x, y, z], "extent": {"shape": "sphere", "radius": 0.1}}            with an extent
 
 `xy` is in pixels of the undistorted frame, pixel centres at +0.5, and may lie outside of the frame. `on` is the light
 that reaches the lens, relative to the frame in which this light is brightest, 0..1. `confidence` is 0..1. Frames
-without an entry are interpolated by frame number; beyond the first and last entry the nearest one holds.
+without an entry are interpolated by frame number; beyond the first and last entry the nearest one holds. A transfer
+sums the flare over an `extent` (light_extent.py); a fit learns it from the frames.
 `core/lights/file.py` writes the file.
 """
 from __future__ import annotations
@@ -28,6 +30,7 @@ from ..errors import CaptureError, SettingsError
 from ..system.file_names import canonical_name
 from ..system.files import read_json
 from .camera import Camera, Floats
+from .light_extent import LightExtent
 
 DOUBTFUL = 0.5
 """Confidence below which a light's place in a frame is doubtful."""
@@ -57,13 +60,15 @@ class LightKey:
 class Light:
     """A light. xyz: (3,) its place in world coordinates, NaN where it has none or moves.
 
-    xy: (2,) its one place on the picture, pixels. keys: places and brightness by the name of the frame.
+    xy: (2,) its one place on the picture, pixels. keys: places and brightness by the name of the frame. extent: around
+    its place, world units; None for a point.
     """
 
     name: str
     xyz: Floats
     xy: Floats | None = None
     keys: Mapping[str, LightKey] = field(default_factory=dict)
+    extent: LightExtent | None = None
 
     @property
     def moves(self) -> bool:
@@ -84,6 +89,8 @@ class Light:
         if self.keys:
             plain.append([[name, _to_list(key.xyz), _to_list(key.xy), key.on, key.confidence]
                           for name, key in sorted(self.keys.items())])
+        if self.extent is not None:
+            plain.append(self.extent.to_json())
         return plain
 
 
@@ -142,7 +149,11 @@ def _parse_light(entry: Mapping[str, Any], name: str, where: str) -> Light:
     elif any(key.place is not None for key in keys.values()):
         raise CaptureError(f"{where}: it has one place and a path; remove one of them.")
     xyz = _parse_place(entry, "xyz", 3, where)
-    return Light(name, np.full(3, np.nan) if xyz is None else xyz, _parse_place(entry, "xy", 2, where), keys)
+    try:
+        extent = LightExtent.read(entry["extent"]) if entry.get("extent") is not None else None
+    except ValueError as problem:
+        raise CaptureError(f"{where}: {problem}; correct the extent, or remove it.") from problem
+    return Light(name, np.full(3, np.nan) if xyz is None else xyz, _parse_place(entry, "xy", 2, where), keys, extent)
 
 
 def _parse_key(key: Any, where: str) -> LightKey:

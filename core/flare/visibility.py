@@ -11,7 +11,7 @@ visibilities are relative to those of the training views that see most of the li
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from torch import Tensor
 from ..choices import Kernels
 from ..gaussians import rasterization
 from ..gaussians.scene import SceneGaussians
+from ..look import PlacedLight
 from ..look.shot import LIGHT_MARGIN, LIGHT_RADIUS
 from .model import FlareModel
 
@@ -28,6 +29,8 @@ MIN_CLEAR = 0.01
 """Clear visibility below which a scene says nothing about a light."""
 CLEAR_QUANTILE = 0.9
 """Quantile of the views' visibilities that counts as clear: a light may be hidden in most of them."""
+MIN_RADIUS, MAX_RADIUS = 1e-4, 0.5
+"""Range of the radius of a cell of an extent, relative to its distance."""
 OCCLUSION_WEIGHT, MIN_VISIBILITY = 1e-4, 1e-6
 """Weight of the loss of a hidden light, about that of the pixels that show it; and what is added to its visibility."""
 
@@ -66,6 +69,30 @@ def visibility_from(scene: SceneGaussians, camera: NDArray[np.float64], light: N
     """
     visibility = light_visibility(scene, torch.from_numpy(camera), torch.from_numpy(light), settings)
     return float(relative_to_clear(visibility, clear))
+
+
+def visibility_behind(scene: SceneGaussians, world_to_camera: NDArray[np.float64], light: PlacedLight,
+                      settings: VisibilitySettings, clear: float = 1.0) -> tuple[float, tuple[float, ...] | None]:
+    """Return the visibility of a placed light behind a scene, 0..1, and the visible shares of the cells of its extent.
+
+    For a point, the shares are the light's own, None. For an extent, the visibility is 1, and the shares are the
+    light's own times those behind the scene. world_to_camera: (4, 4). clear: see `visibility_from`.
+    """
+    pose = np.asarray(world_to_camera, np.float64)
+    eye = -pose[:3, :3].T @ pose[:3, 3]
+    if light.extent is None:
+        return visibility_from(scene, eye, light.xyz, settings, clear), light.shares
+    sampled = light.extent.sampled(light.xyz, pose)
+    shares = []
+    for cell, centre in enumerate(sampled.centres):
+        own = 1.0 if light.shares is None else light.shares[cell]
+        if own > 0:
+            offsets = np.linalg.norm(sampled.points[sampled.cells == cell] - centre, axis=1)
+            distance = max(float(np.linalg.norm(centre - eye)), 1e-9)
+            radius = min(max(float(np.sqrt((offsets**2).mean() / 2)) / distance, MIN_RADIUS), MAX_RADIUS)
+            own *= visibility_from(scene, eye, centre, replace(settings, radius=radius), clear)
+        shares.append(own)
+    return 1.0, tuple(shares)
 
 
 @torch.no_grad()

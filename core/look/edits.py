@@ -278,11 +278,11 @@ def apply_edits(gaussians: PlaneGaussians, light: str, light_position: NDArray[A
         if element.name not in hidden and len(element.members):
             combined = light_edit.combine(edit)
             part = _apply_shape(gaussians.select(element.members), combined, light_position, element.kind == "streak")
-            parts.append(_apply_colour(part, combined, blend))
+            parts.append(apply_colour(part, combined, blend))
             rows.append(element.members)
     if ungrouped.any():
         part = _apply_shape(gaussians.select(ungrouped), light_edit, light_position, False)
-        parts.append(_apply_colour(part, light_edit, blend))
+        parts.append(apply_colour(part, light_edit, blend))
         rows.append(np.flatnonzero(ungrouped))
     whole_flare = concatenate(parts)
     if whole_flare is None:
@@ -290,7 +290,7 @@ def apply_edits(gaussians: PlaneGaussians, light: str, light_position: NDArray[A
     return whole_flare.select(np.argsort(np.concatenate(rows), kind="stable"))
 
 
-def _apply_colour(part: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:
+def apply_colour(part: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:
     """Return the Gaussians with the colours and opacities of an edit."""
     if not edit.changes_colour:
         return part

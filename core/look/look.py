@@ -2,7 +2,8 @@
 """A .flare as a look: reads it, and evaluates its flares for a camera and lights, with an artist's edits.
 
 `Look.evaluate_lights` is the one loop over lights: the overlay and shot bakes call it, and `Look.evaluate` does for the
-lights where the file has them. `core.transfer` uses `Look.visible_lights` with queries of its own.
+lights where the file has them. `core.transfer` uses `Look.visible_lights` with queries of its own. Both evaluate a
+placed light by `placed_light.evaluate_placed`, so that lights with an extent, fall-off and factors are alike in all.
 """
 from __future__ import annotations
 
@@ -27,6 +28,9 @@ from .edits import LookEdits, apply_edits
 from .elements import Element
 from .form import FlareForm
 from .network import Floats, Network, QueryRange, frequency_encoding
+from .placed_light import PlacedLight as PlacedLight
+from .placed_light import ViewOfLight as ViewOfLight
+from .placed_light import evaluate_placed
 from .plane import (
     PlaneGaussians,
     arcs_of_ellipse,
@@ -67,38 +71,6 @@ class TrainedCamera:
         Compares widths; for a portrait and a landscape picture the long sides, since the camera is turned then."""
         turned = (width < height) != (self.width < self.height)
         return max(width, height) / max(self.width, self.height) if turned else width / self.width
-
-
-@dataclass(frozen=True, eq=False)
-class ViewOfLight:
-    """One light seen by one camera.
-
-    camera (3,): position in the world; rotation (3, 3): world to camera; light (2,): normalised image coordinates;
-    depth: of the light along the axis, world units, not positive behind the camera."""
-
-    camera: Floats
-    rotation: Floats
-    light: Floats
-    depth: float
-
-    @classmethod
-    def of(cls, world_to_camera: ArrayLike, xyz: ArrayLike) -> ViewOfLight:
-        """Return the view of a light at xyz (3,) for a pose (4, 4), world to camera."""
-        pose = np.asarray(world_to_camera, np.float64)
-        x, y, z = (pose[:3, :3] @ np.asarray(xyz, np.float64) + pose[:3, 3]).tolist()
-        camera = -pose[:3, :3].T @ pose[:3, 3]
-        light = [x / z, y / z] if z > 0 else [math.inf, math.inf]
-        return cls(camera.astype(np.float32), pose[:3, :3].astype(np.float32), np.array(light, np.float32), z)
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedLight:
-    """A light at xyz (3,) that shows the flare of the look's light `source`; visibility: 0..1."""
-
-    name: str
-    source: str
-    xyz: NDArray[np.float64]
-    visibility: float = 1.0
 
 
 class LightLook:
@@ -248,29 +220,29 @@ class Look:
         range of the training views; "source" the middle of that range. Placement always follows the view.
         """
         flares: dict[str, PlaneGaussians] = {}
-        for light, source, view in self.visible_lights(world_to_camera, lights, edits):
-            if light.visibility <= 0:
-                continue
-            gaussians = source.evaluate(view, query=network_query(source, view, query), edits=edits,
-                                        visibility=light.visibility, name=light.name)
+        for light, source in self.visible_lights(lights, edits):
+            def evaluate(view: ViewOfLight, visibility: float, source: LightLook = source, name: str = light.name
+                         ) -> PlaneGaussians | None:
+                return source.evaluate(view, query=network_query(source, view, query), edits=edits,
+                                       visibility=visibility, name=name)
+
+            gaussians = evaluate_placed(light, world_to_camera, self.blend, evaluate, self.pixel_grid)
             if gaussians is not None:
                 flares[light.name] = gaussians
         return flares
 
-    def visible_lights(self, world_to_camera: ArrayLike, lights: Sequence[PlacedLight],
-                       edits: LookEdits | None = None) -> Iterator[tuple[PlacedLight, LightLook, ViewOfLight]]:
-        """Yield each placed light with its source and its view.
+    def visible_lights(self, lights: Sequence[PlacedLight], edits: LookEdits | None = None
+                       ) -> Iterator[tuple[PlacedLight, LightLook]]:
+        """Yield each placed light with its source.
 
-        Omits lights behind the camera, lights that mute and solo turn off, and lights whose source the look lacks."""
+        Omits lights that mute and solo turn off, and lights whose source the look lacks."""
         sources = {light.name: light for light in self.lights}
         names = [light.name for light in lights]
         for light in lights:
             source = sources.get(light.source)
             if source is None or (edits is not None and not edits.is_visible(light.name, names)):
                 continue
-            view = ViewOfLight.of(world_to_camera, light.xyz)
-            if view.depth > 0:
-                yield light, source, view
+            yield light, source
 
 
 def network_query(light: LightLook, view: ViewOfLight, query: Query) -> ViewOfLight | None:

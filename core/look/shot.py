@@ -3,12 +3,15 @@
 
     {"version": 1, "flare": "lamp.flare", "run": null, "width": 960, "height": 540, "query": "target",
      "frames": [{"frame": 1, "name": "Camera", "intrinsics": [fx, fy, cx, cy], "world_to_camera": [[…], …],
-                 "lights": [{"name": "lamp", "source": "lamp", "xyz": [x, y, z], "share": 1.0}],
+                 "lights": [{"name": "lamp", "source": "lamp", "xyz": [x, y, z], "share": 1.0,
+                             "extent": {"shape": "sphere", "radius": 0.1}, "shares": [1.0, …],
+                             "factor": [r, g, b], "reference_distance": 0.0}],
                  "edits": ["lamp.intensity=2"]}]}
 
 A light of the shot shows the flare of the .flare's light `source`. Edits and layers use its own `name`, so that several
-lights can share a source. `share` is its visibility, 0..1, and `apart` is true if the layers of a single camera have a
-folder of their own too. Coordinates are the capture's if the flare is shown in the scene of its fit, else any.
+lights can share a source. `share` is its visibility, 0..1. `extent` and the three after it are optional
+(`PlacedLight`). `apart` is true if the layers of a single camera have a folder of their own too. Coordinates are the
+capture's if the flare is shown in the scene of its fit, else any.
 """
 from __future__ import annotations
 
@@ -24,6 +27,7 @@ from typing import Any, get_args
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.light_extent import LightExtent
 from ..errors import SettingsError
 from ..system.files import avoid_device_name, read_json, write_json
 from ..system.reading import read_bytes
@@ -32,6 +36,7 @@ from .look import PlacedLight, Query
 VERSION = 1
 MAX_SIDE = 1 << 15  # pixels of a side
 MAX_FRAME = 10**9
+MAX_FACTOR = 1e9  # of a light
 LIGHT_RADIUS = 0.01
 """Default radius of a light, relative to its distance: the standard deviation of the soft disc whose visible part is
 its visibility."""
@@ -51,8 +56,9 @@ class ShotFrame:
 
     def cache_key(self) -> str:
         """Return a text that changes whenever the frame's picture would, for the same .flare and query."""
-        return repr((self.frame, self.name, self.edits, *self.camera.numbers,
-                     [(light.name, light.source, light.xyz.tolist(), light.visibility) for light in self.lights]))
+        lights = ", ".join(light.cache_key() for light in self.lights)
+        numbers = ", ".join(map(repr, (self.frame, self.name, self.edits, *self.camera.numbers)))
+        return f"({numbers}, [{lights}])"  # the form of a tuple's repr, so that earlier layers stay valid
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +107,7 @@ class Shot:
                    "intrinsics": [frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy],
                    "world_to_camera": frame.camera.world_to_camera.tolist(), "exposure": frame.camera.exposure,
                    "edits": list(frame.edits),
-                   "lights": [{"name": light.name, "source": light.source, "xyz": light.xyz.tolist(),
-                               "share": light.visibility} for light in frame.lights]} for frame in self.frames]
+                   "lights": [_light_entry(light) for light in frame.lights]} for frame in self.frames]
         write_json(path, {"version": VERSION, "flare": str(self.flare), "run": str(self.run) if self.run else None,
                           "query": self.query, "live": self.live, "apart": self.own_folder, "frames": frames})
 
@@ -147,14 +152,9 @@ def _read_frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and fx > 0 and fy > 0 and pose.shape == (4, 4)
             and exposure > 0):
         raise ValueError(f"frame {entry['frame']} has no sensible camera")
-    lights = tuple(PlacedLight(str(light["name"]), str(light["source"]), np.array([_to_float(x) for x in light["xyz"]]),
-                               _to_float(light.get("share", 1.0))) for light in entry["lights"])
+    lights = tuple(_read_light(light) for light in entry["lights"])
     if len({light.name for light in lights}) < len(lights):
         raise ValueError(f"frame {entry['frame']} has two lights of one name")
-    if any(light.xyz.shape != (3,) for light in lights):
-        raise ValueError("a light has no place")
-    if not all(0 <= light.visibility <= 1 for light in lights):
-        raise ValueError("the share of a light lies between 0 and 1")
     if not all(isinstance(text, str) for text in entry.get("edits", [])):
         raise ValueError("edits are a list of texts")
     number = _to_int(entry["frame"])
@@ -162,6 +162,45 @@ def _read_frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
         raise ValueError(f"the frame {number} is no number of a file")
     return ShotFrame(number, str(entry.get("name", "Camera")),
                      Camera(width, height, fx, fy, cx, cy, pose, exposure), lights, tuple(entry.get("edits", [])))
+
+
+def _light_entry(light: PlacedLight) -> dict[str, Any]:
+    """Return the JSON form of a light; numbers that change nothing are omitted."""
+    entry: dict[str, Any] = {"name": light.name, "source": light.source, "xyz": light.xyz.tolist(),
+                             "share": light.visibility}
+    if light.extent is not None:
+        entry["extent"] = light.extent.to_json()
+        if light.shares is not None:
+            entry["shares"] = [round(float(share), 6) for share in light.shares]
+    if light.factor != (1.0, 1.0, 1.0):
+        entry["factor"] = list(light.factor)
+    if light.reference_distance:
+        entry["reference_distance"] = light.reference_distance
+    return entry
+
+
+def _read_light(entry: Mapping[str, Any]) -> PlacedLight:
+    """Parse one light. Raises ValueError, KeyError or TypeError where it is invalid."""
+    def numbers(name: str) -> tuple[float, ...]:
+        return tuple(_to_float(value) for value in entry[name])
+
+    xyz, factor = np.array(numbers("xyz")), numbers("factor") if "factor" in entry else (1.0, 1.0, 1.0)
+    if len(factor) != 3 or not all(0 <= value <= MAX_FACTOR for value in factor):
+        raise ValueError(f"the factor of a light has three numbers from 0 to {MAX_FACTOR:g}")
+    red, green, blue = factor
+    extent = LightExtent.read(entry["extent"]) if entry.get("extent") is not None else None
+    shares = numbers("shares") if extent is not None and entry.get("shares") is not None else None
+    light = PlacedLight(str(entry["name"]), str(entry["source"]), xyz, _to_float(entry.get("share", 1.0)), extent,
+                        shares, (red, green, blue), _to_float(entry.get("reference_distance", 0.0)))
+    if xyz.shape != (3,):
+        raise ValueError("a light has no place")
+    if not all(0 <= share <= 1 for share in (light.visibility, *(shares or ()))):
+        raise ValueError("the share of a light lies between 0 and 1")
+    if extent is not None and shares is not None and len(shares) != extent.cell_count:
+        raise ValueError(f"the extent of a light needs {extent.cell_count} shares")
+    if light.reference_distance < 0:
+        raise ValueError("the reference distance of a light is not negative")
+    return light
 
 
 def _to_int(value: Any) -> int:

@@ -29,11 +29,12 @@ from ..errors import SettingsError
 from ..fit.rendering import render_scene, splat_look
 from ..fit.run import ViewLayers
 from ..flare.compositing import linear_layers as linear_layers
-from ..flare.visibility import VisibilitySettings, visibility_from
+from ..flare.visibility import VisibilitySettings, visibility_behind
 from ..gaussians import Splats
 from ..images.picture import Picture
 from ..images.window import crop_to_display_window, move_to_window
-from ..look import LookEdits, PlacedLight, ViewOfLight, read
+from ..look import LightLook, LookEdits, PlacedLight, PlaneGaussians, ViewOfLight, read
+from ..look.placed_light import evaluate_placed
 from ..system.files import check_no_overwrite
 from ..system.progress import Progress
 from ..system.reading import read_bytes
@@ -55,13 +56,15 @@ class TransferSettings:
     """Settings of a transfer. query: view that the appearance follows (see `query`). scale: units of the target's world
     for one of the source's. smooth: frames on either side over which visibility is smoothed, 0 for none. plate_space:
     colour space of the plates, "auto" for that of their capture or files. visibility: how the target's scene hides
-    lights."""
+    lights. fall_off: reference distance of the inverse square fall-off, world units, 0 for the distance in the first
+    frame, None for no fall-off; lights with a reference distance of their own keep it."""
 
     query: Follows = "blend"
     scale: float = 1.0
     smooth: int = 1
     plate_space: str = AUTO
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
+    fall_off: float | None = field(default=None, repr=False)  # in the fingerprints of frames
 
 
 class Transfer:
@@ -76,7 +79,7 @@ class Transfer:
         self.look = read(flare)
         self.sources = {light.name: light for light in self.look.lights}
         self.training_views = queries.training_views(flare, self.look.lights, training)
-        self._visibilities: dict[tuple[int, str], float] = {}
+        self._visibilities: dict[tuple[int, str], tuple[float, tuple[float, ...] | None]] = {}
         self._fixed = self._fixed_views() if self.settings.query == "source" else {}
         self._index = {frame.frame.view: index for index, frame in enumerate(target.frames)}
 
@@ -97,6 +100,8 @@ class Transfer:
         neighbours = self.target.frames[max(index - radius, 0):index + radius + 1]
         fixed = [(name, view.camera.tolist(), view.light.tolist()) for name, view in self._fixed.items()]
         key_text = "".join(frame.cache_key() for frame in neighbours) + repr(fixed)
+        if self.settings.fall_off is not None:
+            key_text += repr([self._reference_distance(light) for light in self.target.frames[index].shot.lights])
         return hashlib.sha256(key_text.encode()).hexdigest()[:16]
 
     @property
@@ -116,11 +121,19 @@ class Transfer:
         """Return the splats of each light with a flare in a frame, for a camera, by the light's name."""
         lights = self.target.frames[index].shot.lights
         splats: dict[str, Splats] = {}
-        for light, source, view in self.look.visible_lights(camera.world_to_camera, lights, edits):
-            gaussians = queries.evaluate(
-                source, view, light.xyz, self.settings.query, self.training_views.get(light.source),
-                visibility=self.visibility(index, light.name), edits=edits, name=light.name,
-                scale=self.settings.scale, fixed=self._fixed.get(light.name))
+        for light, source in self.look.visible_lights(lights, edits):
+            def evaluate(view: ViewOfLight, visibility: float, light: PlacedLight = light, source: LightLook = source
+                         ) -> PlaneGaussians | None:
+                return queries.evaluate(
+                    source, view, light.xyz, self.settings.query, self.training_views.get(light.source),
+                    visibility=visibility, edits=edits, name=light.name, scale=self.settings.scale,
+                    fixed=self._fixed.get(light.name))
+
+            placed = replace(light, visibility=self.visibility(index, light.name),
+                             shares=self._shares(index, light.name),
+                             reference_distance=self._reference_distance(light))
+            gaussians = evaluate_placed(placed, camera.world_to_camera, self.look.blend, evaluate,
+                                        self.look.pixel_grid)
             if gaussians is not None:
                 splats[light.name] = splat_look(self.look, gaussians, camera)
         return splats
@@ -129,24 +142,49 @@ class Transfer:
         """Return the visibility of a light in a frame, 0..1, smoothed along the path."""
         frames = [frame.shot for frame in self.target.frames]
         return smooth_visibility(frames, index, light, self.settings.smooth,
-                                 lambda neighbour: self._frame_visibility(neighbour, light))
+                                 lambda neighbour: self._frame_visibility(neighbour, light)[0])
 
-    def _frame_visibility(self, index: int, light: str) -> float:
-        """Return the visibility in the frame alone: that of the shot times that through the target's scene."""
+    def _frame_visibility(self, index: int, light: str) -> tuple[float, tuple[float, ...] | None]:
+        """Return the visibility in the frame alone, that of the shot times that through the target's scene, and the
+        visible shares of the cells of an extent."""
         key = (index, light)
         if key not in self._visibilities:
             shot = self.target.frames[index].shot
             placed = next((item for item in shot.lights if item.name == light), None)
-            visibility = placed.visibility if placed is not None else 0.0
+            visibility, shares = (0.0, None) if placed is None else (placed.visibility, placed.shares)
             if placed is not None and visibility > 0 and self.target.scene is not None:
                 source = self.sources[placed.source]
                 is_own_scene = np.allclose(placed.xyz, source.xyz, rtol=1e-6, atol=1e-9)  # the scene of the fit
-                visible_share = visibility_from(self.target.scene, shot.camera.position, placed.xyz,
-                                                self.settings.visibility,
-                                                source.clear_visibility if is_own_scene else 1.0)
-                visibility *= min(max((visible_share - VISIBILITY_MARGIN) / (1 - 2 * VISIBILITY_MARGIN), 0.0), 1.0)
-            self._visibilities[key] = visibility
+                behind, shares = visibility_behind(self.target.scene, shot.camera.world_to_camera, placed,
+                                                   self.settings.visibility,
+                                                   source.clear_visibility if is_own_scene else 1.0)
+                visibility *= _without_margin(behind)
+                shares = shares and tuple(map(_without_margin, shares))
+            self._visibilities[key] = visibility, shares
         return self._visibilities[key]
+
+    def _shares(self, index: int, light: str) -> tuple[float, ...] | None:
+        """Return the visible shares of the cells of a light's extent in a frame, not smoothed: an extent is soft."""
+        return self._frame_visibility(index, light)[1]
+
+    def _reference_distance(self, light: PlacedLight) -> float:
+        """Return the reference distance of a light's fall-off: the target's, else that of the settings, where 0 stands
+        for the distance in the first frame that has the light; 0 for no fall-off."""
+        wanted = self.settings.fall_off
+        if light.reference_distance or wanted is None:
+            return light.reference_distance
+        return wanted or self._first_distances.get(light.name, 0.0)
+
+    @cached_property
+    def _first_distances(self) -> dict[str, float]:
+        """The distance of each light from the camera in the first frame that has it in front of the camera."""
+        distances: dict[str, float] = {}
+        for frame in self.target.frames:
+            pose = frame.shot.camera.world_to_camera
+            for light in frame.shot.lights:
+                if light.name not in distances and ViewOfLight.of(pose, light.xyz).depth > 0:
+                    distances[light.name] = float(np.linalg.norm(frame.shot.camera.position - light.xyz))
+        return distances
 
     def _fixed_views(self) -> dict[str, ViewOfLight]:
         """Return the view of each light for the query `source`, by name."""
@@ -221,6 +259,11 @@ class Transfer:
         """
         name = self.settings.plate_space
         return None if name == AUTO else colour_space(name, self.config)
+
+
+def _without_margin(visibility: float) -> float:
+    """Return a visibility with 0 and 1 where it is nearer to them than VISIBILITY_MARGIN."""
+    return min(max((visibility - VISIBILITY_MARGIN) / (1 - 2 * VISIBILITY_MARGIN), 0.0), 1.0)
 
 
 class _FrameRenderer:

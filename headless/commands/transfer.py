@@ -52,6 +52,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     lights.add_argument("--radius", type=float, default=0.0, metavar="UNITS",
                         help="radius of the lights of a .blend, for soft edges (default: the lamp's, else 2%% of the "
                              "distance)")
+    lights.add_argument("--fall-off", type=float, nargs="?", const=0.0, metavar="DISTANCE",
+                        help="dim the flare with the square of the light's distance from the camera; DISTANCE is where "
+                             "it keeps its brightness (default: the distance in the first frame)")
     lights.add_argument("--scale", type=float, default=1.0, metavar="X",
                         help="units of the target's world per unit of the source's (default 1)")
     cameras = parser.add_argument_group("cameras and scenes")
@@ -106,8 +109,10 @@ def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, pr
                                                              options.frames, options.job_frames)}
     around = range(-2 * options.smooth, 2 * options.smooth + 1)
     numbers = [number for number in every if any(number + step in selected for step in around)]
-    if options.query == "source" or not selected:
-        numbers = list(every)  # the middle one selects the training view; without any, the engine step reports it
+    if options.query == "source" or options.fall_off == 0 or not selected:
+        # The middle one selects the training view, the first one the fall-off's distance; without any selected, the
+        # engine step reports it.
+        numbers = list(every)
     names = [name.strip() for name in (options.lights or "").split(",") if name.strip()]
     progress.stage("read the .blend", len(numbers))
     shot = read_shot(scene, flare, names, numbers, radius=options.radius, done=progress.advance)
@@ -130,6 +135,8 @@ def _check_ranges(args: argparse.Namespace) -> None:
         raise SettingsError(f"--smooth has to be from 0 to {MAX_SMOOTH}, and --scale above 0.")
     if args.focal is not None and not 0 < args.focal < math.inf:
         raise SettingsError(f"--focal {args.focal} is not a length in pixels above 0.")
+    if args.fall_off is not None and not 0 <= args.fall_off < math.inf:
+        raise SettingsError(f"--fall-off {args.fall_off} is not a distance above 0.")
     if not 0 <= args.radius < math.inf:
         raise SettingsError(f"--radius {args.radius} is not a length of 0 or more.")
 
@@ -150,7 +157,8 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     if unwritten := sum(target_frame.plate_with_flare_path(args.out) is None for target_frame in plates):
         progress.say(f"For {unwritten} of {len(plates)} plates only the layers are written: the plates have another "
                      "size than is rendered, or lens distortion.")
-    settings = TransferSettings(options.query, options.scale, options.smooth, options.plate_space)
+    settings = TransferSettings(options.query, options.scale, options.smooth, options.plate_space,
+                                fall_off=options.fall_off)
     transfer = Transfer(flare, target, settings, training, args.ocio)
     selected = frames.select_task([target_frame.frame for target_frame in target.frames], args, progress)
     if not selected:

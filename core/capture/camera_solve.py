@@ -16,7 +16,7 @@ from ..system.file_names import canonical_name, natural_key
 from ..system.files import safe_join
 from .colmap import PointCloud, PosedFrame, read_model
 from .frame_files import PictureIndex
-from .layout import LATER_MODEL_PLACES, choose_model, find_models, frames_folder
+from .layout import LATER_MODEL_PLACES, choose_model, find_deeper_model, find_models, frames_folder
 from .transforms import FILE as TRANSFORMS
 from .transforms import read_transforms, transforms_files
 
@@ -67,8 +67,12 @@ def read_solve(folder: Path, *, required: bool = True) -> CameraSolve | None:
         if model is None and not required:
             return None
         if model is None:
+            deeper = find_deeper_model(folder)
             raise CaptureError(f"{folder} has no camera solve: neither sparse/0/cameras.bin (or .txt) nor "
-                               f"{TRANSFORMS}; run solve first.")
+                               f"{TRANSFORMS}; " + (
+                                   "run solve first." if deeper is None else
+                                   f"a model lies in {deeper}: name the folder that holds it and its images, such as "
+                                   f"{deeper.parent}, or move it to {folder / 'sparse' / '0'}."))
         frames, points = read_model(model)
         solve = CameraSolve(frames, points, frames_folder(folder, model))
         solve.sentences += [sentence] if sentence else []

@@ -243,7 +243,7 @@ class Capture:
         """Return the view's frame, undistorted, at its file's size, read in a space in place of the capture's. Raises
         FrameError."""
         path = self.frame_path(view)
-        stored = self._pictures.upright(read_picture(path, space=space), view, path)
+        stored = self._pictures.upright(read_picture(path, space=space, over_black=True), view, path)
         return self._pictures.undistorted(stored, view, path) if view.lens else stored
 
     def frame_path(self, view: View) -> Path:

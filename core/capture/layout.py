@@ -19,6 +19,8 @@ MODEL_PLACES = (".", "sparse", "sparse/*")
 """Folders of a COLMAP model whose world is that of the capture, whatever else lies beside it; * stands for a number."""
 LATER_MODEL_PLACES = ("colmap", "colmap/*", "colmap/sparse", "colmap/sparse/*")
 """Folders of a COLMAP model that counts where there is no transforms.json."""
+_MAX_DEPTH, _MAX_FOLDERS = 3, 200
+"""Levels of folders, and folders of a level, that are searched for a model in another place."""
 _MIN_IMAGE_BYTES = 73
 """Bytes of an image in images.bin, without its name and observations."""
 
@@ -41,6 +43,26 @@ def find_models(folder: Path, places: Iterable[str] = MODEL_PLACES) -> list[Path
 def find_model(folder: Path, places: Iterable[str] = MODEL_PLACES) -> Path | None:
     """Return the folder of the COLMAP model that a capture uses, or None."""
     return choose_model(find_models(folder, places), folder)[0]
+
+
+def find_deeper_model(folder: Path) -> Path | None:
+    """Return the folder of a COLMAP model that lies elsewhere below a capture, as in dense/0/sparse; None without
+    one."""
+    places = [folder]
+    for _ in range(_MAX_DEPTH):
+        places = [child for place in places for child in _subfolders(place)][:_MAX_FOLDERS]
+        for place in places:
+            if is_model(place):
+                return place
+    return None
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    try:
+        return [child for child in sorted(folder.iterdir(), key=natural_key) if child.is_dir()
+                and not child.is_symlink()]
+    except OSError:
+        return []
 
 
 def is_model(folder: Path) -> bool:

@@ -30,13 +30,14 @@ class PictureCache:
         self._lock = threading.Lock()
 
     def get(self, path: Path, view: View, size: tuple[int, int], space: ColourSpace | None = None) -> Picture:
-        """Return a view's picture at a size. space: in place of what the file declares."""
+        """Return a view's picture at a size, over black where it is transparent. space: in place of what the file
+        declares."""
         key = (path, size)
         with self._lock:
             if key in self._pictures:
                 self._pictures.move_to_end(key)
                 return self._pictures[key]
-        picture = self.upright(read_picture(path, space=space), view, path)
+        picture = self.upright(read_picture(path, space=space, over_black=True), view, path)
         if view.lens is not None:
             picture = self.undistorted(picture, view, path)
         elif not same_aspect(picture.size, view.camera.size):

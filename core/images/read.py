@@ -27,13 +27,15 @@ from .unsupported import needs_openimageio, unsupported_file, unsupported_reason
 from .window import crop_to_display_window
 
 
-def read_picture(path: Path | str, *, space: ColourSpace | None = None) -> Picture:
+def read_picture(path: Path | str, *, space: ColourSpace | None = None, over_black: bool = False) -> Picture:
     """Decode a picture of any format (docs/file_formats.md) to display values, or to scene-linear light where its codes
     hold light above white; alpha is dropped.
 
+    over_black: combine the picture with black by its alpha, so that hidden colours are never seen.
+
     What the file declares (profile, curve, primaries) is converted to Rec. 709; `space` is used instead where it is not
-    None. An EXR with more pixels than the frame (overscan), or fewer, is
-    cropped to the frame, and black where it has none.
+    None. An EXR with more pixels than the frame (overscan), or fewer, is cropped to the frame, and black where it has
+    none.
 
     Raises FrameError where the file is missing, damaged or of another kind, or holds NaN or infinity.
     """
@@ -45,6 +47,19 @@ def read_picture(path: Path | str, *, space: ColourSpace | None = None) -> Pictu
     if path.suffix.lower() == ".exr":
         return _read_exr_picture(path, space)
     stored = read_stored_pixels(path)
+    picture = _to_picture(path, stored, space)
+    if not over_black or stored.ndim == 2 or stored.shape[2] < 4 or tiff.is_premultiplied(path):
+        return picture
+    alpha = stored[..., 3:].astype(np.float32)
+    alpha /= np.float32(1 if stored.dtype.kind == "f" else np.iinfo(stored.dtype).max)
+    if alpha.min() >= 1:
+        return picture
+    light = picture.linear() * alpha
+    return Picture(srgb_from_linear(light) if picture.encoding == "srgb" else light, picture.encoding)
+
+
+def _to_picture(path: Path, stored: NDArray[Any], space: ColourSpace | None) -> Picture:
+    """Convert what `read_stored_pixels` returns from its colours, without alpha. Raises FrameError."""
     colour = rgb_codes(stored)
     if stored.dtype.kind == "f":
         pixels = colour.astype(np.float32, copy=False)

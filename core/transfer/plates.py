@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..colour import ColourSpace
-from ..colour.srgb import Pixels, srgb_from_linear
+from ..colour.srgb import Pixels
 from ..images.formats.exif import apply_orientation, undo_orientation
 from ..images.formats.tiff import UPRIGHT
 from ..images.picture import Picture
@@ -21,8 +21,6 @@ from ..images.plates import Plate, read_plate, write_plate
 from ..images.read import read_picture
 
 AUTO = "auto"
-_OPAQUE = (".jpg", ".jpeg", ".exr")
-"""Suffixes of files without alpha, or with premultiplied colours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,10 +128,5 @@ def alpha_with_light(alpha: Pixels, lit: Pixels) -> Pixels:
 def upright_picture(path: Path, orientation: int = UPRIGHT, space: ColourSpace | None = None) -> Picture:
     """Read a picture as viewers show it: upright, and black where its alpha hides it. space: in place of what the file
     declares. Raises FrameError."""
-    picture = read_picture(path, space=space)
-    pixels = picture.pixels
-    alpha = read_plate(path, space).straight_alpha if path.suffix.lower() not in _OPAQUE else None
-    if alpha is not None and (alpha < 1).any():
-        light = picture.linear() * alpha[..., None]
-        pixels = srgb_from_linear(light) if picture.encoding == "srgb" else light
-    return Picture(apply_orientation(pixels, orientation), picture.encoding)
+    picture = read_picture(path, space=space, over_black=True)
+    return Picture(apply_orientation(picture.pixels, orientation), picture.encoding)

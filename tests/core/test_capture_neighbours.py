@@ -90,6 +90,36 @@ def test_the_model_with_the_most_images_is_used(tmp_path: Path, places: tuple[st
     assert f"{places[1]} with 4 frames is used" in sentence and f"{places[0]} 2)" in sentence
 
 
+def test_a_model_in_another_place_is_named(tmp_path: Path) -> None:
+    """COLMAP's automatic reconstruction writes dense/0/sparse."""
+    folder = make_capture(tmp_path / "c")
+    deeper = folder / "dense" / "0" / "sparse"
+    deeper.parent.mkdir(parents=True)
+    (folder / "sparse" / "0").rename(deeper)
+    with pytest.raises(CaptureError, match=f"a model lies in {deeper}: name the folder that holds it"):
+        Capture.open(folder)
+    shutil.rmtree(folder / "dense")
+    with pytest.raises(CaptureError, match="run solve first"):
+        Capture.open(folder)
+
+
+@pytest.mark.parametrize(("suffix", "kind"), [(".png", np.uint8), (".png", np.uint16), (".tif", np.uint16)])
+def test_hidden_colours_of_frames_are_never_seen(suffix: str, kind: type, tmp_path: Path) -> None:
+    """BlenderNeRF's frames are transparent where nothing was rendered."""
+    folder = make_capture(tmp_path / "c", views=2, suffix=suffix)
+    top, seen = np.iinfo(kind).max, []
+    for hidden in (0, top):
+        for path in (folder / "images").iterdir():
+            codes = np.full((48, 64, 4), top // 2, kind)
+            codes[:, 40:, :3], codes[:, :20, 3], codes[:, 40:, 3] = hidden, top, 0
+            cv2.imwrite(str(path), codes)
+        capture = Capture.open(folder)
+        seen.append(capture.frame(capture.views[0]).linear())
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert not seen[0][:, 40:].any()
+    np.testing.assert_allclose(seen[0][:, 20:40], seen[0][:, :20].mean() / 2, rtol=0.01)
+
+
 def test_a_damaged_second_model_does_not_count(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c")
     (folder / "sparse/1").mkdir()

@@ -133,7 +133,7 @@ def read_record(work: Path) -> tuple[list[SourceFrame], list[str]] | None:
 
 def read_full_size(frame: SourceFrame) -> Picture:
     """Read the frame at full size, upright."""
-    return _to_upright(read_picture(Path(frame.file), space=frame.colour_space), frame.orientation)
+    return _to_upright(read_picture(Path(frame.file), space=frame.colour_space, over_black=True), frame.orientation)
 
 
 def _to_upright(picture: Picture, orientation: int) -> Picture:
@@ -153,7 +153,7 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
         scores = []
         for file in files:
             try:
-                scores.append(sharpness(read_picture(file, space=named).display().mean(axis=2)))
+                scores.append(sharpness(read_picture(file, space=named, over_black=True).display().mean(axis=2)))
             except FrameError:
                 scores.append(-1.0)
             progress.advance()
@@ -164,7 +164,7 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
         try:
             picture_size(file)
             orientation, focal = read_exif(file)
-            picture = _to_upright(read_picture(file, space=named), orientation)
+            picture = _to_upright(read_picture(file, space=named, over_black=True), orientation)
             aspect = read_data_window(file).aspect
         except FrameError as problem:
             left_out.append(str(problem))

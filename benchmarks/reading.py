@@ -37,7 +37,7 @@ def write_inputs(folder: Path, frames: int) -> dict[str, Path]:
     scene = cv2.resize(random.integers(20, 220, (40, 60, 3), np.uint8), (SIZE[0] + frames, SIZE[1] + frames),
                        interpolation=cv2.INTER_CUBIC)
     grain = random.integers(0, 24, (SIZE[1], SIZE[0], 3), np.uint8)
-    shown = [np.ascontiguousarray(scene[n:n + SIZE[1], n:n + SIZE[0]] + grain) for n in range(frames)]
+    pictures = [np.ascontiguousarray(scene[n:n + SIZE[1], n:n + SIZE[0]] + grain) for n in range(frames)]
     paths = {}
     for bits, pixels in ((8, "yuv420p"), (10, "yuv420p10le")):
         paths[f"HEVC, {bits} bits"] = folder / f"{bits}.mp4"
@@ -45,13 +45,13 @@ def write_inputs(folder: Path, frames: int) -> dict[str, Path]:
             stream = container.add_stream("libx265", rate=25, options={"preset": "ultrafast", "crf": "22",
                                                                        "x265-params": "log-level=none"})
             stream.width, stream.height, stream.pix_fmt = *SIZE, pixels
-            for picture in shown:
+            for picture in pictures:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
             container.mux(stream.encode())
     for kind, suffix in (("PNG", ".png"), ("JPEG", ".jpg")):
         paths[kind] = folder / kind
         paths[kind].mkdir()
-        for number, picture in enumerate(shown):
+        for number, picture in enumerate(pictures):
             cv2.imwrite(str(paths[kind] / f"{number:04d}{suffix}"), picture)
     return paths
 
@@ -96,7 +96,7 @@ def read_by_picture(folder: Path) -> int:
 
 def measure(readers: dict[str, Callable[[Path], int]], path: Path, frames: int,
             rounds: int) -> dict[str, tuple[float, float]]:
-    """Return milliseconds a frame of each reader, by the clock and of the processor."""
+    """Return for each reader the milliseconds per frame, of the clock and of the processor."""
     best = dict.fromkeys(readers, (np.inf, np.inf))
     for _ in range(rounds):
         for name, read in readers.items():

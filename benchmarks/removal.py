@@ -87,7 +87,7 @@ def draw_plate(path: Path, width: int, height: int) -> None:
         write_png(path, pixels)
 
 
-def one(plate: Path, size: int = WORKING_SIZE, weights: Path | None = None) -> None:
+def measure_plate(plate: Path, size: int = WORKING_SIZE, weights: Path | None = None) -> None:
     """Print seconds and peak megabytes; the process that `speed` measures."""
     began = time.perf_counter()
     remover = Remover(weights, working_size=size)
@@ -107,7 +107,7 @@ def speed(weights: Path | None = None) -> None:
             draw_plate(path, width, height)
             figures: dict[str, dict[str, float]] = {}
             for kind, size in (("working", WORKING_SIZE), ("full", width)):
-                subparser = [sys.executable, __file__, "one", str(path), "--size", str(size)]
+                subparser = [sys.executable, __file__, "measure_plate", str(path), "--size", str(size)]
                 done = subprocess.run(subparser + (["--weights", str(weights)] if weights else []), capture_output=True,
                                       text=True, check=False)
                 if done.returncode:
@@ -442,7 +442,8 @@ PARAMETERS: dict[str, dict[str, Any]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = parser.add_subparsers(required=True, metavar="BENCHMARK")
-    for benchmark in (speed, one, sample, clean, scenes, matte, against, coloured, confidence, aspheric, coverage):
+    for benchmark in (speed, measure_plate, sample, clean, scenes, matte, against, coloured, confidence, aspheric,
+                      coverage):
         aliases = ["odds"] if benchmark is confidence else []  # its former name
         subparser = names.add_parser(benchmark.__name__, aliases=aliases, help=inspect.getdoc(benchmark))
         subparser.set_defaults(benchmark=benchmark)

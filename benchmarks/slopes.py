@@ -100,10 +100,10 @@ def measure(kind: str, count: int) -> int:
     """Do the work of one kind, print its line, return the exit status."""
     torch.set_num_threads(1)
     progress = Sampling()
-    with tempfile.TemporaryDirectory(prefix="slopes-") as made:
-        WORK[kind](Path(made), count, progress)
-    kept = progress.samples[int(len(progress.samples) * WARM_UP):]
-    units, *columns = (list(map(float, column)) for column in zip(*kept, strict=True))
+    with tempfile.TemporaryDirectory(prefix="slopes-") as folder:
+        WORK[kind](Path(folder), count, progress)
+    samples = progress.samples[int(len(progress.samples) * WARM_UP):]
+    units, *columns = (list(map(float, column)) for column in zip(*samples, strict=True))
     memory, files, threads = (slope(units, column) for column in columns)
     print(f"| {kind} | {int(units[-1])} | {columns[0][0]:.0f} | {columns[0][-1]:.0f} | {memory:+.3f} | {files:+.3f} | "
           f"{threads:+.3f} |", flush=True)

@@ -75,7 +75,7 @@ def move_world(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Truth]:
-    """Return frames with exact flares. Each light is hidden for some frames, and behind an edge for two beside them."""
+    """Return frames with exact flares. Each light is hidden in some frames, and partly hidden in those next to them."""
     sources = sources_of(look)
     width, height = size
     truths = []

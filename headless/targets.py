@@ -170,11 +170,12 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
         if options.cameras is None:
             raise SettingsError(f"{to[0]} is a scene without cameras; name a capture that has them with --cameras.")
         return capture_target(Capture.open(options.cameras, need_frames=False), look, sources, lights=lights,
-                              scene=to[0], shown=True)
+                              scene=to[0], scene_is_background=True)
     if kind == "run":
         capture = (Capture.open(options.cameras, need_frames=False) if options.cameras else
                    Run.open(to[0]).capture(need_frames=False))
-        return capture_target(capture, look, sources, lights=lights, scene=options.scene or to[0] / SCENE, shown=True)
+        return capture_target(capture, look, sources, lights=lights, scene=options.scene or to[0] / SCENE,
+                              scene_is_background=True)
     if to[0].is_dir() and not any(to[0].iterdir()):
         raise CaptureError(f"{to[0]} is empty: neither pictures nor a capture; name a target for the flare.")
     return capture_target(Capture.open(to[0]), look, sources, lights=lights, scene=options.scene)

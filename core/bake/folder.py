@@ -53,10 +53,10 @@ class LayerFolder:
         first, *others = files.values()
         for path in others:
             if layers[path] != layers[first]:
-                here, there = (" and ".join(sorted(layers[one] - layers[two])) or "none of its own"
-                               for one, two in ((first, path), (path, first)))
-                raise FrameError(f"{folder} holds frames of two bakes: beside the layers of both {first.name} has "
-                                 f"{here}, {path.name} {there}; bake each into a folder of its own.")
+                only_first, only_other = (" and ".join(sorted(layers[a] - layers[b])) or "no others"
+                                          for a, b in ((first, path), (path, first)))
+                raise FrameError(f"{folder} holds frames of two bakes: beside the layers that both have, {first.name} "
+                                 f"has {only_first}, {path.name} has {only_other}; bake each into its own folder.")
         folder_layers = cls(folder, files)
         folder_layers._check_windows()
         return folder_layers

@@ -106,14 +106,14 @@ def match_frames(solve: CameraSolve) -> MatchedFrames:
     for name in paths:
         if name in files:
             continue
-        found = index.find(name)
-        if found is None or found in used:
+        file = index.find(name)
+        if file is None or file in used:
             missing.append(name)
             continue
-        used.add(found)
-        files[name] = safe_join(solve.root, found, CaptureError)
-        if canonical_name(found) != canonical_name(name):
-            renamed.append(f"{found} for {name}")
+        used.add(file)
+        files[name] = safe_join(solve.root, file, CaptureError)
+        if canonical_name(file) != canonical_name(name):
+            renamed.append(f"{file} for {name}")
     unposed = [name for name in index.names if name not in used]
     return MatchedFrames(files, missing, unposed, _describe(solve, files, missing, unposed, renamed))
 

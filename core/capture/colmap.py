@@ -153,8 +153,8 @@ def check_lens(lens: Lens, where: str) -> Lens:
 
 def _file_path(folder: Path, name: str) -> Path:
     """Return the path of a part of a model, in any case of letters; that of the text where there is none."""
-    found = (find_entry(folder, f"{name}{suffix}") for suffix in (".bin", ".txt"))
-    return next((path for path in found if path is not None and path.is_file()), folder / f"{name}.txt")
+    candidates = (find_entry(folder, f"{name}{suffix}") for suffix in (".bin", ".txt"))
+    return next((path for path in candidates if path is not None and path.is_file()), folder / f"{name}.txt")
 
 
 def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Any:
@@ -271,9 +271,9 @@ def _read_images_bin(file: _ByteReader) -> list[Image]:
         values = file.take("idddddddi")
         name = file.name()
         count = file.count(_POINT2D.itemsize)
-        found = np.frombuffer(file.data, _POINT2D, count, file.at)["point"]
+        point_ids = np.frombuffer(file.data, _POINT2D, count, file.at)["point"]
         file.skip(count * _POINT2D.itemsize)
-        images.append((name, values[8], values[1:5], values[5:8], found))
+        images.append((name, values[8], values[1:5], values[5:8], point_ids))
     return images
 
 

@@ -52,17 +52,17 @@ def matching_pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     out.
     """
     matches: dict[str, Path] = {}
-    found = find_entry(folder.parent, folder.name)
-    if found is None or not found.is_dir():
+    layer = find_entry(folder.parent, folder.name)
+    if layer is None or not layer.is_dir():
         return matches
-    pictures = PictureIndex(found)
+    pictures = PictureIndex(layer)
     for name in names:
-        safe_join(found, name, CaptureError)
+        safe_join(layer, name, CaptureError)
         match = pictures.find(name)
         if match is not None:
-            matches[name] = safe_join(found, match, CaptureError)
+            matches[name] = safe_join(layer, match, CaptureError)
     if pictures.paths and names and not matches:
-        raise CaptureError(f"{found} holds {len(pictures.paths)} pictures, the first {pictures.paths[0].name}, and "
+        raise CaptureError(f"{layer} holds {len(pictures.paths)} pictures, the first {pictures.paths[0].name}, and "
                            f"none has the name of a frame, such as {names[0]}; give them the frames' names.")
     return matches
 
@@ -73,12 +73,12 @@ def mask_pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     0001.jpg has the mask 0001.png or 0001.jpg.png. Frames without a mask are left out.
     """
     masks: dict[str, Path] = {}
-    found = find_entry(folder.parent, folder.name)
-    if found is None or not found.is_dir():
+    mask_folder = find_entry(folder.parent, folder.name)
+    if mask_folder is None or not mask_folder.is_dir():
         return masks
-    pictures = PictureIndex(found)
+    pictures = PictureIndex(mask_folder)
     for name in names:
         match = pictures.find(f"{name}.png") or pictures.find(name)
         if match is not None:
-            masks[name] = safe_join(found, match, CaptureError)
+            masks[name] = safe_join(mask_folder, match, CaptureError)
     return masks

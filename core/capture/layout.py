@@ -67,7 +67,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def is_model(folder: Path) -> bool:
     """True if a folder has the cameras of a COLMAP model."""
-    return any((found := find_entry(folder, f"cameras{suffix}")) is not None and found.is_file()
+    return any((cameras := find_entry(folder, f"cameras{suffix}")) is not None and cameras.is_file()
                for suffix in (".bin", ".txt"))
 
 
@@ -108,7 +108,7 @@ def frames_folder(folder: Path, model: Path) -> Path:
     """
     for parent in (folder, model, model.parent, model.parent.parent):
         if parent.is_relative_to(folder):
-            found = find_entry(parent, "images")
-            if found is not None and found.is_dir():
-                return found
+            images = find_entry(parent, "images")
+            if images is not None and images.is_dir():
+                return images
     return model if model == folder else folder / "images"

@@ -79,7 +79,7 @@ def _describe(names: Sequence[str], reading: str) -> str:
 
 def _compare_colours(frames: Sequence[TurnedFrame], points: PointCloud) -> bool | None:
     """Return True if the points' colours match the frames as shown, False as stored, None where they do not decide."""
-    stored = shown = 0.0
+    error_stored = error_upright = 0.0
     number = 0
     for frame in frames[::max(len(frames) // SAMPLED_FRAMES, 1)][:SAMPLED_FRAMES]:
         try:
@@ -89,10 +89,11 @@ def _compare_colours(frames: Sequence[TurnedFrame], points: PointCloud) -> bool 
         errors = [_colour_error(reading, frame.posed, points)
                   for reading in (picture, apply_orientation(picture, frame.orientation))]
         if None not in errors:
-            stored, shown, number = stored + (errors[0] or 0), shown + (errors[1] or 0), number + 1
-    if not number or min(stored, shown) > MAX_ERROR_RATIO * max(stored, shown):
+            error_stored, error_upright = error_stored + (errors[0] or 0), error_upright + (errors[1] or 0)
+            number += 1
+    if not number or min(error_stored, error_upright) > MAX_ERROR_RATIO * max(error_stored, error_upright):
         return None
-    return shown < stored
+    return error_upright < error_stored
 
 
 def _colour_error(picture: Pixels, posed: PosedFrame, points: PointCloud) -> float | None:

@@ -105,10 +105,10 @@ def _read_frame(path: Path, number: int, meta: dict[str, Any], frame: Any, lense
     mask = frame.get("mask_path")
     if isinstance(mask, str):
         file = safe_join(path.parent, mask, CaptureError)
-        found = find_entry(path.parent, file.relative_to(path.parent).as_posix())
-        if found is None or not found.is_file():
+        mask_file = find_entry(path.parent, file.relative_to(path.parent).as_posix())
+        if mask_file is None or not mask_file.is_file():
             raise CaptureError(f"{where} its mask {file} is missing; put it there, or remove mask_path.")
-        result.masks[name] = found
+        result.masks[name] = mask_file
     return name
 
 
@@ -141,10 +141,10 @@ def _read_lists(path: Path, meta: dict[str, Any], result: Transforms) -> None:
         if unknown := sorted(name for name in names if canonical_name(name) not in known):
             raise CaptureError(f"{path}: {key} names {unknown[0]}, which is not a frame of the file; correct it or "
                                "export the file again.")
-    found = {key: {known[canonical_name(name)] for name in names} for key, names in lists.items()}
-    result.training = found.get("train_filenames")
-    if "val_filenames" in found or "test_filenames" in found:
-        result.held_out = found.get("val_filenames", set()) | found.get("test_filenames", set())
+    frames_by_list = {key: {known[canonical_name(name)] for name in names} for key, names in lists.items()}
+    result.training = frames_by_list.get("train_filenames")
+    if "val_filenames" in frames_by_list or "test_filenames" in frames_by_list:
+        result.held_out = frames_by_list.get("val_filenames", set()) | frames_by_list.get("test_filenames", set())
 
 
 def _with_suffix(folder: Path, name: str) -> str:
@@ -251,10 +251,10 @@ def _read_points(path: Path, meta: dict[str, Any], result: Transforms) -> PointC
     folder, name = path.parent, meta.get("ply_file_path")
     if isinstance(name, str):
         file = safe_join(folder, Path(name).as_posix(), CaptureError)
-        found = find_entry(folder, file.relative_to(folder).as_posix())
-        if found is None or not found.is_file():
+        cloud_file = find_entry(folder, file.relative_to(folder).as_posix())
+        if cloud_file is None or not cloud_file.is_file():
             raise CaptureError(f"{file} is missing, which {path} names as its points.")
-        return read_points(found)
+        return read_points(cloud_file)
     model, sentence = choose_model(find_models(folder, LATER_MODEL_PLACES), folder)
     if model is None:
         return PointCloud.empty()

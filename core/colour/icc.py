@@ -75,8 +75,8 @@ def _space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> Colou
         return light if is_709 else light @ forward
 
     def from_linear(light: NDArray[Any]) -> Pixels:
-        own = np.asarray(light, np.float32) if is_709 else np.asarray(light, np.float32) @ inverse
-        values = np.stack([_invert(curves[k], increasing[k], ramp, own[..., k]) for k in range(3)], -1)
+        profile_light = np.asarray(light, np.float32) if is_709 else np.asarray(light, np.float32) @ inverse
+        values = np.stack([_invert(curves[k], increasing[k], ramp, profile_light[..., k]) for k in range(3)], -1)
         return np.asarray(values, np.float32)
 
     return ColourSpace(f"profile {name}", to_linear, from_linear)

@@ -41,13 +41,13 @@ def ensure_points(capture: Capture, settings: FitSettings, progress: Progress) -
     if len(capture.points) or settings.scene.start:
         return capture, ()
     xyz, rgb, observed = _triangulate(capture, progress)
-    made = f"{len(xyz)} points that were triangulated from matches of its frames"
+    source = f"{len(xyz)} points that were triangulated from matches of its frames"
     if len(xyz) < MIN_TRIANGULATED:
         random_xyz, random_rgb = _random_points(capture, xyz, settings.seed)
         xyz, rgb = np.concatenate([xyz, random_xyz]), np.concatenate([rgb, random_rgb])
-        made = (f"{made} and " if len(observed) else "") + f"{len(random_xyz)} random ones in the cameras' view"
+        source = (f"{source} and " if len(observed) else "") + f"{len(random_xyz)} random ones in the cameras' view"
     cloud = PointCloud(xyz.astype(np.float32), rgb, np.zeros(len(xyz), np.float32))
-    return capture.with_points(cloud, observed), (f"{capture.folder} has no 3D points: the fit starts from {made}.",)
+    return capture.with_points(cloud, observed), (f"{capture.folder} has no 3D points: the fit starts from {source}.",)
 
 
 def _triangulate(capture: Capture,

@@ -54,21 +54,21 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
             if run.finished:
                 progress.say(f"The fit in {folder} is finished already.")
             else:
-                capture, made = ensure_points(capture, run.settings, progress)
+                capture, sentences = ensure_points(capture, run.settings, progress)
                 trainer = Trainer(capture, run.settings, run.exposures)
                 remove_partials_below(folder)
                 if (folder / CHECKPOINT).exists():
                     trainer.load_state(checkpoint.load(folder / CHECKPOINT))
                 else:
-                    _report((*made, *trainer.warnings), run, progress)
+                    _report((*sentences, *trainer.warnings), run, progress)
                 _run_to_end(trainer, run, progress)
         return run
     settings, warnings = resolve_white(settings.validated(), capture)
-    capture, made = ensure_points(capture, settings, progress)
+    capture, sentences = ensure_points(capture, settings, progress)
     trainer = Trainer(capture, settings, progress=progress)  # before anything is written: it may refuse the capture
     with folder_lock(folder):
         run = Run.create(folder, settings, capture.folder, trainer.exposures)
-        _report((*warnings, *made, *trainer.warnings), run, progress)
+        _report((*warnings, *sentences, *trainer.warnings), run, progress)
         _run_to_end(trainer, run, progress)
     return run
 

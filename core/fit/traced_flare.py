@@ -178,8 +178,8 @@ def _fit_settings(settings: TracedFlareSettings) -> FitSettings:
     base = preset("draft", blend="add", iterations=fit.iterations)
     density = replace(base.flare.density, start=max(fit.iterations // 10, 10), stop=int(fit.iterations * 0.7),
                       max_gaussians=fit.max_gaussians)
-    # The light's position is known, and its core is a few pixels: a correction, or large steps of the positions, would
-    # move it off its pixels, and the loss would turn it dark instead of moving it back.
+    # The light's position is known, and its core is a few pixels wide. A correction, or large steps of the positions,
+    # would move the core off its pixels, and the loss would darken it there instead of moving it back.
     form = replace(base.flare.form, light_correction=False)
     rates = replace(base.flare.rates, position=base.flare.rates.position / 4, network=base.flare.rates.network / 2)
     return replace(base, flare=replace(base.flare, form=form, rates=rates, count=fit.gaussians, density=density,
@@ -230,11 +230,10 @@ def _new_model(settings: TracedFlareSettings, fit: FitSettings, traced: TracedPi
 
 
 def _start_at_light(flare: LightFlare, reach: float, pixel: float, generator: torch.Generator) -> None:
-    """Move a share of the first Gaussians to the light, as rays of log-uniform length, and scale the others, which are
-    sized for a normal lens, to the frame.
+    """Move a share of the initial Gaussians to the light, as rays of log-uniform length, and scale all to the frame.
 
-    Starburst and glow, most of a flare's light, follow the light without changing; along the line few would lie there.
-    reach: half the frame's width; pixel: of the traced pictures, normalised coordinates.
+    Starburst and glow have most of a flare's light and stay at the light, where few of the Gaussians along the line
+    would lie. reach: half the frame's width, pixel: width of a pixel of the traced pictures, normalised coordinates.
     """
     rows = flare.gaussians
     with torch.no_grad():
@@ -259,6 +258,7 @@ def _start_at_light(flare: LightFlare, reach: float, pixel: float, generator: to
 
 
 def _encode(light: Tensor) -> Tensor:
+    """Encode linear light for the loss."""
     encoded: Tensor = (light.clamp_min(0) + ENCODING_OFFSET).sqrt()
     return encoded
 

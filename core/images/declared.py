@@ -63,18 +63,18 @@ def jpeg_profile(stream: BinaryIO) -> bytes:
 def _png_space(path: Path) -> ColourSpace | None:
     """Return the space of a PNG, by the order of its specification (third edition, 4.3): cICP, iCCP, sRGB, gAMA."""
     with open_regular(path) as stream:
-        found = dict(png.chunks(stream, (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM"), before_pixels=True))
-    points = found.get(b"cICP", b"")
+        contents = dict(png.chunks(stream, (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM"), before_pixels=True))
+    points = contents.get(b"cICP", b"")
     if len(points) == 4 and (space := space_of_code_points(points[0], points[1])) is not None:
         return space
-    if b"iCCP" in found:
-        space = profile_space(path, _inflate(found[b"iCCP"].partition(b"\0")[2][1:]))
+    if b"iCCP" in contents:
+        space = profile_space(path, _inflate(contents[b"iCCP"].partition(b"\0")[2][1:]))
         if space is not None:
             return space
-    if b"sRGB" in found:
+    if b"sRGB" in contents:
         return colour_space("srgb")
-    gamma = int.from_bytes(found.get(b"gAMA", b""), "big")
-    primaries = _chromaticities(found.get(b"cHRM", b""))
+    gamma = int.from_bytes(contents.get(b"gAMA", b""), "big")
+    primaries = _chromaticities(contents.get(b"cHRM", b""))
     if not gamma and primaries is None:
         return None
     if not gamma or _SRGB_GAMMAS[0] <= gamma <= _SRGB_GAMMAS[1]:

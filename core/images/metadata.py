@@ -91,15 +91,15 @@ def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
     if encoded[2:4] == b"\xff\xe0":
         at = 4 + int.from_bytes(encoded[4:6], "big")
         header = encoded[2:at]
-    kept = []
+    copied = []
     for marker, content in jpeg.segments(io.BytesIO(data)):
         if marker == 0xE0 and content.startswith(b"JFIF\0") and len(content) >= 14:
             header = jpeg.make_segment(marker, content[:12] + b"\0\0")  # density, without its thumbnail
         elif marker in _MARKERS and not content.startswith((_INDEX, _ISO_GAIN_MAP)):
             content = _without_claims(content) if content.startswith(_XMP) else content
             if content:
-                kept.append(jpeg.make_segment(marker, content))
-    return encoded[:2] + header + b"".join(kept) + encoded[at:]
+                copied.append(jpeg.make_segment(marker, content))
+    return encoded[:2] + header + b"".join(copied) + encoded[at:]
 
 
 def _has_claims(segment: bytes) -> bool:

@@ -139,11 +139,11 @@ class Plate:
         codes, changed = self.codes.copy(), (light != 0).any(-1)
         if codes.dtype.kind == "f":
             changed &= np.isfinite(codes).all(-1)
-        values, taken = self.codes[changed].astype(np.float32) / np.float32(self.max_code), light[changed]
+        values, removed = self.codes[changed].astype(np.float32) / np.float32(self.max_code), light[changed]
         if self.space.is_linear:
-            values = values - self.space.from_linear(taken)
+            values = values - self.space.from_linear(removed)
         else:
-            values = self.space.from_linear(self.space.to_linear(values) - taken)
+            values = self.space.from_linear(self.space.to_linear(values) - removed)
         if codes.dtype.kind == "u":
             codes[changed] = (np.clip(values, 0, 1) * np.float32(self.max_code) + np.float32(0.5)).astype(codes.dtype)
         else:

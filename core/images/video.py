@@ -165,10 +165,10 @@ class Video:
         self.path = Path(path)
         self._start = 0
         self._container: Any = None
-        self._begun: Iterator[Any] | None = None
-        """All frames, for the first iteration: to open and decode anew takes as long as several frames."""
+        self._first_pass: Iterator[Any] | None = None
+        """All frames, for the first iteration: opening and decoding anew takes as long as several frames."""
         self.problems: list[str] = []
-        """Sentences about frames that the last iteration did not get or got damaged."""
+        """Sentences about missing and damaged frames of the last iteration."""
         try:
             self._open()
             decoded = self._decode()
@@ -179,7 +179,7 @@ class Video:
         if first is None:
             self.close()
             raise self._unreadable()
-        self._begun = itertools.chain((first,), decoded)
+        self._first_pass = itertools.chain((first,), decoded)
         self.colour = _colour_of(self.path, first, self.stream)
         """What the codes of the first frame mean."""
         self.matrix = display_matrix(first)
@@ -204,7 +204,7 @@ class Video:
 
     def close(self) -> None:
         """Close the file."""
-        self._begun = None
+        self._first_pass = None
         if self._container is not None:
             self._container.close()
             self._container = None
@@ -232,7 +232,7 @@ class Video:
             self.problems.append(f"{len(damaged)} of {number - start} frames of {self.path} are damaged ({names}); "
                                  "copy it again.")
         if number < self.length and start == 0:
-            self.problems.append(f"The header of {self.path} promises {self.length} frames, and {number} could be read"
+            self.problems.append(f"The header of {self.path} declares {self.length} frames, and {number} could be read"
                                  "; if it is cut off, copy it again.")
 
     def check_named_space(self, name: str) -> None:
@@ -273,7 +273,7 @@ class Video:
                           "it again, or convert it to MP4 (H.264).")
 
     def _decode(self) -> Iterator[Any]:
-        """Yield PyAV's frames from the present position; what cannot be decoded is passed over, and missing then."""
+        """Yield PyAV's frames from the present position on, without those that cannot be decoded."""
         av = import_av()
         errors = (av.error.FFmpegError, OSError, ValueError, RuntimeError, MemoryError)
         packets = self._container.demux(self.stream)
@@ -296,9 +296,9 @@ class Video:
 
     def _frames_from(self, number: int) -> Iterator[Any]:
         """Yield PyAV's frames from frame `number` on."""
-        begun, self._begun = self._begun, None
-        if number == 0 and begun is not None:
-            yield from begun
+        first_pass, self._first_pass = self._first_pass, None
+        if number == 0 and first_pass is not None:
+            yield from first_pass
             return
         self._open()
         if number == 0:
@@ -355,6 +355,7 @@ class Video:
         return sum(not entry.is_discard for entry in entries) if len(entries) else int(stream.frames)
 
     def _length_by_duration(self) -> int:
+        """Return the approximate number of frames by the duration; 0 where it is unknown."""
         seconds = Fraction(self._container.duration or 0, 1_000_000)
         return max(int(seconds * self.rate), 0)
 
@@ -387,7 +388,7 @@ def _colour_of(path: Path, raw: Any, stream: Any) -> VideoColour:
     """Return what a frame's codes mean by its tags. Raises FrameError for colours that cannot be converted."""
     context = stream.codec_context
 
-    def tag(of_frame: int, of_container: int) -> int:
+    def tag(of_frame: int, of_container: int) -> int:  # the frame's, unless only the container has one
         return int(of_container if of_frame in (UNSPECIFIED, 0) and of_container else of_frame)
 
     matrix, transfer, primaries = (tag(*pair) for pair in (

@@ -153,13 +153,13 @@ def _output_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFo
     """Return the planar format that is encoded: the source's, or the nearest that the encoder takes."""
     av = import_av()
     _, planar = to_planar(first.raw, video.colour.limited)
-    taken = {pixel_format.name for pixel_format in av.codec.Codec(encoder.name, "w").video_formats or ()}
-    if encoder.keeps(planar) and planar.name in taken and not (encoder.limited and not video.colour.limited):
+    accepted = {pixel_format.name for pixel_format in av.codec.Codec(encoder.name, "w").video_formats or ()}
+    if encoder.keeps(planar) and planar.name in accepted and not (encoder.limited and not video.colour.limited):
         return planar
     name, plain = encoder.fallback, planar.name.replace("yuvj", "yuv")
     if encoder.alpha is None:
         plain = plain.replace("yuva", "yuv")
-    if plain in taken and not encoder.limited:
+    if plain in accepted and not encoder.limited:
         name = plain
     elif planar.has_alpha and encoder.alpha is not None:
         name = encoder.alpha

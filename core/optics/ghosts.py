@@ -110,7 +110,12 @@ def _non_negative_span(start: float, slope: float, left: float, right: float) ->
 def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: Array, stop_x: Array,
                stop_y: Array, radius: float, edges: Array, rim: float, colour: Array,
                picture: NDArray[np.float32]) -> None:
-    """Add the cells of a traced grid to `picture`. px, py: pixels; light: density by ray."""
+    """Add the cells of a traced grid to `picture`, each as two triangles.
+
+    rays: (rows, columns, FIELDS). arrived: which of them reach the sensor. px, py: where, in pixels. light: their
+    density. stop_x, stop_y: (rows, columns, passages) on the stop, mm, of radius `radius`; edges: its `edge_radius`.
+    rim: see `GhostSettings`.
+    """
     rows, columns = px.shape
     height, width = picture.shape[0], picture.shape[1]
     sectors = edges.shape[0]
@@ -134,7 +139,7 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
                 area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
                 if area == 0.0:
                     continue
-                # How far the stop's coordinates run within a pixel is how soft its edge is drawn.
+                # The edge's width is the distance on the stop, relative to its radius, that one pixel covers.
                 s0x, s0y = stop_x[r0, c0, 0], stop_y[r0, c0, 0]
                 stop_area = ((stop_x[r1, c1, 0] - s0x) * (stop_y[r2, c2, 0] - s0y)
                              - (stop_x[r2, c2, 0] - s0x) * (stop_y[r1, c1, 0] - s0y))

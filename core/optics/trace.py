@@ -69,8 +69,9 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
               out: Array) -> bool:
     """Trace one ray that meets the plane z = 0 at (x, y), from a light at tan(field angle) = `slope` along +x.
 
-    first < second: the pair that reflects; both -1 for none. Returns False where the ray misses a surface or is
-    reflected totally. `out` (FIELDS,) receives the result.
+    first < second: the pair of surfaces that reflects; both -1 for none. The arrays describe the surfaces, as in
+    `Prescription`; stop: index of the stop; sensor: its z. Returns False where the ray misses a surface or is reflected
+    totally. `out` (FIELDS,) receives the result.
     """
     length = math.sqrt(1.0 + slope * slope)
     dx, dy, dz = -slope / length, 0.0, 1.0 / length
@@ -144,7 +145,10 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
 def trace_grid(xs: Array, ys: Array, slope: float, first: int, second: int, curvature: Array, vertices: Array,
                index: Array, semi_aperture: Array, coating: Array, stop: int, sensor: float,
                wavelength: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Trace rays through the points xs x ys of the plane z = 0: (rows, columns, FIELDS), and which arrived."""
+    """Trace a ray through each point of the grid xs x ys on the plane z = 0; see `trace_ray` for the other arguments.
+
+    Returns the rays (rows, columns, FIELDS), and which of them reach the sensor.
+    """
     rays = np.zeros((ys.shape[0], xs.shape[0], FIELDS))
     arrived = np.zeros((ys.shape[0], xs.shape[0]), np.bool_)
     for row in range(ys.shape[0]):

@@ -85,12 +85,11 @@ class TargetFrame:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Frames of the whole shot, in order. scene: hides lights; shown: the scene is the background of frames without a
-    plate."""
+    """Frames of the whole shot, in order. scene: hides lights. scene_is_background: frames without a plate show it."""
 
     frames: tuple[TargetFrame, ...]
     scene: SceneGaussians | None = None
-    shown: bool = False
+    scene_is_background: bool = False
     warnings: tuple[str, ...] = ()
     """Sentences for the user."""
 
@@ -194,7 +193,7 @@ def _most_similar_sources(
 
 
 def capture_target(capture: Capture, look: Look, requested: SourceNames, *, lights: Path | None = None,
-                   scene: Path | None = None, shown: bool = False) -> Target:
+                   scene: Path | None = None, scene_is_background: bool = False) -> Target:
     """Return a target of a capture's views. lights: a lights.json instead of the capture's. scene: a 3DGS PLY in its
     world, which hides lights; shown: the scene is the background instead of the frames.
 
@@ -211,7 +210,7 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
     frames = []
     for frame in number_views(views):
         view = views[frame.view]
-        path = None if shown else capture.frame_path(view)
+        path = None if scene_is_background else capture.frame_path(view)
         is_stored_as_seen = view.lens is None and not view.upright
         undistorted = None if is_stored_as_seen or path is None else _undistorted(capture, view)
         window = camera_window(view.camera, path) if undistorted is None and path is not None else None
@@ -220,7 +219,7 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
                                    light.extent) for light, state in zip(known, states, strict=True))
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)
         frames.append(TargetFrame(frame, shot, path, undistorted, window, space=capture.plate_space))
-    return Target(_share_windows(frames), read_ply(scene) if scene else None, shown)
+    return Target(_share_windows(frames), read_ply(scene) if scene else None, scene_is_background)
 
 
 def _undistorted(capture: Capture, view: View) -> Callable[[ColourSpace | None], Picture]:

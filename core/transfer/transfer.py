@@ -317,7 +317,7 @@ class _FrameRenderer:
                 return move_to_window(plate.linear, stored, frame.window), no_depth
             picture = Picture(crop_to_display_window(plate.linear, stored), "linear")
             return np.asarray(picture.resized(*camera.size).pixels, np.float32), no_depth
-        if target.scene is not None and target.shown:
+        if target.scene is not None and target.scene_is_background:
             rendering = render_scene(target.scene, camera)
             return decode(rendering.colour.clamp(0, target.scene.display_white)).numpy(), rendering.depth.numpy()
         return np.zeros((camera.height, camera.width, 3), np.float32), no_depth

@@ -93,7 +93,7 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     root = _add_object(collection, f"{collection.name} Root", None, None)
     root.empty_display_type, root.empty_display_size = "ARROWS", 0.2 * extent
     root.rotation_euler, root.scale = UP_ROTATIONS[settings.up], (settings.scale,) * 3
-    made = _add_cameras(collection, root, capture, extent, settings, scene, notes)
+    camera_objects = _add_cameras(collection, root, capture, extent, settings, scene, notes)
     if settings.points and len(capture.points):
         _add_points(collection, root, capture.points)
     lights = tuple(add_light(collection, root, light.name, light.xyz, 0.02 * extent) for light in capture.lights)
@@ -107,14 +107,14 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     if settings.frames:
         state.over = "plate"
     state.mode = "default" if has_exact_clean_frames(capture) else "estimated"
-    scene.camera = made[0]
+    scene.camera = camera_objects[0]
     if settings.match_scene:
         notes += [note for note in [show_as_filmed(scene)] if note]
     if not lights:
         notes.append("The capture has no lights yet; find or add them in the panel Lights.")
     if any(view.lens for view in capture.views) and settings.frames:
         notes.append("The frames behind the camera show the lens's distortion; the cameras have none.")
-    return Imported(root, made, lights, tuple(notes))
+    return Imported(root, camera_objects, lights, tuple(notes))
 
 
 def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> Any:
@@ -148,7 +148,7 @@ def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, se
         scene.frame_start, scene.frame_end = min(number.values()), max(number.values())
         scene.frame_set(scene.frame_start)
     notes += camera_differences([view.camera for view in capture.views])
-    made: list[Any] = []
+    camera_objects: list[Any] = []
     for folder, views in folders.items():
         label = "Camera" if folder == "." else f"Camera {folder}"
         if settings.cameras == "animated":
@@ -158,15 +158,15 @@ def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, se
             if settings.frames and not _show_sequence(camera, capture, views, [number[view.name] for view in views]):
                 notes.append(f"The frames of {label} have no common numbering, so only the first is shown behind it; "
                              "import with one camera for each frame to see all.")
-            made.append(camera)
+            camera_objects.append(camera)
         else:
             for view in views:
                 camera = _add_camera(collection, root, Path(view.name).stem, view, aspect, 0.08 * extent)
                 camera.fit_flare.view = view.name
                 if settings.frames:
                     _add_background(camera, load_image(capture.frame_path(view)))
-                made.append(camera)
-    return tuple(made)
+                camera_objects.append(camera)
+    return tuple(camera_objects)
 
 
 def camera_differences(all_cameras: Sequence[Camera]) -> Iterator[str]:

@@ -83,18 +83,18 @@ def _add_nodes(group: Any, layers: Sequence[str]) -> None:
     """Add the nodes that compute Flare and Image."""
     entry = new_node(group, "NodeGroupInput", 0, 0)
     sized = [scale_to_render_size(group, entry.outputs[name], 1, -row) for row, name in enumerate(layers, 1)]
-    gained = [_mix(group, "MULTIPLY", one.outputs[0], entry.outputs[gain_input(name)], 2, -row)
-              for row, (name, one) in enumerate(zip(layers, sized, strict=True), 1)]
+    gained = [_mix(group, "MULTIPLY", scaled_layer.outputs[0], entry.outputs[gain_input(name)], 2, -row)
+              for row, (name, scaled_layer) in enumerate(zip(layers, sized, strict=True), 1)]
     total = gained[0]
-    for column, one in enumerate(gained[1:], 3):
-        total = _mix(group, "ADD", total, one, column, -1)
+    for column, layer in enumerate(gained[1:], 3):
+        total = _mix(group, "ADD", total, layer, column, -1)
     column = len(layers) + 2
     tinted = _mix(group, "MULTIPLY", total, entry.outputs["Tint"], column, -1)
     scaled = _mix(group, "MULTIPLY", tinted, entry.outputs["Intensity"], column + 1, -1)
     image = _mix(group, "ADD", entry.outputs["Scene"], scaled, column + 2, 0)
-    leave = new_node(group, "NodeGroupOutput", column + 6, 0)
-    group.links.new(image, leave.inputs["Image"])
-    group.links.new(_add_matte(group, scaled, column + 2), leave.inputs["Flare"])
+    output = new_node(group, "NodeGroupOutput", column + 6, 0)
+    group.links.new(image, output.inputs["Image"])
+    group.links.new(_add_matte(group, scaled, column + 2), output.inputs["Flare"])
 
 
 def _add_matte(group: Any, colour: Any, column: int) -> Any:

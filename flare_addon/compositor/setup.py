@@ -167,10 +167,10 @@ def footage_nodes(scene: Any) -> list[Any]:
 def footage_behind_camera(scene: Any) -> tuple[Any, int, int, int]:
     """Return the footage behind the scene's camera for `set_up`. Raises FrameError where there is none."""
     camera = scene.camera
-    for back in camera.data.background_images if camera is not None and camera.type == "CAMERA" else ():
-        if back.source == "IMAGE" and back.image is not None:
-            user = back.image_user
-            return back.image, user.frame_start, user.frame_offset, user.frame_duration
+    for background in camera.data.background_images if camera is not None and camera.type == "CAMERA" else ():
+        if background.source == "IMAGE" and background.image is not None:
+            user = background.image_user
+            return background.image, user.frame_start, user.frame_offset, user.frame_duration
     raise FrameError("The camera has no footage behind it; put the flare over the present image instead.")
 
 
@@ -219,7 +219,8 @@ def _image_under_flare(tree: Any, node: Any, state: Any) -> Any:
     not count.
     """
     feeder = tree.nodes.get(state["from"])
-    stored = next((one for one in feeder.outputs if one.identifier == state["socket"]), None) if feeder else None
+    outputs = feeder.outputs if feeder else ()
+    stored = next((output for output in outputs if output.identifier == state["socket"]), None)
     for socket in (_feeding_socket(node.inputs.get("Scene")), stored):
         if socket is not None and not _is_ours(socket.node) and not _depends_on(socket.node, node):
             return socket
@@ -247,8 +248,8 @@ def _undo_set_up(scene: Any, tree: Any, source: Any, node_settings: dict[str, An
 
 def _render_node(tree: Any) -> Any:
     """Return the first Render Layers node; one is added where there is none."""
-    found = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
-    return found or _set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
+    render = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
+    return render or _set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
 
 
 def _footage_node(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
@@ -304,15 +305,15 @@ def remove(scene: Any) -> None:
     _remove_crops(tree)
     for name in _OUR_NODES:
         ours = tree.nodes.get(name)
-        if ours is not None and not (name == RENDER and any(one.is_linked for one in ours.outputs)):
+        if ours is not None and not (name == RENDER and any(socket.is_linked for socket in ours.outputs)):
             tree.nodes.remove(ours)
-    if not state["tree"] and all(one.bl_idname in (_OUTPUT_TYPE, "CompositorNodeViewer") or one.name == RENDER
-                                 for one in tree.nodes):
+    if not state["tree"] and all(node.bl_idname in (_OUTPUT_TYPE, "CompositorNodeViewer") or node.name == RENDER
+                                 for node in tree.nodes):
         _discard_tree(scene, tree, bool(state["use_nodes"]))
     elif state["tree"]:
         if state.get("nodes") is not None:
             known = state["nodes"].split("\n")
-            for extra in [one for one in tree.nodes if one.name not in known and one.bl_idname == _OUTPUT_TYPE]:
+            for extra in [node for node in tree.nodes if node.name not in known and node.bl_idname == _OUTPUT_TYPE]:
                 if not any(socket.is_linked for socket in extra.inputs):
                     tree.nodes.remove(extra)
         if not GROUPS_ARE_TREES:
@@ -413,8 +414,8 @@ def _show_layers(node: Any, layers: LayerFolder) -> None:
 def is_over_render(scene: Any) -> bool:
     """Return whether the flare goes over the render of the scene."""
     node = find_node(scene)
-    return node is not None and any(_depends_on(node, one) for one in tree_of(scene).nodes
-                                    if one.bl_idname == "CompositorNodeRLayers")
+    return node is not None and any(_depends_on(node, candidate) for candidate in tree_of(scene).nodes
+                                    if candidate.bl_idname == "CompositorNodeRLayers")
 
 
 def colour_space_warning(scene: Any) -> str:

@@ -35,7 +35,7 @@ def test_frames_with_other_layers_are_refused(tmp_path: Path) -> None:
     frame(tmp_path, 1, ["sun"])
     frame(tmp_path, 2, ["sun"])
     frame(tmp_path, 3, ["sun", "lamp"])
-    with pytest.raises(FrameError, match=r"two bakes.*layers\.0001\.exr has none of its own, layers\.0003\.exr .*lamp"):
+    with pytest.raises(FrameError, match=r"two bakes.*layers\.0001\.exr has no others, layers\.0003\.exr .*lamp"):
         LayerFolder.open(tmp_path)
 
 

@@ -81,7 +81,7 @@ def test_missing_frames_of_a_video_are_reported_each_time(tmp_path: Path) -> Non
     clip.write_bytes(whole[:len(whole) * 6 // 10])
     for count in (1, 2):
         extract_frames(clip, tmp_path / "cut", heard)
-        assert len([sentence for sentence in heard.texts if "promises 4 frames" in sentence]) == count
+        assert len([sentence for sentence in heard.texts if "declares 4 frames" in sentence]) == count
 
 
 def test_an_unreadable_or_cancelled_video_leaves_no_frames(tmp_path: Path) -> None:

@@ -378,7 +378,7 @@ def test_a_truncated_video_is_reported(tmp_path: Path) -> None:
     assert not heard.texts
     video.write_bytes(video.read_bytes()[:video.stat().st_size // 2])
     prepare_frames(video, tmp_path / "cut", 4, 400, heard)
-    assert len(heard.texts) == 1 and "shot.avi promises 12 frames, and " in heard.texts[0], heard.texts
+    assert len(heard.texts) == 1 and "shot.avi declares 12 frames, and " in heard.texts[0], heard.texts
 
 
 def test_the_small_frames_of_a_squeezed_video_are_not(tmp_path: Path) -> None:

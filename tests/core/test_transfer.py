@@ -226,7 +226,7 @@ def test_the_scene_of_the_target_hides_its_lights(flare: Path, look: Look, tmp_p
     transfer = Transfer(flare, there, TransferSettings(smooth=0))
     assert transfer.visibility(0, "lamp") == 0, "splats are never quite opaque, but hide all the same"
     assert transfer.visibility(1, "lamp") == 1
-    shown = Transfer(flare, replace(there, shown=True), TransferSettings(smooth=0))
+    shown = Transfer(flare, replace(there, scene_is_background=True), TransferSettings(smooth=0))
     rendering = shown.frame_renderer(there.frames[0].frame).render(camera)
     assert rendering.scene.max() > 0.1
     assert rendering.depth.max() > 1

@@ -338,13 +338,13 @@ def _model_folders(work: Path) -> list[Path] | None:
     return [work / MODELS_FOLDER / name for name in names]
 
 
-def _refine_principal_point(pycolmap: Any, found: Any) -> Any:
+def _refine_principal_point(pycolmap: Any, model: Any) -> Any:
     """Run bundle adjustment with free principal points; returns the old model where one of them moves too far off
     centre.
 
     No real lens is that far off: the views do not determine it.
     """
-    moved = pycolmap.Reconstruction(found)
+    moved = pycolmap.Reconstruction(model)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
     options.print_summary = False
@@ -358,7 +358,7 @@ def _refine_principal_point(pycolmap: Any, found: Any) -> Any:
     for camera in moved.cameras.values():
         off = np.hypot(camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2)
         if not off < MAX_PRINCIPAL_POINT_OFFSET * max(camera.width, camera.height):
-            return found
+            return model
     return moved
 
 

@@ -47,11 +47,11 @@ class StepsInBackward:
 
     def claim(self, parameters: Sequence[Tensor]) -> StepArrays | None:
         """Return the steps of these parameters, which the caller has to make; None unless all are pending."""
-        found = [self._steps.get(id(parameter)) for parameter in parameters]
-        if any(entry is None or entry[0] in self.claimed for entry in found):
+        pending = [self._steps.get(id(parameter)) for parameter in parameters]
+        if any(entry is None or entry[0] in self.claimed for entry in pending):
             return None
-        self.claimed.update(entry[0] for entry in found if entry is not None)
-        steps = [entry[1] for entry in found if entry is not None]
+        self.claimed.update(entry[0] for entry in pending if entry is not None)
+        steps = [entry[1] for entry in pending if entry is not None]
         return StepArrays(
             tuple(flat(step.first) for step in steps), tuple(flat(step.second) for step in steps),
             tuple(repeat_rates(step.rate) for step in steps),

@@ -131,23 +131,23 @@ class Remover:
         there, whatever its confidence. prediction: for the plate, where it is known (`neighbours.ShotPredictor`).
         """
         opaque, margin = fill_hidden(plate), wrap_margin(plate)
-        shown, gain = to_network_plate(opaque)
-        seen = wrap_plate(shown, margin)
-        prediction = prediction or self.predict(self._scale_to_input(seen))
+        network_plate, gain = to_network_plate(opaque)
+        wrapped = wrap_plate(network_plate, margin)
+        prediction = prediction or self.predict(self._scale_to_input(wrapped))
         maps = fit_guided_filter(prediction.display, self.linear_flare(prediction, inside_matte=matte is not None))
-        codes = seen.codes.copy()
-        flare = np.zeros(codes.shape, np.float16 if seen is plate else np.float32)
+        codes = wrapped.codes.copy()
+        flare = np.zeros(codes.shape, np.float16 if wrapped is plate else np.float32)
         if not maps.is_empty:
             matte = None if matte is None else wrap_columns(matte, margin)
-            area, encoding, max_code = seen.picture_area.slices, seen.encoding, seen.max_code
-            observed, clean, removed = (part[area] for part in (seen.codes, codes, flare))
+            area, encoding, max_code = wrapped.picture_area.slices, wrapped.encoding, wrapped.max_code
+            observed, clean, removed = (part[area] for part in (wrapped.codes, codes, flare))
             for rows, light in upsample_flare(maps, observed, encoding, max_code):
-                light = seen.to_plate_channels(light)
+                light = wrapped.to_plate_channels(light)
                 if matte is not None:
                     light *= matte[area][rows, :, None]
                 clean[rows] = subtract_flare(observed[rows], light, encoding, max_code)
                 removed[rows] = removed_light(observed[rows], clean[rows], light, encoding, max_code)
-        if seen is plate:
+        if wrapped is plate:
             return codes, flare.astype(np.float16)
         light = merge_columns(flare.astype(np.float32), margin) / gain
         alpha = plate.straight_alpha

@@ -180,8 +180,7 @@ def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -
         members = rows[chosen[rows] == number]
         if len(members):
             by_level[divisor] = quads(centres[members] / divisor, covariances[members] / divisor**2, radii[members],
-                                      light[members],
-                                      ring[members], arcs[members] / divisor)
+                                      light[members], ring[members], arcs[members] / divisor)
     return by_level
 
 

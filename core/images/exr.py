@@ -197,8 +197,8 @@ def read_exr(path: Path | str) -> dict[str, Pixels]:
     path = Path(path)
     picture_size(path)
     channels: dict[str, NDArray[Any]] = {}
-    for _, of_part in read_exr_parts(path):
-        for name, pixels in of_part.items():
+    for _, part_channels in read_exr_parts(path):
+        for name, pixels in part_channels.items():
             channels.setdefault(name, pixels)
     return {name: _check_finite(path, name, pixels) for name, pixels in channels.items()}
 

@@ -159,7 +159,7 @@ def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]
     """Return the content of eval.json: means over views, then each view. Numbers that are not finite become null.
 
     A flare's PSNR, that of an empty one and the relative error are means over the views whose reference holds a flare:
-    where it is black, an empty one is exact, and no mean could hold that.
+    where it is black, an empty flare has an infinite PSNR.
     """
     mean = {layer: _mean([scores[layer] for _, scores in views if layer in scores]) for layer in LAYERS}
     return {

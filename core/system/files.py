@@ -245,7 +245,7 @@ def atomic_folder(target: Path | str) -> Iterator[Path]:
     """Yield a temporary folder beside `target`, which must not exist; rename it to `target` when the block succeeds,
     remove it when it fails.
 
-    Temporary folders that a killed process left of `target` are removed.
+    Temporary folders for `target` that a killed process left are removed.
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)

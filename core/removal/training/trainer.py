@@ -135,13 +135,13 @@ class RemovalTrainer:
                       schedule: Tensor) -> tuple[Tensor, Tensor]:
         """Return the loss and the metrics.
 
-        At first, the squared error of each picture divided by its flare's mean square to a power that rises from 0.5 to
-        1: strong flares lead, which are learned sooner; in the end faint ones count as much, and false flares count
-        more. In the last phase, the log of the error divided by that square, which is the picture's gain in PSNR; a
-        loss counts twice. The recipe weighs it against the mean of the same over patches. The prediction without the
-        glow has half the weight of the whole.
+        At first, the loss of a picture is its squared error, divided by its flare's mean square to a power that rises
+        from 0.5 to 1. So strong flares, which are learned sooner, count more at the start; at the end faint ones count
+        as much. In the PSNR phase, the loss is the log of the error divided by that square, the negative of the
+        picture's gain in PSNR; pictures that get worse count twice. The recipe mixes it with the mean of the same over
+        patches. The prediction without the glow has half the weight of the whole one.
 
-        psnr_phase, schedule: of `_schedule`, arguments so that one captured graph serves every iteration.
+        psnr_phase, schedule: the results of `_schedule`, passed in so that one captured graph serves every iteration.
         """
         with _autocast(self.device):
             prediction = self.network(frame)

@@ -25,13 +25,13 @@ from .shots import ShotReading
 STEP_S = 0.02
 """Time for which the reading of a scene holds the window in one go; a frame that takes longer is not interrupted."""
 INTERVAL_S = 0.005
-"""Pause between two such times."""
+"""Pause of the reading between two such times."""
 MAX_PROCESSES = 8
 """Most processes that draw without an engine; each needs about a gigabyte for frames of 4K."""
 
 
 class Preparation:
-    """A scene that is being read for a bake. error: why it ended early; "" else."""
+    """A scene that is being read for a bake. error: why the reading ended early; "" where it did not."""
 
     def __init__(self, reading: ShotReading, own_folder: bool, folder: Path) -> None:
         self.reading, self.error = reading, ""
@@ -170,7 +170,7 @@ ON_BAKED: list[Callable[[jobs.Job, Any], None]] = []
 
 
 def _on_finished(job: jobs.Job) -> None:
-    """Reload the layers that Blender shows, and hand the scenes with these layers on."""
+    """Reload the layers that Blender shows, and call `ON_BAKED` for each scene with these layers."""
     from .images import reload_images
 
     reload_images(job.folder)

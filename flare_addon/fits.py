@@ -138,7 +138,7 @@ def _run_fit(scene: Any, capture: Path, folder: Path) -> Job:
                           state.mode, "--holdout", 0]
     if state.width:
         args += ["--size", state.width]
-    args += plate_space.command_words(scene)
+    args += plate_space.command_args(scene)
     return engine.run("fit", folder, args)
 
 
@@ -234,7 +234,7 @@ def find_lights(scene: Any) -> Job:
         lights.write_to_capture(scene, capture)
     lights.remember_names(scene)
     return engine.run("lights", capture / "lights", ["lights", capture, "--keep",
-                                                        *plate_space.command_words(scene)])
+                                                        *plate_space.command_args(scene)])
 
 
 def clean_frames(scene: Any) -> Job:
@@ -263,7 +263,7 @@ def _cleaning_folder(capture: Path) -> Path:
 def cleaning_args(scene: Any, capture: Path) -> list[object]:
     """Return the arguments of the command `remove`: with the run where the fit is finished, else with the network and
     the matte."""
-    folder, space = run_folder(scene), plate_space.command_words(scene)
+    folder, space = run_folder(scene), plate_space.command_args(scene)
     if folder is not None and fit_state(scene) == "finished" and _may_belong_to(folder, capture):
         moved_capture = ["--capture", capture] if _capture_has_moved(folder, capture) else []
         return ["remove", "--run", folder, *moved_capture, "--out", capture / REMOVED, *space]

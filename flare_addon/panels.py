@@ -357,7 +357,7 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
             column.prop(state, "bake_scene")
             column.prop(state, "bake_composite")
             if state.flare and engine.find_engine() is None:
-                label_lines(layout, "Without an engine, Blender's own Python draws the layers: some seconds a frame.",
+                label_lines(layout, "Without an engine, Blender's own Python draws the layers: some seconds per frame.",
                             "INFO")
             if error := baking.last_error(scene):
                 label_lines(layout, error, "ERROR")

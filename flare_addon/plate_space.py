@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The colour space of a capture's frames in the panel, and the words that pass it to the commands.
+"""The colour space of a capture's frames in the panel, and the options that pass it to the commands.
 
 The field is `--plate-space` of `lights`, `fit` and `remove`, which keep it in the capture. A name of the scene's
 OpenColorIO configuration goes with that configuration.
@@ -39,7 +39,7 @@ def configuration() -> Path | None:
     return path if path is not None and is_file(path) else None
 
 
-def command_words(scene: Any) -> list[object]:
+def command_args(scene: Any) -> list[object]:
     """Return the options of a command that reads the capture's frames; none where the field is empty, which leaves it
     to the capture and the files."""
     name = scene.fit_flare.plate_space.strip()

@@ -165,9 +165,8 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
 
     plate_space: StringProperty(  # type: ignore[valid-type]
         name="Colour Space", description="Colour space of the frames, where their files do not declare it: a camera's "
-                                         "logarithm (logc4, slog3, vlog, ...) or a colour space of Blender. Empty: "
-                                         "what the capture or the files say", search=search_names,
-        search_options={"SUGGESTION"}, update=clear_record)
+        "logarithm (logc4, slog3, vlog, ...) or a colour space of Blender. If empty, the capture or the files declare "
+        "it", search=search_names, search_options={"SUGGESTION"}, update=clear_record)
     matte: StringProperty(  # type: ignore[valid-type]
         name="Matte", description="Where the flares are, roughly painted in white on black: one picture for all "
         "frames, or a folder with one of the same name for each. In white areas, faint flares are removed too; in "
@@ -221,8 +220,8 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         name="Keep Colours Live", description="Do not bake Intensity, Tint, Mute and Solo of lights into the layers; "
         "the compositor applies them, so you can change them without baking again", default=True)
     bake_composite: BoolProperty(  # type: ignore[valid-type]
-        name="Composite after It", description="Set the compositor up when the layers are baked, so that renders show "
-        "the flare over the picture of Over", default=True)
+        name="Composite after Bake", description="Set the compositor up when the layers are baked, so that renders "
+        "show the flare over the picture chosen under Over", default=True)
     over: EnumProperty(  # type: ignore[valid-type]
         name="Over", description="The picture that the compositor adds the flare to",
         items=(("present", "Present Image", "The present output of the compositor, or the render"),

@@ -2,7 +2,7 @@
 """Casts rays at textured rectangles by numpy: the scenes of the sample shots, which need no Blender.
 
 World axes are those of a camera: x right, y down, z forward. Surfaces are matt; lamps light them without shadows, by
-the cosine and the square of the distance. Pictures are scene-linear and averaged over 2 x 2 rays a pixel.
+the cosine and the square of the distance. Pictures are scene-linear and averaged over 2 x 2 rays per pixel.
 """
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .description import Array, Pinhole
 Pixels = NDArray[np.float32]
 
 RAYS_PER_SIDE = 2
-"""Rays of a pixel along each side."""
+"""Rays along each side of a pixel."""
 SHARE_SAMPLES = 128
 """Points on a lamp's disc whose visibility is tested."""
 

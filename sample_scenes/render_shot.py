@@ -43,7 +43,7 @@ def draft_setup(name: str) -> LensSetup:
 
 
 def render_scene(scene: ShotScene, state: FrameState, standing: Hits | None) -> NDArray[np.float32]:
-    """Return the scene layer of a frame, (height, width, 3). standing: hits of the rectangles that stand."""
+    """Return the scene layer of a frame, (height, width, 3). standing: hits of the rectangles that do not move."""
     rays = camera_rays(scene.camera, state.rotation)
     hits = standing if standing is not None else cast(scene.quads, state.eye, rays)
     if state.moving:

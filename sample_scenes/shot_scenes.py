@@ -3,7 +3,7 @@
 
     torch    a locked-off camera; a torch is carried about, out of the frame and behind a screen at times; a walker
     drive    a moving camera; the two headlights of a car that approaches, of which the right one flickers and goes out
-    pan      a camera that turns about its nodal point; a lamp that stands; a walker and a cart cross
+    pan      a camera that turns about its nodal point; a lamp that does not move; a walker and a cart cross
 
 Each also has bright things that are no lamps: a window, lit windows, a white shirt. A seed changes textures, paths, the
 lens and the colours of the lamps. Lengths are metres; axes are those of `raycast`.
@@ -43,7 +43,8 @@ class FrameState:
 
 @dataclass(frozen=True, eq=False)
 class ShotScene:
-    """A shot: camera, lens setup, rectangles that stand, ambient light (3,), and the state of a frame by its index.
+    """A shot: camera, lens setup, rectangles that do not move, ambient light (3,), and the state of a frame by its
+    index.
 
     reference: distance from a lamp at which its flare has its strength. standing: the camera never moves.
     """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The lights of a capture or shot: places that stand, paths in the world or on the picture, and brightness by frame.
+"""The lights of a capture or shot: fixed places, paths in the world or on the picture, and brightness by frame.
 
 `read_lights` reads lights.json, and `LightPath.state` gives each light's place and brightness in a frame:
 
-    {"name": "lamp", "xyz": [x, y, z]}                                            stands in the world
+    {"name": "lamp", "xyz": [x, y, z]}                                            a fixed place in the world
     {"name": "lamp", "xyz": [x, y, z], "frames": {"0001.png": {"on": 0.5}}}       the same, switched or dimmed
     {"name": "car", "frames": {"0001.png": {"xyz": [x, y, z]}}}                   a path in the world
     {"name": "torch", "frames": {"0001.png": {"xy": [px, py], "on": 0.8, "confidence": 0.9}}}   a path on the picture
@@ -82,7 +82,8 @@ class Light:
 
     @property
     def numbers(self) -> list[Any]:
-        """All values as plain data, [name, [x, y, z]] for a light that stands; they change whenever the light does."""
+        """All values as plain data, [name, [x, y, z]] for a light that does not move; they change whenever the light
+        does."""
         plain: list[Any] = [self.name, None if self.moves else self.xyz.tolist()]
         if self.xy is not None:
             plain.append(self.xy.tolist())
@@ -283,7 +284,7 @@ def check_places(lights: Iterable[Light], path: Path, names: Sequence[str], has_
 
 
 def check_standing(lights: Iterable[Light], purpose: str) -> None:
-    """Raise CaptureError for the first light that moves. purpose: what needs lights that stand, a noun phrase."""
+    """Raise CaptureError for the first light that moves. purpose: what needs lights that do not move, a noun phrase."""
     for light in lights:
         if light.moves:
             raise CaptureError(f"The light {light.name!r} has a path, and {purpose} needs one place (xyz) in the "

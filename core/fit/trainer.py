@@ -147,17 +147,17 @@ class Trainer:
         occlusion_loss = self._occlusion_loss(targets)
         if occlusion_loss is not None:
             loss = loss + occlusion_loss
-        if loss.requires_grad:  # a frozen scene without a light in front of the camera teaches nothing
+        if loss.requires_grad:  # it does not with a frozen scene and no light in front of the camera
             with self.optimisers.scene.step_in_backward() if self._steps_in_backward else nullcontext():
                 loss.backward()
         if self.fits_scene:
             self.strategy.observe(scene)
         self.optimisers.step(scene=self.fits_scene)
         if self.fits_scene:
-            if self.iteration < settings.iterations:  # what the last would change nothing would learn
+            if self.iteration < settings.iterations:  # Gaussians added by the last iteration would stay untrained
                 self.strategy.update(self.iteration)
             self._reorder_scene()
-        if not scene_only:  # Gaussians that nothing has taught are neither many nor faint
+        if not scene_only:  # before, flare Gaussians are untrained, and their opacities say nothing
             self._change_flare_density()
         return figures
 

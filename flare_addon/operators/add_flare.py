@@ -28,7 +28,7 @@ def _look_items(_self: Any, _context: Any) -> list[tuple[str, str, str, int, int
 
 
 class FITFLARE_OT_add_library_flare(GuardedOperator, bpy.types.Operator):
-    """Show a flare over the camera view, at the selected lights or at one in view: the scene's, else the library's"""
+    """Show a flare over the camera view, at the selected lights or one in view, with the chosen look of the library"""
 
     bl_idname = "fit_flare.add_library_flare"
     bl_label = "Add Flare"

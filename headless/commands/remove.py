@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments to a parser."""
     parser.add_argument("plates", type=Path, nargs="*", metavar="PLATE",
-                        help="pictures (PNG, JPEG, TIFF, EXR), folders of them (plates that `remove` wrote are left "
-                             "out), or videos, whose frames are extracted to DIR/NAME.frames")
+                        help="pictures (PNG, JPEG, TIFF, EXR, DPX and others), folders of them (plates that `remove` "
+                             "wrote are left out), or videos, whose frames are extracted to DIR/NAME.frames")
     parser.add_argument("--run", type=Path, metavar="RUN",
                         help="instead of PLATE: subtract the flare of this run from the frames that it was fitted to")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="the run's capture, if it was moved")
@@ -38,7 +38,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--matte", type=Path, metavar="PICTURE_OR_DIR",
                         help="where the flares are, white on black: one picture for all plates, or a folder with one "
                              "of the same name for each; nothing is removed outside, and inside faint flares are "
-                             "removed as well")
+                             "removed too")
     plate_space.add_option(parser)
     glow.add_options(parser)
     parser.add_argument("--amount", type=float, metavar="FACTOR",
@@ -46,7 +46,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "removes more than the network predicts")
     parser.add_argument("--sensitivity", choices=("low", "normal", "high"),
                         help="how much evidence the removal needs (default normal). high: the plates are known to "
-                             "have flares, so faint and doubtful ones are removed too; low: only plain ones")
+                             "have flares, so faint and doubtful ones are removed too. low: only obvious ones are "
+                             "removed")
     parser.add_argument("--stills", action="store_true",
                         help="clean each plate by itself, without the plates before and after it")
     parser.add_argument("--working-size", type=int, metavar="PIXELS",

@@ -94,7 +94,7 @@ def test_the_first_render_shows_the_flare(facts: Any) -> None:
     assert facts["set up by itself"] and facts["is seen"]
     assert max(facts["first render"]) < 2e-3
     assert facts["live"] == pytest.approx(1, abs=2e-3)
-    assert facts["left alone"], "with Composite after It switched off"
+    assert facts["left alone"], "with Composite after Bake switched off"
 
 
 def test_a_scene_is_read_a_frame_at_a_time(facts: Any) -> None:

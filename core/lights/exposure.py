@@ -53,8 +53,8 @@ class ExposureDetector:
             if mask is None:
                 continue
             group_excess = float(group_areas[top:top + height, left:left + width][mask].max()) / float(mask.sum()) - 1
-            score = (_shape_score(mask, (left, top), display) * _smoothstep(_attached_share(mask, region), 0.4, 0.1)
-                     * _smoothstep(group_excess, 5.0, 1.5))
+            score = (shape_score(mask, (left, top), display) * smoothstep(_attached_share(mask, region), 0.4, 0.1)
+                     * smoothstep(group_excess, 5.0, 1.5))
             if score >= self.threshold:
                 rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
                 tight = mask[rows[0]:rows[-1] + 1, columns[0]:columns[-1] + 1]
@@ -94,13 +94,13 @@ def _main_body(mask: NDArray[np.bool_], largest: float) -> NDArray[np.bool_] | N
         return None
     reach = int(OPENING_RATIO * thickest)
     if reach >= 1:
-        number, labels, boxes, _ = cv2.connectedComponentsWithStats(_open_by_disc(padded, reach), connectivity=4)
+        number, labels, boxes, _ = cv2.connectedComponentsWithStats(open_by_disc(padded, reach), connectivity=4)
         if number > 1:
             padded = (labels == 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA]))).astype(np.uint8)
     return np.asarray(padded[1:-1, 1:-1] > 0)
 
 
-def _open_by_disc(mask: NDArray[np.uint8], reach: int) -> NDArray[np.uint8]:
+def open_by_disc(mask: NDArray[np.uint8], reach: int) -> NDArray[np.uint8]:
     """Remove the parts of a mask that are too narrow for a disc of radius `reach`.
 
     Large regions are opened by distance transforms, whose cost does not grow with the disc, slightly rounder at the
@@ -132,13 +132,13 @@ def _attached_share(core: NDArray[np.bool_], region: NDArray[np.bool_]) -> float
     return float(np.pad(region, room)[ring].mean())
 
 
-def _smoothstep(value: float, low: float, high: float) -> float:
+def smoothstep(value: float, low: float, high: float) -> float:
     """0 below `low`, 1 above `high`, smooth between; reversed for low > high."""
     t = min(max((value - low) / (high - low), 0.0), 1.0)
     return t * t * (3 - 2 * t)
 
 
-def _shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:
+def shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:
     """Return the score of a mask's shape, size, whiteness and surroundings."""
     import cv2
 
@@ -150,10 +150,10 @@ def _shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDAr
     solid = area / (cv2.contourArea(hull) + 0.5 * cv2.arcLength(hull, True) + 1.0)
     sides = np.sort(np.asarray(cv2.minAreaRect(hull)[1]) + 1.0)
     colours = display[corner[1]:corner[1] + mask.shape[0], corner[0]:corner[0] + mask.shape[1]][mask]
-    return (_smoothstep(solid, 0.84, 0.95) * _smoothstep(sides[1] / sides[0], 9.0, 5.0)
-            * _smoothstep(area / (width * height), MAX_AREA_SHARE, 0.005)
-            * _smoothstep(float(colours.min(axis=1).mean()), 0.78, 0.97)
-            * _smoothstep(_surrounding_level(mask, corner, display), 0.97, 0.9))
+    return (smoothstep(solid, 0.84, 0.95) * smoothstep(sides[1] / sides[0], 9.0, 5.0)
+            * smoothstep(area / (width * height), MAX_AREA_SHARE, 0.005)
+            * smoothstep(float(colours.min(axis=1).mean()), 0.78, 0.97)
+            * smoothstep(_surrounding_level(mask, corner, display), 0.97, 0.9))
 
 
 def _surrounding_level(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:

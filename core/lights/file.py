@@ -2,12 +2,15 @@
 """Reads and writes lights.json, and keeps what a person has changed in it.
 
     {"lights": [{"name": "light1", "xyz": [x, y, z], "colour": [r, g, b], "support": 36, "views": 60,
-                 "residual_px": 0.6, "uncertainty": 0.006, "far": false, "how": "triangulated"}],
-     "found": [[x, y, z], ...]}
+                 "residual_px": 0.6, "uncertainty": 0.006, "far": false, "how": "triangulated"},
+                {"name": "light2", "frames": {"0001.png": {"xy": [px, py], "on": 0.8, "confidence": 0.9}, ...},
+                 "colour": [r, g, b], "support": 30, "views": 40, "how": "followed"}],
+     "found": [[x, y, z], ...], "found_paths": [{"0001.png": [px, py], ...}, ...]}
 
-`found` lists the places that earlier runs wrote. With `keep`, existing entries stay unchanged, including renamed, moved
-and added ones; a light that exists is not added twice, and one that an earlier run wrote and a person deleted is not
-added again.
+`core/capture/lights.py` says what the places mean, and reads them.
+`found` and `found_paths` list the places and paths that earlier runs wrote. With `keep`, existing entries stay
+unchanged, including renamed, moved and added ones; a light that exists is not added twice, and one that an earlier run
+wrote and a person deleted is not added again.
 """
 from __future__ import annotations
 
@@ -20,10 +23,11 @@ import numpy as np
 
 from ..capture import read_lights
 from ..capture.camera import Camera
-from ..capture.lights import is_point
+from ..capture.lights import is_finite, is_point
 from ..errors import CaptureError
 from ..system.files import follow_link, read_json, round_for_text, write_json
 from .found_light import FoundLight
+from .tracks import TrackedLight
 
 SAME_PLACE = 0.02
 """Distance of two projections, in frame diagonals, below which they are one light."""
@@ -35,27 +39,34 @@ def check_replaceable(path: Path) -> None:
         return
     read_lights(path)  # checks it
     data = read_json(path, CaptureError)
-    places = _read_earlier_places(data, path)
-    by_hand = [str(entry["name"]) for number, entry in enumerate(data["lights"], 1) if not (
-        "support" in entry and entry["name"] == f"light{number}"
-        and "xyz" in entry and any(np.allclose(entry["xyz"], place, rtol=1e-3, atol=1e-5) for place in places))]
+    places, paths = _read_earlier_places(data, path), _read_earlier_paths(data, path)
+
+    def is_unchanged(entry: dict[str, Any]) -> bool:
+        if "xyz" in entry:
+            return any(np.allclose(entry["xyz"], place, rtol=1e-3, atol=1e-5) for place in places)
+        return any(_places_by_frame(entry) == earlier for earlier in paths)
+
+    by_hand = [str(entry["name"]) for number, entry in enumerate(data["lights"], 1)
+               if not ("support" in entry and entry["name"] == f"light{number}" and is_unchanged(entry))]
     if by_hand:
         raise CaptureError(f"{path} has lights that were added or changed by hand ({', '.join(by_hand)}); add --keep "
                            "to keep them, or remove the file to search for all lights again.")
 
 
 def write_lights(path: Path, lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
-                 keep: bool = False) -> list[dict[str, Any]]:
-    """Write lights.json and return its entries. keep: see the module's head.
+                 keep: bool = False, tracked: Sequence[TrackedLight] = ()) -> list[dict[str, Any]]:
+    """Write lights.json and return its entries. keep: see the module's head. tracked: lights on paths.
 
     Raises CaptureError where an existing file is to be kept and cannot be read.
     """
     entries: list[dict[str, Any]] = []
     found_before: list[Any] = []
+    paths_before: list[dict[str, Any]] = []
     if keep and path.exists():
         read_lights(path)  # checks it
         data = read_json(path, CaptureError)
         entries, found_before = list(data["lights"]), _read_earlier_places(data, path)
+        paths_before = _read_earlier_paths(data, path)
         for entry in entries:
             _check_writable(entry, path)
     known = [*(entry["xyz"] for entry in entries if "xyz" in entry), *found_before]
@@ -65,8 +76,44 @@ def write_lights(path: Path, lights: Sequence[FoundLight], views: Sequence[tuple
         entries.append(_to_entry(light, _free_name({entry["name"] for entry in entries})))
     places = [[round_for_text(float(x)) for x in light.xyz] for light in lights]
     places += [xyz for xyz in found_before if not any(_is_same_light(place, xyz, views) for place in places)]
-    write_json(follow_link(path), {"lights": entries, "found": places})
+    known_paths = [*(_places_by_frame(entry) for entry in entries if "frames" in entry), *paths_before]
+    paths = [*paths_before]
+    for track in tracked:
+        entry = _to_track_entry(track, _free_name({entry["name"] for entry in entries}))
+        places_by_frame = _places_by_frame(entry)
+        if any(_is_same_path(places_by_frame, other, views[0][1]) for other in known_paths):
+            continue
+        entries.append(entry)
+        paths.append(places_by_frame)
+    found: dict[str, Any] = {"lights": entries, "found": places}
+    write_json(follow_link(path), {**found, "found_paths": paths} if paths else found)
     return entries
+
+
+def _places_by_frame(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return the place of an entry's path by the name of the frame, [px, py] or [x, y, z]."""
+    keys = entry.get("frames") or {}
+    return {name: key.get("xy", key.get("xyz")) for name, key in keys.items() if {"xy", "xyz"} & key.keys()}
+
+
+def _is_same_path(path: dict[str, Any], other: dict[str, Any], camera: Camera) -> bool:
+    """True if two paths on the picture are close to each other in most frames that they share."""
+    shared = [name for name in path if name in other and len(path[name]) == len(other[name]) == 2]
+    if len(shared) < 0.5 * min(len(path), len(other)) or not shared:
+        return False
+    distances = np.linalg.norm(np.subtract([path[name] for name in shared], [other[name] for name in shared]), axis=1)
+    return bool(np.median(distances) < SAME_PLACE * np.hypot(*camera.size))
+
+
+def _read_earlier_paths(data: dict[str, Any], path: Path) -> list[dict[str, Any]]:
+    """Return the paths that earlier runs wrote. Raises CaptureError where the list is invalid."""
+    paths = data.get("found_paths", [])
+    valid = isinstance(paths, list) and all(
+        isinstance(each, dict) and all(isinstance(place, list) and len(place) in (2, 3) and all(map(is_finite, place))
+                                       for place in each.values()) for each in paths)
+    if not valid:
+        raise CaptureError(f"{path}: found_paths should be a list of places by frame; remove that entry.")
+    return list(paths)
 
 
 def _read_earlier_places(data: dict[str, Any], path: Path) -> list[list[float]]:
@@ -92,6 +139,17 @@ def _to_entry(light: FoundLight, name: str) -> dict[str, Any]:
             "colour": [round(float(c), 3) for c in light.colour], "support": len(light.support),
             "views": light.visible, "residual_px": round(light.residual, 3),
             "uncertainty": round(light.uncertainty, 5), "far": light.far, "how": light.how}
+
+
+def _to_track_entry(light: TrackedLight, name: str) -> dict[str, Any]:
+    frames = {}
+    for frame, key in light.keys.items():
+        place = key.place
+        assert place is not None
+        on = {} if key.on is None else {"on": round(key.on, 3)}
+        frames[frame] = {"xy": [round(float(x), 2) for x in place], **on, "confidence": round(key.confidence, 2)}
+    return {"name": name, "frames": frames, "colour": [round(float(c), 3) for c in light.colour],
+            "support": len(light.support), "views": len(frames), "how": light.how}
 
 
 def _free_name(used_names: set[str]) -> str:

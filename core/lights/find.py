@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..capture import LIGHTS, Capture
+from ..capture import LIGHTS, Capture, read_lights
 from ..errors import SettingsError
 from ..system.files import write_json
 from ..system.progress import Progress
@@ -22,6 +22,7 @@ from .file import write_lights
 from .found_light import FAR, FoundLight
 from .ghosts import find_blobs, locate_by_ghosts
 from .lifted import lift_to_gaussians
+from .tracks import TrackFindings
 from .triangulation import TriangulationSettings, triangulate_lights
 
 SHEETS, REPORT = "lights", "report.json"
@@ -109,6 +110,33 @@ def write_findings(capture: Capture, findings: Findings, keep: bool = False) -> 
             {"xy": detection.xy.round(3).tolist(), "radius": round(detection.radius, 2),
              "score": round(detection.score, 3), "cut": detection.is_cut} for detection in in_view]}
                   for view, in_view in zip(capture.views, findings.detections, strict=True)],
+        "sheets": [str(path.relative_to(capture.folder)) for path in sheets],
+    }
+    write_json(capture.folder / SHEETS / REPORT, report)
+    return report
+
+
+def write_tracks(capture: Capture, findings: TrackFindings, keep: bool = False) -> dict[str, Any]:
+    """Write lights.json, sheets and a report of lights that were followed into the capture; return the report.
+
+    lights/sheetN.png shows every frame; lights/report.json lists evidence, doubtful frames, and doubtful lights.
+    """
+    from .track_sheet import write_track_sheets
+
+    views = [(view.name, view.camera) for view in capture.views]
+    entries = write_lights(capture.folder / LIGHTS, (), views, keep, findings.lights)
+    lit = capture.with_lights(read_lights(capture.folder / LIGHTS))
+    sheets = write_track_sheets(capture.folder / SHEETS, lit, findings.sources)
+    report = {
+        "lights": entries, "says": findings.messages,
+        "followed": [{"support": list(light.support), "evidence": round(light.evidence, 3),
+                      "doubtful_frames": light.doubtful} for light in findings.lights],
+        "doubtful": [{"support": list(light.support), "evidence": round(light.evidence, 3)}
+                     for light in findings.doubtful],
+        "views": [{"name": view.name, "sources": [
+            {"xy": source.xy.round(2).tolist(), "radius": round(source.detection.radius, 2),
+             "evidence": round(source.evidence, 3)} for source in in_view]}
+            for view, in_view in zip(capture.views, findings.sources, strict=True)],
         "sheets": [str(path.relative_to(capture.folder)) for path in sheets],
     }
     write_json(capture.folder / SHEETS / REPORT, report)

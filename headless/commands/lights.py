@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...core.capture import LIGHTS
+from ...core.capture.unsolved import CAMERA
 from ...core.errors import CaptureError, SettingsError
+from ...core.system.files import write_json
 from ...core.system.progress import Progress
 from .. import plate_space, tallies
 from ..command import Command, Step, parse_seed
@@ -23,7 +25,8 @@ METHODS = ("exposure", "grounded")
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments to a parser."""
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/ and a camera solve")
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/; without a camera solve the "
+                        "lights are followed from frame to frame")
     parser.add_argument("--keep", action="store_true",
                         help="keep the entries of lights.json, with what was renamed, moved, added or removed by hand; "
                              "add only lights that were never found before")
@@ -39,6 +42,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", type=Path, metavar="SCENE.PLY",
                         help="a fitted scene (RUN/scene.ply) on whose Gaussians to place the detections, as the paper "
                              "does")
+    parser.add_argument("--focal", type=float, metavar="PIXELS",
+                        help=f"focal length of frames without a camera solve (default: {CAMERA}, Exif data, or a usual "
+                             f"one); it is recorded in {CAMERA}")
     plate_space.add_option(parser)
     parser.add_argument("--seed", type=parse_seed, default=0, metavar="N", help="random seed (default 0)")
 
@@ -52,8 +58,12 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.method != "grounded" and (args.boxes or args.masks):
         raise SettingsError(f"--{'boxes' if args.boxes else 'masks'} is for --method grounded; leave it out.")
     plate_space.record(args, args.capture)
-    capture = Capture.open(args.capture)
+    capture = Capture.open(args.capture, need_cameras=False, focal=args.focal)
+    if capture.has_cameras and args.focal is not None:
+        raise SettingsError("--focal is for frames without a camera solve, and this capture has one; leave it out.")
     tallies.report_capture(capture, progress)
+    if not capture.has_cameras:
+        return _follow(capture, args, progress)
     detector = detector_for(args.method, args.threshold, args.boxes, args.masks)
     settings = TriangulationSettings(min_views=args.min_views, seed=args.seed)
     gaussians = _read_gaussians(args.scene) if args.scene else None
@@ -65,6 +75,42 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             **tallies.report_tally(tallies.tally_capture(capture, "searched"), progress)}
 
 
+def _follow(capture: Capture, args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Follow the lights of frames without a camera solve as the arguments say, and return the command's result."""
+    from ...core.lights.file import check_replaceable
+
+    unused = {"--method": args.method != "exposure", "--threshold": args.threshold is not None,
+              "--scene": args.scene is not None}
+    if any(unused.values()):
+        raise SettingsError(f"{next(name for name, used in unused.items() if used)} needs a camera solve, and "
+                            f"{capture.folder} has none; leave it out, or run solve first.")
+    if args.focal is not None:
+        camera = capture.views[0].camera
+        write_json(capture.folder / CAMERA, {"focal_px": args.focal, "width": camera.width, "height": camera.height})
+    if not args.keep:
+        check_replaceable(capture.folder / LIGHTS)
+    report = _follow_and_record(capture, progress, keep=args.keep)
+    return {"lights": report["lights"], "file": str(capture.folder / LIGHTS),
+            "sheets": [str(capture.folder / sheet) for sheet in report["sheets"]],
+            **tallies.report_tally(tallies.tally_capture(capture, "searched"), progress)}
+
+
+def _follow_and_record(capture: Capture, progress: Progress, keep: bool = False) -> dict[str, Any]:
+    """Follow the lights of a shot, write lights.json and the sheets, and report them; return the report."""
+    from ...core.lights.find import write_tracks
+    from ...core.lights.tracks import track_lights
+
+    _check_writable(capture)
+    progress.say(f"{capture.folder} has no camera solve; its lights are followed from frame to frame.")
+    findings = track_lights(capture, progress)
+    report = write_tracks(capture, findings, keep=keep)
+    for sentence in findings.messages:
+        progress.say(sentence)
+    progress.say(f"Look at {capture.folder / report['sheets'][0]}. You can edit {LIGHTS}; `lights --keep` keeps your "
+                 "changes.")
+    return report
+
+
 def with_lights(capture: Capture, progress: Progress) -> Capture:
     """Return the capture with its lights; they are found and written to its folder where lights.json is missing."""
     from ...core.lights import detector_for
@@ -72,6 +118,9 @@ def with_lights(capture: Capture, progress: Progress) -> Capture:
     if capture.lights or (capture.folder / LIGHTS).exists():
         return capture
     progress.say(f"{capture.folder} has no {LIGHTS}; searching for its lights.")
+    if not capture.has_cameras:
+        _follow_and_record(capture, progress)
+        return capture.reopen()
     _find_and_record(capture, detector_for("exposure"), progress)
     return capture.reopen()
 
@@ -86,12 +135,7 @@ def _find_and_record(capture: Capture, detector: Detector, progress: Progress,
     from ...core.lights import find_lights, write_findings
     from ...core.lights.find import REPORT, SHEETS
 
-    if not os.access(capture.folder, os.W_OK):
-        raise CaptureError(f"{capture.folder} cannot be written, and {LIGHTS} belongs there; change the permissions, "
-                           "or copy the capture to another folder.")
-    sheets = capture.folder / SHEETS
-    if sheets.exists() and not sheets.is_dir():
-        raise CaptureError(f"{sheets} is a file where a folder for the sheets is needed; move it away.")
+    _check_writable(capture)
     findings = find_lights(capture, detector, progress, settings, gaussians=gaussians)
     report = write_findings(capture, findings, keep=keep)
     for sentence in findings.messages:
@@ -104,6 +148,18 @@ def _find_and_record(capture: Capture, detector: Detector, progress: Progress,
     progress.say(f"Look at {capture.folder / report['sheets'][0]}. You can edit {LIGHTS}; `lights --keep` keeps your "
                  "changes.")
     return report
+
+
+def _check_writable(capture: Capture) -> None:
+    """Raise CaptureError where the lights of a capture cannot be written to its folder."""
+    from ...core.lights.find import SHEETS
+
+    if not os.access(capture.folder, os.W_OK):
+        raise CaptureError(f"{capture.folder} cannot be written, and {LIGHTS} belongs there; change the permissions, "
+                           "or copy the capture to another folder.")
+    sheets = capture.folder / SHEETS
+    if sheets.exists() and not sheets.is_dir():
+        raise CaptureError(f"{sheets} is a file where a folder for the sheets is needed; move it away.")
 
 
 def _describe_light(light: dict[str, Any]) -> str:
@@ -131,5 +187,9 @@ COMMAND = Command(
 detections of all views are triangulated; of far lights only the direction is used. A light that is never in frame is
 found by its ghosts, if many views show one.
 
-  run.py lights captures/shot""",
+Frames without a camera solve are taken for consecutive frames of a shot. Lights are followed from frame to frame, and
+lights.json has the path, brightness and confidence of each by frame; the sheets show the paths.
+
+  run.py lights captures/room
+  run.py lights shots/night_drive""",
     arguments, (Step("lights", "engine", run),))

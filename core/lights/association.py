@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Follows the sources of consecutive frames: which source of a frame is which of the frames before.
+
+A track predicts its next place by its velocity. The pair of track and source with the smallest cost is joined first;
+the cost is the distance from the prediction, with the change of size and colour. A track that loses its source waits,
+with a tolerance that grows as far as its own acceleration lets it go. Tracks that ended and tracks that began later are
+then joined where extrapolations of both meet. `tracks.py` calls it.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..capture.camera import Floats
+from .sources import Source
+
+BASE_GATE, SPEED_GATE, FIRST_GATE = 0.032, 0.4, 0.15
+"""Tolerance of a prediction: share of the diagonal, plus share of the speed; and that of a track of one frame."""
+FAINT_FIRST_GATE = 0.03
+"""The last one for a source that hardly looks like a lamp."""
+MIN_ACCELERATION, MAX_ACCELERATION = 0.003, 0.03
+"""Bounds of a track's acceleration, diagonals per frame²."""
+UNLIKELY_GATE = 0.4
+"""Factor on the tolerance for a source that hardly looks like a lamp, of a track that does."""
+MAX_WAIT, MAX_GAP = 2, 24
+"""Frames to the next source of a track, first without and then with knowledge of what comes later."""
+SIZE_COST, COLOUR_COST, EVIDENCE_COST, GAP_COST = 0.4, 0.3, 0.5, 0.02
+"""Weights of the change of size (logarithm), colour and evidence, and of a frame without a source, beside distance over
+gate."""
+TYPICAL = 9
+"""Sources at the end of a track whose median size is compared."""
+MAX_DIFFERENCE = 1.0
+"""Largest sum of these changes."""
+LIKELY = 0.25
+"""Evidence from which a source looks like a lamp."""
+
+
+@dataclass(eq=False)
+class Chain:
+    """The sources of one thing by frame index, in order."""
+
+    frames: list[int] = field(default_factory=list)
+    sources: list[Source] = field(default_factory=list)
+
+    def append(self, frame: int, source: Source) -> None:
+        """Add the source of a later frame."""
+        self.frames.append(frame)
+        self.sources.append(source)
+
+    @property
+    def places(self) -> Floats:
+        """(n, 2) pixels."""
+        return np.array([source.xy for source in self.sources])
+
+    @property
+    def evidence(self) -> float:
+        """The 70th percentile of the sources' evidence: ghosts that cross a lamp spoil some frames."""
+        return float(np.quantile([source.evidence for source in self.sources], 0.7))
+
+    def velocity(self, at_end: bool) -> Floats:
+        """Return (2,) pixels per frame at the last or first frame; 0 for a single frame."""
+        if len(self.frames) < 2:
+            return np.zeros(2)
+        index = (-1, -2) if at_end else (1, 0)
+        step = self.frames[index[0]] - self.frames[index[1]]
+        places = self.places
+        return np.asarray((places[index[0]] - places[index[1]]) / step)
+
+    def predict(self, frame: int) -> Floats:
+        """Return (2,) the place in a frame after the last or before the first one, at constant velocity."""
+        at_end = frame >= self.frames[-1]
+        start = self.frames[-1] if at_end else self.frames[0]
+        return np.asarray(self.places[-1 if at_end else 0] + (frame - start) * self.velocity(at_end))
+
+    def acceleration(self, diagonal: float) -> float:
+        """Return the acceleration, pixels per frame², within bounds."""
+        places, frames = self.places, np.array(self.frames)
+        least, most = MIN_ACCELERATION * diagonal, MAX_ACCELERATION * diagonal
+        if len(frames) < 3:
+            return least
+        rates = np.diff(places, axis=0) / np.diff(frames)[:, None]
+        changes = np.linalg.norm(np.diff(rates, axis=0), axis=1) / (0.5 * (frames[2:] - frames[:-2]))
+        return float(np.clip(1.5 * np.quantile(changes, 0.8), least, most))
+
+
+def follow(sources: Sequence[Sequence[Source]], diagonal: float) -> list[Chain]:
+    """Return the chains of the sources of consecutive frames, the longest first. diagonal: of the frames, pixels."""
+    open_chains: list[Chain] = []
+    closed: list[Chain] = []
+    for frame, in_frame in enumerate(sources):
+        pairs = sorted((cost, chain, number) for chain, other in enumerate(open_chains)
+                       for number, source in enumerate(in_frame)
+                       if (cost := _cost(other, frame, source, diagonal)) is not None)
+        used_chains: set[int] = set()
+        used_sources: set[int] = set()
+        for _, chain, number in pairs:
+            if chain not in used_chains and number not in used_sources:
+                used_chains.add(chain)
+                used_sources.add(number)
+                open_chains[chain].append(frame, in_frame[number])
+        closed += [chain for chain in open_chains if frame - chain.frames[-1] > _patience(chain)]
+        open_chains = [chain for chain in open_chains if frame - chain.frames[-1] <= _patience(chain)]
+        open_chains += [Chain([frame], [source]) for number, source in enumerate(in_frame)
+                        if number not in used_sources]
+    return _join(closed + open_chains, diagonal)
+
+
+def _patience(chain: Chain) -> int:
+    """Return the number of frames that a chain waits for its source; longer gaps are closed by `_join`."""
+    return MAX_WAIT if chain.evidence >= LIKELY else 1
+
+
+def _cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | None:
+    """Return the cost of joining a chain to a source of a later frame; None beyond the gate."""
+    gap = frame - chain.frames[-1]
+    last = chain.sources[-1]
+    if len(chain.frames) < 2:
+        likely = min(last.evidence, source.evidence) >= LIKELY
+        gate = (FIRST_GATE if likely else FAINT_FIRST_GATE) * diagonal * gap
+    else:
+        speed = float(np.linalg.norm(chain.velocity(at_end=True)))
+        before = chain.frames[-1] - chain.frames[-2]
+        gate = (BASE_GATE * diagonal + SPEED_GATE * speed
+                + 0.5 * chain.acceleration(diagonal) * (gap * gap - 1 + (before - 1) * gap))
+    if chain.evidence >= LIKELY > source.evidence:
+        # A lamp that something begins to hide looks less like one, where it was expected, and only at once.
+        if gap > 1 or source.detection.radius > 1.3 * last.detection.radius:
+            return None
+        gate *= UNLIKELY_GATE
+    distance = float(np.linalg.norm(chain.predict(frame) - source.xy))
+    difference = _difference(last, source)
+    if distance > gate or difference > MAX_DIFFERENCE:
+        return None
+    return distance / gate + difference + GAP_COST * (gap - 1) + 0.2 * (len(chain.frames) < 2)
+
+
+def _difference(first: Source, second: Source) -> float:
+    """Return how much two sources differ in size, colour and evidence; one that the frame's edge cuts has no size."""
+    one, two = first.detection, second.detection
+    cut = one.is_cut or two.is_cut
+    size = 0.0 if cut else abs(float(np.log(one.radius / two.radius)))
+    return (SIZE_COST * size + COLOUR_COST * float(np.abs(one.colour - two.colour).mean())
+            + EVIDENCE_COST * abs(first.evidence - second.evidence))
+
+
+def _join(chains: list[Chain], diagonal: float) -> list[Chain]:
+    """Join chains where one ends before another begins and both extrapolations meet, the best pair first."""
+    while True:
+        best: tuple[float, int, int] | None = None
+        for i, first in enumerate(chains):
+            for j, second in enumerate(chains):
+                if i != j and (cost := _join_cost(first, second, diagonal)) is not None \
+                        and (best is None or cost < best[0]):
+                    best = (cost, i, j)
+        if best is None:
+            return sorted(chains, key=lambda chain: -len(chain.frames))
+        _, i, j = best
+        joined = Chain(chains[i].frames + chains[j].frames, chains[i].sources + chains[j].sources)
+        chains = [chain for number, chain in enumerate(chains) if number not in (i, j)] + [joined]
+
+
+def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
+    """Return the cost of taking two chains for one thing; None where that cannot be."""
+    gap = second.frames[0] - first.frames[-1]
+    if not 0 < gap <= MAX_GAP or min(first.evidence, second.evidence) < LIKELY:
+        return None
+    if len(first.frames) + len(second.frames) < 4:
+        return None
+    acceleration = max(first.acceleration(diagonal), second.acceleration(diagonal))
+    gate = BASE_GATE * diagonal + acceleration * gap * gap / 3
+    speeds = [float(np.linalg.norm(chain.velocity(at_end))) for chain, at_end in ((first, True), (second, False))]
+    if 1 in (len(first.frames), len(second.frames)):  # a single frame has no velocity; it may have the other's
+        gate += 0.5 * gap * max(speeds)
+    # Half the way by each: the velocities need not agree, only the places in the middle.
+    middle = first.frames[-1] + gap / 2
+    forth = first.places[-1] + first.velocity(at_end=True) * (middle - first.frames[-1])
+    back = second.places[0] - second.velocity(at_end=False) * (second.frames[0] - middle)
+    distance = float(np.linalg.norm(forth - back))
+    difference = _difference(_typical(first, at_end=True), _typical(second, at_end=False))
+    if distance > gate or difference > MAX_DIFFERENCE:
+        return None
+    return distance / gate + difference + GAP_COST * gap
+
+
+def _typical(chain: Chain, at_end: bool) -> Source:
+    """Return the source of median size among the last or first few of a chain: the very last may be half hidden."""
+    near = chain.sources[-TYPICAL:] if at_end else chain.sources[:TYPICAL]
+    return sorted(near, key=lambda source: source.detection.radius)[len(near) // 2]

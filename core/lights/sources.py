@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Finds everything in a frame that may be a light: the candidates that `tracks.py` follows from frame to frame.
+
+A source is a clipped spot. Spots that touch, such as twin headlights from afar or two bulbs, are parted where they are
+thick. The place of a source is the flux centroid of its thick part, which spikes of the starburst and ghosts beside it
+hardly move. Its evidence says how much it looks like a lamp: compact and white as for `exposure.py`, and soft, because
+the flare round a lamp fades over many pixels, where a clipped window, shirt or sheet of paper ends at an edge.
+"""
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture.camera import Floats
+from ..images.picture import Picture
+from .detection import Detection, Mask, measure_detection
+from .exposure import MAX_AREA_SHARE, open_by_disc, shape_score, smoothstep
+
+OPENING_RATIO = 0.75
+"""Radius of the opening that removes spikes and parts spots, relative to the thickest part's."""
+MIN_THICKNESS = 0.55
+"""Thickness of a part, relative to the thickest of its spot, from which it is a source of its own."""
+MIN_RADIUS = 0.0018
+"""Smallest radius of a spot, in frame diagonals; one pixel at least."""
+CLIPPED = 0.98
+"""Display value from which pixels are clipped, unless the whole shot stays below it."""
+HARD, SOFT = 0.04, 0.16
+"""Softness of an edge that no lamp has, and from which every lamp may have it."""
+NEAR, FAR = (1.5, 3.5), (9.0, 16.0)
+"""Rings of the softness: distances from the spot's edge, pixels of a frame with a diagonal of REFERENCE."""
+REFERENCE = 550.0
+PROFILE_RADII = (3.0, 4.5, 6.5, 9.0, 12.0, 16.0, 21.0, 27.0, 34.0, 42.0)
+"""Edges of the rings of the brightness, pixels from the centre, as above."""
+SECTORS = 12
+"""Sectors of a ring; the median over them leaves out ghosts, streaks and what stands beside the light."""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A candidate for a light in one frame.
+
+    detection: place, radius, colour and mask. evidence: 0..1, how much it looks like a lamp. profile: (9,) linear light
+    in the rings of PROFILE_RADII, NaN where a ring is clipped or out of the frame.
+    """
+
+    detection: Detection
+    evidence: float
+    profile: Floats
+
+    @property
+    def xy(self) -> Floats:
+        """(2,) pixels."""
+        return self.detection.xy
+
+
+def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source]:
+    """Return the sources of a frame, the largest evidence first. clipped_from: display value of clipped pixels."""
+    import cv2
+
+    display, linear = picture.display(), picture.linear()
+    value = np.asarray(display.max(axis=2))
+    luminance = np.minimum(linear, 1.0).mean(axis=2)
+    diagonal = float(np.hypot(*picture.size))
+    clipped = (value >= clipped_from).astype(np.uint8)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(clipped, connectivity=8)
+    min_area = max(3.0, np.pi * (MIN_RADIUS * diagonal) ** 2)
+    scaled = display if clipped_from >= CLIPPED else np.minimum(display / np.float32(clipped_from), 1)
+    sources = []
+    for label in range(1, count):
+        left, top, width, height, area = map(int, boxes[label])
+        if area < min_area:
+            continue
+        region = labels[top:top + height, left:left + width] == label
+        for mask, corner in _parts(region, MAX_AREA_SHARE * clipped.size):
+            corner = (left + corner[0], top + corner[1])
+            shape = shape_score(mask, corner, scaled)
+            soft = smoothstep(_softness(mask, corner, luminance, diagonal / REFERENCE), HARD, SOFT)
+            found = measure_detection(mask, corner, picture, scaled, shape)
+            if picture.encoding == "linear":
+                found = _at_flux(found, linear)
+            sources.append(Source(found, shape * soft, measure_profile(luminance, found.xy)))
+    return sorted(sources, key=lambda source: -source.evidence)
+
+
+def _parts(region: Mask, largest: float) -> Iterator[tuple[Mask, tuple[int, int]]]:
+    """Yield the thick parts of a spot with their corners (x, y) in it; none where a disc of `largest` px fits in."""
+    import cv2
+
+    padded = np.pad(region, 1).astype(np.uint8)
+    outline, _ = cv2.findContours(padded, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(padded, outline, -1, (1.0,), cv2.FILLED)
+    thickness = np.asarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5))
+    thickest = float(thickness.max())
+    if np.pi * thickest ** 2 > largest:
+        return
+    for ratio in (MIN_THICKNESS, OPENING_RATIO):  # part with a small disc, then trim each part by its own thickness
+        reach = int(ratio * thickest)
+        opened = open_by_disc(padded, reach) if reach >= 1 else padded
+        if ratio == MIN_THICKNESS:
+            count, labels = cv2.connectedComponents(opened, connectivity=4)
+            if count > 2:
+                break
+    else:
+        yield _trimmed(opened, (1, 1))
+        return
+    for label in range(1, count):
+        part = (np.asarray(labels) == label).astype(np.uint8)
+        reach = int(OPENING_RATIO * float(cv2.distanceTransform(part, cv2.DIST_L2, 5).max()))
+        trimmed = open_by_disc(part, reach) if reach >= 1 else part
+        if trimmed.any():
+            yield _trimmed(trimmed, (1, 1))
+
+
+def _trimmed(mask: NDArray[np.uint8], padding: tuple[int, int]) -> tuple[Mask, tuple[int, int]]:
+    """Return the largest connected part of a mask within its box, and the box's corner without the padding."""
+    import cv2
+
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    label = 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA])) if count > 1 else 0
+    left, top, width, height = map(int, boxes[label][:4])
+    return (np.asarray(labels[top:top + height, left:left + width] == label),
+            (left - padding[0], top - padding[1]))
+
+
+def _at_flux(found: Detection, linear: NDArray[np.float32]) -> Detection:
+    """Return a detection at the flux centroid of the part above half its peak, where frames hold light above white."""
+    from dataclasses import replace
+
+    left, top, right, bottom = found.box
+    light = linear[top:bottom, left:right].mean(axis=2) * found.mask
+    peak = float(light.max())
+    if peak <= 2.0:
+        return found
+    weight = np.maximum(light - 0.5 * peak, 0)
+    v, u = np.mgrid[top:bottom, left:right] + 0.5
+    return replace(found, xy=np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum())
+
+
+def _softness(mask: Mask, corner: tuple[int, int], luminance: NDArray[np.float32], scale: float) -> float:
+    """Return how softly a spot ends: the light just outside its edge, above that farther out, relative to the spot."""
+    import cv2
+
+    height, width = luminance.shape
+    room = int(np.ceil(FAR[1] * scale)) + 1
+    left, top = max(corner[0] - room, 0), max(corner[1] - room, 0)
+    right, bottom = min(corner[0] + mask.shape[1] + room, width), min(corner[1] + mask.shape[0] + room, height)
+    area = np.ones((bottom - top, right - left), np.uint8)
+    y, x = corner[1] - top, corner[0] - left
+    area[y:y + mask.shape[0], x:x + mask.shape[1]][mask] = 0
+    distance = np.asarray(cv2.distanceTransform(area, cv2.DIST_L2, 5))
+    around = luminance[top:bottom, left:right]
+    near, far = (around[(distance > low * scale) & (distance <= high * scale)] for low, high in (NEAR, FAR))
+    if not len(near) or not len(far):
+        return 0.0
+    outside = float(np.median(far))
+    return (float(np.median(near)) - outside) / max(1 - outside, 1e-3)
+
+
+def measure_profile(luminance: NDArray[np.float32], xy: Floats) -> Floats:
+    """Return linear light in the rings of PROFILE_RADII round a place: the median over the sectors of each ring.
+
+    luminance: (height, width), clipped at 1. NaN for a ring that is clipped, or mostly out of the frame.
+    """
+    height, width = luminance.shape
+    radii = np.array(PROFILE_RADII) * float(np.hypot(height, width)) / REFERENCE
+    reach = int(np.ceil(radii[-1]))
+    left, right = max(int(xy[0]) - reach, 0), min(int(xy[0]) + reach + 1, width)
+    top, bottom = max(int(xy[1]) - reach, 0), min(int(xy[1]) + reach + 1, height)
+    profile = np.full(len(radii) - 1, np.nan)
+    if right <= left or bottom <= top:
+        return profile
+    v, u = np.mgrid[top:bottom, left:right] + 0.5
+    u, v = u - xy[0], v - xy[1]
+    ring = np.digitize(np.hypot(u, v), radii) - 1
+    sector = ((np.arctan2(v, u) / (2 * np.pi) % 1.0) * SECTORS).astype(int) % SECTORS
+    inside = (ring >= 0) & (ring < len(profile))
+    index = (ring * SECTORS + sector)[inside]
+    pixels = luminance[top:bottom, left:right][inside]
+    count = np.bincount(index, minlength=len(profile) * SECTORS).reshape(len(profile), SECTORS)
+    total = np.bincount(index, pixels, minlength=len(profile) * SECTORS).reshape(len(profile), SECTORS)
+    for number in range(len(profile)):
+        seen = count[number] > 0
+        if seen.sum() >= SECTORS // 2:
+            means = total[number][seen] / count[number][seen]
+            level = float(np.median(means))
+            profile[number] = level if level < 0.85 else np.nan
+    return profile

@@ -1,0 +1,299 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Follows lights through the frames of a shot: places on the picture, brightness and confidence by frame.
+
+`sources.py` finds candidates in each frame, `association.py` chains them. A chain is a light if its sources look like
+lamps in most frames and it is no ghost of another light. Between the frames that show a light its path is a cubic
+through places and velocities; beyond them it goes on at constant velocity until it is well out of the frame. Each
+interpolated place has an expected error, from the light's own acceleration, which becomes its confidence.
+
+Brightness is the height of the glow round the light's place in unclipped rings, with one profile for the whole shot:
+I[t, r] = on[t] G[r] + background[t], by alternating least squares.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import Capture
+from ..capture.camera import Floats
+from ..capture.lights import DOUBTFUL, LightKey
+from ..system.progress import Progress
+from .association import Chain, follow
+from .sources import CLIPPED, Source, find_sources, measure_profile
+
+MIN_EVIDENCE = 0.3
+"""Evidence of a chain from which it is a light; chains down to half of it are doubtful."""
+MIN_FRAMES = 4
+"""Frames that must show a light, or a tenth of the shot."""
+GHOST_ERROR, MIN_GHOST_MOTION = 0.008, 0.03
+"""Largest median distance of a ghost from the line through its light, and the least motion of that light, diagonals."""
+TOLERATED_ERROR = 3.0
+"""Expected error, pixels of a frame with a diagonal of 550, at which a place is as good as doubtful."""
+MAX_BEYOND = 12
+"""Frames by which a path goes on beyond those that show the light."""
+OUT_MARGIN = 0.25
+"""Distance out of the frame, diagonals, at which a path ends."""
+BRIGHTNESS_STEPS = 40
+DARK = 0.03
+"""Brightness below which a light is out."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedLight:
+    """A light on a path on the picture.
+
+    keys: place, brightness and confidence by the name of the frame. support: names of the frames that show it.
+    evidence: 0..1, how much it looks like a lamp. colour: (3,) linear, largest channel 1. radius: median, pixels.
+    """
+
+    keys: dict[str, LightKey]
+    support: tuple[str, ...]
+    evidence: float
+    colour: Floats
+    radius: float
+    how: str = "followed"
+
+    @property
+    def doubtful(self) -> list[str]:
+        """Names of the frames in which the light's place is doubtful."""
+        return [name for name, key in self.keys.items() if key.confidence < DOUBTFUL]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackFindings:
+    """The result of following: lights, the longest first; doubtful ones; sources of each frame; sentences for the
+    user."""
+
+    lights: list[TrackedLight]
+    doubtful: list[TrackedLight]
+    sources: list[list[Source]]
+    messages: list[str]
+
+
+def track_lights(capture: Capture, progress: Progress | None = None) -> TrackFindings:
+    """Follow the lights of a capture's frames, which are taken for consecutive. Raises FrameError and Cancelled."""
+    progress = progress or Progress()
+    views = capture.views
+    progress.stage("look for lights", len(views))
+    clipped = clip_level(capture)
+    sources: list[list[Source]] = []
+    for view in views:
+        sources.append(find_sources(capture.frame(view), clipped))
+        progress.advance(1, found=sum(map(len, sources)))
+    camera = views[0].camera
+    diagonal = float(np.hypot(*camera.size))
+    chains = follow(sources, diagonal)
+    enough = max(MIN_FRAMES, len(views) // 10) if len(views) >= MIN_FRAMES else 1
+    long = [chain for chain in chains if len(chain.frames) >= enough]
+    lamps = [chain for chain in long if chain.evidence >= MIN_EVIDENCE]
+    ghosts = [chain for chain in lamps if _is_ghost(chain, lamps, np.array([camera.cx, camera.cy]), diagonal)]
+    lamps = [chain for chain in lamps if chain not in ghosts]
+    unsure = [chain for chain in long if MIN_EVIDENCE > chain.evidence >= 0.5 * MIN_EVIDENCE]
+    progress.stage("follow lights", len(lamps) + len(unsure))
+    tracked = []
+    for chain in [*lamps, *unsure]:
+        tracked.append(_to_light(chain, capture, diagonal))
+        progress.advance()
+    lights, doubtful = tracked[:len(lamps)], tracked[len(lamps):]
+    return TrackFindings(lights, doubtful, sources, _messages(lights, doubtful, len(ghosts), sources))
+
+
+def clip_level(capture: Capture) -> float:
+    """Return the display value from which pixels of a shot are clipped, a little below its largest one.
+
+    Footage with a limited range or a soft shoulder never reaches white.
+    """
+    peaks = []
+    for view in capture.views[::max(len(capture.views) // 12, 1)]:
+        value = capture.frame(view).display().max(axis=2)
+        peaks.append(float(np.partition(value.ravel(), -12)[-12]) if value.size > 12 else float(value.max()))
+    return min(CLIPPED, 0.985 * max(peaks))
+
+
+def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], ghosts: int,
+              sources: Sequence[Sequence[Source]]) -> list[str]:
+    number = sum(map(len, sources))
+    messages = [f"{number} bright spots in {sum(map(bool, sources))} of {len(sources)} frames, of which "
+                f"{len(lights)} {'is a light' if len(lights) == 1 else 'are lights'} that could be followed."]
+    for index, light in enumerate(lights, 1):
+        frames = light.doubtful
+        if frames:
+            messages.append(f"light{index} is hidden, out of the frame or out in {len(frames)} of {len(light.keys)} "
+                            f"frames where its place is doubtful (first {frames[0]}).")
+    if ghosts:
+        messages.append(f"{ghosts} more follow another light through the middle of the picture and are its ghosts.")
+    if doubtful:
+        messages.append(f"{len(doubtful)} moving bright things look too little like lamps and are left out.")
+    if not lights:
+        messages.append("No light was found: none is in frame for long enough, or none is over-exposed.")
+    return messages
+
+
+def _is_ghost(chain: Chain, lamps: Sequence[Chain], centre: Floats, diagonal: float) -> bool:
+    """True if a chain keeps to a fixed ratio of the way from the picture's middle to a larger light that moves."""
+    for light in lamps:
+        shared = sorted(set(chain.frames) & set(light.frames))
+        if light is chain or len(shared) < max(3, 0.7 * len(chain.frames)):
+            continue
+        ghost, source = (np.array([each.sources[each.frames.index(frame)].xy for frame in shared]) - centre
+                         for each in (chain, light))
+        radius, other = (np.median([each.sources[each.frames.index(frame)].detection.radius for frame in shared])
+                         for each in (chain, light))
+        if radius > 0.9 * other or np.ptp(source, axis=0).max() < MIN_GHOST_MOTION * diagonal:
+            continue
+        # To third order in the field angle, a ghost lies at (a + b field²) of the way to its light.
+        field = (source ** 2).sum(axis=1, keepdims=True) / diagonal ** 2
+        terms = np.stack([source.ravel(), (field * source).ravel()], axis=1)
+        ratios = np.linalg.lstsq(terms, ghost.ravel(), rcond=None)[0]
+        left = (ghost.ravel() - terms @ ratios).reshape(-1, 2)
+        error = float(np.median(np.linalg.norm(left, axis=1)))
+        if error < GHOST_ERROR * diagonal and abs(ratios[0] - 1) > 0.05:
+            return True
+    return False
+
+
+def _to_light(chain: Chain, capture: Capture, diagonal: float) -> TrackedLight:
+    """Return the light of a chain with its keys in all frames that its path reaches."""
+    size = np.array(capture.views[0].camera.size, np.float64)
+    frames, places, errors = _fill(chain, len(capture.views), size, diagonal)
+    shown = dict(zip(chain.frames, chain.sources, strict=True))
+    profiles = []
+    for frame, place in zip(frames, places, strict=True):
+        source = shown.get(frame)
+        if source is not None:
+            profiles.append(source.profile)
+        elif ((place > 0) & (place < size)).all():
+            pixels = np.minimum(capture.frame(capture.views[frame]).linear(), 1).mean(axis=2)
+            profiles.append(measure_profile(pixels, place))
+        else:
+            profiles.append(np.full(len(chain.sources[0].profile), np.nan))
+    brightness = fit_brightness(np.array(profiles), np.array([frame in shown for frame in frames]))
+    tolerated = TOLERATED_ERROR * diagonal / 550.0
+    keys = {}
+    for frame, place, error, on in zip(frames, places, errors, brightness, strict=True):
+        confidence = 1 / (1 + (error / tolerated) ** 2)
+        inside = bool(((place > 0) & (place < size)).all())
+        known = None if np.isnan(on) else float(on)
+        if frame not in shown:
+            # A place that is off its light shows no glow, so only a dark one is believed where the place is doubtful.
+            known = (0.0 if known is None or known < DARK or confidence < DOUBTFUL else known) if inside else None
+        keys[capture.views[frame].name] = LightKey(None, place, known, float(confidence))
+    colour = np.median([source.detection.colour for source in chain.sources], axis=0)
+    return TrackedLight(keys, tuple(capture.views[frame].name for frame in chain.frames), chain.evidence,
+                        colour / max(float(colour.max()), 1e-6),
+                        float(np.median([source.detection.radius for source in chain.sources])))
+
+
+def _fill(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple[list[int], Floats, Floats]:
+    """Return the frames of a chain's path, places (n, 2) and expected errors (n,) in pixels.
+
+    count: number of frames of the shot. Sources that the frame's edge cuts count as missing where their path is known.
+    """
+    whole = _without_cut(chain)
+    acceleration = chain.acceleration(diagonal)
+    measured = dict(zip(chain.frames, chain.sources, strict=True))
+    first, last = max(chain.frames[0] - MAX_BEYOND, 0), min(chain.frames[-1] + MAX_BEYOND, count - 1)
+    frames, places, errors = [], [], []
+    knots, points = np.array(whole.frames), whole.places
+    rates = _velocities(knots, points)
+    for frame in range(first, last + 1):
+        after = int(np.searchsorted(knots, frame))
+        if after < len(knots) and knots[after] == frame:
+            place, error = points[after], _outlier(whole, after, acceleration)
+        elif 0 < after < len(knots):
+            low, high = after - 1, after
+            span = float(knots[high] - knots[low])
+            place = _hermite((frame - knots[low]) / span, span, points[low], rates[low], points[high], rates[high])
+            error = acceleration * span * span / 16
+        else:
+            end = -1 if after else 0
+            step = float(frame - knots[end])
+            place, error = points[end] + step * rates[end], 0.5 * acceleration * step * step
+        source = measured.get(frame)
+        if source is not None and source.detection.is_cut:
+            # The part within the frame bounds the place: no farther out than its radius.
+            place = source.xy if np.linalg.norm(place - source.xy) > 3 * source.detection.radius else place
+            error = max(error, 0.5 * source.detection.radius)
+        outside = float(np.maximum(np.maximum(-place, place - size), 0).max())
+        if outside > OUT_MARGIN * diagonal and not chain.frames[0] <= frame <= chain.frames[-1]:
+            continue
+        frames.append(frame)
+        places.append(place)
+        errors.append(error)
+    return frames, np.array(places), np.array(errors)
+
+
+def _without_cut(chain: Chain) -> Chain:
+    """Return the chain without sources that the frame's edge cuts; the whole chain where too few are left."""
+    kept = [(frame, source) for frame, source in zip(chain.frames, chain.sources, strict=True)
+            if not source.detection.is_cut]
+    if len(kept) < 2:
+        return chain
+    return Chain([frame for frame, _ in kept], [source for _, source in kept])
+
+
+def _velocities(frames: Floats, places: Floats) -> Floats:
+    """Return the velocity (n, 2) at each place: of the parabola through it and its two nearest neighbours in time."""
+    if len(frames) < 2:
+        return np.zeros_like(places)
+    rates = []
+    for index in range(len(frames)):
+        start = min(max(index - 1, 0), max(len(frames) - 3, 0))
+        near = slice(start, min(start + 3, len(frames)))
+        times = (frames[near] - frames[index]).astype(np.float64)
+        degree = min(2, len(times) - 1)
+        if np.ptp(times) > 6:  # neighbours across a gap say nothing of the velocity here
+            before, after = max(index - 1, 0), min(index + 1, len(frames) - 1)
+            sides = [pair for pair in ((before, index), (index, after)) if pair[0] != pair[1]]
+            low, high = min(sides, key=lambda pair: frames[pair[1]] - frames[pair[0]])
+            rates.append((places[high] - places[low]) / (frames[high] - frames[low]))
+            continue
+        rates.append(np.polyfit(times, places[near], degree)[-2])
+    return np.array(rates)
+
+
+def _hermite(part: float, span: float, start: Floats, out: Floats, end: Floats, into: Floats) -> Floats:
+    """Return the cubic between two places with their velocities per frame, at 0..1 of the span."""
+    square, cube = part * part, part ** 3
+    return np.asarray((2 * cube - 3 * square + 1) * start + (cube - 2 * square + part) * span * out
+                      + (3 * square - 2 * cube) * end + (cube - square) * span * into)
+
+
+def _outlier(chain: Chain, index: int, acceleration: float) -> float:
+    """Return the expected error of a measured place: how far it is from its neighbours' path, beyond acceleration."""
+    frames, places = chain.frames, chain.places
+    if not 0 < index < len(frames) - 1 or frames[index + 1] - frames[index - 1] > 4:
+        return 0.5
+    part = (frames[index] - frames[index - 1]) / (frames[index + 1] - frames[index - 1])
+    middle = (1 - part) * places[index - 1] + part * places[index + 1]
+    span = frames[index + 1] - frames[index - 1]
+    return 0.5 + max(float(np.linalg.norm(places[index] - middle)) - acceleration * span * span / 8, 0.0)
+
+
+def fit_brightness(profiles: Floats, shown: NDArray[np.bool_]) -> Floats:
+    """Return the brightness (n,) of a light from its profiles (n, rings): 0..1, NaN where no ring is usable.
+
+    shown: (n,) frames in which the light is seen; only they shape the common profile.
+    """
+    light = profiles[:, :-1] - profiles[:, -1:]
+    usable = np.isfinite(light)
+    brightness = np.where(usable.any(axis=1), 1.0, np.nan)
+    if not (usable & shown[:, None]).any():
+        return brightness
+    filled = np.where(usable, light, 0.0)
+    shape = np.full(light.shape[1], 0.1)
+    for _ in range(BRIGHTNESS_STEPS):
+        weight = (usable & shown[:, None]).astype(np.float64)
+        gain = np.nan_to_num(brightness)[:, None]
+        shape = np.maximum((weight * gain * filled).sum(0) / np.maximum((weight * gain * gain).sum(0), 1e-9), 0)
+        strong = usable * np.sqrt(shape)  # inner rings stand out of the scene's texture
+        total = (strong * shape * shape).sum(1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            brightness = np.where(total > 1e-9, np.maximum((strong * filled * shape).sum(1), 0) / total, np.nan)
+        peak = np.nanmax(np.where(shown, brightness, np.nan)) if np.isfinite(brightness[shown]).any() else 1.0
+        brightness = brightness / max(float(peak), 1e-9)
+    return np.clip(brightness, 0, 1)
+

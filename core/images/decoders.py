@@ -39,6 +39,10 @@ MAX_PIXELS = 500_000_000
 """Largest picture that is opened; a header that claims more is damaged or hostile."""
 MAX_BYTES = 2 << 30
 """Bound of a file that is read whole."""
+_DPX_ENCODING = 806, 808
+"""Bytes of a DPX's header that say whether its pixels are packed as runs (SMPTE 268M, image element 1)."""
+_MAX_RUN_LENGTH = 256
+"""Bound of the compression of formats that store runs of equal pixels."""
 _PACKAGES = {"OpenImageIO": ("OpenImageIO", "engine"), "pillow_heif": ("pillow-heif", "heif"),
              "PIL.Image": ("pillow", "heif"), "pillow_jxl": ("pillow-jxl-plugin", "jxl"), "rawpy": ("rawpy", "raw")}
 """Package and dependency group of each module."""
@@ -212,6 +216,21 @@ def _check_stated_size(path: Path, kind: Kind) -> None:
         raise _damaged(path, f"it has {size} of {stated} bytes")
 
 
+def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
+    """Raise FrameError for a file that cannot hold the pixels that its header claims: their memory may be gigabytes."""
+    size = path.stat().st_size
+    bits = spec.get_int_attribute("oiio:BitsPerSample", 0) or 8 * spec.format.size()
+    claimed = spec.width * spec.height * spec.nchannels * bits // 8
+    if kind in ("dpx", "cineon"):
+        with open_regular(path) as stream:
+            is_packed = kind == "dpx" and stream.read(_DPX_ENCODING[1])[_DPX_ENCODING[0]:] not in (b"", b"\0\0")
+        most = _MAX_RUN_LENGTH * size if is_packed else size
+    else:
+        most = _MAX_RUN_LENGTH * size if kind in ("tga", "bmp", "hdr") else claimed
+    if claimed > most:
+        raise _damaged(path, f"it claims {spec.width} x {spec.height} pixels in {size} bytes")
+
+
 def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
     """Decode a file with OpenImageIO; see `decode_foreign`. Raises FrameError."""
     _check_stated_size(path, kind)
@@ -227,6 +246,7 @@ def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
             channels = 4 if spec.alpha_channel == 3 else 3
         if spec.width * spec.height > MAX_PIXELS:
             raise FrameError(f"{path} claims {spec.width} x {spec.height} pixels, more than this program opens.")
+        _check_claimed_pixels(path, kind, spec)
         name = {"uint8": "uint8", "uint16": "uint16", "half": "half"}.get(str(spec.format), "float")
         pixels = opened.read_image(0, 0, 0, channels, name)
         problem = opened.geterror()

@@ -163,6 +163,21 @@ def test_a_tiff_keeps_text_place_and_exif(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_plate(tmp_path / "b.tif").codes, plate.codes // 2)
 
 
+@pytest.mark.parametrize(("name", "width", "height"), [
+    ("log DPX", (772, 4, "big"), (776, 4, "big")), ("Targa", (12, 2, "little"), (14, 2, "little")),
+    ("BMP", (18, 4, "little"), (22, 4, "little"))])
+def test_a_header_that_claims_more_than_the_file_can_hold_costs_no_memory(
+        name: str, width: tuple[int, int, Any], height: tuple[int, int, Any], tmp_path: Path) -> None:
+    path, _ = write(name, tmp_path, scene())
+    data = bytearray(path.read_bytes())
+    for (at, length, order), value in ((width, 20_000), (height, 16_000)):
+        data[at:at + length] = value.to_bytes(length, order)
+    path.write_bytes(data)
+    for read in (read_picture, read_plate):
+        with pytest.raises(FrameError, match=rf"{path.name} is damaged or truncated"):
+            read(path)
+
+
 @pytest.mark.parametrize("factor", [0.5, 3.0, 8.0])
 def test_a_plate_of_another_exposure_is_shown_alike_to_the_network(factor: float) -> None:
     light = scene()

@@ -3,7 +3,7 @@
 
 Bytes, words and JSON values of valid files are replaced, and each file is read as the program reads it. A reader may
 succeed or raise FitFlareError (OSError too, which the commands report in a sentence). Anything else is a failure, and
-so are ten seconds for one file, and two gigabytes of memory. Each format is read in a forked process, so that a crash
+so are ten seconds for one file, and a gigabyte of memory. Each format is read in a forked process, so that a crash
 of a library counts as a failure and does not end the others. Prints a table by format; the exit status is 1 where
 anything failed. `test_faults.py` reads a few files of each in its own process.
 """
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import copy
+import importlib.util
 import json
 import os
 import pickle
@@ -37,6 +38,7 @@ if __name__ == "__main__":
 import cv2
 import numpy as np
 import torch
+from PIL import Image
 
 from core.bake.bake import read_manifest
 from core.capture import Capture, read_lights
@@ -54,6 +56,7 @@ from core.flare.file import save as save_flare
 from core.gaussians.ply import read_ply, write_ply
 from core.images.plates import read_plate
 from core.images.read import read_picture
+from core.images.video import Video
 from core.images.write import write_exr
 from core.look import TrainedCamera, read
 from core.look.keyed import KeyedEdits
@@ -65,11 +68,15 @@ from core.removal.training.run import _read_log
 from core.system.files import read_json, write_json
 from tests.core.captures import make_capture, make_transforms
 from tests.core.flared import cameras
+from tests.core.picture_files import WRITERS, scene
 from tests.core.removal_cases import network_file, picture
 from tests.core.test_flare import some_flare
+from tests.core.videos import X265, stripes, write_video
 
 TIME_LIMIT_S = 10
-MEMORY_LIMIT = 2 << 30
+MEMORY_LIMIT = 1 << 30
+UNWRITABLE = {name for name, package in (("HEIC", "pillow_heif"),) if importlib.util.find_spec(package) is None}
+"""Formats of pictures whose encoder is not installed."""
 _NUMBERS = ["1" + "0" * 400, "-1", "0", "1e999", "NaN", "Infinity", "9223372036854775808", "2147483648", "1e-320",
             "0.5", "99999999999", "-0.0"]
 _WORDS = ["null", "true", "[]", "{}", '""', '"x"', "[" * 3000, '{"a":' * 3000, r'"\u0000"', r'"\ud800"',
@@ -187,6 +194,25 @@ def formats(base: Path) -> list[Format]:
     for suffix in (".png", ".jpg", ".tif"):
         add(f"picture {suffix}", f"a{suffix}", lambda folder, suffix=suffix: read_both(folder / f"a{suffix}"),  # type: ignore[misc]
             lambda folder, suffix=suffix: cv2.imwrite(str(folder / f"a{suffix}"), codes))  # type: ignore[misc]
+    light = scene()
+    for name, (file_name, _, write) in WRITERS.items():
+        if name not in UNWRITABLE:
+            add(f"picture {name}", file_name,
+                lambda folder, file_name=file_name: read_both(folder / file_name),  # type: ignore[misc]
+                lambda folder, file_name=file_name, write=write: write(folder / file_name, light))  # type: ignore[misc]
+    for suffix, options in (("gif", {}), ("avif", {"quality": 90}), ("webp", {"quality": 60})):
+        add(f"picture lossy {suffix}", f"a.{suffix}",
+            lambda folder, suffix=suffix: read_both(folder / f"a.{suffix}"),  # type: ignore[misc]
+            lambda folder, suffix=suffix, options=options: Image.fromarray(codes).save(  # type: ignore[misc]
+                folder / f"a.{suffix}", **options))
+    for name, codec, pixels, tags in (
+            ("h264.mp4", "libx264", "yuv420p", None), ("hevc.mp4", "libx265", "yuv420p10le", (9, 16, 9)),
+            ("ffv1.mkv", "ffv1", "gbrp10le", None), ("prores.mov", "prores_ks", "yuva444p10le", None),
+            ("vp9.webm", "libvpx-vp9", "yuv420p", None), ("mpeg2.ts", "mpeg2video", "yuv420p", None)):
+        add(f"video {name}", name, lambda folder, name=name: read_video(folder / name),  # type: ignore[misc]
+            lambda folder, name=name, codec=codec, pixels=pixels, tags=tags: write_video(  # type: ignore[misc]
+                folder / name, codec, pixels, [stripes(64, 64)] * 4, matrix=9 if tags else 1, tags=tags,
+                options=X265 if codec == "libx265" else {}, alpha=np.ones((64, 64)) if "yuva" in pixels else None))
     add("picture .exr", "a.exr", lambda folder: read_both(folder / "a.exr"), lambda folder: write_exr(
         folder / "a.exr", {channel: np.ones((24, 32), np.float32) for channel in "RGB"}))
     return found
@@ -216,6 +242,13 @@ def read_removed(folder: Path) -> None:
     manifest.is_up_to_date(Path("a.png"), "1", [folder / "a.png"])
     list(manifest.unedited([Path("a.png")]))
     manifest.results()
+
+
+def read_video(path: Path) -> None:
+    """Decode all frames of a video."""
+    with Video(path) as video:
+        for frame in video:
+            frame.picture()
 
 
 def read_both(path: Path) -> None:

@@ -19,7 +19,7 @@ from tests.faults import injection
 from tests.faults.cases import why_not_whole
 
 HERE = Path(__file__).parent
-FILES_OF_EACH = 15
+FILES_OF_EACH = 8
 
 needs_injection = pytest.mark.skipif(bool(injection.reason_to_skip()), reason=injection.reason_to_skip())
 
@@ -88,6 +88,7 @@ def test_mutated_files_are_read_or_refused(tmp_path: Path) -> None:
     from tests.faults.fuzz import formats, fuzz
 
     kinds = formats(tmp_path)
-    failures = [text for one in kinds for text in fuzz(one, FILES_OF_EACH, seed=1).failures]
+    failures = [text for one in kinds for text in fuzz(
+        one, 2 if "2000" in one.name else FILES_OF_EACH, seed=1).failures]  # a process of its own decodes JPEG 2000
     assert not failures, "\n".join(failures)
     assert len({one.name for one in kinds}) > 25

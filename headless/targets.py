@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..core.transfer.query import TrainingViews
     from ..core.transfer.target import Target
 
-TARGET_OPTIONS = {"picture": ("light", "focal", "centre"),
+TARGET_OPTIONS = {"picture": ("light", "focal", "centre", "highlights", "highlight_gain"),
                   ".blend": ("lights", "scene", "plates", "radius", "fall_off"),
                   ".json": ("scene", "plates", "fall_off"), ".ply": ("lights", "cameras", "fall_off"),
                   "run": ("lights", "scene", "cameras", "fall_off"), "capture": ("lights", "scene", "fall_off")}
@@ -48,6 +48,8 @@ class TargetOptions:
     smooth: int = 1
     radius: float = 0.0
     fall_off: float | None = None
+    highlights: float | None = None
+    highlight_gain: float | None = None
     scale: float = 1.0
     cameras: Path | None = None
     scene: Path | None = None
@@ -136,6 +138,7 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
     from ..core.lights.exposure import ExposureDetector
     from ..core.look import read
     from ..core.look.shot import Shot
+    from ..core.transfer.highlights import NAME
     from ..core.transfer.query import training_views
     from ..core.transfer.sources import parse_assignments
     from ..core.transfer.target import capture_target, picture_target, shot_target
@@ -150,13 +153,18 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
         to = pictures_in(to[0])
     kind = _target_kind(to[0])
     check_options(options, kind)
+    if options.highlight_gain is not None and options.highlights is None:
+        raise SettingsError("--highlight-gain is for --highlights; give both.")
     if kind == "picture":
         views = training_views(flare, look.lights, training)
         distances = {light.name: _median_distance(light, views.get(light.name)) for light in look.lights}
-        detector: Detector | None = None if options.light else ExposureDetector()
+        if options.highlights is not None and options.light:
+            raise SettingsError("--highlights takes the lights from the plates; leave --light out.")
+        named = {NAME: (0.5, 0.5)} if options.highlights is not None else _parse_lights(options.light)
+        detector: Detector | None = None if named else ExposureDetector()
         centre = _parse_point(options.centre) if options.centre else None
         space = None if options.plate_space == "auto" else colour_space(options.plate_space, options.ocio)
-        return picture_target(to, look, _parse_lights(options.light), sources, distances, detector=detector,
+        return picture_target(to, look, named, sources, distances, detector=detector,
                               focal=options.focal, centre=centre, space=space, training=views)
     if kind in (".blend", ".json"):
         path = shot_path(options) if kind == ".blend" else to[0]

@@ -7,6 +7,7 @@
     {"shape": "ellipse", "axes": [[x, y, z], [x, y, z]]}                         the two half axes
     {"shape": "sphere", "radius": 0.1}
     {"shape": "points", "points": [[x, y, z], ...]}                              offsets from the light's position
+    {"shape": "points", "points": [...], "factors": [[r, g, b], ...]}            each a light of its own factor
 
 A one-sided extent emits to the side of axes[0] x axes[1], with the cosine of Lambert's law; any other emits alike in
 all directions. The samples are fixed in the coordinates of the light, so nothing flickers when it moves. They are
@@ -33,6 +34,8 @@ SAMPLES = 256
 """Number of samples of an extent, the same number in each cell. A power of two."""
 MAX_POINTS = 4096
 """Most points of an extent of points."""
+MAX_FACTORS = 1024
+"""Most points of an extent with a factor for each."""
 MAX_LENGTH = 1e9
 """Largest length of an extent, world units."""
 
@@ -42,12 +45,13 @@ class SampledExtent:
     """The samples of a light's extent as one camera sees them.
 
     points (m, 3): positions in the world. cells (m,): the cell of each, numbered from 0. emission: 0..1, the cosine of
-    a one-sided light, else 1.
+    a one-sided light, else 1. factors (cells, 3): linear RGB of each cell, if the cells are lights of their own.
     """
 
     points: Floats
     cells: NDArray[np.int64]
     emission: float = 1.0
+    factors: Floats | None = None
 
     @property
     def count(self) -> int:
@@ -67,7 +71,9 @@ class SampledExtent:
 
     @property
     def weights(self) -> Floats:
-        """(cells,) part of the light in each cell; they sum to 1."""
+        """(cells,) part of the light in each cell; they sum to 1, unless the cells are lights of their own."""
+        if self.factors is not None:
+            return np.ones(self.count)
         return np.bincount(self.cells) / len(self.cells)
 
 
@@ -76,7 +82,8 @@ class LightExtent:
     """An extent around a light's position; see the module's head. Make one with `rectangle`, `ellipse`, `sphere`,
     `of_points`, or `read`.
 
-    axes (2, 3): of a rectangle or ellipse. points (n, 3): of points, neighbours beside each other.
+    axes (2, 3): of a rectangle or ellipse. points (n, 3): of points, neighbours beside each other. factors (n, 3):
+    None, or linear RGB of each point, each of which is a cell then and has a whole flare.
     """
 
     shape: Shape
@@ -84,6 +91,7 @@ class LightExtent:
     radius: float = 0.0
     points: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     one_sided: bool = False
+    factors: Floats | None = None
 
     @classmethod
     def rectangle(cls, axes: ArrayLike, *, one_sided: bool = False) -> LightExtent:
@@ -101,10 +109,11 @@ class LightExtent:
         return cls("sphere", radius=float(radius))._checked()
 
     @classmethod
-    def of_points(cls, points: ArrayLike) -> LightExtent:
+    def of_points(cls, points: ArrayLike, factors: ArrayLike | None = None) -> LightExtent:
         """Return points of equal strength; points (n, 3): offsets from the light's position, neighbours beside each
-        other, as `sample_surface` and `sample_curve` return them."""
-        return cls("points", points=np.array(points, np.float64))._checked()
+        other, as `sample_surface` and `sample_curve` return them. factors (n, 3): of lights of their own."""
+        return cls("points", points=np.array(points, np.float64),
+                   factors=None if factors is None else np.array(factors, np.float64))._checked()
 
     @classmethod
     def read(cls, entry: Any) -> LightExtent:
@@ -116,27 +125,32 @@ class LightExtent:
         try:
             return cls(entry["shape"], np.array(entry.get("axes", np.zeros((2, 3))), np.float64),
                        float(entry.get("radius", 0)), np.array(entry.get("points", np.zeros((0, 3))), np.float64),
-                       entry.get("one_sided", False))._checked()
+                       entry.get("one_sided", False),
+                       np.array(entry["factors"], np.float64) if entry.get("factors") is not None else None)._checked()
         except TypeError as problem:
             raise ValueError(f"the extent of a light is not valid ({problem})") from problem
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON form."""
         by_shape: dict[str, Any] = {"sphere": {"radius": self.radius}, "points": {"points": self.points.tolist()}}
-        one_sided = {"one_sided": True} if self.one_sided else {}
-        return {"shape": self.shape, **by_shape.get(self.shape, {"axes": self.axes.tolist()}), **one_sided}
+        others: dict[str, Any] = {"one_sided": True} if self.one_sided else {}
+        if self.factors is not None:
+            others["factors"] = self.factors.tolist()
+        return {"shape": self.shape, **by_shape.get(self.shape, {"axes": self.axes.tolist()}), **others}
 
     @property
     def cell_count(self) -> int:
         """Number of cells, and of the visible shares of a light with this extent."""
-        return min(CELLS, len(self.points)) if self.shape == "points" else CELLS
+        if self.shape != "points":
+            return CELLS
+        return min(CELLS, len(self.points)) if self.factors is None else len(self.points)
 
     def transformed(self, matrix: ArrayLike) -> LightExtent:
         """Return the extent under a linear map (3, 3), such as the rotation and scale of another world."""
         linear = np.asarray(matrix, np.float64)
         scale = abs(float(np.linalg.det(linear))) ** (1 / 3)
         return LightExtent(self.shape, self.axes @ linear.T, self.radius * scale, self.points @ linear.T,
-                           self.one_sided)._checked()
+                           self.one_sided, self.factors)._checked()
 
     def sampled(self, xyz: ArrayLike, world_to_camera: ArrayLike) -> SampledExtent:
         """Return the samples of the extent around a light at xyz (3,) for a camera of this pose (4, 4)."""
@@ -144,7 +158,7 @@ class LightExtent:
         eye = -pose[:3, :3].T @ pose[:3, 3]
         if self.shape == "points":
             numbers = np.arange(len(self.points))
-            return SampledExtent(centre + self.points, numbers * self.cell_count // len(numbers))
+            return SampledExtent(centre + self.points, numbers * self.cell_count // len(numbers), 1.0, self.factors)
         axes, emission = self.axes, 1.0
         if self.shape == "sphere":
             axes = self.radius * _facing_axes(centre - eye, pose)
@@ -162,6 +176,10 @@ class LightExtent:
             if self.points.ndim != 2 or self.points.shape[1:] != (3,) or not 1 <= len(self.points) <= MAX_POINTS:
                 raise ValueError(f"an extent of points needs 1 to {MAX_POINTS} points of three numbers")
             is_valid = bool((np.abs(self.points) < MAX_LENGTH).all())
+            factors = np.zeros((len(self.points), 3)) if self.factors is None else self.factors
+            if factors.shape != self.points.shape or (self.factors is not None and len(factors) > MAX_FACTORS):
+                raise ValueError(f"factors of points are three numbers for each of {MAX_FACTORS} points at most")
+            is_valid = is_valid and bool(((factors >= 0) & (factors < MAX_LENGTH)).all())
         elif self.shape == "sphere":
             is_valid = 0 <= self.radius < MAX_LENGTH
         else:

@@ -127,14 +127,16 @@ def _sum_over_cells(light: PlacedLight, extent: LightExtent, pose: NDArray[np.fl
     is_in_front = np.bincount(sampled.cells, seen[:, 2] > 0) == np.bincount(sampled.cells)
     plane = seen[:, :2] / np.where(seen[:, 2] > 0, seen[:, 2], np.inf)[:, None]
     centres = sampled.centres
-    factors = [fall_off(float(distance), light.reference_distance)
-               for distance in np.linalg.norm(centres - eye, axis=1)]
-    if is_in_front.all() and np.ptp(plane, axis=0).max() < 2 * SMALLEST_EXTENT:
+    factors = np.array([fall_off(float(distance), light.reference_distance)
+                        for distance in np.linalg.norm(centres - eye, axis=1)])[:, None] * light.factor
+    if sampled.factors is not None:
+        factors *= sampled.factors
+    elif is_in_front.all() and np.ptp(plane, axis=0).max() < 2 * SMALLEST_EXTENT:
         gaussians = _point(pose, centres.mean(0), light.visibility * float(strengths.sum()), evaluate)
-        return None if gaussians is None else multiply(gaussians, np.multiply(light.factor, np.mean(factors)), blend)
+        return None if gaussians is None else multiply(gaussians, factors.mean(0), blend)
     # Hidden cells are evaluated too: they show how the Gaussians follow the light.
     parts, places, cells = [], [], []
-    for cell in np.flatnonzero(is_in_front):
+    for cell in np.flatnonzero(is_in_front & (strengths > 0 if sampled.factors is not None else True)):
         part = _point(pose, centres[cell], light.visibility, evaluate)
         if part is not None:
             parts.append(part)
@@ -142,13 +144,15 @@ def _sum_over_cells(light: PlacedLight, extent: LightExtent, pose: NDArray[np.fl
             cells.append(int(cell))
     if not parts:
         return None
-    motions = _motions(parts, np.array(places))
+    are_points = sampled.count == len(sampled.points)
+    motions = None if are_points else _motions(parts, np.array(places))
     visible = []
     for part, cell in zip(parts, cells, strict=True):
         if strengths[cell] > 0:
-            offsets = plane[sampled.cells == cell]
-            spread = CELL_BLUR * np.cov(offsets.T, bias=True)
-            lit = multiply(_blurred(part, motions, spread, low_pass), np.multiply(light.factor, factors[cell]), blend)
+            if motions is not None:
+                spread = CELL_BLUR * np.cov(plane[sampled.cells == cell].T, bias=True)
+                part = _blurred(part, motions, spread, low_pass)
+            lit = multiply(part, factors[cell], blend)
             visible.append(replace(lit, opacities=np.asarray(lit.opacities * strengths[cell], np.float32)))
     return concatenate(visible)
 

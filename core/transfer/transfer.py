@@ -33,12 +33,14 @@ from ..flare.visibility import VisibilitySettings, visibility_behind
 from ..gaussians import Splats
 from ..images.picture import Picture
 from ..images.window import crop_to_display_window, move_to_window
+from ..lights.highlights import find_highlights
 from ..look import LightLook, LookEdits, PlacedLight, PlaneGaussians, ViewOfLight, read
 from ..look.placed_light import evaluate_placed
 from ..system.files import check_no_overwrite
 from ..system.progress import Progress
 from ..system.reading import read_bytes
 from . import query as queries
+from .highlights import at_highlights
 from .plates import AUTO, ColouredPlate, alpha_with_light
 from .target import Target, TargetFrame, background, plate_window
 from .visibility import smooth_visibility
@@ -57,7 +59,8 @@ class TransferSettings:
     for one of the source's. smooth: frames on either side over which visibility is smoothed, 0 for none. plate_space:
     colour space of the plates, "auto" for that of their capture or files. visibility: how the target's scene hides
     lights. fall_off: reference distance of the inverse square fall-off, world units, 0 for the distance in the first
-    frame, None for no fall-off; lights with a reference distance of their own keep it."""
+    frame, None for no fall-off; lights with a reference distance of their own keep it. highlights: luminance from which
+    pixels of the plates are lights, instead of the target's; None for the target's. highlight_gain: factor of these."""
 
     query: Follows = "blend"
     scale: float = 1.0
@@ -65,6 +68,8 @@ class TransferSettings:
     plate_space: str = AUTO
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
     fall_off: float | None = field(default=None, repr=False)  # in the fingerprints of frames
+    highlights: float | None = field(default=None, repr=False)  # in the fingerprint
+    highlight_gain: float = field(default=1.0, repr=False)
 
 
 class Transfer:
@@ -92,6 +97,8 @@ class Transfer:
         digest.update(self.target.fingerprint().encode())
         meaning = self.plate_space.fingerprint if self.plate_space is not None else ""
         digest.update(repr((self.settings, self.config, meaning, sorted(self.training_views))).encode())
+        if self.settings.highlights is not None:
+            digest.update(repr((self.settings.highlights, self.settings.highlight_gain)).encode())
         return digest.hexdigest()[:16]
 
     def fingerprint_of(self, index: int) -> str:
@@ -117,9 +124,15 @@ class Transfer:
 
     # ---- flares -----------------------------------------------------------------------------------
 
-    def flares(self, index: int, camera: Camera, edits: LookEdits | None = None) -> dict[str, Splats]:
-        """Return the splats of each light with a flare in a frame, for a camera, by the light's name."""
-        lights = self.target.frames[index].shot.lights
+    def flares(self, index: int, camera: Camera, edits: LookEdits | None = None, scene: Pixels | None = None
+               ) -> dict[str, Splats]:
+        """Return the splats of each light with a flare in a frame, for a camera, by the light's name.
+
+        scene (height, width, 3): linear light of the frame at the camera's size, in which highlights are found."""
+        lights: Sequence[PlacedLight] = self.target.frames[index].shot.lights
+        if self.settings.highlights is not None and scene is not None:
+            found = find_highlights(scene, self.settings.highlights, self.settings.highlight_gain)
+            lights = [at_highlights(light, found, camera) for light in lights] if len(found) else []
         splats: dict[str, Splats] = {}
         for light, source in self.look.visible_lights(lights, edits):
             def evaluate(view: ViewOfLight, visibility: float, light: PlacedLight = light, source: LightLook = source
@@ -294,7 +307,7 @@ class _FrameRenderer:
         """Render scene, flare of each light, and depth; scene-linear Rec. 709."""
         with torch.no_grad():
             scene, depth = self._background(camera)
-            flares = self._transfer.flares(self._index, camera, edits)
+            flares = self._transfer.flares(self._index, camera, edits, scene)
             # The blend "over" works in display space, over the clipped scene; the scene layer stays unclipped.
             display = encode(torch.from_numpy(np.clip(scene, 0, 1)))
             parts = linear_layers(display, flares, self._transfer.look.blend)

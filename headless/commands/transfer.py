@@ -40,6 +40,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     lights.add_argument("--light", action="append", default=[], metavar="[NAME=]X,Y",
                         help="for pictures: a light in pixels, inside the frame or outside; repeatable (default: found "
                              "by exposure)")
+    lights.add_argument("--highlights", type=float, nargs="?", const=0.95, metavar="LEVEL",
+                        help="for pictures: every spot brighter than LEVEL (linear, 1 is white; default 0.95) has a "
+                             "flare by its light, in one layer `highlights`")
+    lights.add_argument("--highlight-gain", type=float, metavar="FACTOR",
+                        help="brightness of the flares of --highlights (default 1: that of the .flare for white on "
+                             "1/2000 of the frame)")
     lights.add_argument("--lights", metavar="FILE|NAMES",
                         help="a lights.json instead of the capture's; or the names of objects of the .blend, with "
                              "commas between (default: its lamps)")
@@ -137,6 +143,10 @@ def _check_ranges(args: argparse.Namespace) -> None:
         raise SettingsError(f"--focal {args.focal} is not a length in pixels above 0.")
     if args.fall_off is not None and not 0 <= args.fall_off < math.inf:
         raise SettingsError(f"--fall-off {args.fall_off} is not a distance above 0.")
+    if args.highlights is not None and not 0 < args.highlights < math.inf:
+        raise SettingsError(f"--highlights {args.highlights} is not a level above 0.")
+    if args.highlight_gain is not None and not 0 < args.highlight_gain < math.inf:
+        raise SettingsError(f"--highlight-gain {args.highlight_gain} is not a factor above 0.")
     if not 0 <= args.radius < math.inf:
         raise SettingsError(f"--radius {args.radius} is not a length of 0 or more.")
 
@@ -158,7 +168,8 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
         progress.say(f"For {unwritten} of {len(plates)} plates only the layers are written: the plates have another "
                      "size than is rendered, or lens distortion.")
     settings = TransferSettings(options.query, options.scale, options.smooth, options.plate_space,
-                                fall_off=options.fall_off)
+                                fall_off=options.fall_off, highlights=options.highlights,
+                                highlight_gain=1.0 if options.highlight_gain is None else options.highlight_gain)
     transfer = Transfer(flare, target, settings, training, args.ocio)
     selected = frames.select_task([target_frame.frame for target_frame in target.frames], args, progress)
     if not selected:

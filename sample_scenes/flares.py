@@ -38,5 +38,8 @@ LENS_SETUPS: dict[str, LensSetup] = {
                                     dispersion=0.15),
                                Ring(gain=0.20, radius=0.055, width=0.06, follow=0.45, lean=0.2, dispersion=0.1),
                                Ring(gain=0.14, radius=0.27, width=0.025, follow=-0.3, grow=-0.1, dispersion=0.1))),
+    "normal": LensSetup("US4621909", stop_down=0.4, blades=9, turn=12.0, seed=47,
+                        coating=(0.52, 0.58, 0.45, 0.63, 0.49, 0.55), ghosts=GhostSettings(count=22, gain=420.0),
+                        starburst=Starburst(gain=1400.0, peak=9.0), glow=Glow(0.2, 0.03, 1.2, 0.025, 0.3, 0.002)),
 }
 """Setups by name, one for each sample capture."""

@@ -44,20 +44,20 @@ def gradient(values: Texture, palette: Palette) -> Texture:
     return colours[low] * (1 - part) + colours[low + 1] * part
 
 
-def _colour(rng: np.random.Generator, palette: Palette) -> tuple[int, int, int]:
+def random_colour(rng: np.random.Generator, palette: Palette) -> tuple[int, int, int]:
     red, green, blue = palette[rng.integers(len(palette))]
     return int(red), int(green), int(blue)
 
 
 def poster(rng: np.random.Generator, height: int, width: int, palette: Palette, shapes: int = 60) -> Texture:
     """Draw overlapping discs, rings, polygons, bars and lines."""
-    picture = np.full((height, width, 3), _colour(rng, palette), np.uint8)
+    picture = np.full((height, width, 3), random_colour(rng, palette), np.uint8)
     size = min(height, width)
     for index in range(shapes):
         scale = size * (0.30 * (1 - index / shapes) ** 1.5 + 0.04)
         x, y = int(rng.integers(width)), int(rng.integers(height))
         radius = int(scale * rng.uniform(0.5, 1.0)) + 2
-        colour = _colour(rng, palette)
+        colour = random_colour(rng, palette)
         kind = rng.integers(5)
         if kind == 0:
             cv2.circle(picture, (x, y), radius, colour, -1, cv2.LINE_AA)
@@ -160,11 +160,11 @@ def tiles(rng: np.random.Generator, height: int, width: int, palette: Palette, r
             x0, x1 = max(int((column + shift) * wide) + gap, 0), min(int((column + shift + 1) * wide), width)
             if x1 <= x0:
                 continue
-            tone = np.array(_colour(rng, palette), np.float32) / 255
+            tone = np.array(random_colour(rng, palette), np.float32) / 255
             picture[y0:y1, x0:x1] = tone * (0.55 + 0.6 * grain[y0:y1, x0:x1, None])
             if rng.random() < 0.45:
                 centre = (int((x0 + x1) / 2), int((y0 + y1) / 2))
-                mark = tuple(value / 255 for value in _colour(rng, palette))
+                mark = tuple(value / 255 for value in random_colour(rng, palette))
                 cv2.circle(picture, centre, int(0.22 * min(tall, wide)), mark, -1, cv2.LINE_AA)
     return np.clip(picture, 0, 1)
 
@@ -175,9 +175,9 @@ def weave(rng: np.random.Generator, height: int, width: int, palette: Palette) -
     border = min(height, width) // 14
     for ring in range(4):
         inset = ring * border
-        cv2.rectangle(picture, (inset, inset), (width - inset - 1, height - inset - 1), _colour(rng, palette), -1)
+        cv2.rectangle(picture, (inset, inset), (width - inset - 1, height - inset - 1), random_colour(rng, palette), -1)
         for x in range(inset + border, width - inset - border, 2 * border):
-            colour = _colour(rng, palette)
+            colour = random_colour(rng, palette)
             for y in (inset + border // 2, height - inset - border // 2):
                 cv2.circle(picture, (x, y), border // 3, colour, -1, cv2.LINE_AA)
     step = int(2.6 * border)
@@ -185,18 +185,18 @@ def weave(rng: np.random.Generator, height: int, width: int, palette: Palette) -
         for x in range(5 * border + (row % 2) * step // 2, width - 4 * border, step):
             reach = step // 2 - 2
             corners = np.array([(x - reach, y), (x, y - reach), (x + reach, y), (x, y + reach)], np.int32)
-            cv2.fillPoly(picture, [corners], _colour(rng, palette), cv2.LINE_AA)
-            cv2.circle(picture, (x, y), reach // 3, _colour(rng, palette), -1, cv2.LINE_AA)
+            cv2.fillPoly(picture, [corners], random_colour(rng, palette), cv2.LINE_AA)
+            cv2.circle(picture, (x, y), reach // 3, random_colour(rng, palette), -1, cv2.LINE_AA)
     worn = 0.75 + 0.35 * noise(rng, height, width, border, 3)[..., None]
     return np.clip(picture.astype(np.float32) / 255 * worn, 0, 1)
 
 
 def facade(rng: np.random.Generator, height: int, width: int, palette: Palette, floors: int, bays: int) -> Texture:
     """Draw the front of a house: plaster, rows of windows with shutters, a door or two, a cornice."""
-    plaster = np.array(_colour(rng, palette), np.float32) / 255
+    plaster = np.array(random_colour(rng, palette), np.float32) / 255
     picture = plaster * (0.75 + 0.35 * noise(rng, height, width, height / 5, 4)[..., None])
     tall, wide = height / floors, width / bays
-    shutter = np.array(_colour(rng, palette), np.float32) / 255 * 0.8
+    shutter = np.array(random_colour(rng, palette), np.float32) / 255 * 0.8
     for floor in range(floors):
         for bay in range(bays):
             top, left = int((floor + 0.22) * tall), int((bay + 0.3) * wide)

@@ -219,6 +219,25 @@ def uniform_world(colour: Vec, strength: float) -> None:
     background.inputs["Strength"].default_value = strength
 
 
+def far_world(texture: Texture) -> None:
+    """Set a world that shows a panorama in linear light (`panorama`) and lights the scene by it, without parallax."""
+    height, width = texture.shape[:2]
+    image = bpy.data.images.new("surrounding", width, height, float_buffer=True)
+    image.colorspace_settings.name = "Linear Rec.709"
+    pixels = np.ones((height, width, 4), np.float32)
+    pixels[..., :3] = texture[::-1]
+    image.pixels.foreach_set(pixels.ravel())
+    image.pack()
+    world = bpy.data.worlds.new("World")
+    bpy.context.scene.world = world
+    world.use_nodes = True
+    nodes, links = world.node_tree.nodes, world.node_tree.links
+    source = nodes.new("ShaderNodeTexEnvironment")
+    source.image = image
+    background = next(node for node in nodes if node.type == "BACKGROUND")
+    links.new(source.outputs["Color"], background.inputs["Color"])
+
+
 def dome(radius: float, texture: Texture, strength: float) -> Any:
     """Add a sky: a sphere about the origin that emits inwards."""
     material = picture_material("sky", texture)

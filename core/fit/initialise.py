@@ -16,6 +16,7 @@ from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..images.picture import Picture
 from ..lights.snap import FlareView, flare_view, snap_lights
+from .far_layer import find_far_layer
 from .frames import Frames, subsample
 from .settings import FitSettings
 from .sky import add_sky_points
@@ -65,8 +66,12 @@ def _load_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...]
         return scene
     if not len(capture.points):
         raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")
-    sky = settings.uses_parallax and settings.split.sky
-    return SceneGaussians.from_points(add_sky_points(capture, views, frames) if sky else capture.points)
+    layer = find_far_layer(capture, views, frames) if settings.scene.far_layer else None
+    sky = layer is None and settings.uses_parallax and settings.split.sky
+    scene = SceneGaussians.from_points(add_sky_points(capture, views, frames) if sky else capture.points)
+    if layer is not None:
+        scene.add_far_layer(layer.points, layer.sphere)
+    return scene
 
 
 def _check_in_view(scene: SceneGaussians, views: tuple[View, ...], path: str) -> None:

@@ -103,7 +103,8 @@ class SceneSettings:
 
     sh_every: iterations between degrees of spherical harmonics. reorder_every: iterations between sorts along the
     Morton curve, which keeps neighbours together in memory. start: a 3DGS PLY in the capture's world to start from
-    instead of the points. frozen: keep that scene unchanged and fit only the flare.
+    instead of the points. frozen: keep that scene unchanged and fit only the flare. far_layer: add a far layer where
+    the frames show something beyond the parallax of the capture (`far_layer`).
     """
 
     start: str = ""
@@ -114,6 +115,7 @@ class SceneSettings:
     rates: SceneRates = field(default_factory=SceneRates)
     sh_every: int = 1000
     reorder_every: int = 500
+    far_layer: bool = True
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from ..gaussians.spherical_harmonics import MAX_DEGREE
 from ..system.progress import Progress
 from . import metering
 from .checkpoint import FitInputs, State
+from .far_layer import far_layer_sentences
 from .frames import Frames, Targets, masked, subsample
 from .initialise import initial_flare, initial_scene
 from .optimisers import Optimisers
@@ -92,7 +93,8 @@ class Trainer:
         # Models, made from the inputs.
         self.scene = initial_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else initial_flare(capture, self.views, self.frames, settings)
-        self.warnings = (*self.frames.warnings, *metering.exposure_warnings(self.exposures),
+        self.warnings = (*self.frames.warnings, *far_layer_sentences(self.scene),
+                         *metering.exposure_warnings(self.exposures),
                          *footage_warnings(capture, settings, self.views, self.frames),
                          *(() if self.flare is None else moved_light_warnings(capture, self.flare)))
         self._inputs = FitInputs(capture, removed=self.frames.reference == "removed", lights=self.flare is not None)
@@ -147,12 +149,15 @@ class Trainer:
         occlusion_loss = self._occlusion_loss(targets)
         if occlusion_loss is not None:
             loss = loss + occlusion_loss
+        far_rows = self.scene.far_rows()
+        far_means = self.scene.means.detach()[far_rows]
         if loss.requires_grad:  # it does not with a frozen scene and no light in front of the camera
             with self.optimisers.scene.step_in_backward() if self._steps_in_backward else nullcontext():
                 loss.backward()
         if self.fits_scene:
             self.strategy.observe(scene)
         self.optimisers.step(scene=self.fits_scene)
+        self._turn_far_layer(far_rows, far_means)
         if self.fits_scene:
             if self.iteration < settings.iterations:  # Gaussians added by the last iteration would stay untrained
                 self.strategy.update(self.iteration)
@@ -160,6 +165,13 @@ class Trainer:
         if not scene_only:  # before, flare Gaussians are untrained, and their opacities say nothing
             self._change_flare_density()
         return figures
+
+    @torch.no_grad()
+    def _turn_far_layer(self, rows: Tensor, before: Tensor) -> None:
+        """Turn far Gaussians, which were at `before`, by the angle that a near one would appear to move by a step."""
+        if self.scene.far is not None and self.fits_scene and len(rows):
+            steps = self.optimisers.scene.last_step("means", rows) * (self.scene.far.radius / self.extent)
+            self.scene.means[rows] = self.scene.far.move(before, steps)
 
     def _clip_as_filmed(self, scene: Tensor) -> Tensor:
         """Clip a scene's picture where the frame clips; with equal exposures the picture already does."""
@@ -299,7 +311,7 @@ class Trainer:
     def _strategy(self) -> Strategy:
         settings, adam, generator = self.settings.scene, self.optimisers.scene, self._generator(0, 0)
         if settings.strategy == "mcmc":
-            return Mcmc(self.scene, adam, generator, settings.mcmc)
+            return Mcmc(self.scene, adam, generator, settings.mcmc, self.extent)
         return Classic(self.scene, adam, self.extent, generator, settings.classic)
 
     def _reorder_scene(self) -> None:

@@ -117,7 +117,7 @@ class Classic:
         """Clone small and split large Gaussians of high gradient, and prune faint ones; `prune_large` prunes large ones
         too."""
         s, scene = self.settings, self.scene
-        size = scene.scales.amax(-1)
+        size = scene.scales.amax(-1) / scene.units(self.extent)
         removed = scene.opacities < s.faint
         if prune_large:
             removed |= size > s.large * self.extent
@@ -188,15 +188,18 @@ class Mcmc:
 
     def __init__(
         self, scene: SceneGaussians, optimiser: Adam, generator: torch.Generator,
-        settings: McmcSettings | None = None,
+        settings: McmcSettings | None = None, extent: float = 1.0,
     ) -> None:  # fmt: skip
+        """extent: of the scene, by which the units of far Gaussians are measured."""
         self.scene, self.optimiser, self.generator = scene, optimiser, generator
+        self.extent = extent
         self.settings = settings or McmcSettings()
 
     def regulariser(self) -> Tensor:
         """Return the penalty on opacities and scales (the paper's eq. 12), a scalar for the loss."""
-        s = self.settings
-        return s.opacity_weight * self.scene.opacities.mean() + s.scale_weight * self.scene.scales.mean()
+        s, units = self.settings, self.scene.units(self.extent)
+        scales = self.scene.scales if isinstance(units, float) else self.scene.scales / units[:, None]
+        return s.opacity_weight * self.scene.opacities.mean() + s.scale_weight * scales.mean()
 
     def observe(self, rendering: Rendering) -> None:
         """Do nothing: this strategy needs no statistics."""
@@ -262,6 +265,9 @@ class Mcmc:
             return
         strength = torch.sigmoid(self.NOISE_STEEPNESS * (self.settings.faint - opacities[rows])) * self.settings.noise
         noise = _randn((len(rows), 3), self.generator, opacities) * strength[:, None] * rate
+        units = self.scene.units(self.extent)
+        if isinstance(units, Tensor):
+            noise = noise / units[rows][:, None]
         axes = rotation_matrices(self.scene.quaternions[rows]) * self.scene.scales[rows][:, None, :]
         self.scene.means[rows] += (axes @ (axes.transpose(1, 2) @ noise[..., None]))[..., 0]
 

@@ -115,6 +115,14 @@ class Adam:
         if fused is not None:
             fused.adam_steps(fused_steps, **options)
 
+    @torch.no_grad()
+    def last_step(self, name: str, rows: Tensor) -> Tensor:
+        """Return the last step (m, ...) of rows (m,) of a parameter, with full precision where the values are large."""
+        first, second = (moment[rows] for moment in self.moments[name])
+        count = max(self.steps[name], 1)
+        root = (second.sqrt() / math.sqrt(1 - BETA2**count)).add_(self.epsilon)
+        return first / root * (-self.rates[name] / (1 - BETA1**count))
+
     def zero_grad(self) -> None:
         """Set all gradients to None."""
         for parameter in self.parameters.values():

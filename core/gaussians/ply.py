@@ -22,15 +22,17 @@ from ..errors import FlareFileError
 from ..system.files import atomic_path
 from ..system.reading import open_regular
 from .compressed import is_compressed, read_compressed
+from .far_sphere import FarSphere
 from .rendering import NEAR
 from .scene import COEFFICIENTS, SceneGaussians
 
 MODE_COMMENT = "SplatRenderMode:"
 """Header comment of scenes that were trained with a mip filter, as Brush writes it, with the value "mip"."""
 MAX_HEADER_BYTES = 1 << 16
-NEAR_COMMENT, WHITE_COMMENT, FOCAL_COMMENT = "near", "white", "focal_lengths"
+NEAR_COMMENT, WHITE_COMMENT, FOCAL_COMMENT, FAR_COMMENT = "near", "white", "focal_lengths", "far_sphere"
 """Header comments of this package: the scene's `near` and `display_white`, a number each, unless they have their
-defaults, and the two focal lengths of its `pixel_grid`, if it has one."""
+defaults, the two focal lengths of its `pixel_grid`, if it has one, and centre and radius of its far sphere, likewise.
+"""
 MAX_WHITE = 107.0
 """Largest display white in a file: somewhat above the display value of the largest half float."""
 ORDERS = {form: order for form, order in ply.BYTE_ORDERS.items() if form != "ascii"}
@@ -74,6 +76,8 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
     if scene.pixel_grid is not None:
         grid = scene.pixel_grid
         comments.append(f"{FOCAL_COMMENT} {grid.min_focal_length:.9g} {grid.max_focal_length:.9g}")
+    if scene.far is not None:
+        comments.append(" ".join([FAR_COMMENT, *(f"{number:.9g}" for number in (*scene.far.centre, scene.far.radius))]))
     if scene.antialiased:
         comments.append(f"{MODE_COMMENT} mip")
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments),
@@ -134,7 +138,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
         columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0].clone(), sh
     )
     scene.near, scene.display_white, scene.pixel_grid = header.near, header.display_white, header.pixel_grid
-    scene.antialiased = header.antialiased
+    scene.antialiased, scene.far = header.antialiased, header.far
     return scene
 
 
@@ -148,6 +152,7 @@ class _Header(NamedTuple):
     display_white: float
     pixel_grid: PixelGrid | None
     antialiased: bool
+    far: FarSphere | None
 
 
 def _header(path: Path, head: bytes) -> _Header:
@@ -168,6 +173,7 @@ def _header(path: Path, head: bytes) -> _Header:
     if not parsed.format or not names or len(set(names)) < len(names):
         raise FlareFileError(f"{path} is not a PLY file of Gaussians; export the scene as one.")
     near, display_white, pixel_grid = NEAR, 1.0, None
+    far: FarSphere | None = None
     for words in parsed.comments:
         with contextlib.suppress(ValueError):
             match words:
@@ -177,9 +183,11 @@ def _header(path: Path, head: bytes) -> _Header:
                     display_white = float(number) if 1 < float(number) < MAX_WHITE else 1.0
                 case [word, least, most] if word == FOCAL_COMMENT:
                     pixel_grid = PixelGrid(float(least), float(most))
+                case [word, x, y, z, radius] if word == FAR_COMMENT:
+                    far = FarSphere.parse(float(x), float(y), float(z), float(radius))
     antialiased = any(map(_is_mip_comment, parsed.comments))
     return _Header(vertices.rows, vertices.row(ORDERS[parsed.format]), parsed.start, near, display_white, pixel_grid,
-                   antialiased)
+                   antialiased, far)
 
 
 def _is_mip_comment(words: Sequence[str]) -> bool:

@@ -2,6 +2,8 @@
 """The scene as 3D Gaussians, with the unconstrained parameters that a fit optimises."""
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -11,6 +13,7 @@ from ..choices import Kernels
 from ..conventions.pixel_grid import PixelGrid, dilation
 from ..errors import SettingsError
 from . import spherical_harmonics
+from .far_sphere import FarSphere
 from .ordering import nearest_distances
 from .projection import determinants, project
 from .rasterizer import rasterization
@@ -55,6 +58,8 @@ class SceneGaussians(nn.Module):
         opacity by as much (Yu et al. 2024; gsplat's rasterize_mode "antialiased")."""
         self.pixel_grid: PixelGrid | None = None
         """Pixel grid of the frames that the scene was fitted to, or None if unknown; see `conventions.pixel_grid`."""
+        self.far: FarSphere | None = None
+        """The sphere of the Gaussians that stand for directions, beyond all parallax; None without a far layer."""
 
     @classmethod
     def from_points(cls, points: PointCloud) -> SceneGaussians:
@@ -82,6 +87,31 @@ class SceneGaussians(nn.Module):
             torch.logit(torch.full((n,), INITIAL_OPACITY)),
             sh,
         )
+
+    @torch.no_grad()
+    def add_far_layer(self, points: PointCloud, sphere: FarSphere, opacity: float = INITIAL_OPACITY) -> None:
+        """Add a Gaussian at each point, which lies on the sphere, as `from_points` makes them but for the opacity."""
+        layer = SceneGaussians.from_points(points)
+        layer.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
+        for name, parameter in self.named_parameters():
+            parameter.data = torch.cat([parameter.data, layer.get_parameter(name).data])
+        self.far = sphere
+
+    def far_rows(self) -> Tensor:
+        """Return the numbers (m,) of the rows that are on the far sphere."""
+        if self.far is None:
+            return torch.zeros(0, dtype=torch.int64, device=self.means.device)
+        return torch.nonzero(self.far.contains(self.means))[:, 0]
+
+    def units(self, extent: float) -> Tensor | float:
+        """Return (n,) by how much larger the world units of a Gaussian are than those at `extent`: 1 for near ones.
+
+        Scales and steps divided by it are angles, as near ones appear; densification measures far Gaussians so. 1
+        without a far layer.
+        """
+        if self.far is None:
+            return 1.0
+        return 1 + self.far.contains(self.means) * (self.far.radius / extent - 1)
 
     @classmethod
     def empty(cls, n: int = 0) -> SceneGaussians:

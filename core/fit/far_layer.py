@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Finds what lies beyond the parallax of a capture, such as a skyline, clouds or a view from a window, and makes the
+far points that the scene starts from there. `initialise` calls it.
+
+Structure from motion has no points there, and a scene that grows over such places from near points stands at wrong
+depths. A sphere sweep decides: each direction is taken for points on an infinite sphere and on some near ones about the
+cameras, and the frames are compared where they see it. On a far direction the frames agree on the infinite sphere, and
+differ on the near ones, on which its texture does not meet itself. A plain direction, such as a clear sky, agrees on
+all, and follows the directions with contrast about it. A near surface agrees on none of them.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..capture import Camera, Capture, PointCloud, View
+from ..colour.srgb_torch import expose
+from ..gaussians.far_sphere import FarSphere
+from ..gaussians.scene import SceneGaussians
+from ..images.picture import Picture
+from .frames import Frames, subsample
+
+SWEEP_VIEWS, SWEEP_WIDTH = 24, 120
+"""Approximate number of views of the sweep, and their width in pixels."""
+PITCH_PX = 1.7
+"""Distance of neighbouring directions of the sweep, pixels of its pictures."""
+PATCH_PITCHES = 3.0
+"""Distance of neighbouring patches, which are decided as a whole, in distances of directions."""
+PARALLAXES_PX = (4.0, 7.0, 12.0, 20.0)
+"""Radii of the near spheres, as the parallax of their points over the spread of the cameras, pixels of the pictures."""
+MAX_DIFFERENCE = 0.05
+"""Difference, display values, up to which two views agree."""
+MIN_VIEWS, MIN_SEEN_SHARE = 3, 0.5
+"""Number of views that must see a direction, and share of a patch's directions that so many must see."""
+MIN_CONTRAST = 0.1
+"""Share of the views that differ on near spheres, below which a patch is plain and undecided."""
+DECISIVE_RATIO = 0.7
+"""Ratio of the shares that differ on the infinite sphere and on near ones, below which a patch is certainly far."""
+NEIGHBOURS, MIN_GAIN = 7, 0.06
+"""Number of patches with contrast, itself among them, by which a patch is decided once the capture has a far layer, and
+by how much less the views differ there on the infinite sphere, relative to near ones."""
+MAX_COST = 0.3
+"""Share of views that differ on the infinite sphere up to which a patch with contrast is far then: mostly plain ones
+that something hides in some views."""
+MIN_FAR_SHARE, MIN_FAR_PATCHES = 0.08, 12
+"""Share and number of the patches with contrast that must be far for a capture to have a far layer."""
+RADIUS_FACTOR, MAX_PARALLAX_PX = 20.0, 0.25
+"""Smallest radius of the far sphere relative to the distance of the farthest points, and the largest parallax of its
+points over the spread of the cameras, pixels of the fit's frames."""
+FARTHEST_QUANTILE = 0.99
+POINT_PITCH_PX = 4.0
+"""Distance of neighbouring far points, pixels of the fit's frames."""
+MAX_POINTS = 16_000
+COLOUR_QUANTILE = 0.25
+"""Quantile of the views' colours that a far point takes where the frames have a flare: flares only add light."""
+
+Floats = NDArray[np.float64]
+Values = NDArray[np.float32]
+Booleans = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class FarLayer:
+    """The far points of a capture, and the sphere that they lie on."""
+
+    sphere: FarSphere
+    points: PointCloud
+
+
+@dataclass(frozen=True, eq=False)
+class SweepView:
+    """A view of the sweep: its small camera, display values (height, width, 3), and which
+    pixels count (height, width)."""
+
+    camera: Camera
+    picture: Values
+    counts: Booleans | None
+
+
+def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) -> FarLayer | None:
+    """Return the far layer of a capture; None where nothing that its views see lies beyond their parallax."""
+    sampled = subsample(views, SWEEP_VIEWS)
+    cameras = [view.camera.scaled(min(SWEEP_WIDTH, view.camera.width)) for view in sampled]
+    extent = _spread(cameras)
+    if not len(capture.points) or not extent:
+        return None
+    patches = decide_patches([_sweep_view(view, frames) for view in sampled])
+    if patches is None:
+        return None
+    distances = np.linalg.norm(capture.points.xyz - _centre(cameras), axis=1)
+    focal = max(frames.camera(view).focal_length for view in sampled)
+    radius = max(RADIUS_FACTOR * float(np.quantile(distances, FARTHEST_QUANTILE)), extent * focal / MAX_PARALLAX_PX)
+    sphere = FarSphere(tuple(map(float, _centre(cameras))), radius)
+    return FarLayer(sphere, _far_points(sphere, patches, sampled, frames))
+
+
+def far_layer_sentences(scene: SceneGaussians) -> tuple[str, ...]:
+    """Return a sentence for the user on the far layer of a scene that a fit starts from; none without one."""
+    count = len(scene.far_rows())
+    if not count:
+        return ()
+    return (f"The frames show something beyond the parallax of the capture: {count} far Gaussians stand for it.",)
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Directions (n, 3), unit vectors, each the middle of a patch, and which (n,) are far."""
+
+    directions: Floats
+    is_far: Booleans
+
+    def contain(self, directions: Floats) -> Booleans:
+        """Return (m,) whether the patches of directions (m, 3) are far."""
+        return self.is_far[_nearest(directions, self.directions)]
+
+
+def decide_patches(views: list[SweepView]) -> Patches | None:
+    """Decide which patches of directions are far; None where too few are for a far layer."""
+    directions, costs, misaligned = sweep_patches(views)
+    has_contrast = misaligned >= MIN_CONTRAST
+    is_far = has_contrast & (costs < DECISIVE_RATIO * misaligned)
+    if is_far.sum() < max(MIN_FAR_PATCHES, MIN_FAR_SHARE * has_contrast.sum()):
+        return None
+    return Patches(directions, _fill(directions, costs, misaligned))
+
+
+def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats]:
+    """Sweep spheres about the cameras of views.
+
+    Returns directions (n, 3) of patches, the share (n,) of the views that differ there on the infinite sphere, and the
+    median share (n,) on near ones.
+    """
+    cameras = [view.camera for view in views]
+    focal = float(np.median([camera.focal_length for camera in cameras]))
+    pitch = PITCH_PX / focal
+    directions = _seen_directions(cameras, pitch)
+    patch_directions = _seen_directions(cameras, PATCH_PITCHES * pitch)
+    patch_of = _nearest(directions, patch_directions)
+    members = np.bincount(patch_of, minlength=len(patch_directions))
+    costs = np.full((len(PARALLAXES_PX) + 1, len(patch_directions)), np.nan)
+    for row, parallax in zip(costs, (0.0, *PARALLAXES_PX), strict=True):
+        cost, seen = _disagreement(views, directions, parallax / focal / _spread(cameras))
+        sums = np.bincount(patch_of, np.where(seen, cost, 0), len(patch_directions))
+        numbers = np.bincount(patch_of, seen, len(patch_directions))
+        row[:] = np.where((numbers > 0) & (numbers >= MIN_SEEN_SHARE * members), sums / np.maximum(numbers, 1), np.nan)
+    usable = np.isfinite(costs[0]) & np.isfinite(costs[1:]).any(0)
+    return patch_directions[usable], costs[0, usable], np.nanmedian(costs[1:, usable], axis=0)
+
+
+def _fill(directions: Floats, costs: Floats, misaligned: Floats) -> Booleans:
+    """Return which patches (n,) are far, each by the nearest patches that are not plain, weighted by their contrast.
+
+    costs: (n,) on the infinite sphere; misaligned: (n,) on near ones.
+    """
+    known = misaligned >= MIN_CONTRAST
+    count = min(NEIGHBOURS, int(known.sum()))
+    filled = np.zeros(len(directions), bool)
+    for index, direction in enumerate(directions):
+        nearest = np.argpartition(-(directions[known] @ direction), count - 1)[:count]
+        gain = misaligned[known][nearest] - costs[known][nearest]
+        filled[index] = gain.sum() > MIN_GAIN * misaligned[known][nearest].sum()
+    return filled | known & (costs < MAX_COST)
+
+
+def _sweep_view(view: View, frames: Frames) -> SweepView:
+    """Return a view for the sweep: of its clean frame, where the fit has exact ones, else of its frame."""
+    camera, frame, clean = frames.targets(view)
+    small = camera.scaled(min(SWEEP_WIDTH, camera.width))
+    picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
+    values = Picture(picture, "srgb").resized(*small.size).display()
+    mask = frames.mask(view)
+    counts = None
+    if mask is not None:
+        share = Picture(mask.numpy().astype(np.float32), "linear").resized(*small.size).pixels
+        counts = np.asarray(share.min(axis=2) > 0.99)
+    return SweepView(small, values, counts)
+
+
+def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: float) -> tuple[Floats, Booleans]:
+    """Return the share (n,) of the views that differ from the largest group that agrees, in directions (n, 3) on the
+    sphere of a radius, and which directions (n,) enough views see.
+
+    Groups are robust: a direction may be hidden by something near in most views.
+    """
+    centre = _centre([view.camera for view in views])
+    values = np.full((len(views), len(directions), 3), np.nan, np.float32)
+    for row, view in zip(values, views, strict=True):
+        inside, place = _project(view.camera, centre, directions, inverse_radius)
+        x, y = np.minimum(place.astype(int), np.array(view.camera.size) - 1).T
+        row[inside] = _bilinear(view.picture, place)
+        if view.counts is not None:
+            row[np.flatnonzero(inside)[~view.counts[y, x]]] = np.nan
+    numbers = np.isfinite(values[..., 0]).sum(0)
+    seen = numbers >= MIN_VIEWS
+    cost = np.zeros(len(directions))
+    part = torch.from_numpy(values[:, seen])
+    best = torch.zeros(part.shape[1])
+    for row in part:  # comparisons with NaN are false
+        agree = ((part - row).abs() <= MAX_DIFFERENCE).all(-1).sum(0)
+        best = torch.maximum(best, agree)
+    cost[seen] = 1 - (best.numpy() - 1) / (numbers[seen] - 1)
+    return cost, seen
+
+
+def _bilinear(picture: Values, places: Floats) -> Values:
+    """Return bilinear samples (n, 3) of a picture at places (n, 2), pixels."""
+    height, width = picture.shape[:2]
+    x, y = np.clip(places[:, 0] - 0.5, 0, width - 1), np.clip(places[:, 1] - 0.5, 0, height - 1)
+    left, top = x.astype(int), y.astype(int)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    u, v = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
+    upper = picture[top, left] * (1 - u) + picture[top, right] * u
+    lower = picture[bottom, left] * (1 - u) + picture[bottom, right] * u
+    return np.asarray(upper * (1 - v) + lower * v)
+
+
+def _project(camera: Camera, centre: Floats, directions: Floats, inverse_radius: float) -> tuple[Booleans, Floats]:
+    """Return which directions (n,) of the sphere of a radius about a centre lie on the camera's frame, and the places
+    (m, 2) of those, pixels."""
+    rotation = camera.world_to_camera[:3, :3]
+    local = (directions + inverse_radius * (centre - camera.position)) @ rotation.T
+    in_front = local[:, 2] > 1e-6
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    inside = in_front & camera.contains(np.where(in_front[:, None], places, -1))
+    return inside, places[inside]
+
+
+def _far_points(sphere: FarSphere, patches: Patches, views: Sequence[View], frames: Frames) -> PointCloud:
+    """Return points on the far sphere in the far patches, in the colours of the frames."""
+    centre = np.array(sphere.centre)
+    targets = [frames.targets(view) for view in views]
+    focal = float(np.median([target.camera.focal_length for target in targets]))
+    pitch = POINT_PITCH_PX / focal
+    cameras = [target.camera for target in targets]
+    directions = _seen_directions(cameras, pitch)
+    directions = directions[patches.contain(directions)]
+    if len(directions) > MAX_POINTS:
+        directions = _seen_directions(cameras, pitch * (len(directions) / MAX_POINTS) ** 0.5)
+        directions = directions[patches.contain(directions)]
+    colours = np.full((len(views), len(directions), 3), np.nan, np.float32)
+    is_exact = all(target.clean is not None for target in targets)
+    for row, view, (camera, frame, clean) in zip(colours, views, targets, strict=True):
+        small = camera.scaled(max(round(camera.width * PITCH_PX / POINT_PITCH_PX), 8))
+        picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
+        values = Picture(picture, "srgb").resized(*small.size).display()
+        inside, place = _project(small, centre, directions, 0.0)
+        row[inside] = _bilinear(values, place)
+        if (mask := frames.mask(view)) is not None:
+            x, y = np.minimum((place / small.width * camera.width).astype(int), np.array(camera.size) - 1).T
+            row[np.flatnonzero(inside)[~mask.numpy()[y, x]]] = np.nan
+    seen = np.isfinite(colours[..., 0]).any(0)
+    chosen = np.nanquantile(colours[:, seen], 0.5 if is_exact else COLOUR_QUANTILE, axis=0)
+    xyz = centre + sphere.radius * directions[seen]
+    return PointCloud(xyz.astype(np.float32), (chosen.clip(0, 1) * 255 + 0.5).astype(np.uint8),
+                      np.zeros(len(xyz), np.float32))
+
+
+def _centre(cameras: list[Camera]) -> Floats:
+    """Return (3,), the mean position of cameras."""
+    return np.asarray(np.mean([camera.position for camera in cameras], axis=0))
+
+
+def _spread(cameras: list[Camera]) -> float:
+    """Return the largest distance of a camera from the mean position, world units."""
+    return max(float(np.linalg.norm(camera.position - _centre(cameras))) for camera in cameras)
+
+
+def _seen_directions(cameras: list[Camera], pitch: float) -> Floats:
+    """Return unit vectors (n, 3) that some camera sees, about `pitch` radians from each other.
+
+    They are part of a Fibonacci lattice (Swinbank and Purser 2006) about the mean viewing direction.
+    """
+    forwards = np.array([camera.forward for camera in cameras])
+    axis = forwards.mean(0)
+    axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 0.1 else forwards[0]
+    reach = [np.arccos((forward @ axis).clip(-1, 1)) + np.arctan(camera.corner_radius)
+             for forward, camera in zip(forwards, cameras, strict=True)]
+    lowest = float(np.cos(min(max(reach), np.pi)))
+    count = max(int(2 * np.pi * (1 - lowest) / (pitch * pitch)), 1)
+    number = np.arange(count) + 0.5
+    z, azimuth = 1 - (1 - lowest) * number / count, number * np.pi * (3 - np.sqrt(5))
+    flat = np.sqrt(np.maximum(1 - z * z, 0))
+    helper = np.eye(3)[int(np.abs(axis).argmin())]
+    right = np.cross(helper, axis)
+    right /= np.linalg.norm(right)
+    directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z], 1) @ np.stack(
+        [right, np.cross(axis, right), axis])
+    seen = np.zeros(count, bool)
+    for camera in cameras:
+        seen |= _project(camera, camera.position, directions, 0.0)[0]
+    return directions[seen]
+
+
+def _nearest(directions: Floats, others: Floats) -> NDArray[np.int64]:
+    """Return (n,) the index of the nearest of other unit vectors (m, 3) for each of (n, 3)."""
+    result = np.zeros(len(directions), np.int64)
+    right = torch.from_numpy(others.T.astype(np.float32))
+    for start in range(0, len(directions), 4096):
+        block = torch.from_numpy(directions[start:start + 4096].astype(np.float32))
+        result[start:start + 4096] = (block @ right).argmax(1).numpy()
+    return result

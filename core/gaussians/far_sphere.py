@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The sphere on which a scene shows what lies beyond the parallax of its capture: its Gaussians stand for directions.
+
+A Gaussian farther from the centre than half the radius is far. It hides no light, and densification measures it by the
+angle that it covers: `SceneGaussians.units` returns by how much larger the world units of far Gaussians are.
+"""
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+FAR_RATIO = 0.5
+"""Distance from the centre, relative to the radius, above which a Gaussian is far."""
+
+
+@dataclass(frozen=True)
+class FarSphere:
+    """A sphere about `centre`, world coordinates, of a radius in world units."""
+
+    centre: tuple[float, ...]
+    radius: float
+
+    @classmethod
+    def parse(cls, x: float, y: float, z: float, radius: float) -> FarSphere | None:
+        """Return a sphere of numbers from a file; None if they are no sphere."""
+        if not all(map(math.isfinite, (x, y, z, radius))) or radius <= 0:
+            return None
+        return cls((x, y, z), radius)
+
+    @property
+    def min_distance(self) -> float:
+        """Distance from the centre above which a Gaussian is far, world units."""
+        return FAR_RATIO * self.radius
+
+    def contains(self, means: Tensor) -> Tensor:
+        """Return (n,) which Gaussians at `means` (n, 3) are far."""
+        away = means.detach() - torch.tensor(self.centre, dtype=means.dtype, device=means.device)
+        return away.square().sum(-1) > self.min_distance**2
+
+    def move(self, means: Tensor, steps: Tensor) -> Tensor:
+        """Return means (m, 3) on the sphere, moved along it by steps (m, 3), world units."""
+        centre = torch.tensor(self.centre, dtype=means.dtype, device=means.device)
+        away = means + steps - centre
+        return centre + away * (self.radius / away.norm(dim=-1, keepdim=True).clamp(min=self.min_distance))

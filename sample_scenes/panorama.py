@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Draws a far surrounding for all directions, in linear light; the scene `hill` stands before it."""
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from .patterns import MOSS, PLUM, STONE, WARM, Texture, gradient, noise, random_colour
+
+
+def panorama(rng: np.random.Generator, height: int, sun: tuple[float, float]) -> Texture:
+    """Draw a far surrounding in linear light, (height, 2 height, 3), for all directions: clouds, hills, a town, trees
+    and fields.
+
+    Rows go from the zenith to the nadir, columns from Blender's -x through +y, +x and -y, as its worlds map pictures.
+    sun: azimuth from +y towards +x and elevation, radians; the sky is brightest about it, up to several times white.
+    """
+    width = 2 * height
+    pixel = np.pi / height
+    azimuth = ((np.arange(width, dtype=np.float32) + 0.5) * pixel - np.pi)[None]
+    elevation = (np.pi / 2 - (np.arange(height, dtype=np.float32) + 0.5) * pixel)[:, None]
+    cosine = np.sin(elevation) * np.sin(sun[1]) + np.cos(elevation) * np.cos(sun[1]) * np.cos(azimuth - sun[0])
+    angle = np.arccos(cosine.clip(-1, 1)).astype(np.float32)[..., None]
+    picture = _linear_sky(rng, height, elevation, angle)
+    for low, high, cell, haze in ((0.02, 0.13, 420, 0.75), (0.0, 0.075, 260, 0.45)):
+        ridge = low + (high - low) * _ring(rng, width, cell)
+        wood = gradient(noise(rng, height, width, 26, 4), ((30, 44, 34), (72, 92, 58), (124, 120, 84))) ** 2.2
+        hill = wood * (1 - haze) + np.array((0.46, 0.40, 0.36), np.float32) * haze
+        picture = np.where((elevation < ridge)[..., None], hill, picture)
+    field = _fields(rng, azimuth, elevation)
+    picture = np.where((elevation < 0)[..., None], field, picture)
+    _draw_town(rng, picture, pixel)
+    _draw_trees(rng, picture, pixel)
+    return np.roll(picture, -width // 4, 1).astype(np.float32)  # until here +y is in the middle
+
+
+def _linear_sky(rng: np.random.Generator, height: int, elevation: Texture, angle: Texture) -> Texture:
+    """Return linear light (height, 2 height, 3) of a clouded evening sky; angle: to the sun, radians, (..., 1)."""
+    up = (elevation.clip(0, None) / (np.pi / 2))[..., None] ** 0.5
+    clear = np.array((0.62, 0.44, 0.30), np.float32) * (1 - up) + np.array((0.06, 0.13, 0.34), np.float32) * up
+    warm = np.array((1.0, 0.72, 0.42), np.float32)
+    halo = 1.6 * np.exp(-angle / 0.10) + 0.5 * np.exp(-angle / 0.45)
+    streaks = noise(rng, height, 2 * height, height / 9, 6, stretch=3.0)
+    billows = noise(rng, height, 2 * height, height / 22, 5, stretch=1.6)
+    cover = np.clip(2.6 * (0.65 * streaks + 0.35 * billows) - 1.05, 0, 1)[..., None]
+    shade = (0.25 + 0.95 * billows[..., None]) * (0.55 + 1.5 * np.exp(-angle / 0.5))
+    cloud = shade * np.array((0.62, 0.52, 0.48), np.float32)
+    return (clear + warm * halo) * (1 - 0.85 * cover) + cloud * cover * 0.9
+
+
+def _ring(rng: np.random.Generator, width: int, cell: float) -> Texture:
+    """Return (width,) noise 0..1 that wraps."""
+    line = noise(rng, 4, 2 * width, cell, 6)[1]
+    ramp = np.linspace(0, 1, width, dtype=np.float32)
+    return line[:width] * (1 - ramp) + line[width:] * ramp
+
+
+def _fields(rng: np.random.Generator, azimuth: Texture, elevation: Texture) -> Texture:
+    """Return linear light of flat land below the horizon: patches with furrows, in perspective."""
+    distance = 1 / np.tan(np.maximum(-elevation, 0.012))
+    x, y = distance * np.sin(azimuth), distance * np.cos(azimuth)
+    side = 512
+    crops = gradient(noise(rng, side, side, 40, 4), MOSS) ** 2.2
+    plots = rng.random((64, 64, 3), np.float32) * 0.5 + 0.6
+    columns, rows = np.floor(x * 1.7).astype(int) % 64, np.floor(y * 1.1).astype(int) % 64
+    u, v = (x * 60).astype(int) % side, (y * 60).astype(int) % side
+    furrows = 1 + 0.25 * np.sin(x * 40 + 6 * plots[rows, columns, 0]) * np.exp(-distance / 6)
+    land = crops[v, u] * plots[rows, columns] * furrows[..., None] * 0.8
+    haze = (1 - np.exp(-distance / 30))[..., None]
+    return land * (1 - haze) + np.array((0.40, 0.36, 0.31), np.float32) * haze
+
+
+def _draw_town(rng: np.random.Generator, picture: Texture, pixel: float) -> None:
+    """Draw houses and towers with windows along the horizon into a panorama; pixel: its size, radians."""
+    height, width = picture.shape[:2]
+    ground = height // 2 + int(0.008 / pixel)
+    left = 0
+    while left < width:
+        wide = int(rng.uniform(0.025, 0.07) / pixel)
+        if rng.random() < 0.4:
+            left += int(rng.uniform(0.01, 0.06) / pixel)
+            continue
+        tall = int(rng.uniform(0.035, 0.085) * (1.9 if rng.random() < 0.15 else 1) / pixel)
+        plaster = np.array(random_colour(rng, (WARM, STONE, PLUM)[rng.integers(3)]), np.float32) / 255
+        wall = plaster**2.2 * 0.55 + 0.06
+        part = picture[ground - tall:ground, left:left + wide]
+        part[:] = wall * (0.8 + 0.4 * noise(rng, tall, wide, 12, 2)[: part.shape[0], : part.shape[1], None])
+        step = max(int(0.012 / pixel), 4)
+        for y in range(step // 2, tall - step // 2, step):
+            for x in range(step // 3, wide - step // 2, step):
+                part[y:y + step // 2, x:x + step // 2] = (0.9, 0.62, 0.3) if rng.random() < 0.12 else wall * 0.3
+        part[: max(2, step // 4)] *= 0.5
+        left += wide
+
+
+def _draw_trees(rng: np.random.Generator, picture: Texture, pixel: float) -> None:
+    """Draw trees of different sizes before and below the horizon into a panorama; pixel: its size, radians."""
+    height, width = picture.shape[:2]
+    leaves = gradient(noise(rng, height // 4, width, 9, 3), ((14, 26, 14), (52, 80, 34), (128, 140, 70))) ** 2.2
+    for _ in range(90):
+        depth = rng.random()
+        size = (0.016 + 0.075 * depth**2) / pixel
+        x, foot = int(rng.integers(width)), height / 2 + (0.012 + 0.12 * depth**2) / pixel
+        shape = np.zeros((height // 4, width), np.uint8)
+        top = height // 2 - height // 8
+        trunk = int(max(size * 0.12, 2))
+        for _ in range(12):
+            centre = (int(x + rng.normal() * size * 0.35), int(foot - top - size * (1.1 + rng.normal() * 0.32)))
+            cv2.circle(shape, centre, max(int(size * rng.uniform(0.15, 0.38)), 2), 255, -1, cv2.LINE_AA)
+        cv2.rectangle(shape, (x - trunk // 2, int(foot - top - size)), (x + trunk // 2, int(foot - top)), 255, -1)
+        cover = (shape.astype(np.float32) / 255)[..., None]
+        band = picture[top:top + height // 4]
+        shift = int(rng.integers(width))
+        band[:] = band * (1 - cover) + np.roll(leaves, shift, 1) * (0.6 + 0.5 * rng.random()) * cover

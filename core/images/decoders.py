@@ -51,8 +51,8 @@ _DPX_TRANSFERS = {"linear": "linear", "printing density": "cineon", "logarithmic
 
 
 class Description(NamedTuple):
-    """Size, colour space (None where the file names none), Exif orientation, ICC profile and code points of a picture,
-    by its header."""
+    """Size, colour space (None where the file names none), Exif orientation, ICC profile, code points, Exif block and
+    XMP of a picture, by its header. The last two are those of formats whose clean plate is a PNG."""
 
     width: int
     height: int
@@ -60,6 +60,8 @@ class Description(NamedTuple):
     orientation: int = 1
     profile: bytes = b""
     code_points: tuple[int, int] | None = None
+    exif: bytes = b""
+    xmp: bytes = b""
 
 
 def file_kind(path: Path) -> Kind:
@@ -86,7 +88,8 @@ def describe(path: Path, kind: Kind) -> Description:
         if kind == "avif" and _avif_orientation(picture) in SWAPS_SIDES:
             width, height = height, width
         space = profile_space(path, profile) or (space_of_code_points(*points) if points else None)
-        return Description(width, height, space, 1, profile, points)
+        exif, xmp = (bytes(picture.info.get(name) or b"") for name in ("exif", "xmp"))
+        return Description(width, height, space, 1, profile, points, exif.removeprefix(b"Exif\0\0"), xmp)
 
 
 def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:

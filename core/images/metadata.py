@@ -35,8 +35,13 @@ _MARKERS = frozenset({jpeg.APP1, jpeg.APP2, 0xED, jpeg.COMMENT, *range(0xE3, 0xE
 _INDEX, _ISO_GAIN_MAP = b"MPF\0", b"urn:iso:std:iso:ts:21496:-1"
 """Segments that describe the pictures behind a JPEG's first one."""
 _XMP = b"http://ns.adobe.com/xap/1.0/\0"
+_HEIF_GAIN_MAPS = (b"aux:hdrgainmap", b"urn:iso:std:iso:ts:21496:-1", b"tmap")
+"""Names of gain maps in the header of HEIC and AVIF: Apple's, and that of ISO 21496-1."""
+_HEAD_BYTES = 1 << 16
+"""Bytes of a file in which its header is looked for."""
 _CLAIMS = ("http://ns.adobe.com/hdr-gain-map/1.0/", "http://ns.google.com/photos/1.0/container/",
-           "http://ns.google.com/photos/1.0/container/item/", "http://ns.google.com/photos/1.0/camera/")
+           "http://ns.google.com/photos/1.0/container/item/", "http://ns.google.com/photos/1.0/camera/",
+           "http://ns.apple.com/HDRGainMap/1.0/")
 """Name spaces of XMP by which a file claims that a gain map or a clip follows its first picture."""
 
 
@@ -73,10 +78,23 @@ def with_colour_chunks(encoded: bytes, profile: bytes, code_points: tuple[int, i
     return encoded[:_HEADER_END] + chunk + encoded[_HEADER_END:]
 
 
+def with_description(encoded: bytes, exif: bytes, xmp: bytes) -> bytes:
+    """Return an encoded PNG with the Exif block and the XMP of the picture of another format that it was made from;
+    without the claims of what the PNG does not hold."""
+    chunks = png.make_chunk(png.EXIF, exif) if exif else b""
+    if packet := _without_claims(_XMP + xmp).removeprefix(_XMP) if xmp else b"":
+        chunks += png.make_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + packet)
+    return encoded[:_HEADER_END] + chunks + encoded[_HEADER_END:]
+
+
 def dropped_parts(path: Path) -> str:
     """Return a sentence on what a clean picture cannot keep of this file; "" where it keeps all."""
     with open_regular(path) as stream:
-        if stream.read(2) != b"\xff\xd8":
+        head = stream.read(_HEAD_BYTES)
+        if head[4:8] == b"ftyp" and any(name in head for name in _HEIF_GAIN_MAPS):
+            return (f"{path} holds a gain map, which would still show the flare; the clean picture goes without it, "
+                    "and without the tags that claim it.")
+        if head[:2] != b"\xff\xd8":
             return ""
         for _, content in jpeg.segments(stream):
             if content.startswith((_INDEX, _ISO_GAIN_MAP)) or (content.startswith(_XMP) and _has_claims(content)):

@@ -27,9 +27,10 @@ from .declared import declared_space
 from .decoders import Description, describe, file_kind
 from .exr import foreign_strings, has_chroma, missing_rgb, read_exr_parts, read_luminance_chroma
 from .formats import png, tiff
+from .formats.exif import upright_block
 from .formats.kinds import SUFFIXES as SUFFIX_KINDS
 from .listing import SUFFIXES
-from .metadata import copy_metadata, dropped_parts, with_colour_chunks
+from .metadata import copy_metadata, dropped_parts, with_colour_chunks, with_description
 from .oiio_writer import OIIO_FORMATS, needs_oiio_writer, write_by_oiio
 from .picture import Encoding
 from .read import read_stored_pixels, rgb_codes
@@ -327,6 +328,7 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
     encoded = copy_metadata(data.tobytes(), plate.path, has_alpha=plate.alpha is not None)
     if suffix == ".png" and (described := plate.description) is not None:
         encoded = with_colour_chunks(encoded, described.profile, described.code_points)
+        encoded = with_description(encoded, upright_block(described.exif), described.xmp)
     with atomic_path(path) as temporary:
         temporary.write_bytes(encoded)
 

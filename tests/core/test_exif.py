@@ -82,6 +82,30 @@ def test_a_picture_of_each_format_is_turned_as_viewers_show_it(suffix: str, orie
     assert again.shape == shown.shape and np.abs(again - seen // 2).mean() < 3
 
 
+@pytest.mark.parametrize("suffix", [".heic", ".avif"])
+def test_a_phones_pictures_give_their_focal_length_and_keep_what_describes_them(suffix: str, tmp_path: Path) -> None:
+    if suffix == ".heic":
+        pytest.importorskip("pillow_heif").register_heif_opener()
+    elif not features.check("avif"):
+        pytest.skip("Pillow is built without AVIF")
+    exif = Image.Exif()
+    exif[tiff.ORIENTATION], exif[0x13B] = 6, "Ada"
+    exif.get_ifd(0x8769)[0xA405] = 27
+    xmp = (b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+           b'<rdf:Description xmlns:dc="http://purl.org/dc/elements/1.1/" dc:format="image/heic" '
+           b'xmlns:HDRGainMap="http://ns.apple.com/HDRGainMap/1.0/" HDRGainMap:HDRGainMapVersion="65536"/>'
+           b"</rdf:RDF></x:xmpmeta>")
+    path = tmp_path / f"IMG_0001{suffix}"
+    Image.fromarray(np.full((40, 60, 3), 90, np.uint8)).save(path, exif=exif.tobytes(), xmp=xmp)
+    assert read_exif(path) == (1, 0.75)
+    plate = read_plate(path)
+    write_plate(tmp_path / "clean.png", plate, plate.codes // 2)
+    assert read_exif(tmp_path / "clean.png") == (1, 0.75)
+    with Image.open(tmp_path / "clean.png") as clean:
+        assert clean.getexif()[0x13B] == "Ada"
+        assert "image/heic" in str(clean.info["xmp"]) and "HDRGainMap" not in str(clean.info["xmp"])
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_an_orientation_is_applied_and_undone(orientation: int) -> None:
     """As OpenCV turns a JPEG of that orientation."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,17 @@ from . import jpeg, png, tiff, webp
 EXIF, FOCAL_35MM = 0x8769, 0xA405
 SWAPS_SIDES = (5, 6, 7, 8)
 """Orientations that swap width and height."""
+_BLOCK = re.compile(rb"Exif\0\0((?:II\*\0|MM\0\*).{0,65536})", re.DOTALL)
+"""An Exif block in a file whose structure of boxes is not parsed."""
+_MAX_SEARCH_BYTES = 1 << 22
+"""First bytes of such a file in which the block is looked for."""
 WIDTH_35MM = 36.0
 """Long side of 35 mm film in millimetres."""
 
 
 def read_exif(path: Path) -> tuple[int, float | None]:
-    """Return (orientation 1..8, focal length as a multiple of the long side or None) of a JPEG, PNG, TIFF or WebP.
+    """Return (orientation 1..8, focal length as a multiple of the long side or None) of a JPEG, PNG, TIFF, WebP,
+    HEIC or AVIF.
 
     (1, None) for other files, and where the tags are missing.
     """
@@ -40,11 +46,28 @@ def _exif_block(stream: BinaryIO) -> BinaryIO:
     if magic[:2] == b"\xff\xd8":
         blocks = (content[6:] for marker, content in jpeg.segments(stream)
                   if marker == jpeg.APP1 and content.startswith(b"Exif\0\0"))
+    elif magic[4:8] == b"ftyp":  # HEIC and AVIF, whose pixels are read upright
+        found = _BLOCK.search(magic + stream.read(_MAX_SEARCH_BYTES))
+        return io.BytesIO(upright_block(found[1]) if found else b"")
     elif magic[:4] == b"RIFF":
         blocks = (content.removeprefix(b"Exif\0\0") for name, content in webp.chunks(stream) if name == b"EXIF")
     else:
         blocks = (content for _, content in png.chunks(stream, (png.EXIF,)))
     return io.BytesIO(next(blocks, b""))
+
+
+def upright_block(block: bytes) -> bytes:
+    """Return an Exif block whose orientation is 1, for pixels that stand upright; empty for a damaged one."""
+    order: Literal["little", "big"] = "little" if block[:2] == b"II" else "big"
+    first = int.from_bytes(block[4:8], order)
+    if block[:4] not in (b"II*\0", b"MM\0*") or first + 2 > len(block):
+        return b""
+    changed = bytearray(block)
+    for number in range(int.from_bytes(block[first:first + 2], order)):
+        at = first + 2 + 12 * number
+        if at + 12 <= len(block) and int.from_bytes(block[at:at + 2], order) == tiff.ORIENTATION:
+            changed[at + 8:at + 10] = (1).to_bytes(2, order)
+    return bytes(changed)
 
 
 def apply_orientation(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:

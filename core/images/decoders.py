@@ -6,6 +6,7 @@
 | OpenImageIO | WebP, DPX, Cineon, PSD, BMP, Radiance HDR, Targa; BigTIFF, TIFF of 16 bit floats, planes |
 | OpenCV | JPEG 2000, in up to 16 bits |
 | Pillow | GIF, AVIF; HEIC with pillow-heif |
+| PyAV | AVIF of 10 and 12 bits, and the code points of any |
 | pillow-jxl-plugin | JPEG XL, which OpenImageIO's wheels for numpy 1.26 lack |
 | rawpy | raw files of cameras, DNG |
 
@@ -17,7 +18,7 @@ import importlib
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +26,16 @@ from numpy.typing import NDArray
 from ..colour import ColourSpace, colour_space
 from ..colour.cicp import space_of_code_points
 from ..colour.icc import UnreadableProfile, space_of_profile
-from ..errors import FrameError
+from ..errors import EngineError, FrameError
 from ..system.child import ChildDied, run_in_child
 from ..system.progress import Progress
 from ..system.reading import check_regular, open_regular, read_bytes
 from .formats import tiff
 from .formats.exif import SWAPS_SIDES, apply_orientation
 from .formats.kinds import HEAD_BYTES, Kind, kind_of
+
+if TYPE_CHECKING:
+    from .video import VideoFrame
 
 OIIO_KINDS = frozenset({"webp", "dpx", "cineon", "psd", "bmp", "hdr", "tga"})
 """Formats that OpenImageIO alone reads."""
@@ -85,8 +89,11 @@ def describe(path: Path, kind: Kind) -> Description:
         profile = picture.info.get("icc_profile") or b""
         nclx = picture.info.get("nclx_profile")
         points = (int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])) if nclx else None
-        if kind == "avif" and _avif_orientation(picture) in SWAPS_SIDES:
-            width, height = height, width
+        if kind == "avif":
+            if _avif_orientation(picture) in SWAPS_SIDES:
+                width, height = height, width
+            if not profile and (frame := _av1_frame(path)) is not None:
+                points = int(frame.raw.color_primaries), int(frame.raw.color_trc)
         space = profile_space(path, profile) or (space_of_code_points(*points) if points else None)
         exif, xmp = (bytes(picture.info.get(name) or b"") for name in ("exif", "xmp"))
         return Description(width, height, space, 1, profile, points, exif.removeprefix(b"Exif\0\0"), xmp)
@@ -109,12 +116,27 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
         if getattr(picture, "n_frames", 1) > 1:
             raise FrameError(f"{path} has {picture.n_frames} frames; export them as files of their own.")
         orientation = _avif_orientation(picture) if kind == "avif" else 1
+        frame = _av1_frame(path) if kind == "avif" and picture.mode == "RGB" else None
+        if frame is not None and frame.colour.bits > 8 and (frame.raw.width, frame.raw.height) == picture.size:
+            return _bgr(apply_orientation(frame.stored_codes(), orientation))
         mode = picture.mode if picture.mode in ("L", "RGB", "RGBA") else "RGBA" if "A" in picture.mode else "RGB"
         try:
             pixels = np.asarray(picture.convert(mode))
         except Exception as problem:  # the plug-ins raise what their libraries do
             raise _damaged(path, problem) from problem
     return _bgr(apply_orientation(pixels, orientation))
+
+
+def _av1_frame(path: Path) -> VideoFrame | None:
+    """Return the picture of an AVIF by PyAV, which knows its code points and more than the 8 bits of Pillow; None where
+    it cannot be read so."""
+    from .video import Video
+
+    try:
+        with Video(path) as video:
+            return next(iter(video), None)
+    except (FrameError, EngineError):
+        return None
 
 
 def _avif_orientation(picture: Any) -> int:

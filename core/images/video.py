@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
@@ -115,6 +115,11 @@ class VideoFrame:
     def _signal(self) -> NDArray[Any]:
         arrays, planar = self._planes
         return self.colour.to_signal(stack_planes(arrays, planar))
+
+    def stored_codes(self) -> NDArray[Any]:
+        """(height, width, 3): R G B codes of the signal as stored, uint8 or uint16, whatever its transfer says."""
+        arrays, planar = self._planes
+        return replace(self.colour, transfer="display", primaries=None).to_signal(stack_planes(arrays, planar))
 
     def pixels(self) -> NDArray[Any]:
         """(height, width, 3): R G B as uint8 or uint16 codes of display values, or float32 linear light."""

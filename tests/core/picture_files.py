@@ -17,6 +17,7 @@ from core.colour.icc import _to_d50
 from core.colour.spaces import P3_D65, Chromaticities, matrix_to_xyz
 from core.images.formats import jpeg, png, tiff
 from core.images.write import write_exr
+from tests.core.videos import write_video
 
 
 def scene(width: int = 96, height: int = 64, level: float = 0.7) -> NDArray[np.float32]:
@@ -100,6 +101,13 @@ def heic(path: Path, light: NDArray[np.float32]) -> None:
     pillow_heif.from_bytes("RGB", (codes.shape[1], codes.shape[0]), codes.tobytes()).save(path, quality=100)
 
 
+def avif(path: Path, light: NDArray[np.float32]) -> None:
+    """Write an AVIF of 10 bits in PQ, with its code points."""
+    signal = np.clip(colour_space("pq").from_linear(light), 0, 1)
+    write_video(path, "libsvtav1", "yuv420p10le", [signal], matrix=9, tags=(9, 16, 9), full=True,
+                options={"crf": "1", "preset": "8"})
+
+
 def tiff_16(path: Path, values: NDArray[Any], tags: dict[int, tiff.Tag] | None = None) -> None:
     """Write values 0..1 as 16 bit TIFF with tags."""
     data = cv2.imencode(".tif", (np.clip(values, 0, 1) * 65535 + 0.5).astype(np.uint16)[..., ::-1])[1].tobytes()
@@ -131,6 +139,7 @@ WRITERS: dict[str, tuple[str, str, Callable[[Path, NDArray[np.float32]], None]]]
         "oiio:BitsPerSample": 10, "dpx:Transfer": "ITU-R 709-4"})),
     "P3 JPEG": ("a.jpg", "", p3_jpeg),
     "HEIC": ("a.heic", "", heic),
+    "PQ AVIF": ("a.avif", "", avif),
     "WebP": ("a.webp", "", lambda path, light: by_oiio(path, _encoded(light, "srgb"), oiio.UINT8,
                                                        {"compression": "lossless"})),
     "BMP": ("a.bmp", "", lambda path, light: by_oiio(path, _encoded(light, "srgb"), oiio.UINT8)),

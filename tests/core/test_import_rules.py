@@ -147,7 +147,8 @@ def test_core_imports_no_blender() -> None:
 
 
 def test_the_modules_that_blender_imports_need_numpy_alone() -> None:
-    missing = ("torch", "cv2", "OpenEXR", "pycolmap", "numba", "safetensors", "tqdm", "bpy")
+    missing = ("torch", "cv2", "OpenEXR", "pycolmap", "numba", "safetensors", "tqdm", "bpy", "av", "OpenImageIO", "PIL",
+               "PyOpenColorIO", "simplejpeg", "rawpy", "pillow_heif", "pillow_jxl")
     run_isolated(f"import importlib, sys\n"
                  f"sys.modules.update(dict.fromkeys({missing!r}))\n"  # None in sys.modules: the import fails
                  f"for name in {NUMPY_ONLY!r}:\n"

@@ -38,7 +38,7 @@ if __name__ == "__main__":
 import cv2
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, features
 
 from core.bake.bake import read_manifest
 from core.capture import Capture, read_lights
@@ -76,6 +76,7 @@ from tests.core.videos import X265, stripes, write_video
 TIME_LIMIT_S = 10
 MEMORY_LIMIT = 1 << 30
 UNWRITABLE = {name for name, package in (("HEIC", "pillow_heif"),) if importlib.util.find_spec(package) is None}
+UNWRITABLE |= set() if features.check("avif") else {"PQ AVIF"}
 """Formats of pictures whose encoder is not installed."""
 _NUMBERS = ["1" + "0" * 400, "-1", "0", "1e999", "NaN", "Infinity", "9223372036854775808", "2147483648", "1e-320",
             "0.5", "99999999999", "-0.0"]

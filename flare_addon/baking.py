@@ -18,7 +18,7 @@ import bpy
 from ..core.errors import FitFlareError, RunError, os_error_message
 from ..core.system.files import remove_file, write_json
 from ..core.system.processes import available_cores
-from . import engine, jobs, looks, shots
+from . import engine, jobs, lamp_drive, looks, shots
 from .properties import redraw_viewports
 from .shots import ShotReading
 
@@ -104,6 +104,7 @@ def start(scene: Any, camera_objects: Sequence[Any], *, replace_others: bool = F
     shots.check_bake(scene, camera_objects)
     if not replace_others and (replaced := shots.frames_to_replace(scene, camera_objects)):
         raise RunError(shots.replacement_warning(shots.layers_folder(scene), replaced))
+    lamp_drive.measure_driven(scene)
     reading = ShotReading(scene, camera_objects, shots.frames_to_bake(scene))
     folder = shots.choose_layers_folder(scene)
     shots.live_record(scene.fit_flare, ())  # gives each flare its id inside the operator's undo step

@@ -66,14 +66,21 @@ def save(look: Look, edits: LookEdits, name: str, notes: str, licence: str) -> P
 
     Raises FlareFileError where the name is taken or not valid.
     """
+    path = free_path(name)
+    write_annotated(look.path, path, notes=notes, licence=licence, edits=edits)
+    write_png(path.with_suffix(".png"), thumbnail(read(path)))
+    return path
+
+
+def free_path(name: str) -> Path:
+    """Return the file of a new entry, whose folder exists. Raises FlareFileError where the name is taken or not valid.
+    """
     safe = "".join(letter for letter in name if letter.isalnum() or letter in " -_()").strip()
     if not safe:
         raise FlareFileError(f"{name!r} is not a valid file name; use letters and digits.")
     path = folder(create=True) / f"{avoid_device_name(safe)}.flare"
     if path.exists():
         raise FlareFileError(f"The library has {safe!r} already; choose another name.")
-    write_annotated(look.path, path, notes=notes, licence=licence, edits=edits)
-    write_png(path.with_suffix(".png"), thumbnail(read(path)))
     return path
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.errors import CaptureError, FlareFileError
 from ..core.look import Edit, LightLook, Look, LookEdits, PlacedLight, PlaneGaussians, read
 from ..core.look.look import Query
-from . import cameras, fcurves, occlusion
+from . import cameras, fcurves, lamp_drive, light_extents, occlusion
 from .compositor import drivers
 from .lights import capture_position, free_name, light_name, light_position, scene_lights
 from .objects import depsgraph_of, world_matrix
@@ -76,8 +76,9 @@ def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add:
         if item is None and (is_first or light.name in objects):
             item = _new_flare(state, look, light)
             item.name = free_name(light.name, {entry.name for entry in state.lights})
-        if item is not None and item.target is None and objects.get(light.name) not in _targets(state):
-            item.target = objects.get(light.name)
+        lamp = objects.get(light.name)
+        if item is not None and item.target is None and lamp is not None and lamp not in _targets(state):
+            item.target, item.follow_power = lamp, False  # the power of a light of the footage is in its flare
     _place_at(scene, look, targets, add)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
     state.native = _was_learned_here(look, state, objects, depsgraph_of(scene))
@@ -95,6 +96,7 @@ def _place_at(scene: Any, look: Look, targets: Sequence[Any], add: bool) -> None
     remaining = [target for target in targets if target not in _targets(state)]
     for item in [item for item in state.lights if item.target is None][:len(remaining)]:
         item.target = remaining.pop(0)
+        lamp_drive.measure(scene, item)
     for target in remaining if add else ():
         add_flare(scene, target, look.names[0])
 
@@ -210,6 +212,7 @@ def add_flare(scene: Any, target: Any, source: str) -> Any:
         name, number = f"{target.name} {number}", number + 1
     item = _new_flare(state, look, light)
     item.name, item.target = name, target
+    lamp_drive.measure(scene, item)
     state.light = len(state.lights) - 1
     return item
 
@@ -262,11 +265,30 @@ def place_lights(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.fl
     for item in state.lights:
         if not is_placed(item, scene):
             continue
-        position = light_position(item.target, world_matrix(item.target, depsgraph), matrix.translation)
-        visibility = occlusion.visibility(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0
-        xyz = (to_capture @ np.array([*position, 1.0]))[:3]
-        lights.append(PlacedLight(item.name, item.source, xyz, visibility))
+        lights.append(place_light(scene, depsgraph, matrix, to_capture, item, hides=state.occlusion))
     return cameras.pose_in_capture(matrix, state.root, depsgraph), lights
+
+
+def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.float64], item: Any, *,
+                hides: bool) -> PlacedLight:
+    """Return the light of a flare as a camera of this matrix_world sees it. Raises CaptureError.
+
+    to_capture: matrix (4, 4) from Blender's world to the coordinates of the result. hides: whether objects hide it.
+    """
+    eye = camera.translation
+    placed = world_matrix(item.target, depsgraph)
+    position = light_position(item.target, placed, eye)
+    xyz = (to_capture @ np.array([*position, 1.0]))[:3]
+    gain = lamp_drive.factor(scene, depsgraph, item)
+    extent = light_extents.extent_of(item, depsgraph, placed)
+    if extent is None:
+        visibility = occlusion.visibility(scene, depsgraph, eye, item) if hides else 1.0
+        return PlacedLight(item.name, item.source, xyz, visibility, factor=gain)
+    shares = None
+    if hides:
+        sampled = extent.sampled(np.array(position), np.linalg.inv(cameras.camera_to_world(camera)))
+        shares = tuple(sampled.shares(occlusion.visible_points(scene, depsgraph, eye, item, sampled.points)).tolist())
+    return PlacedLight(item.name, item.source, xyz, 1.0, extent.transformed(to_capture[:3, :3]), shares, gain)
 
 
 def evaluate_flares(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:

@@ -39,10 +39,15 @@ def visibility(scene: Any, depsgraph: Any, eye: Any, item: Any) -> float:
     the instances of these.
     """
     position = light_position(item.target, world_matrix(item.target, depsgraph), eye)
-    lamp = (item.target, *item.target.children_recursive)
-    ignored = {obj.name for obj in lamp}
-    instances = _instances_of(depsgraph, ignored) if any(obj.is_instancer for obj in lamp) else set()
+    ignored, instances = _lamp_parts(item, depsgraph)
     return disc_visibility(scene, depsgraph, eye, position, ignored, item.radius, instances)
+
+
+def _lamp_parts(item: Any, depsgraph: Any) -> tuple[set[str], set[tuple[str, Any]]]:
+    """Return the names of the light object of a flare and its children, and the instances of these."""
+    lamp = (item.target, *item.target.children_recursive)
+    names = {obj.name for obj in lamp}
+    return names, _instances_of(depsgraph, names) if any(obj.is_instancer for obj in lamp) else set()
 
 
 def _instances_of(depsgraph: Any, parents: set[str]) -> set[tuple[str, Any]]:
@@ -59,8 +64,6 @@ def disc_visibility(scene: Any, depsgraph: Any, eye: Any, light: Any, ignored: s
     ignored, instances: objects by name, and instances by name and matrix_world, that hide nothing. disc_radius: radius
     in world units, 0 for the default part of the distance.
     """
-    from mathutils import Vector
-
     offset = light - eye
     distance = offset.length
     if distance < 1e-6:
@@ -70,27 +73,43 @@ def disc_visibility(scene: Any, depsgraph: Any, eye: Any, light: Any, ignored: s
     right = forward.orthogonal().normalized()
     up = forward.cross(right)
     visible = 0.0
-    reach = (1 - LIGHT_MARGIN) * distance
     for (x, y), weight in zip(_POINTS.tolist(), _WEIGHTS.tolist(), strict=True):
         target = light + radius * (x * right + y * up)
-        direction = (target - eye).normalized()
-        start, remaining, clear = Vector(eye), reach, True
-        for _ in range(4):  # past the lamp's own meshes
-            hit, hit_point, _normal, _index, obj, matrix = scene.ray_cast(depsgraph, start, direction,
-                                                                          distance=remaining)
-            if not hit:
-                break
-            if obj is None or not (obj.original.name in ignored or _is_invisible_to_camera(obj)
-                                     or any(obj.original.name == name and matrix == place
-                                            for name, place in instances)):
-                clear = False
-                break
-            step = (hit_point - start).length + 1e-4 * distance
-            start, remaining = start + direction * step, remaining - step
-            if remaining <= 0:
-                break
-        visible += weight * clear
+        visible += weight * _is_clear(scene, depsgraph, eye, (target - eye).normalized(), distance, ignored, instances)
     return min(visible, 1.0)  # rounding
+
+
+def visible_points(scene: Any, depsgraph: Any, eye: Any, item: Any, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which points (n, 3) of a flare's light no object hides from `eye`; the lamp itself hides nothing."""
+    from mathutils import Vector
+
+    ignored, instances = _lamp_parts(item, depsgraph)
+    clear = []
+    for point in points.tolist():
+        offset = Vector(point) - eye
+        clear.append(offset.length < 1e-6 or _is_clear(scene, depsgraph, eye, offset.normalized(), offset.length,
+                                                       ignored, instances))
+    return np.array(clear, bool)
+
+
+def _is_clear(scene: Any, depsgraph: Any, eye: Any, direction: Any, distance: float, ignored: set[str],
+              instances: Collection[tuple[str, Any]]) -> bool:
+    """Return whether nothing hides a light at this distance from `eye` in a direction; see `disc_visibility`."""
+    from mathutils import Vector
+
+    start, remaining = Vector(eye), (1 - LIGHT_MARGIN) * distance
+    for _ in range(4):  # past the lamp's own meshes
+        hit, hit_point, _normal, _index, obj, matrix = scene.ray_cast(depsgraph, start, direction, distance=remaining)
+        if not hit:
+            return True
+        if obj is None or not (obj.original.name in ignored or _is_invisible_to_camera(obj)
+                               or any(obj.original.name == name and matrix == place for name, place in instances)):
+            return False
+        step = (hit_point - start).length + 1e-4 * distance
+        start, remaining = start + direction * step, remaining - step
+        if remaining <= 0:
+            return True
+    return True
 
 
 def _is_invisible_to_camera(obj: Any) -> bool:

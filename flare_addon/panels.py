@@ -13,9 +13,10 @@ import bpy
 from ..core.capture import REMOVED
 from ..core.conventions.run_files import FLARE
 from ..core.errors import FitFlareError
-from . import baking, engine, fits, jobs, library, lights, looks, overlay, shots
-from .compositor import drivers, flare_node
+from . import baking, engine, fits, jobs, lamp_drive, library, light_extents, lights, looks, overlay, shots
+from .compositor import drivers, flare_node, setup
 from .layouts import draw_progress, label_lines
+from .operators import make_flare
 from .paths import is_folder
 
 
@@ -266,6 +267,7 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
                           "Clean under Capture to see this one alone.", "INFO")
         if looks.duplicate_name(state):
             label_lines(layout, f"Two flares have the name {looks.duplicate_name(state)}: rename one.", "ERROR")
+        layout.label(text="All Flares", icon="OUTLINER_OB_LIGHT")
         _draw_sliders(layout, state.master)
         if scene.camera is not None:
             column = layout.column()
@@ -305,6 +307,7 @@ def _draw_sliders(layout: Any, sliders: Any, streak: bool = True) -> None:
 def _draw_flare(layout: Any, scene: Any, item: Any) -> None:
     """Draw the settings and elements of one flare."""
     box = layout.box()
+    box.label(text=item.name, icon="LIGHT_SUN")
     column = box.column()
     column.use_property_split = True
     column.prop(item, "target")
@@ -316,7 +319,11 @@ def _draw_flare(layout: Any, scene: Any, item: Any) -> None:
     _draw_sliders(box, item)
     column = box.column()
     column.use_property_split = True
-    column.prop(item, "radius")
+    if lamp_drive.is_lamp(item.target):
+        column.prop(item, "follow_power")
+    column.prop(item, "extent")
+    if item.extent == "point" or item.target is None or light_extents.is_point(item):
+        column.prop(item, "radius")
     if not item.elements:
         return
     row = box.row()
@@ -325,6 +332,7 @@ def _draw_flare(layout: Any, scene: Any, item: Any) -> None:
     if item.show_elements:
         box.template_list("FITFLARE_UL_elements", "", item, "elements", item, "element", rows=4)
         if 0 <= item.element < len(item.elements):
+            box.label(text=item.elements[item.element].name.capitalize(), icon="DOT")
             _draw_sliders(box, item.elements[item.element], item.elements[item.element].kind == "streak")
 
 
@@ -364,7 +372,8 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
             elif job is not None and job.error:
                 label_lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
             elif job is not None and job.state == "done":
-                label_lines(layout, f"Layers of {job.result.get('frames', 0)} frames are baked.", "CHECKMARK")
+                count = job.result.get("frames", 0)
+                label_lines(layout, f"Layers of {count} frame{'' if count == 1 else 's'} are baked.", "CHECKMARK")
                 for warning in job.warnings:
                     label_lines(layout, warning, "ERROR")
             row = layout.row(align=True)
@@ -398,6 +407,8 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
             box.operator("fit_flare.remove_compositor", icon="X")
         else:
             box.operator("fit_flare.set_up_compositor", text="Other Layers …", icon="FILE_FOLDER")
+            if setup.shows_plate_alone(scene):
+                box.operator("fit_flare.remove_compositor", icon="X")
 
 
 def _draw_bake_log(layout: Any, job: jobs.Job) -> None:
@@ -436,11 +447,16 @@ class FITFLARE_PT_library(_SidebarPanel, bpy.types.Panel):
             label_lines(layout, notes)
         row = layout.row()
         row.scale_y = 1.3
-        if not state.flare:
-            row.operator("fit_flare.add_library_flare", icon="LIGHT_SUN")
-            return
-        row.operator("fit_flare.apply_flare", text="Use This Look", icon="LIGHT_SUN")
-        row.operator("fit_flare.add_library_flare", text="Add Flare", icon="ADD")
+        if state.flare:
+            row.operator("fit_flare.apply_flare", text="Use This Look", icon="LIGHT_SUN").add = False
+        row.operator("fit_flare.add_library_flare", icon="ADD" if state.flare else "LIGHT_SUN")
+        job = make_flare.making_job()
+        if job is not None and job.running:
+            draw_progress(layout, job, job.stage.capitalize())
+        elif engine.find_engine() is not None:
+            if job is not None and job.error:
+                label_lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
+            layout.operator("fit_flare.make_flare", icon="CAMERA_STEREO")
 
 
 _CLASSES = (FITFLARE_PT_library, FITFLARE_PT_capture, FITFLARE_PT_lights, FITFLARE_PT_fit, FITFLARE_PT_look,

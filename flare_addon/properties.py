@@ -58,6 +58,14 @@ def redraw_viewports(_self: Any = None, _context: Any = None) -> None:
                 area.tag_redraw()
 
 
+def _update_target(self: Any, context: Any) -> None:
+    """Measure the power of a flare's new light object, and redraw."""
+    from .lamp_drive import on_target
+
+    on_target(self, context)
+    redraw_viewports()
+
+
 def _update_footage(self: Any, _context: Any) -> None:
     """Show the frames as filmed, or the clean frames, behind the cameras."""
     from .capture.importer import show_footage
@@ -133,7 +141,19 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
         name="Look", description="The light of the .flare that this flare looks like")
     target: PointerProperty(  # type: ignore[valid-type]
         name="Light", description="The light object of this flare; the flare follows it",
-        type=bpy.types.Object, update=redraw_viewports)
+        type=bpy.types.Object, update=_update_target)
+    follow_power: BoolProperty(  # type: ignore[valid-type]
+        name="Follow Power", description="Power and colour of the lamp brighten, dim and colour its flare, relative to "
+        "the first frame of the scene", default=True, update=redraw_viewports)
+    reference_light: FloatVectorProperty(size=3, default=(0.0, 0.0, 0.0))  # type: ignore[valid-type]
+    reference_is_driven: BoolProperty()  # type: ignore[valid-type]
+    extent: EnumProperty(  # type: ignore[valid-type]
+        name="Extent", description="Whether the light flares as a point or as the sum over its visible part",
+        items=(("auto", "Automatic", "Area lights as areas, other lights as points"),
+               ("point", "Point", "A point at the origin of the object"),
+               ("shape", "Shape", "The area of an area light, the radius of another lamp, the surface of a mesh, a "
+                                  "curve. This is slower")),
+        default="auto", update=redraw_viewports)
     identity: StringProperty()  # type: ignore[valid-type]  # stays when the flare is renamed; the baked layers store it
     elements: CollectionProperty(type=FITFLARE_PG_element)  # type: ignore[valid-type]
     element: IntProperty(name="Element", description="The element whose sliders are shown", default=0)  # type: ignore[valid-type]

@@ -19,7 +19,7 @@ from ...core.errors import CaptureError
 from ...core.look import PlacedLight
 from ...core.look.shot import Shot, ShotFrame
 from ...core.system.files import write_json
-from .. import cameras, lights, occlusion
+from .. import cameras, lamp_drive, lights, looks
 from ..objects import enabled_collections, world_matrix
 from . import exporter
 
@@ -49,14 +49,15 @@ def read_shot(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[in
     light_objects = _find_lights(scene, names)
     if not light_objects:
         raise CaptureError(f"The scene {scene.name!r} has no lights; name objects with --lights.")
+    scene.frame_set(scene.frame_start)
+    items = [_flare_of(obj, radius) for obj in light_objects]
     shot_frames = []
     for frame in frames:
         scene.frame_set(frame)
         depsgraph = bpy.context.evaluated_depsgraph_get()
         camera = _active_camera(scene).evaluated_get(depsgraph)
         core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
-        eye = camera.matrix_world.translation
-        placed = tuple(_place_light(scene, depsgraph, obj, eye, radius) for obj in light_objects)
+        placed = tuple(_place_light(scene, depsgraph, item, camera.matrix_world) for item in items)
         shot_frames.append(ShotFrame(frame, scene.name, core, placed))
         done()
     return Shot(flare, tuple(shot_frames))
@@ -86,12 +87,19 @@ def _find_lights(scene: Any, names: Sequence[str]) -> list[Any]:
             and not obj.hide_render and obj.name in rendered]
 
 
-def _place_light(scene: Any, depsgraph: Any, obj: Any, eye: Any, radius: float) -> PlacedLight:
-    """Return a light with its position and visibility."""
-    position = _light_position(depsgraph, obj, eye)
-    item = SimpleNamespace(target=obj, radius=radius or _lamp_radius(obj))
-    visibility = occlusion.visibility(scene, depsgraph, eye, item)
-    return PlacedLight(obj.name, obj.name, position, float(visibility))
+def _flare_of(obj: Any, radius: float) -> Any:
+    """Return the settings of a flare at a light, as the add-on's flares have them by default; the scene is at its first
+    frame, to which the power of lamps is relative."""
+    light = lamp_drive.light_of(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data).tolist() \
+        if lamp_drive.is_lamp(obj) else (0.0, 0.0, 0.0)
+    return SimpleNamespace(name=obj.name, source=obj.name, target=obj, radius=radius or _lamp_radius(obj),
+                           follow_power=True, reference_light=light, extent="auto")
+
+
+def _place_light(scene: Any, depsgraph: Any, item: Any, camera: Any) -> PlacedLight:
+    """Return a light with its position, visibility, extent and power, seen by a camera of this matrix_world."""
+    _light_position(depsgraph, item.target, camera.translation)  # refuses one that is not finite
+    return looks.place_light(scene, depsgraph, camera, np.eye(4), item, hides=True)
 
 
 def _light_position(depsgraph: Any, obj: Any, eye: Any) -> cameras.Floats:

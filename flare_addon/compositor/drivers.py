@@ -14,7 +14,8 @@ from typing import Any
 import bpy
 
 from .. import fcurves
-from .flare_node import GROUP, GROUPS_ARE_TREES, find_node, gain_input, layer_of_gain, tree_of
+from .flare_node import GROUP, find_node, gain_input, layer_of_gain
+from .trees import GROUPS_ARE_TREES, tree_of
 
 SOLOS = "solos"  # a property of the node: how many flares are solo
 _INPUT_PATH = re.compile(rf'nodes\["{GROUP}"\]\.inputs\[(\d+)\]\.default_value')

@@ -4,8 +4,7 @@
     Flare = Intensity * Tint * (sum of the flare layers, each times its Gain),   Image = Scene + Flare
 
 in scene-linear light, so the picture is the bake's composite at Intensity 1 with white Tint and Gains. `setup` adds the
-node. It works with the compositors of 4.2 to 5.2: up to 4.5 a scene owns a node tree, from 5.0 it refers to a node
-group, and the mix and math nodes are of other types.
+node. It works with the compositors of 4.2 to 5.3, see `trees`; from 5.0 on the mix and math nodes are of other types.
 """
 from __future__ import annotations
 
@@ -15,21 +14,14 @@ from typing import Any
 import bpy
 
 from ...core.images.window import DataWindow
+from .trees import GROUPS_ARE_TREES, NODE, tree_of
 
-GROUP = "Fit Flare"
-GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
+GROUP = NODE
 MISSING_IS_MAGENTA = bpy.app.version < (4, 4, 0)
 """Whether the compositor shows missing pictures in magenta instead of black."""
 _GAIN = " Gain"
 _MIX, _MATH = (("ShaderNodeMix", "ShaderNodeMath") if GROUPS_ARE_TREES
                else ("CompositorNodeMixRGB", "CompositorNodeMath"))
-
-
-def tree_of(scene: Any) -> Any:
-    """Return the compositor tree of the scene; None where it has none."""
-    if GROUPS_ARE_TREES:
-        return scene.compositing_node_group
-    return scene.node_tree if scene.use_nodes else None
 
 
 def find_node(scene: Any) -> Any:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Sets the compositor of a scene up to combine baked layers with the node "Fit Flare" (flare_node.py).
 
-The previous state is stored on the scene, so that `remove` restores it. It works with the compositors of 4.2 to 5.2: up
-to 4.5 the tree ends in a Composite node, from 5.0 in a Group Output.
+The previous state is stored on the scene, so that `remove` restores it. It works with the compositors of 4.2 to 5.3
+(`trees`): up to 4.5 the tree ends in a Composite node, from 5.0 in a Group Output.
 """
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ from ...core.images.exr import exr_colour_space
 from .. import fcurves
 from ..images import load_image
 from ..paths import absolute
-from . import drivers
+from . import drivers, trees
 from .flare_node import (
     GROUP,
-    GROUPS_ARE_TREES,
     crop_to_frame,
     find_node,
     layer_of_gain,
     new_node,
     node_group,
     scale_to_render_size,
-    tree_of,
 )
+from .trees import GROUPS_ARE_TREES, tree_of
 
 LAYERS = "Fit Flare Layers"
 PLATE = "Fit Flare Footage"
@@ -39,10 +38,12 @@ SIZE = "Fit Flare Size"
 CROP = "Fit Flare Crop"
 """Start of the names of the nodes that cut the overscan of the layers off, one for each layer."""
 _OUR_NODES = (GROUP, LAYERS, PLATE, SIZE, VIEWER, RENDER)
+_ENDS = (trees.OUTPUT_TYPE, "NodeGroupInput", "CompositorNodeViewer")
+"""Nodes of a tree without a picture of its own."""
 STATE_PROPERTY = "fit_flare_compositor"  # of the scene: the state before the set-up
 _MAX_FRAMES = 1048574  # the limit of Blender; frames without a file have no flare
 _IMAGE_NODE_SETTINGS = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
-_OUTPUT_TYPE = "NodeGroupOutput" if GROUPS_ARE_TREES else "CompositorNodeComposite"
+_OUTPUT_TYPE = trees.OUTPUT_TYPE
 
 
 def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: Any = None) -> Any:
@@ -73,7 +74,7 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     if not names or "scene" not in sockets:
         _undo_set_up(scene, tree, source, node_settings, state)
         if original is not None and tree != original:  # a copy made for this set-up
-            scene.compositing_node_group = original
+            trees.replace_tree(scene, original)
             bpy.data.node_groups.remove(tree)
         raise FrameError(f"{layers.files[layers.first]} holds no scene and flare layers; choose a folder of a bake.")
     if STATE_PROPERTY not in scene:
@@ -115,7 +116,7 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     if plate is not None:
         scene_socket = _footage_node(tree, plate).outputs["Image"]
     elif keep_image:
-        scene_socket = before or _render_node(tree).outputs["Image"]
+        scene_socket = before or _render_picture(tree)
     if (size := tree.nodes.get(SIZE)) is not None:
         tree.nodes.remove(size)
     if scene_socket is not None and (scene_socket.node.name in (LAYERS, PLATE) or _is_crop(scene_socket.node)):
@@ -152,8 +153,8 @@ def _own_tree(scene: Any) -> Any:
     """
     tree = tree_of(scene)
     if GROUPS_ARE_TREES and tree is not None and (tree.library is not None or any(
-            other != scene and tree_of(other) == tree for other in bpy.data.scenes)):
-        tree = scene.compositing_node_group = tree.copy()
+            other != scene and trees.uses_tree(other, tree) for other in bpy.data.scenes)):
+        tree = trees.replace_tree(scene, tree.copy())
     return tree
 
 
@@ -191,6 +192,12 @@ def show_plate(scene: Any) -> bool:
         size = tree.nodes.get(SIZE) or _set_name(scale_to_render_size(tree, footage.outputs["Image"], -3, 1), SIZE)
         tree.links.new(size.outputs[0], _output_input(tree))
     return True
+
+
+def shows_plate_alone(scene: Any) -> bool:
+    """Return whether the compositor has the nodes of `show_plate`, without layers."""
+    tree = tree_of(scene)
+    return tree is not None and find_node(scene) is None and PLATE in tree.nodes and STATE_PROPERTY in scene
 
 
 def _feeding_socket(socket: Any) -> Any:
@@ -240,16 +247,21 @@ def _undo_set_up(scene: Any, tree: Any, source: Any, node_settings: dict[str, An
     else:
         tree.nodes.remove(source)
         if not state["tree"]:
-            _discard_tree(scene, tree, bool(state["use_nodes"]))
+            trees.discard_tree(scene, tree, bool(state["use_nodes"]))
         elif not GROUPS_ARE_TREES:
             scene.use_nodes = bool(state["use_nodes"])
     _remove_unused([image], state)
 
 
-def _render_node(tree: Any) -> Any:
-    """Return the first Render Layers node; one is added where there is none."""
+def _render_picture(tree: Any) -> Any:
+    """Return the socket of the render; a node for it is added where there is none.
+
+    In a stack of effects it is the picture that comes into the effect.
+    """
     render = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
-    return render or _set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
+    if render is None and (incoming := trees.incoming_picture(tree)) is not None:
+        return incoming
+    return (render or _set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)).outputs["Image"]
 
 
 def _footage_node(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
@@ -269,9 +281,7 @@ def _footage_node(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
 def _scene_state(scene: Any) -> dict[str, Any]:
     """Return the compositor state of the scene and the file before the set-up."""
     viewer = any(image.type == "COMPOSITING" for image in bpy.data.images)  # Blender makes one for a Viewer node
-    if GROUPS_ARE_TREES:
-        return {"tree": scene.compositing_node_group is not None, "use_nodes": True, "viewer": viewer}
-    return {"tree": scene.node_tree is not None, "use_nodes": bool(scene.use_nodes), "viewer": viewer}
+    return {"tree": trees.has_tree(scene), "use_nodes": GROUPS_ARE_TREES or bool(scene.use_nodes), "viewer": viewer}
 
 
 def _tree_state(tree: Any) -> dict[str, Any]:
@@ -284,7 +294,15 @@ def _tree_state(tree: Any) -> dict[str, Any]:
 
 
 def remove(scene: Any) -> None:
-    """Remove our nodes and restore the state before `set_up`. Raises FrameError where it is not set up."""
+    """Remove our nodes and restore the state before `set_up` or `show_plate`. Raises FrameError where none is there."""
+    if shows_plate_alone(scene):
+        tree = tree_of(scene)
+        image = tree.nodes[PLATE].image
+        trees.discard_tree(scene, tree, bool(scene[STATE_PROPERTY]["use_nodes"]))
+        state = dict(scene[STATE_PROPERTY])
+        del scene[STATE_PROPERTY]
+        _remove_unused([image], state)
+        return
     if find_node(scene) is None:
         raise FrameError(f"The compositor of the scene {scene.name!r} has no nodes of Fit Flare to remove.")
     tree = _own_tree(scene)
@@ -294,7 +312,7 @@ def remove(scene: Any) -> None:
     group, images = node.node_tree, [tree.nodes[name].image for name in (LAYERS, PLATE) if tree.nodes.get(name)]
     below = _image_under_flare(tree, node, state)
     if below is None and not state["tree"]:
-        below = _render_node(tree).outputs["Image"]
+        below = _render_picture(tree)
     for fed in [link.to_socket for link in tree.links if link.from_node == node
                 and (link.from_socket.name == "Image" or link.to_node.bl_idname == _OUTPUT_TYPE)]:
         if below is not None:
@@ -307,9 +325,9 @@ def remove(scene: Any) -> None:
         ours = tree.nodes.get(name)
         if ours is not None and not (name == RENDER and any(socket.is_linked for socket in ours.outputs)):
             tree.nodes.remove(ours)
-    if not state["tree"] and all(node.bl_idname in (_OUTPUT_TYPE, "CompositorNodeViewer") or node.name == RENDER
+    if not state["tree"] and all(node.bl_idname in _ENDS or node.name == RENDER
                                  for node in tree.nodes):
-        _discard_tree(scene, tree, bool(state["use_nodes"]))
+        trees.discard_tree(scene, tree, bool(state["use_nodes"]))
     elif state["tree"]:
         if state.get("nodes") is not None:
             known = state["nodes"].split("\n")
@@ -333,17 +351,6 @@ def _remove_unused(images: Sequence[Any], state: dict[str, Any]) -> None:
             bpy.data.images.remove(image)
 
 
-def _discard_tree(scene: Any, tree: Any, use_nodes: bool) -> None:
-    """Remove the compositor tree of the scene."""
-    if GROUPS_ARE_TREES:
-        scene.compositing_node_group = None
-        if not tree.users:
-            bpy.data.node_groups.remove(tree)
-    else:
-        tree.nodes.clear()
-        scene.use_nodes = use_nodes
-
-
 def _input_value(node: Any, name: str) -> Any:
     """Return the value of an input, a number or a tuple."""
     value = node.inputs[name].default_value
@@ -361,17 +368,9 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
 
     A Render Layers node makes Blender render the 3D scene even if it is not used, so none is added without need.
     """
-    fresh = GROUPS_ARE_TREES or scene.node_tree is None
-    if GROUPS_ARE_TREES:
-        tree = scene.compositing_node_group = bpy.data.node_groups.new("Compositor", "CompositorNodeTree")
-    else:
-        scene.use_nodes = True
-        tree = scene.node_tree
-    if fresh:
-        tree.nodes.clear()
-        if keep_image:
-            render = _set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
-            tree.links.new(render.outputs["Image"], _output_input(tree))
+    tree = trees.new_tree(scene)
+    if keep_image and not tree.nodes:
+        tree.links.new(_render_picture(tree), _output_input(tree))
     return tree
 
 
@@ -414,8 +413,9 @@ def _show_layers(node: Any, layers: LayerFolder) -> None:
 def is_over_render(scene: Any) -> bool:
     """Return whether the flare goes over the render of the scene."""
     node = find_node(scene)
+    sources = ("CompositorNodeRLayers", "NodeGroupInput")
     return node is not None and any(_depends_on(node, candidate) for candidate in tree_of(scene).nodes
-                                    if candidate.bl_idname == "CompositorNodeRLayers")
+                                    if candidate.bl_idname in sources)
 
 
 def colour_space_warning(scene: Any) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 from ...core.bake.folder import LayerFolder
 from ...core.conventions.frame_numbers import NumberedFrame, missing_numbers
 from ...core.images.picture import same_aspect
-from . import drivers, flare_node, setup
+from . import drivers, flare_node, setup, trees
 
 
 def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
@@ -20,6 +20,9 @@ def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
     if not render.use_compositing:
         yield ("Compositing is switched off for this scene, so renders have no flare; switch it on in the output "
                "properties, under Post Processing.")
+    if trees.is_off_in_renders(scene):
+        yield ("The compositor effect with the flare is switched off for renders, so they have no flare; switch it on "
+               "in the list of effects.")
     if strips := _active_strips(scene):
         yield (f"Renders show the video sequencer, which has {strips[0].name!r}, in place of the compositor, without "
                "the flare; switch Sequencer off in the output properties, under Post Processing.")

@@ -151,7 +151,7 @@ class FITFLARE_OT_remove_compositor(GuardedOperator, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        if flare_node.find_node(context.scene) is None:
+        if flare_node.find_node(context.scene) is None and not setup.shows_plate_alone(context.scene):
             return "The compositor is not set up"
         return ""
 

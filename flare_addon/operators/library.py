@@ -56,6 +56,9 @@ class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
+    add: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Add at Selected", description="Give each selected object without a flare one", default=True,
+        options={"SKIP_SAVE"})
 
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:
@@ -68,7 +71,7 @@ class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
         if not path:
             raise FlareFileError("Choose a flare of the library first.")
         chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
-        looks.show_look(context.scene, Path(path), chosen, add=True)
+        looks.show_look(context.scene, Path(path), chosen, add=self.add)
         missing = [item.name for item in context.scene.fit_flare.lights if item.target is None]
         if missing:
             self.report({"WARNING"}, f"{', '.join(missing)}: choose the light object in the panel Look")
@@ -203,6 +206,7 @@ class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):
         scene.render.pixel_aspect_x = scene.render.pixel_aspect_y = 1.0
         scene.frame_start = scene.frame_end = scene.frame_current
         scene.fit_flare.over = "plate"
+        scene.render.film_transparent = True  # else the world hides the picture in a rendered view
         if note := render_settings.show_as_filmed(scene):
             self.report({"WARNING"}, note)
         if not setup.show_plate(scene):

@@ -97,6 +97,19 @@ def test_the_first_render_shows_the_flare(facts: Any) -> None:
     assert facts["left alone"], "with Composite after Bake switched off"
 
 
+def test_a_flare_lies_over_a_stack_of_effects(facts: Any) -> None:
+    """Block of first_minute.py: "a stack of effects"."""
+    if not facts["has effects"]:
+        pytest.skip("this Blender has no stack of compositor effects; 5.3 has")
+    names, difference, left = facts["one effect"]
+    assert (names, left) == (["Fit Flare"], 0)
+    assert difference < 2e-3
+    stacked, again, names, warned, restored = facts["beside others"]
+    assert max(stacked, again) < 5e-3, "once, over the picture of all effects"
+    assert names == ["half", "double"] and warned
+    assert restored == 0
+
+
 def test_a_scene_is_read_a_frame_at_a_time(facts: Any) -> None:
     """Block of first_minute.py: "reading a scene in steps"."""
     assert facts["read one"] == [1, 3, 1]
@@ -110,4 +123,28 @@ def test_a_single_picture_is_rendered_with_its_flare(facts: Any) -> None:
     assert facts["picture is rendered"] == pytest.approx([0.0509, 0.214, 0.5225], abs=2e-3)
     assert facts["picture with its flare"] < 2e-3
     assert facts["picked"] == [["Flare", True], ["light1", False]], "the new light is moved first"
-    assert facts["picture removed"]
+    assert facts["picture alone removed"] and facts["picture removed"]
+
+
+def test_power_and_colour_of_a_lamp_drive_its_flare(facts: Any) -> None:
+    """Block of first_minute.py: "lamps drive their flares"."""
+    assert facts["dimmed by hand"] == [0.5, 0.25, 0.5]
+    assert facts["half as bright"] == pytest.approx(0.5, abs=1e-3)
+    assert facts["not following"] == [1, 1, 1]
+    assert facts["keyed"] == [[1, 1, 1], [3, 3, 3]], "relative to the first frame"
+    assert facts["keyed, in a bake"] == facts["keyed, in a transfer"] == [1, 3]
+    assert facts["driven"] == [4, [1, 1, 1], [4, 4, 4]], "and the timeline stays where it was"
+
+
+def test_area_lights_flare_as_areas(facts: Any) -> None:
+    """Block of first_minute.py: "lights that are areas"."""
+    shape, size, emission, share = facts["area"]
+    assert (shape, emission) == ("rectangle", pytest.approx(1))
+    assert size == pytest.approx([2, 0, 1], abs=0.11)
+    assert share == pytest.approx(0.5, abs=0.05)
+    assert facts["half hidden"] == pytest.approx(0.5, abs=0.06)
+    assert facts["from behind"] == 0
+    assert facts["as a point"]
+    assert facts["as a sphere"] == ["sphere", 0.5]
+    assert facts["as a mesh"] == ["points", [4, 0, 1]]
+    assert "choose Point as its extent" in facts["an area of nothing"]

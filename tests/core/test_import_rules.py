@@ -15,7 +15,8 @@ SOURCES = ("core", "flare_addon", "headless")
 # Modules that Blender's own Python, which has numpy and no other dependency of the engine, must be able to import.
 NUMPY_ONLY = ("core.errors", "core.choices", "core.system.files", "core.system.progress",
               "core.conventions.splatting", "core.conventions.run_files", "core.images.read", "core.images.write",
-              "core.capture", "core.bake.bake", "core.bake.shot_frames", "core.metrics.evaluation", "core.look")
+              "core.capture", "core.bake.bake", "core.bake.shot_frames", "core.metrics.evaluation", "core.look",
+              "core.optics.lenses")
 
 # Layers from the lowest; modules of `core` that are not listed are below all of them.
 LAYERS = ("core.system", "core.conventions", "core.optics", "core.colour", "core.images", "core.capture",

@@ -23,6 +23,9 @@ from measure import module
 WIDTH, HEIGHT = 480, 270
 MARGIN = 2  # pixels at the edge of the frame, where the camera's border is drawn
 
+EDGE = 12  # codes between neighbours, above which a pixel counts as the edge of an object, whose place is rounded
+NEIGHBOURS = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+
 
 def steps():
     settings = bpy.context.preferences
@@ -76,7 +79,7 @@ def prepare(over: str):
 def add_grey(scene, x: float, value: float) -> None:
     """A square of constant light before the camera."""
     mesh = bpy.data.meshes.new("Grey")
-    mesh.from_pydata([(-1, -1, -8), (1, -1, -8), (1, 1, -8), (-1, 1, -8)], [], [(0, 1, 2, 3)])
+    mesh.from_pydata([(-1, -9, -12), (1, -9, -12), (1, 9, -12), (-1, 9, -12)], [], [(0, 1, 2, 3)])
     item = bpy.data.objects.new("Grey", mesh)
     scene.collection.objects.link(item)
     item.parent, item.location = scene.camera, (x, 0, 0)
@@ -114,6 +117,7 @@ def compare(scene, engine: str, over: str, results) -> None:
     space.region_3d.view_perspective = "CAMERA"
     with ui.override():
         bpy.ops.view3d.zoom_camera_1_to_1()
+    align(scene)
     for item in scene.objects:
         item.select_set(False)
     yield 1
@@ -121,10 +125,14 @@ def compare(scene, engine: str, over: str, results) -> None:
         scene.view_settings.view_transform = transform
         bpy.ops.render.render(scene=scene.name)
         rendered = saved(scene, flow.out / f"{over}_{engine}_{transform}_render.png")
-        yield 4
-        path = flow.out / f"{over}_{engine}_{transform}_view.png"
-        ui.screenshot(str(path))
-        yield 0.5
+        path, before = flow.out / f"{over}_{engine}_{transform}_view.png", None
+        for _ in range(12):  # until the viewport's render is finished
+            yield 3
+            ui.screenshot(str(path))
+            yield 0.5
+            if before is not None and np.array_equal(before, pixels(path)):
+                break
+            before = pixels(path)
         with ui.override():
             frame = module("overlay").camera_frame(bpy.context, scene, scene.camera)
         region = ui.region("WINDOW")
@@ -137,13 +145,37 @@ def compare(scene, engine: str, over: str, results) -> None:
         for y in (-1, 0, 1):  # the frame's corner is rounded
             for x in (-1, 0, 1):
                 moved = np.roll(rendered, (y, x), (0, 1))[inner]
-                away = np.abs(moved - view[inner])[(moved < 254) & (view[inner] < 254)]
+                steep = np.maximum(*(np.abs(moved - np.roll(moved, 1, axis)).max(-1) for axis in (0, 1))) > EDGE
+                edge = np.logical_or.reduce([np.roll(steep, shift, (0, 1)) for shift in NEIGHBOURS])
+                away = np.abs(moved - view[inner])[(moved < 254) & (view[inner] < 254) & ~edge[..., None]]
                 if best is None or away.mean() < best.mean():
                     best = away
         results[f"{over} {engine} {transform}"] = {
             "largest": float(best.max()), "mean": round(float(best.mean()), 3),
             "within_2": round(float((best <= 2).mean()), 5), "brightest": float(rendered.max())}
         print(over, engine, transform, results[f"{over} {engine} {transform}"], flush=True)
+
+
+def align(scene) -> None:
+    """Move the camera's frame to whole pixels of the region."""
+    view = ui.area().spaces.active.region_3d
+
+    def corner():
+        with ui.override():
+            frame = module("overlay").camera_frame(bpy.context, scene, scene.camera)
+        return np.array([frame.left, frame.bottom])
+
+    for _ in range(3):
+        start, offset = corner(), np.array(view.view_camera_offset)
+        for axis in (0, 1):
+            moved = offset.copy()
+            moved[axis] += 0.01
+            view.view_camera_offset = moved
+            ui.redraw()
+            slope = (corner()[axis] - start[axis]) / 0.01
+            moved[axis] = offset[axis] + (round(start[axis]) - start[axis]) / slope
+            view.view_camera_offset = offset = moved
+            ui.redraw()
 
 
 def saved(scene, path: Path):

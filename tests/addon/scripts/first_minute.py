@@ -110,8 +110,10 @@ element = state.lights[0].elements[0].name
 ops.apply_flare(filepath=flare)
 facts["another look"] = [rows(scene), state.lights[0].intensity, round(state.lights[1].rotation, 5),
                          [round(value, 5) for value in state.master.tint]]
-ops.apply_flare(filepath=path_of["Clean Prime"])
-ops.apply_flare(filepath=two)
+cube = object_in(scene, "Cube", bpy.data.meshes.new("Cube"), (0, 5, 0))
+select(scene, cube)
+ops.apply_flare(filepath=path_of["Clean Prime"], add=False)
+ops.apply_flare(filepath=two, add=False)
 facts["back again"] = [rows(scene), state.lights[0].intensity, round(state.lights[1].rotation, 5)]
 
 # ---- the library keeps edits ----------------------------------------------------------------------------
@@ -208,6 +210,58 @@ ops.remove_compositor()
 ops.bake()
 facts["left alone"] = flare_node.find_node(scene) is None
 
+# ---- a stack of effects ---------------------------------------------------------------------------------
+def effect(scene, name, factor):
+    """An effect that multiplies the picture before it."""
+    tree = bpy.data.node_groups.new(name, "CompositorNodeTree")
+    for direction in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Image", in_out=direction, socket_type="NodeSocketColor")
+    begin, end, mix = (tree.nodes.new(kind) for kind in ("NodeGroupInput", "NodeGroupOutput", "ShaderNodeMix"))
+    mix.data_type, mix.blend_type, mix.inputs["Factor"].default_value = "RGBA", "MULTIPLY", 1.0
+    colours = [socket for socket in mix.inputs if socket.type == "RGBA"]
+    colours[1].default_value = (factor, factor, factor, 1)
+    tree.links.new(begin.outputs[0], colours[0])
+    tree.links.new(next(socket for socket in mix.outputs if socket.type == "RGBA"), end.inputs[0])
+    made = scene.compositor_effects.new(name=name)
+    made.node_group = tree
+    return made
+
+
+facts["has effects"] = part("flare_addon.compositor.trees").HAS_EFFECTS
+if facts["has effects"]:
+    setup = part("flare_addon.compositor.setup")
+    layers_folder = str(folder)
+    scene.fit_flare.lights[0].intensity = 1.0
+    scene.frame_set(1)
+    ops.set_up_baked()
+    alone = [effect.name for effect in scene.compositor_effects]
+    flare_light = drawn(scene)
+    only = float(np.abs(rendered(scene) - flare_light).max() / flare_light.max())
+    ops.remove_compositor()
+    facts["one effect"] = [alone, only, len(scene.compositor_effects)]
+    cube = object_in(scene, "Bright", bpy.data.meshes.new("Bright"), (0, 0, 0))
+    cube.data.from_pydata([(-9, 9, -9), (9, 9, -9), (9, 9, 9), (-9, 9, 9)], [], [(0, 1, 2, 3)])
+    cube.color = (0.5, 0.5, 0.5, 1)
+    scene.display.shading.light, scene.display.shading.color_type = "FLAT", "OBJECT"
+    scene.fit_flare.occlusion = False
+    under = rendered(scene)
+    first, second = effect(scene, "half", 0.5), effect(scene, "double", 2.0)
+    first.is_active = True
+    ops.set_up_baked()
+    stacked = float(np.abs(rendered(scene) - under - flare_light).max() / flare_light.max())
+    second.is_active = True
+    ops.set_up_baked()  # the flare is there once, whichever effect is active
+    again = float(np.abs(rendered(scene) - under - flare_light).max() / flare_light.max())
+    part("flare_addon.compositor.trees").effect_of(scene).enable_for_render = False
+    operator = MagicMock()
+    part("flare_addon.operators.bake").set_up(operator, scene, layers_folder, keep_image=True, plate=False)
+    said = [call.args[1] for call in operator.report.mock_calls if call.args[0] == {"WARNING"}]
+    second.enable_for_render = True
+    ops.remove_compositor()
+    facts["beside others"] = [stacked, again, [item.name for item in scene.compositor_effects],
+                              any("effect with the flare is switched off" in text for text in said),
+                              float(np.abs(rendered(scene) - under).max())]
+
 # ---- reading a scene in steps ---------------------------------------------------------------------------
 reading = shots.ShotReading(scene, [], range(1, 4))
 reading.step()
@@ -220,6 +274,99 @@ try:
 except part("core.errors").FitFlareError as problem:
     facts["camera deleted while it reads"] = str(problem)
 scene.camera = lens
+
+# ---- lamps drive their flares ---------------------------------------------------------------------------
+def factor(scene, frame=None):
+    """The factor of the first flare, as a shot has it."""
+    if frame is not None:
+        scene.frame_set(frame)
+    bpy.context.view_layer.update()
+    _, (light,) = looks.place_lights(scene, bpy.context.evaluated_depsgraph_get(), scene.camera)
+    return [round(value, 4) for value in light.factor]
+
+
+scene, (lamp,) = scene_with((0.5, 8, 0.4))
+lamp.data.energy, scene.frame_end = 100, 9
+select(scene, lamp)
+ops.add_library_flare()
+item = scene.fit_flare.lights[0]
+bright = brightness(scene)
+lamp.data.energy, lamp.data.color = 50, (1, 0.5, 1)
+facts["dimmed by hand"] = factor(scene)
+lamp.data.color = (1, 1, 1)
+bpy.context.view_layer.update()
+facts["half as bright"] = brightness(scene) / bright
+item.follow_power = False
+facts["not following"] = factor(scene)
+item.follow_power = True
+for frame, energy in ((1, 20), (9, 60)):
+    lamp.data.energy = energy
+    lamp.data.keyframe_insert("energy", frame=frame)
+facts["keyed"] = [factor(scene, 1), factor(scene, 9)]
+shot = shots.scene_shot(scene, [], [1, 9], Path(flare), None)
+facts["keyed, in a bake"] = [round(frame.lights[0].factor[0], 4) for frame in shot.frames]
+lamp.data.animation_data_clear()
+driver = lamp.data.driver_add("energy").driver
+driver.type, driver.expression = "SCRIPTED", "10 * frame"
+scene.frame_set(4)
+part("flare_addon.lamp_drive").measure_driven(scene)
+facts["driven"] = [scene.frame_current, factor(scene, 1), factor(scene, 4)]
+lamp.data.driver_remove("energy")
+blend_shot = part("flare_addon.capture.blend_shot")
+for frame, energy in ((1, 20), (9, 60)):
+    lamp.data.energy = energy
+    lamp.data.keyframe_insert("energy", frame=frame)
+read = blend_shot.read_shot(scene, Path(flare), [], [1, 9])
+facts["keyed, in a transfer"] = [round(frame.lights[0].factor[1], 4) for frame in read.frames]
+
+# ---- lights that are areas ------------------------------------------------------------------------------
+scene, (lamp,) = scene_with((0, 8, 0))
+lamp.data.type, lamp.data.shape = "AREA", "RECTANGLE"
+lamp.data.size, lamp.data.size_y = 2.0, 1.0
+lamp.rotation_euler = (-np.pi / 2, 0, 0)  # its -Z looks at the camera
+select(scene, lamp)
+ops.add_library_flare(look=path_of["Clean Prime"])
+item = scene.fit_flare.lights[0]
+wall = object_in(scene, "Wall", bpy.data.meshes.new("Wall"), (0, 0, 0))
+wall.data.from_pydata([(-9, 6, -9), (0, 6, -9), (0, 6, 9), (-9, 6, 9)], [], [(0, 1, 2, 3)])
+bpy.context.view_layer.update()
+
+
+def placed():
+    bpy.context.view_layer.update()
+    _, (light,) = looks.place_lights(scene, bpy.context.evaluated_depsgraph_get(), scene.camera)
+    return light
+
+
+half = placed()
+core_light = half.extent.sampled(half.xyz, np.linalg.inv(
+    part("flare_addon.cameras").camera_to_world(scene.camera.matrix_world)))
+facts["area"] = [half.extent.shape, np.ptp(core_light.points, axis=0).round(1).tolist(), float(core_light.emission),
+                 round(float(np.mean(half.shares)), 2)]
+hidden = brightness(scene)
+wall.hide_render = True
+whole = brightness(scene)
+facts["half hidden"] = round(hidden / whole, 2)
+lamp.rotation_euler = (np.pi / 2, 0, 0)
+bpy.context.view_layer.update()
+facts["from behind"] = brightness(scene)
+lamp.rotation_euler = (-np.pi / 2, 0, 0)
+item.extent = "point"
+facts["as a point"] = placed().extent is None
+item.extent = "shape"
+lamp.data.type, lamp.data.shadow_soft_size = "POINT", 0.5
+facts["as a sphere"] = [placed().extent.shape, placed().extent.radius]
+sign = object_in(scene, "Sign", bpy.data.meshes.new("Sign"), (0, 8, 0))
+sign.data.from_pydata([(-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1)], [], [(0, 1, 2, 3)])
+item.target, sign.scale = sign, (2, 1, 0.5)
+bpy.context.view_layer.update()
+facts["as a mesh"] = [placed().extent.shape, np.ptp(placed().extent.points, axis=0).round(0).tolist()]
+item.target = object_in(scene, "Nothing", bpy.data.meshes.new("Nothing"), (0, 8, 0))
+bpy.context.view_layer.update()
+try:
+    placed()
+except part("core.errors").FitFlareError as problem:
+    facts["an area of nothing"] = str(problem)
 
 # ---- a single picture -----------------------------------------------------------------------------------
 photo = bpy.data.images.new("photo", 64, 36, float_buffer=False)
@@ -236,6 +383,9 @@ if hasattr(scene.render, "compositor_device"):
     scene.render.compositor_device = "CPU"
 plain = rendered(scene)
 facts["picture is rendered"] = plain[18, 32].tolist()
+ops.remove_compositor()
+facts["picture alone removed"] = flare_node.tree_of(scene) is None
+ops.shot_from_picture(filepath=str(Path(out) / "photo.png"))
 ops.add_library_flare(look=path_of["Vintage Ring"])
 ops.bake()
 facts["picture with its flare"] = float(np.abs(rendered(scene) - plain - drawn(scene)).max() / drawn(scene).max())

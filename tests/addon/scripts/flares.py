@@ -83,7 +83,7 @@ state.lights[0].name = "sun"
 state.lights[0].intensity = 2
 facts["renamed"] = [shown(scene), work(scene)]
 state.lights[0].name = "lamp"
-shots.write_json(live, shots.live_record(state, ["lamp", "key"]))  # as a bake writes it
+part("core.system.files").write_json(live, shots.live_record(state, ["lamp", "key"]))  # as a bake writes it
 state.lights[0].name = "sun"
 ops.set_up_baked()
 facts["renamed, set up again"] = [shown(scene), work(scene), "act on it." in said(scene)]

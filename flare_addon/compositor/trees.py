@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The compositor tree of a scene: its own tree until 4.5, a node group from 5.0, one of a stack of effects from 5.3.
+
+The effects of a stack follow each other. The Group Input of an effect's tree is the picture of the effects before it,
+that of the first is the render. The flare belongs into the last effect, so that it lies over the whole picture.
+"""
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
+HAS_EFFECTS = "compositor_effects" in bpy.types.Scene.bl_rna.properties
+OUTPUT_TYPE = "NodeGroupOutput" if GROUPS_ARE_TREES else "CompositorNodeComposite"
+NODE = "Fit Flare"
+"""Name of our node, and of the effect that holds it where the scene has none."""
+
+
+def tree_of(scene: Any) -> Any:
+    """Return the compositor tree of the scene; None where it has none.
+
+    Of a stack of effects it is the tree with our node, else that of the last effect.
+    """
+    if HAS_EFFECTS:
+        effect = effect_of(scene)
+        return effect.node_group if effect is not None else None
+    if GROUPS_ARE_TREES:
+        return scene.compositing_node_group
+    return scene.node_tree if scene.use_nodes else None
+
+
+def effect_of(scene: Any) -> Any:
+    """Return the effect with our node, else the last one that has a tree; None without any, and before 5.3."""
+    if not HAS_EFFECTS:
+        return None
+    effects = [effect for effect in scene.compositor_effects if effect.node_group is not None]
+    ours = (effect for effect in effects if NODE in effect.node_group.nodes)
+    return next(ours, effects[-1] if effects else None)
+
+
+def uses_tree(scene: Any, tree: Any) -> bool:
+    """Return whether a scene composites with this tree."""
+    if HAS_EFFECTS:
+        return any(effect.node_group == tree for effect in scene.compositor_effects)
+    return bool(tree_of(scene) == tree)
+
+
+def replace_tree(scene: Any, tree: Any) -> Any:
+    """Make the scene use `tree` in place of the one of `tree_of`, or as a new effect; return it. From 5.0 on."""
+    if not HAS_EFFECTS:
+        scene.compositing_node_group = tree
+        return tree
+    effect = effect_of(scene)
+    if effect is None:
+        effect = scene.compositor_effects.new(name=NODE)
+    effect.node_group = tree
+    return tree
+
+
+def new_tree(scene: Any) -> Any:
+    """Give a scene without a compositor tree an empty one; return it.
+
+    In an earlier Blender a tree that was switched off keeps its nodes.
+    """
+    if GROUPS_ARE_TREES:
+        return replace_tree(scene, bpy.data.node_groups.new("Compositor", "CompositorNodeTree"))
+    is_new = scene.node_tree is None
+    scene.use_nodes = True
+    if is_new:
+        scene.node_tree.nodes.clear()
+    return scene.node_tree
+
+
+def discard_tree(scene: Any, tree: Any, use_nodes: bool) -> None:
+    """Remove the compositor tree of the scene, with its effect. use_nodes: state until 4.5."""
+    if not GROUPS_ARE_TREES:
+        tree.nodes.clear()
+        scene.use_nodes = use_nodes
+        return
+    if HAS_EFFECTS:
+        for effect in [effect for effect in scene.compositor_effects if effect.node_group == tree]:
+            scene.compositor_effects.remove(effect)
+    else:
+        scene.compositing_node_group = None
+    if not tree.users:
+        bpy.data.node_groups.remove(tree)
+
+
+def has_tree(scene: Any) -> bool:
+    """Return whether the scene has a compositor tree, also one that is switched off."""
+    return tree_of(scene) is not None if GROUPS_ARE_TREES else scene.node_tree is not None
+
+
+def is_off_in_renders(scene: Any) -> bool:
+    """Return whether the effect with our node is switched off for renders."""
+    effect = effect_of(scene)
+    return effect is not None and NODE in effect.node_group.nodes and not effect.enable_for_render
+
+
+def incoming_picture(tree: Any) -> Any:
+    """Return the socket of the picture that comes into an effect's tree; None before 5.3."""
+    if not HAS_EFFECTS:
+        return None
+    if not any(getattr(item, "in_out", "") == "INPUT" for item in tree.interface.items_tree):
+        tree.interface.new_socket("Image", in_out="INPUT", socket_type="NodeSocketColor")
+    node = next((node for node in tree.nodes if node.bl_idname == "NodeGroupInput"), None)
+    if node is None:
+        node = tree.nodes.new("NodeGroupInput")
+        node.location = (-880, 220)
+    return node.outputs[0]

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The operator that makes a look of the library from a lens prescription, in the engine."""
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ...core.errors import SettingsError
+from ...core.optics.lenses import lens_names
+from .. import engine, jobs, library
+from ..reports import GuardedOperator
+
+FILE = "FILE"
+_items: list[tuple[str, str, str]] = []
+
+
+def making_job() -> jobs.Job | None:
+    """Return the job of the flare that is being made, or that was made last; None without one."""
+    return jobs.find(engine.user_folder("make_flare"))
+
+
+def _lens_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
+    """Return the lenses as menu items, kept here since Blender holds no reference to the texts."""
+    global _items
+    if not _items:
+        _items = [*((name, name, f"The lens of the patent {name}") for name in lens_names()),
+                  (FILE, "Lens File", "A prescription of your own in the .lens format")]
+    return _items
+
+
+class FITFLARE_OT_make_flare(GuardedOperator, bpy.types.Operator):
+    """Trace a lens and add its flare to the library; the engine needs some minutes"""
+
+    bl_idname = "fit_flare.make_flare"
+    bl_label = "Make from Lens"
+    changes_scene = False
+
+    name: bpy.props.StringProperty(name="Name", description="Name of the look in the library", default="My Lens")  # type: ignore[valid-type]
+    lens: bpy.props.EnumProperty(name="Lens", description="The prescription to trace", items=_lens_items)  # type: ignore[valid-type]
+    filepath: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="File", description="A prescription in the .lens format", subtype="FILE_PATH")
+    f_number: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="F-Number", description="Opening of the iris; 0 is two stops below the widest", default=0.0, min=0.0,
+        soft_max=22.0, max=64.0)
+    blades: bpy.props.IntProperty(name="Blades", description="Blades of the iris", default=8, min=3, max=32)  # type: ignore[valid-type]
+    squeeze: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Squeeze", description="Squeeze of an anamorphic lens; 1 is spherical", default=1.0, min=1.0, max=4.0)
+    streak: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Streak", description="Brightness of a horizontal streak; 0 is none", default=0.0, min=0.0, soft_max=2.0,
+        max=100.0)
+    ring: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Ring", description="Brightness of a ring around the light; 0 is none", default=0.0, min=0.0,
+        soft_max=0.5, max=100.0)
+    dust: bpy.props.IntProperty(name="Dust", description="Specks of dust on the glass", default=30, min=0, max=1000)  # type: ignore[valid-type]
+    scratches: bpy.props.IntProperty(name="Scratches", description="Scratches on the glass", default=0, min=0, max=200)  # type: ignore[valid-type]
+
+    @classmethod
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        job = making_job()
+        return "A flare is being made" if job is not None and job.running else engine.missing_reason()
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, width=360, confirm_text="Make")
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        for name in ("name", "lens", *(("filepath",) if self.lens == FILE else ()), "f_number", "blades", "squeeze",
+                     "streak", "ring", "dust", "scratches"):
+            layout.prop(self, name)
+
+    def act(self, _context: bpy.types.Context) -> None:
+        lens = bpy.path.abspath(self.filepath) if self.lens == FILE else self.lens
+        if not lens:
+            raise SettingsError("Choose a .lens file first.")
+        target = library.free_path(self.name)
+        options = {"--f-number": self.f_number, "--squeeze": self.squeeze if self.squeeze != 1 else 0.0,
+                   "--streak": self.streak, "--ring": self.ring}
+        args = [word for name, value in options.items() if value for word in (name, f"{value:.6g}")]
+        engine.run("make flare", engine.user_folder("make_flare", create=True), [
+            "make-flare", lens, "--out", target, "--blades", self.blades, "--dust", self.dust, "--scratches",
+            self.scratches, *args])
+
+
+def register() -> None:
+    bpy.utils.register_class(FITFLARE_OT_make_flare)
+
+
+def unregister() -> None:
+    bpy.utils.unregister_class(FITFLARE_OT_make_flare)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError, SettingsError
 from ..system.files import atomic_path
 from .video import Video, VideoFrame, import_av
+from .video_mastering import x265_options
 from .video_planes import PlaneFormat, plane_arrays, plane_format, shrink_plane, to_planar
 
 CONTAINERS = {".mov": "mov", ".mp4": "mp4", ".m4v": "mp4", ".mkv": "matroska"}
@@ -113,7 +114,7 @@ def rewrite_video(source: Path, target: Path, codec: str, change: Change, *,
         try:
             with av.open(str(temporary), "w", format=container_format, container_options=options) as out:
                 _copy_tags(other.metadata, out.metadata, _BRANDS)
-                stream = _add_picture(out, video, other, encoder)
+                stream = _add_picture(out, video, other, encoder, left_out)
                 sound = _OtherStreams(other, out, video, left_out)
                 _copy_chapters(other, out)
                 _encode(out, stream, encoder, video, change, sound, on_frame)
@@ -170,14 +171,21 @@ def _output_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFo
     return chosen
 
 
-def _add_picture(out: Any, video: Video, source: Any, encoder: Encoder) -> Any:
-    """Add the stream of the frames, with the tags, timing and shape of the source's."""
+def _add_picture(out: Any, video: Video, source: Any, encoder: Encoder, left_out: list[str]) -> Any:
+    """Add the stream of the frames, with the tags, timing and shape of the source's. left_out: sentences about what is
+    not written, to which others are added."""
     first = next(iter(video), None)
     if first is None:
         raise FrameError(f"{video.path} has no frame that can be read; copy it again.")
     planar, raw = _output_format(encoder, video, first), first.raw
     original = video.stream
     options = dict(encoder.options)
+    mastering = x265_options(raw)
+    if mastering and "x265-params" not in options:
+        left_out.append(f"{encoder.name} writes neither the mastering display nor the light levels that {video.path} "
+                        "names; use --codec h265 to keep them.")
+    elif mastering:
+        options["x265-params"] += mastering
     stream = out.add_stream(encoder.name, rate=video.rate, options=options)
     stream.width, stream.height = video.stored_size
     stream.pix_fmt = planar.name

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from core.errors import Cancelled, FrameError, SettingsError
 from core.images.read import read_picture
 from core.images.video import Video, VideoFrame
+from core.images.video_mastering import x265_options
 from core.images.video_writer import rewrite_video
 from core.images.write import write_png
 from core.removal.jobs.clean_video import check_request, frames_folder, write_clean_video
@@ -146,6 +147,21 @@ def test_a_video_is_written_with_what_changed_alone(suffix: str, codec: str, sou
         was, is_now = (new.colour.from_pixels(pixels) * 255 for pixels in (was, is_now))
         assert np.abs(was - is_now)[32:, 4:24].max() <= bound, "untouched"
         assert np.abs(was - is_now)[4:20, 4:20].max() <= bound + 1, "darkened"
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "h265"), (".mkv", "h265"), (".mkv", "ffv1")])
+def test_the_mastering_display_and_light_levels_stay_or_are_named(suffix: str, codec: str, tmp_path: Path) -> None:
+    mastering = ("master-display=G(13250,34500)B(7500,3000)R(34000,16000)WP(15635,16450)L(10000000,50):"
+                 "max-cll=1000,400")
+    film = write_video(tmp_path / "film.mp4", "libx265", "yuv420p10le", [stripes(96)] * 2, matrix=9, tags=(9, 16, 9),
+                       options={"x265-params": f"log-level=none:{mastering}", "preset": "ultrafast"})
+    target = tmp_path / f"out{suffix}"
+    sentences = rewrite_video(film, target, codec, darkened)
+    assert x265_options(frames_of(film)[0].raw) == f":{mastering}"
+    if codec == "h265":
+        assert not sentences and x265_options(frames_of(target)[0].raw) == f":{mastering}"
+    else:
+        assert any("neither the mastering display nor the light levels" in sentence for sentence in sentences)
 
 
 def test_sound_tags_timecode_shape_and_alpha_of_a_video_stay(tmp_path: Path) -> None:

@@ -183,10 +183,10 @@ class Transfer:
     def _reference_distance(self, light: PlacedLight) -> float:
         """Return the reference distance of a light's fall-off: the target's, else that of the settings, where 0 stands
         for the distance in the first frame that has the light; 0 for no fall-off."""
-        wanted = self.settings.fall_off
-        if light.reference_distance or wanted is None:
+        fall_off = self.settings.fall_off
+        if light.reference_distance or fall_off is None:
             return light.reference_distance
-        return wanted or self._first_distances.get(light.name, 0.0)
+        return fall_off or self._first_distances.get(light.name, 0.0)
 
     @cached_property
     def _first_distances(self) -> dict[str, float]:

@@ -55,7 +55,7 @@ def test_a_file_of_an_earlier_version_keeps_its_drivers(facts: Any) -> None:
 
 
 def test_drivers_without_a_flare_are_reported(facts: Any) -> None:
-    """Block of flares.py: "dead drivers are told"."""
+    """Block of flares.py: "dead drivers give a warning"."""
     assert "set it up again" in facts["dead"]
 
 
@@ -84,7 +84,7 @@ def test_a_frame_that_was_baked_again_is_shown(facts: Any) -> None:
 
 
 def test_frames_without_layers_are_reported_and_show_no_flare(facts: Any) -> None:
-    """Block of flares.py: "what is told of frames without layers and of animated sliders"."""
+    """Block of flares.py: "warnings about frames without layers and animated sliders"."""
     assert facts["all frames"] == []
     (warning,) = facts["too few"]
     assert "The scene has the frames 0-6, and there are no layers of 0,4-6," in warning
@@ -104,19 +104,19 @@ def test_frames_without_layers_are_reported_and_show_no_flare(facts: Any) -> Non
     ("transparent", "The film is transparent, and PNG files lose the flare"),
 ])
 def test_renders_that_would_not_show_the_composite_give_a_warning(facts: Any, case: str, sentence: str) -> None:
-    """Block of flares.py: "what is told of renders that would not show the composite as it is"."""
+    """Block of flares.py: "warnings about renders that would not show the composite as it is"."""
     (warning,) = facts[case]
     assert sentence in warning
 
 
 @pytest.mark.parametrize("case", ["muted", "no alpha"])
 def test_renders_that_show_the_composite_give_no_warning(facts: Any, case: str) -> None:
-    """Block of flares.py: "what is told of renders that would not show the composite as it is"."""
+    """Block of flares.py: "warnings about renders that would not show the composite as it is"."""
     assert facts[case] == []
 
 
 def test_animated_live_sliders_give_a_warning_for_farms(facts: Any) -> None:
-    """Block of flares.py: "what is told of frames without layers and of animated sliders"."""
+    """Block of flares.py: "warnings about frames without layers and animated sliders"."""
     assert facts["scale keyed"] == []
     (warning,) = facts["intensity keyed"]
     assert "without this extension, as on a farm, they do not move" in warning

@@ -308,16 +308,16 @@ def test_the_extent_follows_the_cameras(tmp_path: Path) -> None:
 
 def test_the_extent_reads_each_camera_a_few_times_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = Capture.open(make_capture(tmp_path / "c", views=12))
-    asked, position = [], Camera.position.fget
-    monkeypatch.setattr(Camera, "position", property(lambda camera: asked.append(camera) or position(camera)))
+    calls, position = [], Camera.position.fget
+    monkeypatch.setattr(Camera, "position", property(lambda camera: calls.append(camera) or position(camera)))
     assert capture.extent > 0
-    assert len(asked) < 12 * 12 / 2
+    assert len(calls) < 12 * 12 / 2
 
 
 @pytest.mark.parametrize("slip", [0.0, 1e-15, 1e-7, 1e-4])
 @pytest.mark.parametrize("offset", [0.0, 1e6])
 def test_the_extent_of_a_rotating_camera_is_that_of_its_points(slip: float, offset: float, tmp_path: Path) -> None:
-    """Its positions are told by rotated vectors, whose rounding is no path."""
+    """The positions come from rotated vectors, whose rounding is no path."""
     whole = Capture.open(make_capture(tmp_path / "c"))
     random = np.random.default_rng(0)
     poses = [view.camera.world_to_camera.copy() for view in whole.views]

@@ -131,13 +131,13 @@ def test_frames_are_undistorted(tmp_path: Path, model: str, scale: int) -> None:
                 assert np.linalg.norm(found - (x, y)) < 0.15 * scale
 
 
-@pytest.mark.parametrize(("model", "told"), [
+@pytest.mark.parametrize(("model", "coefficients"), [
     ("OPENCV", {"k1": -0.1, "k2": 0.02, "k3": -0.003, "p1": 0.004, "p2": -0.005}),
     ("OPENCV_FISHEYE", {"k1": -0.1, "k2": 0.02, "k3": -0.003, "k4": 0.0006})])
-def test_coefficients_of_transforms_json_are_read_by_name(model: str, told: dict[str, float],
+def test_coefficients_of_transforms_json_are_read_by_name(model: str, coefficients: dict[str, float],
                                                           tmp_path: Path) -> None:
-    found = Capture.open(make_transforms(tmp_path / "c", camera_model=model, **told)).views[0].lens
-    assert {name: found.parameters[name] for name in told} == told
+    found = Capture.open(make_transforms(tmp_path / "c", camera_model=model, **coefficients)).views[0].lens
+    assert {name: found.parameters[name] for name in coefficients} == coefficients
 
 
 def test_fields_of_view_give_focal_lengths(tmp_path: Path) -> None:

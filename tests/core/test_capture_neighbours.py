@@ -458,11 +458,11 @@ def test_points_outside_all_views_are_reported(tmp_path: Path, change: str) -> N
     assert "do not fit each other" in sentence
 
 
-@pytest.mark.parametrize(("focal", "told"), [(0.035, True), (35.0, False), (9e5, True), (2.0, True), (640.0, False)])
-def test_an_implausible_focal_length_is_reported(tmp_path: Path, focal: float, told: bool) -> None:
+@pytest.mark.parametrize(("focal", "is_bad"), [(0.035, True), (35.0, False), (9e5, True), (2.0, True), (640.0, False)])
+def test_an_implausible_focal_length_is_reported(tmp_path: Path, focal: float, is_bad: bool) -> None:
     folder = make_transforms(tmp_path / "t", fl_x=focal, fl_y=focal)
     edit(folder, fl_x=focal, fl_y=focal)
-    assert any("focal length of 3 of 3 frames cannot be" in text for text in Capture.open(folder).sentences) == told
+    assert any("focal length of 3 of 3 frames cannot be" in text for text in Capture.open(folder).sentences) == is_bad
 
 
 # Exif orientation.

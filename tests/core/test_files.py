@@ -90,15 +90,15 @@ def test_a_write_waits_for_a_file_that_windows_locks(tmp_path: Path, monkeypatch
     write_text(tmp_path / "a.txt", "new")
     assert (tmp_path / "a.txt").read_text() == "new"
     assert not refusals
-    asked = []
+    attempts = []
 
     def forbidden() -> None:
-        asked.append(1)
+        attempts.append(1)
         raise PermissionError(errno.EACCES, "Permission denied")
 
     with pytest.raises(PermissionError):
         retry_while_locked(forbidden)
-    assert len(asked) == 1, "what stays forbidden is told at once"
+    assert len(attempts) == 1, "what stays forbidden is reported at once"
     monkeypatch.setattr("core.system.files._RETRY_S", 0.1)
     refusals[:] = [refused_by_windows() for _ in range(100)]
     with pytest.raises(PermissionError):

@@ -89,19 +89,19 @@ def test_a_picture_cut_off_by_a_quota_is_not_cached(short: int, tmp_path: Path) 
 
 def test_a_frame_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = Capture.open(make_capture(tmp_path / "c"))
-    decode, asked = capture.frame, []
+    decode, decoded = capture.frame, []
 
     def counted(view: View, size: tuple[int, int] | None = None) -> Picture:
-        asked.append(view.name)
+        decoded.append(view.name)
         return decode(view, size)
 
     monkeypatch.setattr(capture, "frame", counted)
     names = [view.name for view in capture.views]
     for memory, again in ((0, names[:1]), (1 << 20, [])):
         frames = Frames(capture, memory=memory)
-        assert asked == names[:1], "for its borders, of which it has none"
+        assert decoded == names[:1], "for its borders, of which it has none"
         with frames.cache.overflowing_into(tmp_path):
             first, second = ([frames.frame(view) for view in capture.views] for _ in range(2))
         assert all(map(torch.equal, first, second))
-        assert asked == names[:1] + again + names[1:]
-        asked.clear()
+        assert decoded == names[:1] + again + names[1:]
+        decoded.clear()

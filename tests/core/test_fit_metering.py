@@ -85,8 +85,8 @@ def test_exposures_are_measured_under_a_veil(tmp_path: Path, veil: float) -> Non
     """A camera left to itself: the more flare, the less it is exposed."""
     stops = 0.6 * np.sin(np.arange(COUNT))
     capture = wall(tmp_path / "a", lambda number, light: (light + veil * (stops[number] < 0)) * 2 ** stops[number])
-    told = np.log2(list(found(capture).values()))
-    assert told == pytest.approx(stops - np.median(stops), abs=0.06)
+    exposures = np.log2(list(found(capture).values()))
+    assert exposures == pytest.approx(stops - np.median(stops), abs=0.06)
 
 
 def test_a_veil_alone_does_not_change_the_exposure(tmp_path: Path) -> None:
@@ -99,9 +99,9 @@ def test_points_in_a_glow_are_outliers_of_the_exposure(tmp_path: Path) -> None:
         lit[:, : lit.shape[1] // 4] += 0.3 * (number % 3)
         return lit * 2 ** (0.5 * (-1) ** number)
 
-    told = np.log2(list(found(wall(tmp_path / "a", glowing)).values()))
-    assert told[::2].mean() - told[1::2].mean() == pytest.approx(1.0, abs=0.1)
-    assert max(told[::2].std(), told[1::2].std()) < 0.1
+    exposures = np.log2(list(found(wall(tmp_path / "a", glowing)).values()))
+    assert exposures[::2].mean() - exposures[1::2].mean() == pytest.approx(1.0, abs=0.1)
+    assert max(exposures[::2].std(), exposures[1::2].std()) < 0.1
 
 
 def test_frames_without_points_take_the_nearest_exposure(tmp_path: Path) -> None:
@@ -109,10 +109,10 @@ def test_frames_without_points_take_the_nearest_exposure(tmp_path: Path) -> None
     def filmed(number: int, light: Light) -> Light:
         return light * (0.0 if number in (4, 5, 6, 7) else 2.0 if number < 6 else 1.0)
 
-    told = found(wall(tmp_path / "a", filmed))
+    exposures = found(wall(tmp_path / "a", filmed))
     for dark, next_to in ((4, 3), (5, 3), (6, 8), (7, 8)):
-        assert told[f"{dark:04d}.png"] == told[f"{next_to:04d}.png"]
-    assert told["0003.png"] / told["0008.png"] == pytest.approx(2, rel=0.05)
+        assert exposures[f"{dark:04d}.png"] == exposures[f"{next_to:04d}.png"]
+    assert exposures["0003.png"] / exposures["0008.png"] == pytest.approx(2, rel=0.05)
 
 
 @pytest.mark.parametrize("why", ["few points are lit", "something else lies over it"])
@@ -127,8 +127,8 @@ def test_a_frame_with_an_uncertain_exposure_takes_the_nearest(tmp_path: Path, wh
         other = np.random.default_rng(5).uniform(0, 0.3, (*light.shape[:2], 1)).astype(np.float32)
         return 0.1 * light + other
 
-    told = found(wall(tmp_path / "a", filmed))
-    assert told["0004.png"] == told["0003.png"]
+    exposures = found(wall(tmp_path / "a", filmed))
+    assert exposures["0004.png"] == exposures["0003.png"]
 
 
 def test_one_frame_of_another_exposure_leaves_the_exposure_fixed(tmp_path: Path) -> None:
@@ -191,9 +191,9 @@ def flare_error(capture: Capture, run: Run) -> float:
         layers = run.render(view.camera)
         clean = capture.removed(view)
         assert clean is not None
-        told, filmed = ((np.clip(srgb_from_linear(sum(layers.flare_by_light.values(), clean.linear())), 0, 1)),
-                        capture.frame(view).display())
-        errors.append(float(np.square(told - filmed).mean()))
+        composite = np.clip(srgb_from_linear(sum(layers.flare_by_light.values(), clean.linear())), 0, 1)
+        filmed = capture.frame(view).display()
+        errors.append(float(np.square(composite - filmed).mean()))
     return float(np.mean(errors))
 
 

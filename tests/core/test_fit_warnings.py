@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is told of footage that a flare can hardly be told from, and that mode split looks at frames alone."""
+"""Warnings about footage in which a fit can hardly separate the flare; mode split uses frames alone."""
 from __future__ import annotations
 
 import shutil

@@ -105,9 +105,9 @@ def test_broken_files_are_refused_by_name(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("read", [read_picture, read_plate])
 def test_a_video_is_refused_with_a_way_to_extract_its_frames(read: Callable[[Path], object], tmp_path: Path) -> None:
-    for name, told in (("a.MP4", r"a\.MP4 is a video; .*ffmpeg -i a\.MP4"), ("a.txt", r"a\.txt is not a picture")):
+    for name, message in (("a.MP4", r"a\.MP4 is a video; .*ffmpeg -i a\.MP4"), ("a.txt", r"a\.txt is not a picture")):
         (tmp_path / name).touch()
-        with pytest.raises(FrameError, match=told):
+        with pytest.raises(FrameError, match=message):
             read(tmp_path / name)
     with pytest.raises(CaptureError, match=r"a\.MP4 is a video; .*solve a\.MP4"):
         Capture.open(tmp_path / "a.MP4")
@@ -207,13 +207,13 @@ def test_a_full_disk_is_reported_as_such(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(write, "atomic_path", full)
     for sides in ((200, 300), (2, 2)):  # the smaller is refused no sooner than at its closing
-        with pytest.raises(OSError) as told:
+        with pytest.raises(OSError) as error:
             write_exr(tmp_path / "a.exr", {"R": np.random.default_rng(0).random(sides).astype(np.float32)})
-        assert told.value.errno == errno.ENOSPC
-        assert told.value.filename == str(tmp_path / "a.exr")
-    with pytest.raises(OSError) as told:
+        assert error.value.errno == errno.ENOSPC
+        assert error.value.filename == str(tmp_path / "a.exr")
+    with pytest.raises(OSError) as error:
         write_png(tmp_path / "a.png", RAMP)
-    assert told.value.errno == errno.ENOSPC
+    assert error.value.errno == errno.ENOSPC
 
 
 def test_a_tiff_with_0_for_white_is_read_as_what_it_shows(tmp_path: Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Processes of an earlier session: known again, and told from others that have come by their numbers."""
+"""Processes of an earlier session: recognised, and distinguished from others with the same numbers."""
 from __future__ import annotations
 
 import os
@@ -49,12 +49,12 @@ def test_an_unreaped_process_does_not_run() -> None:
 
 
 def test_start_times_are_read_from_ps(monkeypatch: pytest.MonkeyPatch) -> None:
-    for told, age in (("      03:07\n", 187), ("1-02:03:04", 93784), ("   12:00:00", 43200),
+    for output, age in (("      03:07\n", 187), ("1-02:03:04", 93784), ("   12:00:00", 43200),
                       ("441077234-00:18:40\n", 0)):
         monkeypatch.setattr(processes.subprocess, "run",
-                            lambda *_words, told=told, **_options: subprocess.CompletedProcess([], 0, told))
+                            lambda *_argv, output=output, **_options: subprocess.CompletedProcess([], 0, output))
         assert processes._start_time_ps(1) == pytest.approx(time.time() - age, abs=1)
-    monkeypatch.setattr(processes.subprocess, "run", lambda *_words, **_options: subprocess.CompletedProcess([], 1, ""))
+    monkeypatch.setattr(processes.subprocess, "run", lambda *_argv, **_options: subprocess.CompletedProcess([], 1, ""))
     assert processes._start_time_ps(1) is None
 
 

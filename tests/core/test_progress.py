@@ -214,7 +214,7 @@ def test_a_stop_file_ends_the_work(of_main_thread: bool, tmp_path: Path, monkeyp
 
 
 class Clock:
-    """In place of the time module's: it goes on when told."""
+    """A clock in place of the time module's; the test moves it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 1000.0

@@ -125,9 +125,9 @@ def test_a_light_that_is_off_leaves_no_dark_flare(capture: Capture, tmp_path: Pa
         light = scene_of(capture, view.camera) + np.float32(share) * flare(view.camera)
         write_png(capture.frame_path(view), srgb_from_linear(light).clip(0, 1))
     dimmed = Capture.open(capture.folder)
-    told = RecordingProgress()
-    remove_fitted_flare(Exact(capture), dimmed, dimmed.views, tmp_path / "clean", told)
-    assert [text for text in told.texts if "1 of 3 frames show less than half of the flare that 'a'" in text]
+    progress = RecordingProgress()
+    remove_fitted_flare(Exact(capture), dimmed, dimmed.views, tmp_path / "clean", progress)
+    assert [text for text in progress.texts if "1 of 3 frames show less than half of the flare that 'a'" in text]
     for view in dimmed.views:
         clean = read_picture(tmp_path / "clean" / view.name).linear()
         lit = (dimmed.frame(view).display().max(-1) < 0.95) & (flare(view.camera).max(-1) > 0.02)

@@ -399,7 +399,7 @@ def test_the_log_has_metrics_and_validation_gains(tmp_path: Path, monkeypatch: p
 
 def test_the_log_of_a_killed_training_restarts_at_its_checkpoint(tmp_path: Path,
                                                                  monkeypatch: pytest.MonkeyPatch) -> None:
-    """What it told after its last checkpoint is told anew, once."""
+    """Lines that were logged after the last checkpoint are logged again, once."""
     monkeypatch.setattr(run, "VALIDATE_EVERY", 1)
     with pytest.raises(Cancelled):
         run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), processes=1, progress=StopAfter(2))

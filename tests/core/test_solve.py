@@ -536,13 +536,13 @@ def test_the_up_direction_is_found() -> None:
     assert up_direction(rotations[:1] * 5) @ -rotations[0][1] > 0.9  # all look one way: the frames' own up
 
 
-@pytest.mark.parametrize(("apart", "told"), [(0, 0), (1, 1)])
+@pytest.mark.parametrize(("offset", "warnings"), [(0, 0), (1, 1)])
 @pytest.mark.parametrize("as_video", [True, False])
-def test_interlaced_footage_raises_a_warning(apart: int, told: int, as_video: bool, tmp_path: Path) -> None:
-    """Every other line of the frame after."""
+def test_interlaced_footage_raises_a_warning(offset: int, warnings: int, as_video: bool, tmp_path: Path) -> None:
+    """Every other line comes from the next frame."""
     frames = [render(camera) for camera in orbit(8, size=SIZE, arc=0.9)]
     for first, second in pairwise(list(frames)):
-        if apart:
+        if offset:
             first[1::2] = second[1::2]
     if as_video:
         source = write_video(tmp_path / "shot.mp4", frames)
@@ -553,7 +553,7 @@ def test_interlaced_footage_raises_a_warning(apart: int, told: int, as_video: bo
             cv2.imwrite(str(source / f"{number:03d}.png"), frame)
     heard = RecordingProgress()
     prepare_frames(source, tmp_path / "work", 6, 480, heard)
-    assert sum("interlaced" in text for text in heard.texts) == told
+    assert sum("interlaced" in text for text in heard.texts) == warnings
 
 
 def test_models_are_written_as_read(tmp_path: Path) -> None:
@@ -616,11 +616,11 @@ def test_quaternions_convert_to_rotations_and_back() -> None:
 LISTENS = """
 import signal, threading, time
 from core.capture.solve.mapping import load_pycolmap
-signal.signal(signal.SIGTERM, lambda *_: told.set())
-told = threading.Event()
+signal.signal(signal.SIGTERM, lambda *_: received.set())
+received = threading.Event()
 load_pycolmap()
 signal.raise_signal(signal.SIGTERM)
-print("stopped as asked" if told.wait(5) else "not told")
+print("stopped as asked" if received.wait(5) else "not stopped")
 """
 
 

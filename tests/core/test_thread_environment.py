@@ -16,8 +16,8 @@ OTHERS = {name: value for name, value in os.environ.items() if name not in VARIA
 
 def variables_after(script: str, given: dict[str, str]) -> dict[str, str | None]:
     """VARIABLES as a process finds them in its environment after the script."""
-    told = f"\nimport json, os; print(json.dumps({{name: os.environ.get(name) for name in {list(VARIABLES)}}}))"
-    found = subprocess.run([sys.executable, "-c", script + told], cwd=ROOT, env={**OTHERS, **given},
+    report = f"\nimport json, os; print(json.dumps({{name: os.environ.get(name) for name in {list(VARIABLES)}}}))"
+    found = subprocess.run([sys.executable, "-c", script + report], cwd=ROOT, env={**OTHERS, **given},
                            capture_output=True, text=True, check=True)
     read: dict[str, str | None] = json.loads(found.stdout.splitlines()[-1])
     return read

@@ -276,9 +276,9 @@ def test_blend_averages_training_views_and_changes_smoothly(flare: Path, look: L
     for step in np.linspace(0, 1, 60):
         view = ViewOfLight(np.float32([100 + 1.2 * (2 * step - 1), 0, -4]), np.eye(3, dtype=np.float32),
                            np.float32([0.05 + 0.1 * step, -0.1]), 5.0)
-        asked = queries._weighted_queries(light, view, xyz, "blend", seen, 1.0, None)
-        assert sum(weight for weight, _ in asked) == pytest.approx(1)
-        assert all(any(np.allclose(one.camera, known, atol=1e-4) for known in seen.cameras) for _, one in asked)
+        queried = queries._weighted_queries(light, view, xyz, "blend", seen, 1.0, None)
+        assert sum(weight for weight, _ in queried) == pytest.approx(1)
+        assert all(any(np.allclose(one.camera, known, atol=1e-4) for known in seen.cameras) for _, one in queried)
         found = queries.evaluate(light, view, xyz, "blend", seen)
         assert found is not None
         means.append(found.opacities)
@@ -293,15 +293,15 @@ def test_a_slightly_displaced_light_is_in_the_same_world(query: Any, flare: Path
     light, seen, camera = look.lights[0], queries.training_views(flare, look.lights)[name(look)], cameras(6)[2]
     aside = np.array([0.0, np.linalg.norm(camera.position - light.xyz), 0.0])
 
-    def asked(share: float) -> list[ViewOfLight]:
+    def queried_views(share: float) -> list[ViewOfLight]:
         xyz = light.xyz + share * aside
         view = ViewOfLight.of(camera.world_to_camera, xyz)
         return [one for _, one in queries._weighted_queries(light, view, xyz, query, seen, 1.0, None)]
 
     for share in (0.0, 0.01):
-        assert len(asked(share)) == 1
-        np.testing.assert_allclose(asked(share)[0].camera, camera.position, atol=1e-6)
-    assert np.linalg.norm(asked(0.05)[0].camera - camera.position) > 0.1, "elsewhere it is another world"
+        assert len(queried_views(share)) == 1
+        np.testing.assert_allclose(queried_views(share)[0].camera, camera.position, atol=1e-6)
+    assert np.linalg.norm(queried_views(0.05)[0].camera - camera.position) > 0.1, "elsewhere it is another world"
 
 
 def test_dissimilarity_grows_with_position_and_distance() -> None:
@@ -320,9 +320,9 @@ def test_source_queries_one_view_for_the_whole_shot(flare: Path, look: Look) -> 
     transfer = Transfer(flare, shot_target(shot(flare, look, views), look, {}), TransferSettings(query="source"))
     fixed = transfer._fixed["lamp"]
     assert any(np.allclose(fixed.camera, known, atol=1e-4) for known in transfer.training_views[name(look)].cameras)
-    asked = [queries._weighted_queries(look.lights[0], ViewOfLight.of(view.world_to_camera, look.lights[0].xyz),
-                            look.lights[0].xyz, "source", None, 1.0, fixed) for view in views]
-    assert all(one == [(1.0, fixed)] for one in asked)
+    queried = [queries._weighted_queries(look.lights[0], ViewOfLight.of(view.world_to_camera, look.lights[0].xyz),
+                                         look.lights[0].xyz, "source", None, 1.0, fixed) for view in views]
+    assert all(one == [(1.0, fixed)] for one in queried)
 
 
 def test_sources_are_assigned_by_request_name_and_turn() -> None:
@@ -649,13 +649,14 @@ def test_a_scaled_world_is_queried_at_the_source_s_distance(times: int, flare: P
 
 def test_the_fixed_view_is_chosen_by_scaled_distances(flare: Path, look: Look,
                                                       monkeypatch: pytest.MonkeyPatch) -> None:
-    xyz, told = look.lights[0].xyz, list[float]()
+    xyz, distances_seen = look.lights[0].xyz, list[float]()
     fixed_view = queries.fixed_view
     monkeypatch.setattr(queries, "fixed_view", lambda light, views, distances, training: (
-        told.extend(distances), fixed_view(light, views, distances, training))[1])
+        distances_seen.extend(distances), fixed_view(light, views, distances, training))[1])
     views = [replace(camera, world_to_camera=from_ten_times_as_far(camera, xyz, xyz)) for camera in cameras(5)[:2]]
     Transfer(flare, shot_target(shot(flare, look, views), look, {}), TransferSettings(query="source", scale=10))
-    np.testing.assert_allclose(told, [np.linalg.norm(camera.position - xyz) for camera in cameras(5)[:2]], rtol=1e-6)
+    expected = [np.linalg.norm(camera.position - xyz) for camera in cameras(5)[:2]]
+    np.testing.assert_allclose(distances_seen, expected, rtol=1e-6)
 
 
 def test_a_frame_is_rendered_again_when_a_smoothing_neighbour_changes(flare: Path, look: Look) -> None:

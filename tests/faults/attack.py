@@ -178,7 +178,7 @@ class Attack:
         ending = "other"
         if outcome.status == 0:
             ending = "harmless"
-            self._compare(fault, "success told", self.varying)
+            self._compare(fault, "success reported", self.varying)
         elif killed and outcome.status == -9:
             ending = "killed"
         elif outcome.status in (1, 2):

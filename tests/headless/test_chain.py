@@ -59,7 +59,7 @@ def run(command: Sequence[str], *args: object, stop_at: str = "", **variables: s
                              env={**os.environ, **variables}, start_new_session=True)
     events = []
     assert child.stdout is not None
-    for event in told(child.stdout):
+    for event in json_lines(child.stdout):
         events.append(event)
         if event["type"] == "progress" and event["stage"] == stop_at:
             child.send_signal(signal.SIGINT)
@@ -68,7 +68,7 @@ def run(command: Sequence[str], *args: object, stop_at: str = "", **variables: s
     return Ended(child.returncode, events, errors)
 
 
-def told(lines: Iterator[str]) -> Iterator[dict[str, Any]]:
+def json_lines(lines: Iterator[str]) -> Iterator[dict[str, Any]]:
     """A real Blender says its name and farewell on the same stream."""
     return (json.loads(line) for line in lines if line.startswith("{"))
 

@@ -34,9 +34,9 @@ if word == "threads":
     sys.exit(f"{os.environ['OMP_NUM_THREADS']} and {os.environ['NUMBA_NUM_THREADS']}")
 if word == "loud":
     sys.exit("Bus error at 0x0")
-if word == "told":
-    with open(__file__ + ".json", "w") as told:
-        json.dump(sys.argv[1:], told)
+if word == "recorded":
+    with open(__file__ + ".json", "w") as record:
+        json.dump(sys.argv[1:], record)
 """
 
 
@@ -77,9 +77,9 @@ def test_processes_share_the_available_cores(monkeypatch: pytest.MonkeyPatch,
 @pytest.mark.usefixtures("program")
 def test_names_after_the_end_of_options_stay_names() -> None:
     words = argparse.Namespace(argv=["remove", "--", "bad", "--frames"])
-    jobs.run_parts(words, "remove", [["--frames", "told"]], 1, 1, Progress(), continue_on_failure=True)
+    jobs.run_parts(words, "remove", [["--frames", "recorded"]], 1, 1, Progress(), continue_on_failure=True)
     args = json.loads(Path(f"{hand_off.RUN_SCRIPT}.json").read_text(encoding="utf-8"))
-    assert args == ["remove", "--step", "remove", "--frames", "told", "--progress", "json", "--", "bad", "--frames"]
+    assert args == ["remove", "--step", "remove", "--frames", "recorded", "--progress", "json", "--", "bad", "--frames"]
 
 
 @pytest.mark.usefixtures("program")

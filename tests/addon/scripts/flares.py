@@ -61,8 +61,8 @@ def said(scene):
     return " ".join(call.kwargs["text"] for call in layout.mock_calls if call[0].endswith(".label"))
 
 
-def told(scene):
-    """What Set Up Compositor warns of."""
+def set_up_warnings(scene):
+    """Return the warnings of Set Up Compositor."""
     operator = MagicMock()
     bake.set_up(operator, scene, layers, keep_image=True, plate=False)
     return [call.args[1] for call in operator.report.mock_calls if call.args[0] == {"WARNING"}]
@@ -127,7 +127,7 @@ facts["of an earlier version"] = [shown(scene), work(scene)]
 ops.set_up_baked()
 facts["of an earlier version"] += [shown(scene), work(scene)]
 
-# ---- dead drivers are told --------------------------------------------------------------------------
+# ---- dead drivers give a warning --------------------------------------------------------------------------
 for curve in drivers.node_drivers(scene):
     for variable in curve.driver.variables:
         variable.targets[0].data_path = "fit_flare.nothing"
@@ -171,45 +171,45 @@ ops.set_up_baked()
 facts["keyed node"] += [shown(scene, 3), shown(scene, 1)]
 live.with_suffix(".away").rename(live)
 
-# ---- what is told of frames without layers and of animated sliders ----------------------------------
+# ---- warnings about frames without layers and animated sliders ----------------------------------
 scene = shot(["lamp"])
 setup._new_tree(scene, keep_image=False)
 colour = flare_node.tree_of(scene).nodes.new("CompositorNodeRGB")
 colour.outputs[0].default_value = (0.5, 0.5, 0.5, 1)
 flare_node.tree_of(scene).links.new(colour.outputs[0], setup._output_input(flare_node.tree_of(scene)))
 scene.frame_start, scene.frame_end = 1, 3
-facts["all frames"] = told(scene)
+facts["all frames"] = set_up_warnings(scene)
 scene.frame_start, scene.frame_end = 0, 6
-facts["too few"] = told(scene)
+facts["too few"] = set_up_warnings(scene)
 facts["missing is magenta"] = bpy.app.version < (4, 4, 0)
 facts["after the last"] = [shown(scene, frame) for frame in (3, 4, 6)]
 scene.frame_start, scene.frame_end = 1, 3
 scene.fit_flare.lights[0].keyframe_insert("scale", frame=1)
-facts["scale keyed"] = told(scene)
+facts["scale keyed"] = set_up_warnings(scene)
 scene.fit_flare.lights[0].keyframe_insert("intensity", frame=1)
-facts["intensity keyed"] = told(scene)
+facts["intensity keyed"] = set_up_warnings(scene)
 
-# ---- what is told of renders that would not show the composite as it is ------------------------------
+# ---- warnings about renders that would not show the composite as it is ------------------------------
 scene = shot(["lamp"])
 scene.frame_start, scene.frame_end = 1, 3
 scene.render.use_compositing = False
-facts["switched off"] = told(scene)
+facts["switched off"] = set_up_warnings(scene)
 scene.render.use_compositing = True
 editor = scene.sequence_editor_create()
 strips = editor.strips if hasattr(editor, "strips") else editor.sequences
 ends = "length" if "length" in strips.bl_rna.functions["new_effect"].parameters else "frame_end"
 strip = strips.new_effect(name="title", type="COLOR", channel=1, frame_start=1, **{ends: 4})
-facts["sequenced"] = told(scene)
+facts["sequenced"] = set_up_warnings(scene)
 strip.mute = True
-facts["muted"] = told(scene)
+facts["muted"] = set_up_warnings(scene)
 scene.render.resolution_x = scene.render.resolution_y
-facts["square"] = told(scene)
+facts["square"] = set_up_warnings(scene)
 scene.render.resolution_x, scene.render.resolution_y = 32, 16
 scene.render.film_transparent = True
 scene.render.image_settings.color_mode = "RGBA"
-facts["transparent"] = told(scene)
+facts["transparent"] = set_up_warnings(scene)
 scene.render.image_settings.color_mode = "RGB"
-facts["no alpha"] = told(scene)
+facts["no alpha"] = set_up_warnings(scene)
 
 # ---- a layer that an artist looks at as a still -----------------------------------------------------
 scene = shot(["lamp"])

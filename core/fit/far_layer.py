@@ -2,11 +2,11 @@
 """Finds what lies beyond the parallax of a capture, such as a skyline, clouds or a view from a window, and makes the
 far points that the scene starts from there. `initialise` calls it.
 
-Structure from motion has no points there, and a scene that grows over such places from near points stands at wrong
-depths. A sphere sweep decides: each direction is taken for points on an infinite sphere and on some near ones about the
-cameras, and the frames are compared where they see it. On a far direction the frames agree on the infinite sphere, and
-differ on the near ones, on which its texture does not meet itself. A plain direction, such as a clear sky, agrees on
-all, and follows the directions with contrast about it. A near surface agrees on none of them.
+Structure from motion has no points there, and a scene that grows over such places from near points has wrong depths
+there. A sphere sweep decides: it projects each direction into the frames, as a point on an infinite sphere and as
+points on some near spheres about the cameras, and compares the frames there. In a far direction the frames agree on the
+infinite sphere and differ on the near ones. In a plain direction, such as a clear sky, they agree on all, so it is
+decided like the directions with contrast about it. On a near surface they agree on none.
 """
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ MIN_CONTRAST = 0.1
 DECISIVE_RATIO = 0.7
 """Ratio of the shares that differ on the infinite sphere and on near ones, below which a patch is certainly far."""
 NEIGHBOURS, MIN_GAIN = 7, 0.06
-"""Number of patches with contrast, itself among them, by which a patch is decided once the capture has a far layer, and
-by how much less the views differ there on the infinite sphere, relative to near ones."""
+"""In a capture with a far layer, a patch is decided by so many patches with contrast next to it, itself included; and
+the views must differ there by so much less on the infinite sphere than on near ones."""
 MAX_COST = 0.3
 """Share of views that differ on the infinite sphere up to which a patch with contrast is far then: mostly plain ones
 that something hides in some views."""

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The sphere on which a scene shows what lies beyond the parallax of its capture: its Gaussians stand for directions.
+"""The sphere on which a scene shows what lies beyond the parallax of its capture: only the directions of its Gaussians
+matter.
 
 A Gaussian farther from the centre than half the radius is far. It hides no light, and densification measures it by the
 angle that it covers: `SceneGaussians.units` returns by how much larger the world units of far Gaussians are.

@@ -19,7 +19,7 @@ from .sources import Source
 BASE_GATE, SPEED_GATE, FIRST_GATE = 0.032, 0.4, 0.15
 """Tolerance of a prediction: share of the diagonal, plus share of the speed; and that of a track of one frame."""
 FAINT_FIRST_GATE = 0.03
-"""The last one for a source that hardly looks like a lamp."""
+"""Tolerance of a track of one frame for a source that hardly looks like a lamp."""
 MIN_ACCELERATION, MAX_ACCELERATION = 0.003, 0.03
 """Bounds of a track's acceleration, diagonals per frame²."""
 UNLIKELY_GATE = 0.4
@@ -30,7 +30,7 @@ SIZE_COST, COLOUR_COST, EVIDENCE_COST, GAP_COST = 0.4, 0.3, 0.5, 0.02
 """Weights of the change of size (logarithm), colour and evidence, and of a frame without a source, beside distance over
 gate."""
 TYPICAL = 9
-"""Sources at the end of a track whose median size is compared."""
+"""Number of sources at the end of a track whose median size is compared."""
 MAX_DIFFERENCE = 1.0
 """Largest sum of these changes."""
 LIKELY = 0.25

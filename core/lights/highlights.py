@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Highlights of a picture as lights: every clipped or bright spot, with its place and light; called by `transfer`.
 
-No spot is tracked, and nothing jumps from frame to frame. Each bright pixel shares its light among the four nearest
+Spots are not tracked, and nothing jumps from frame to frame. Each bright pixel shares its light among the four nearest
 nodes of a coarse grid, by its distance to them; a node's place is the centre of the light that it received. A spot that
 moves passes its light from node to node, while their places stay on it. Spots nearer than two nodes share one place.
 """

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Finds everything in a frame that may be a light: the candidates that `tracks.py` follows from frame to frame.
 
-A source is a clipped spot. Spots that touch, such as twin headlights from afar or two bulbs, are parted where they are
-thick. The place of a source is the flux centroid of its thick part, which spikes of the starburst and ghosts beside it
-hardly move. Its evidence says how much it looks like a lamp: compact and white as for `exposure.py`, and soft, because
-the flare round a lamp fades over many pixels, where a clipped window, shirt or sheet of paper ends at an edge.
+A source is a clipped spot. Spots that touch, such as distant twin headlights or two bulbs, are separated into their
+thick parts. The place of a source is the flux centroid of its thick part, which spikes of the starburst and ghosts
+beside it hardly move. Its evidence says how much it looks like a lamp: compact and white as for `exposure.py`, and
+soft, because the flare round a lamp fades over many pixels, where a clipped window, shirt or sheet of paper ends at an
+edge.
 """
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from .detection import Detection, Mask, measure_detection
 from .exposure import MAX_AREA_SHARE, open_by_disc, shape_score, smoothstep
 
 OPENING_RATIO = 0.75
-"""Radius of the opening that removes spikes and parts spots, relative to the thickest part's."""
+"""Radius of the opening that removes spikes and separates spots, relative to the thickest part's."""
 MIN_THICKNESS = 0.55
 """Thickness of a part, relative to the thickest of its spot, from which it is a source of its own."""
 MIN_RADIUS = 0.0018

@@ -27,13 +27,13 @@ from .sources import CLIPPED, Source, find_sources, measure_profile
 MIN_EVIDENCE = 0.3
 """Evidence of a chain from which it is a light; chains down to half of it are doubtful."""
 MIN_FRAMES = 4
-"""Frames that must show a light, or a tenth of the shot."""
+"""Smallest number of frames that must show a light; in a long shot it is a tenth of the frames."""
 GHOST_ERROR, MIN_GHOST_MOTION = 0.008, 0.03
 """Largest median distance of a ghost from the line through its light, and the least motion of that light, diagonals."""
 TOLERATED_ERROR = 3.0
 """Expected error, pixels of a frame with a diagonal of 550, at which a place is as good as doubtful."""
 MAX_BEYOND = 12
-"""Frames by which a path goes on beyond those that show the light."""
+"""Number of frames by which a path continues before and after those that show the light."""
 OUT_MARGIN = 0.25
 """Distance out of the frame, diagonals, at which a path ends."""
 BRIGHTNESS_STEPS = 40

@@ -44,7 +44,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "does")
     parser.add_argument("--focal", type=float, metavar="PIXELS",
                         help=f"focal length of frames without a camera solve (default: {CAMERA}, Exif data, or a usual "
-                             f"one); it is recorded in {CAMERA}")
+                             f"one); {CAMERA} records it")
     plate_space.add_option(parser)
     parser.add_argument("--seed", type=parse_seed, default=0, metavar="N", help="random seed (default 0)")
 
@@ -187,8 +187,8 @@ COMMAND = Command(
 detections of all views are triangulated; of far lights only the direction is used. A light that is never in frame is
 found by its ghosts, if many views show one.
 
-Frames without a camera solve are taken for consecutive frames of a shot. Lights are followed from frame to frame, and
-lights.json has the path, brightness and confidence of each by frame; the sheets show the paths.
+Frames without a camera solve count as consecutive frames of a shot. The lights are followed from frame to frame, and
+lights.json lists their path, brightness and confidence by frame. The sheets show the paths.
 
   run.py lights captures/room
   run.py lights shots/night_drive""",

@@ -42,7 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "by exposure)")
     lights.add_argument("--highlights", type=float, nargs="?", const=0.95, metavar="LEVEL",
                         help="for pictures: every spot brighter than LEVEL (linear, 1 is white; default 0.95) has a "
-                             "flare by its light, in one layer `highlights`")
+                             "flare with the spot's brightness and colour, all in one layer")
     lights.add_argument("--highlight-gain", type=float, metavar="FACTOR",
                         help="brightness of the flares of --highlights (default 1: that of the .flare for white on "
                              "1/2000 of the frame)")

@@ -219,8 +219,8 @@ def _bilinear(picture: Values, places: Floats) -> Values:
 
 
 def _project(camera: Camera, centre: Floats, directions: Floats, inverse_radius: float) -> tuple[Booleans, Floats]:
-    """Return which directions (n,) of the sphere of a radius about a centre lie on the camera's frame, and the places
-    (m, 2) of those, pixels."""
+    """Return which points (n,) of a sphere about `centre`, in these directions, lie on the camera's frame, and their
+    places (m, 2), pixels. inverse_radius: of the sphere, 0 for an infinite one."""
     rotation = camera.world_to_camera[:3, :3]
     local = (directions + inverse_radius * (centre - camera.position)) @ rotation.T
     in_front = local[:, 2] > 1e-6

@@ -32,6 +32,12 @@ MAX_SUPERSAMPLED_WIDTH = 1300
 """Width in pixels above which ghosts are not supersampled."""
 MAX_DENSITY = 40.0
 """Largest density of light; where rays cross (caustics) it would be unbounded."""
+MAX_STRAY = 1.02
+"""Distance of a ray outside the rims, relative to them, above which its cell is not drawn; below, the edge is drawn."""
+MIN_EDGE, MAX_EDGE = 0.004, 0.6
+"""Bounds of the width of a ghost's edge, relative to the stop's radius."""
+RIM_WIDTH_SQUARED = 0.0036
+"""Square of the width of the bright rim inside a ghost's edge, relative to the stop's radius."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +135,7 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
                     r1, c1, r2, c2 = row + 1, column + 1, row + 1, column
                 if not (arrived[r0, c0] and arrived[r1, c1] and arrived[r2, c2]):
                     continue
-                if min(rays[r0, c0, 2], rays[r1, c1, 2], rays[r2, c2, 2]) > 1.02:
+                if min(rays[r0, c0, STRAY], rays[r1, c1, STRAY], rays[r2, c2, STRAY]) > MAX_STRAY:
                     continue
                 x0, y0, x1, y1, x2, y2 = px[r0, c0], py[r0, c0], px[r1, c1], py[r1, c1], px[r2, c2], py[r2, c2]
                 low_x, high_x = min(x0, x1, x2), max(x0, x1, x2)
@@ -144,7 +150,7 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
                 stop_area = ((stop_x[r1, c1, 0] - s0x) * (stop_y[r2, c2, 0] - s0y)
                              - (stop_x[r2, c2, 0] - s0x) * (stop_y[r1, c1, 0] - s0y))
                 ramp = math.sqrt(abs(stop_area / area)) / radius
-                ramp = min(max(ramp, 0.004), 0.6)
+                ramp = min(max(ramp, MIN_EDGE), MAX_EDGE)
                 slope1, slope2 = (y2 - y0) / area, (y0 - y1) / area
                 for y in range(max(0, math.ceil(low_y - 0.5)), min(height - 1, math.floor(high_y - 0.5)) + 1):
                     # Barycentric coordinates run linearly along a row: b = start + slope (u - x0).
@@ -158,7 +164,7 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
                         u = x + 0.5 - x0
                         b1, b2 = start1 + slope1 * u, start2 + slope2 * u
                         b0 = 1.0 - b1 - b2
-                        stray = b0 * rays[r0, c0, 2] + b1 * rays[r1, c1, 2] + b2 * rays[r2, c2, 2]
+                        stray = b0 * rays[r0, c0, STRAY] + b1 * rays[r1, c1, STRAY] + b2 * rays[r2, c2, STRAY]
                         mask = min(max((1.0 - stray) / ramp + 0.5, 0.0), 1.0)
                         if mask == 0.0:
                             continue
@@ -176,7 +182,7 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
                             edge = edges[low % sectors] * (1.0 - part) + edges[(low + 1) % sectors] * part
                             inside = edge - math.sqrt(sx * sx + sy * sy) / radius
                             mask *= min(max(inside / ramp + 0.5, 0.0), 1.0)
-                            rim_glow = max(rim_glow, math.exp(-(inside * inside) / (0.0036 + ramp * ramp)))
+                            rim_glow = max(rim_glow, math.exp(-(inside * inside) / (RIM_WIDTH_SQUARED + ramp * ramp)))
                         if mask == 0.0:
                             continue
                         value = mask * (1.0 + rim * rim_glow)

@@ -71,7 +71,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if not args.lens or args.out is None:
         raise SettingsError("make-flare needs a lens and --out FILE; --list shows the lenses of the program.")
     if args.out.suffix != ".flare":
-        raise SettingsError(f"--out {args.out} is not a .flare; give it that ending.")
+        raise SettingsError(f"--out {args.out} is not a .flare; give the file that suffix.")
     if Path(args.lens).is_file():
         check_no_overwrite([Path(args.lens)], [args.out])
 
@@ -131,9 +131,9 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 COMMAND = Command(
     "make-flare", "Makes a flare from a lens prescription, without footage.",
-    """Traces the flare of a lens at many places of the light: ghosts, starburst, glow, rings, streaks. Then it fits a
-flare model to the pictures and writes a .flare, which behaves as a fitted one. It says how large the error is on a path
-of the light that the fit did not see. docs/make_flare.md describes the settings and the .lens format.
+    """Traces the flare of a lens for many positions of the light: ghosts, starburst, glow, rings, streaks. Then it fits a
+flare model to the pictures and writes a .flare, which works like a fitted one. It prints the error on a path of the
+light that the fit did not see. docs/make_flare.md describes the settings and the .lens format.
 
   run.py make-flare US3576360 --out prime.flare
   run.py make-flare my.lens --out blue.flare --squeeze 1.8 --streak 1.5 --blades 6""",

@@ -131,8 +131,8 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 COMMAND = Command(
     "make-flare", "Makes a flare from a lens prescription, without footage.",
-    """Traces the flare of a lens for many positions of the light: ghosts, starburst, glow, rings, streaks. Then it fits a
-flare model to the pictures and writes a .flare, which works like a fitted one. It prints the error on a path of the
+    """Traces the flare of a lens for many positions of the light: ghosts, starburst, glow, rings, streaks. Then it fits
+a flare model to the pictures and writes a .flare, which works like a fitted one. It prints the error on a path of the
 light that the fit did not see. docs/make_flare.md describes the settings and the .lens format.
 
   run.py make-flare US3576360 --out prime.flare

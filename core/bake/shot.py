@@ -47,8 +47,8 @@ class ShotRenderer(ShotSource):
             by_light = self.look.evaluate_lights(camera.world_to_camera, placed, edits, self.shot.query)
             flares = {name: splat_look(self.look, gaussians, camera) for name, gaussians in by_light.items()}
             dark = torch.zeros(camera.height, camera.width, 3)
-            scene, white = (None, 1.0) if self.run is None else (render_scene(self.run.scene, camera),
-                                                                 self.run.scene.display_white)
+            scene, white = (None, 1.0) if self.run is None else (render_scene(self.run.gaussians, camera),
+                                                                 self.run.gaussians.display_white)
             parts = linear_layers(dark if scene is None else scene.colour, flares, self.look.blend, white)
         layers = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()
                   for name, layer in parts.flares.items()}
@@ -65,7 +65,7 @@ class ShotRenderer(ShotSource):
         settings = self.run.settings.flare.active_visibility if self.run is not None else None
         if self.run is None or settings is None:
             return light
-        visibility, shares = visibility_behind(self.run.scene, camera.world_to_camera, light, settings,
+        visibility, shares = visibility_behind(self.run.gaussians, camera.world_to_camera, light, settings,
                                                self._clear.get(light.source, 1.0))
         return replace(light, visibility=light.visibility * visibility, shares=shares)
 

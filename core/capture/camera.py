@@ -21,7 +21,8 @@ ASPECT_TOLERANCE = 0.02
 class Camera:
     """A pinhole camera: size in pixels, intrinsics in pixels, and `world_to_camera` (4, 4), a rigid motion.
 
-    exposure: factor of the frame's light relative to the capture's median frame.
+    exposure: factor of the frame's light relative to the capture's median frame. frame: name of the frame, where its
+    lights or its plate belong to it alone; else empty.
     """
 
     width: int
@@ -32,6 +33,7 @@ class Camera:
     cy: float
     world_to_camera: Floats
     exposure: float = 1.0
+    frame: str = ""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -42,7 +44,8 @@ class Camera:
     def numbers(self) -> tuple[Any, ...]:
         """All values as plain numbers, which change whenever the camera's picture would."""
         unusual = () if self.exposure == 1 else (self.exposure,)
-        return self.size, self.intrinsics.tolist(), self.world_to_camera.tolist(), *unusual
+        named = (self.frame,) if self.frame else ()
+        return self.size, self.intrinsics.tolist(), self.world_to_camera.tolist(), *unusual, *named
 
     @property
     def intrinsics(self) -> Floats:

@@ -176,6 +176,12 @@ class Capture:
                            for view in self.views)
         return same
 
+    def with_frame_names(self) -> Capture:
+        """Return a copy whose cameras carry the names of their frames (`Camera.frame`)."""
+        same = copy(self)
+        same.views = tuple(replace(view, camera=replace(view.camera, frame=view.name)) for view in self.views)
+        return same
+
     def with_lights_at(self, places: Mapping[str, Floats]) -> Capture:
         """Return a copy with the lights at these positions (3,), by name; those on a path stay on it."""
         return self.with_lights([light if light.moves else replace(light, xyz=places.get(light.name, light.xyz))

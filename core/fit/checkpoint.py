@@ -158,9 +158,16 @@ def _describe_change(old: list[Any], new: list[Any], tolerance: float) -> str:
 
     Positions may differ by `tolerance`, and by what Blender's single precision rounds to.
     """
-    before, after = ([name for name, _ in lights] for lights in (old, new))
+    before, after = ([name for name, *_ in lights] for lights in (old, new))
     if before != after:
         return f"its lights were {', '.join(map(repr, before))}, and are {', '.join(map(repr, after))} now"
-    return next((f"{name!r} was at {old_position}, and is at {new_position} now"
-                 for (name, old_position), (_, new_position) in zip(old, new, strict=True)
-                 if not np.allclose(old_position, new_position, rtol=1e-6, atol=tolerance)), "")
+    for (name, old_position, *old_path), (_, new_position, *new_path) in zip(old, new, strict=True):
+        if None in (old_position, new_position):
+            moved = old_position != new_position
+        else:
+            moved = not np.allclose(old_position, new_position, rtol=1e-6, atol=tolerance)
+        if moved:
+            return f"{name!r} was at {old_position}, and is at {new_position} now"
+        if old_path != new_path:
+            return f"the path or the brightness of {name!r} is another now"
+    return ""

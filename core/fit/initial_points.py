@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 
 def ensure_points(capture: Capture, settings: FitSettings, progress: Progress) -> tuple[Capture, tuple[str, ...]]:
     """Return the capture with points, and a sentence where they had to be made. Raises Cancelled."""
-    if len(capture.points) or settings.scene.start:
+    if len(capture.points) or settings.scene.start or settings.uses_plates:
         return capture, ()
     xyz, rgb, observed = _triangulate(capture, progress)
     source = f"{len(xyz)} points that were triangulated from matches of its frames"

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from ..capture import LIGHTS, Capture, View
-from ..capture.lights import check_standing
 from ..errors import CaptureError
 from ..flare.deformation import QueryRange
 from ..flare.model import FlareModel, LightFlare, ViewOfLight
@@ -18,6 +18,7 @@ from ..images.picture import Picture
 from ..lights.snap import FlareView, flare_view, snap_lights
 from .far_layer import find_far_layer
 from .frames import Frames, subsample
+from .light_results import read_frame_lights
 from .settings import FitSettings
 from .sky import add_sky_points
 
@@ -28,6 +29,9 @@ SAMPLED_POINTS = 10_000
 """Approximate number of points whose depths are computed."""
 MIN_SHARE_OF_SEEING_VIEWS = 0.5
 """Share of the views that must have a Gaussian of a scene from elsewhere on their frames."""
+CAMERA_RANGE = 1e6
+"""Half the side of the model's camera range in a fit over plates, world units: appearance follows the place of the
+light in the picture alone, so all cameras fall on one point of the grid."""
 SNAP_WIDTH, SNAP_VIEWS = 160, 40
 """Width in pixels of the frames by which lights are moved, and the approximate number of frames."""
 
@@ -95,28 +99,51 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
         raise CaptureError(f"{capture.folder / LIGHTS} lists no light; add one by hand, or fit with --mode 3dgs."
                            if is_listed else
                            f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
-    check_standing(capture.lights, "this fit")
     generator = torch.Generator().manual_seed(settings.seed)
-    positions = torch.tensor([list(map(float, light.xyz)) for light in capture.lights], dtype=torch.float64)
-    if not settings.flare.detection:
-        # Paper, appendix: the centroid of the points, offset by uniform noise in [0, 1) along each axis.
-        centroid = torch.from_numpy(capture.points.xyz).double().mean(0)
-        positions = centroid + torch.rand(positions.shape, generator=generator, dtype=torch.float64)
-    elif settings.flare.snap_lights and frames.reference:
-        positions = torch.from_numpy(snap_lights(_snap_views(views, frames), positions.numpy()))
-    poses = [torch.from_numpy(view.camera.world_to_camera) for view in views]
-    corner_radius = max(view.camera.corner_radius for view in views)
+    names = [light.name for light in capture.lights]
+    frame_lights = None
+    if settings.uses_plates or has_frame_lights(capture):
+        frame_lights = read_frame_lights(capture, names)
+    if frame_lights is None:
+        positions = _standing_positions(capture, views, frames, settings, generator)
+    else:
+        positions = frame_lights.positions[len(frame_lights.positions) // 2].clone()
+    cameras = [view.camera for view in views]
+    corner_radius = max(camera.corner_radius for camera in cameras)
     flares = []
-    for light, xyz in zip(capture.lights, positions, strict=True):
-        light_views = [ViewOfLight.of(pose, xyz) for pose in poses]
+    for number, light in enumerate(capture.lights):
+        light_views = [
+            ViewOfLight.of(torch.from_numpy(camera.world_to_camera), positions[number] if frame_lights is None else
+                           frame_lights.positions[frame_lights.rows[view.name], number])
+            for view, camera in zip(views, cameras, strict=True)]
         in_front = [view for view in light_views if view.depth > 0]
         if not in_front:
             raise CaptureError(f"The light {light.name!r} is behind the camera in every view of {capture.folder}; "
                                "correct or remove it in lights.json.")
         query = QueryRange.of(torch.stack([view.camera for view in in_front]),
                               torch.stack([view.light for view in in_front]), corner_radius)
+        if settings.uses_plates:
+            query = replace(query, camera_low=(-CAMERA_RANGE,) * 3, camera_high=(CAMERA_RANGE,) * 3)
         flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator, settings.flare.opacity))
-    return FlareModel([light.name for light in capture.lights], positions, flares)
+    return FlareModel(names, positions, flares, frame_lights)
+
+
+def has_frame_lights(capture: Capture) -> bool:
+    """True if some light moves, or has a brightness of its own in each frame."""
+    return any(light.moves or light.keys for light in capture.lights)
+
+
+def _standing_positions(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings,
+                        generator: torch.Generator) -> torch.Tensor:
+    """Return the places (lights, 3) of lights that stand, moved to their flares where the settings say so."""
+    positions = torch.tensor([list(map(float, light.xyz)) for light in capture.lights], dtype=torch.float64)
+    if not settings.flare.detection:
+        # Paper, appendix: the centroid of the points, offset by uniform noise in [0, 1) along each axis.
+        centroid = torch.from_numpy(capture.points.xyz).double().mean(0)
+        return centroid + torch.rand(positions.shape, generator=generator, dtype=torch.float64)
+    if settings.flare.snap_lights and frames.reference:
+        return torch.from_numpy(snap_lights(_snap_views(views, frames), positions.numpy()))
+    return positions
 
 
 def _snap_views(views: tuple[View, ...], frames: Frames) -> list[FlareView]:

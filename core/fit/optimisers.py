@@ -22,9 +22,10 @@ class Optimisers:
     """The optimisers of the scene, of the flare (networks and Gaussians) and of its grids; the last two are None
     without a flare."""
 
-    def __init__(self, scene: SceneGaussians, flare: FlareModel | None, settings: FitSettings, extent: float,
+    def __init__(self, scene: SceneGaussians | None, flare: FlareModel | None, settings: FitSettings, extent: float,
                  display_white: float) -> None:
-        """extent: of the capture, world units. display_white: largest display value of the frames."""
+        """scene: None for plates, of which nothing is learned. extent: of the capture, world units. display_white:
+        largest display value of the frames."""
         self._settings, self._extent = settings, extent
         rates = settings.scene.rates
         features = torch.full((COEFFICIENTS, 1), rates.features_rest)
@@ -33,7 +34,8 @@ class Optimisers:
             "means": self._means_rate(0.0), "log_scales": rates.scale, "quaternions": rates.rotation,
             "opacity_logits": rates.opacity, "sh": features.expand(COEFFICIENTS, 3).contiguous(),
         }
-        self.scene = Adam(dict(scene.named_parameters()), rate_by_name)
+        self.scene = Adam({} if scene is None else dict(scene.named_parameters()),
+                          {} if scene is None else rate_by_name)
         self._flare_optimisers = None if flare is None else FlareOptimisers(flare, settings.flare.rates)
         self.flare = None if self._flare_optimisers is None else self._flare_optimisers.dense
         self.grids = None if self._flare_optimisers is None else self._flare_optimisers.grids
@@ -41,7 +43,8 @@ class Optimisers:
     def set_rates(self, iteration: int) -> None:
         """Set the learning rates of an iteration, from 1."""
         progress = iteration / self._settings.iterations
-        self.scene.rates["means"] = self._means_rate(progress)
+        if self.scene.parameters:
+            self.scene.rates["means"] = self._means_rate(progress)
         if self._flare_optimisers is not None:
             self._flare_optimisers.set_rates(progress)
 
@@ -51,17 +54,23 @@ class Optimisers:
 
     def step(self, *, scene: bool) -> None:
         """Step by the gradients and clear them; the scene only if `scene`."""
-        for optimiser in (self.scene if scene else None, self.flare, self.grids):
+        for optimiser in (self.scene if scene else None, self.flare, self.grids, self._brightness):
             if optimiser is not None:
                 optimiser.step()
                 optimiser.zero_grad()
+
+    @property
+    def _brightness(self) -> torch.optim.SparseAdam | None:
+        return None if self._flare_optimisers is None else self._flare_optimisers.brightness
 
     def state(self) -> State:
         """Return the moments, in the form of `checkpoint.save`."""
         state: State = {"scene_adam": self.scene.state_dict()}
         if self.flare is not None and self.grids is not None:
             state["flare_adam"] = self.flare.state_dict()
-            state["grid_adam"] = {str(key): dict(value) for key, value in self.grids.state_dict()["state"].items()}
+            state["grid_adam"] = _moments(self.grids)
+        if self._brightness is not None:
+            state["brightness_adam"] = _moments(self._brightness)
         return state
 
     def load_state(self, state: State) -> None:
@@ -69,9 +78,18 @@ class Optimisers:
         self.scene.load_state_dict(state["scene_adam"])
         if self.flare is not None and self.grids is not None:
             self.flare.load_state_dict(state["flare_adam"])
-            groups = self.grids.state_dict()["param_groups"]
-            moments = {int(key): value for key, value in state.get("grid_adam", {}).items()}
-            self.grids.load_state_dict({"state": moments, "param_groups": groups})
+            _load_moments(self.grids, state.get("grid_adam", {}))
+        if self._brightness is not None:
+            _load_moments(self._brightness, state.get("brightness_adam", {}))
+
+
+def _moments(optimiser: torch.optim.SparseAdam) -> State:
+    return {str(key): dict(value) for key, value in optimiser.state_dict()["state"].items()}
+
+
+def _load_moments(optimiser: torch.optim.SparseAdam, state: State) -> None:
+    groups = optimiser.state_dict()["param_groups"]
+    optimiser.load_state_dict({"state": {int(key): value for key, value in state.items()}, "param_groups": groups})
 
 
 def _decay(first: float, last: float, progress: float) -> float:
@@ -80,8 +98,8 @@ def _decay(first: float, last: float, progress: float) -> float:
 
 
 class FlareOptimisers:
-    """The optimisers of a flare: `dense` for networks and Gaussians, and `grids`, which updates only the rows of the
-    hash grids that a view touched."""
+    """The optimisers of a flare: `dense` for networks and Gaussians, `grids`, which updates only the rows of the hash
+    grids that a view touched, and `brightness`, None for lights that stay on."""
 
     def __init__(self, flare: FlareModel, rates: FlareRates) -> None:
         self._rates = rates
@@ -102,6 +120,9 @@ class FlareOptimisers:
             rate_by_name[name] = gaussian_rates[last] if ".gaussians." in name else rates.network
         self.dense = Adam(dense, rate_by_name)
         self.grids = torch.optim.SparseAdam(tables, lr=rates.grids)
+        lights = flare.frame_lights
+        self.brightness = (None if lights is None else
+                           torch.optim.SparseAdam([lights.brightness.weight], lr=rates.brightness))
         self._first_rates = dict(self.dense.rates)
 
     def set_rates(self, progress: float) -> None:
@@ -114,6 +135,8 @@ class FlareOptimisers:
             self.dense.rates[name] = new_rate
         for group in self.grids.param_groups:
             group["lr"] = rates.grids * decay
+        for group in () if self.brightness is None else self.brightness.param_groups:
+            group["lr"] = rates.brightness * decay
 
     def step(self) -> None:
         """Step by the gradients and clear them."""

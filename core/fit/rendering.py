@@ -23,6 +23,10 @@ from ..gaussians import Rendering, Splats
 from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits
 from ..look import PlaneGaussians as LookGaussians
+from .plate_scene import PlateScene
+
+Scene = SceneGaussians | PlateScene
+"""The scene of a fit: Gaussians, or one plate a frame."""
 
 MIN_ALPHA = 1e-6
 """Smallest alpha by which a depth is divided: where nothing is, it stays 0."""
@@ -46,7 +50,7 @@ def pose_and_intrinsics(camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def render_flare(flare: FlareModel | None, blend: Blend, camera: Camera, kernels: Kernels = "auto", *,
-                 scene: SceneGaussians | None = None, visibility: VisibilitySettings | None = None) -> Splats | None:
+                 scene: Scene | None = None, visibility: VisibilitySettings | None = None) -> Splats | None:
     """Render the flares of all lights as one set of splats; None if no light is in front of the camera.
 
     With `visibility`, each flare is scaled by the visibility of its light behind `scene`.
@@ -54,22 +58,24 @@ def render_flare(flare: FlareModel | None, blend: Blend, camera: Camera, kernels
     if flare is None:
         return None
     pose, intrinsics = pose_and_intrinsics(camera)
-    gaussians = concatenate(flare(pose, _visibilities(flare, pose, scene, visibility, kernels)))
+    visibilities = _visibilities(flare, camera, scene, visibility, kernels)
+    gaussians = concatenate(flare(pose, visibilities, camera.frame))
     if gaussians is None:
         return None
     return splat_flare(gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels,
                        exposure=camera.exposure)
 
 
-def _visibilities(flare: FlareModel, pose: Tensor, scene: SceneGaussians | None, visibility: VisibilitySettings | None,
+def _visibilities(flare: FlareModel, camera: Camera, scene: Scene | None, visibility: VisibilitySettings | None,
                   kernels: Kernels) -> dict[str, Tensor] | None:
-    if scene is None or visibility is None:
+    if visibility is None or not isinstance(scene, SceneGaussians):
         return None
-    return light_visibilities(scene, flare, pose, visibility, kernels)
+    pose, _ = pose_and_intrinsics(camera)
+    return light_visibilities(scene, flare, pose, visibility, kernels, camera.frame)
 
 
 @torch.no_grad()
-def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera: Camera,
+def render(scene: Scene, flare: FlareModel | None, blend: Blend, camera: Camera,
            kernels: Kernels = "auto", *, visibility: VisibilitySettings | None = None,
            look: Look | None = None, edits: LookEdits | None = None,
            pixel_grid: PixelGrid | None = None) -> RenderedView:
@@ -77,15 +83,15 @@ def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera
 
     edits: changes of the flare; `look` evaluates them. pixel_grid: the grid at which the flare was fitted.
     """
-    rendering = render_scene(scene, camera, kernels)
+    rendering = scene.render_frame(camera) if isinstance(scene, PlateScene) else render_scene(scene, camera, kernels)
     flares: dict[str, Splats] = {}
     if flare is not None:
         pose, intrinsics = pose_and_intrinsics(camera)
-        visibilities = _visibilities(flare, pose, scene, visibility, kernels)
+        visibilities = _visibilities(flare, camera, scene, visibility, kernels)
         if look is None or edits is None:
-            gaussians = flare(pose, visibilities)
+            gaussians = flare(pose, visibilities, camera.frame)
         else:
-            gaussians = _evaluate_edited(look, edits, camera, visibilities)
+            gaussians = _evaluate_edited(look, flare, edits, camera, visibilities)
         flares = {name: splat_flare(light_gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels,
                                     pixel_grid=pixel_grid, exposure=camera.exposure)
                   for name, light_gaussians in gaussians.items()}
@@ -124,11 +130,13 @@ def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels
                    median_depth=large.median_depth[middle, middle])
 
 
-def _evaluate_edited(look: Look, edits: LookEdits, camera: Camera,
-                     visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
-    """Return each light's Gaussians under an artist's edits."""
-    visible = {name: float(share) for name, share in (visibilities or {}).items()}
-    gaussians_by_light = look.evaluate(camera.world_to_camera, edits=edits, visibilities=visible)
+def _evaluate_edited(look: Look, flare: FlareModel, edits: LookEdits, camera: Camera,
+            visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
+    """Return each light's Gaussians under an artist's edits, with places and brightness of the camera's frame."""
+    shares = flare.shares(visibilities, camera.frame) or {}
+    places = dict(zip(flare.names, flare.positions_in(camera.frame).numpy(), strict=True))
+    gaussians_by_light = look.evaluate(camera.world_to_camera, lights=places, edits=edits,
+                                       visibilities={name: float(share) for name, share in shares.items()})
     return {name: as_tensors(gaussians) for name, gaussians in gaussians_by_light.items()}
 
 

@@ -5,6 +5,8 @@
     capture.txt     the capture's folder
     exposures.json  exposure of each frame relative to the median frame, where they differ
     flare.flare     the flare            scene.ply   the scene, standard 3DGS
+    plates/         in place of scene.ply, a plate a frame, for a shot without a camera solve
+    lights.json     places and fitted brightness of the lights by frame, where they move or change
     checkpoint/     state.safetensors    the state that a resumed fit needs
     metrics.jsonl   one line of figures at intervals; preview.png, preview_small.png; eval.json; log.txt
 """
@@ -17,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..capture import Camera, Capture
+from ..capture import Camera, Capture, read_lights
 from ..colour.srgb import Pixels
 from ..conventions import exposures
-from ..conventions.run_files import CAPTURE, CONFIG, FLARE, SCENE
+from ..conventions.run_files import CAPTURE, CONFIG, FLARE, FRAME_LIGHTS, PLATES, SCENE
 from ..errors import RunError
 from ..flare import file as flare_file
 from ..flare.file import FlareFile
@@ -33,7 +35,9 @@ from ..system.progress import Progress
 from ..system.reading import MAX_PATH_BYTES, read_text
 from ..typed import is_utf8
 from .config import read_config, write_config
-from .rendering import RenderedView, render
+from .light_results import read_frame_lights
+from .plate_scene import PlateScene
+from .rendering import RenderedView, Scene, render
 from .settings import FitSettings
 
 
@@ -56,6 +60,7 @@ class Run:
         self.folder = folder
         self.settings = settings
         self.capture_folder = capture_folder
+        self._opened: Capture | None = None
 
     @staticmethod
     def check_free(folder: Path) -> None:
@@ -117,13 +122,24 @@ class Run:
         Without `need_frames`, views whose frames are missing have the size of the fitted frames. Raises RunError,
         CaptureError, FrameError.
         """
-        capture = Capture.open(self.find_capture(folder), need_frames=need_frames).with_exposures(self.exposures)
+        capture = Capture.open(self.find_capture(folder), need_frames=need_frames,
+                               need_cameras=not self.settings.uses_plates).with_exposures(self.exposures)
+        self._opened = capture = self._with_lights(capture)
         if not (self.folder / FLARE).is_file() or self.flare is None:
             return capture
         model, lens = self.flare.model, self.flare.camera
         if not need_frames:
             capture = capture.with_frame_size((lens.width, lens.height))
         return capture.with_lights_at(dict(zip(model.names, model.positions.numpy().astype(np.float64), strict=True)))
+
+    def _with_lights(self, capture: Capture) -> Capture:
+        """Return the capture with the lights of the run by frame, where it has such; cameras then name their frames."""
+        path = self.folder / FRAME_LIGHTS
+        return capture.with_lights(read_lights(path)).with_frame_names() if path.is_file() else capture
+
+    def _capture(self) -> Capture:
+        """Return the capture as it was opened last."""
+        return self._opened or self.capture(need_frames=False)
 
     def find_capture(self, folder: Path | None) -> Path:
         """Return the folder of the capture: `folder`, else the one that was fitted. Raises RunError if that is missing.
@@ -148,12 +164,31 @@ class Run:
     @cached_property
     def flare(self) -> FlareFile | None:
         """The fitted flare; None for plain 3DGS."""
-        return None if self.settings.mode == "3dgs" else flare_file.load(self._require(FLARE))
+        if self.settings.mode == "3dgs":
+            return None
+        flare = flare_file.load(self._require(FLARE))
+        if (self.folder / FRAME_LIGHTS).is_file():
+            flare.model.frame_lights = read_frame_lights(self._capture(), flare.model.names)
+        return flare
 
     @cached_property
-    def scene(self) -> SceneGaussians:
-        """The fitted scene."""
-        return read_ply(self._require(SCENE))
+    def scene(self) -> Scene:
+        """The fitted scene: Gaussians, or one plate a frame. Raises RunError."""
+        if not self.settings.uses_plates:
+            return read_ply(self._require(SCENE))
+        if not (self.folder / PLATES).is_dir():
+            raise RunError(f"{self.folder} has no {PLATES}/ yet; finish the fit with --resume first.")
+        capture = self._capture()
+        return PlateScene.from_folder(self.folder / PLATES, {view.name: view.camera for view in capture.views},
+                                      self.settings.display_white, capture.plate_space)
+
+    @property
+    def gaussians(self) -> SceneGaussians:
+        """The fitted scene as Gaussians. Raises RunError for a scene of plates."""
+        if isinstance(self.scene, SceneGaussians):
+            return self.scene
+        raise RunError(f"The scene of {self.folder} is one plate a frame: it has no 3D, and other cameras cannot see "
+                       "it; use its flare alone (flare.flare).")
 
     @cached_property
     def look(self) -> Look | None:
@@ -173,7 +208,8 @@ class Run:
     @cached_property
     def fingerprint(self) -> str:
         """A digest that changes with any picture of this run."""
-        return hash_files(self.folder / name for name in (SCENE, FLARE))
+        plates = sorted((self.folder / PLATES).rglob("*.*")) if self.settings.uses_plates else []
+        return hash_files([*(self.folder / name for name in (SCENE, FLARE, FRAME_LIGHTS)), *plates])
 
     def render_view(self, camera: Camera, edits: LookEdits | None = None) -> RenderedView:
         """Render scene, flares and composite of a view as tensors."""

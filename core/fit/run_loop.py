@@ -5,28 +5,28 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import torch
 
 from ..capture import Capture
 from ..conventions.pixel_grid import PixelGrid
-from ..conventions.run_files import CHECKPOINT, CONFIG, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW
+from ..conventions.run_files import CHECKPOINT, CONFIG, FLARE, LOG, METRICS, PREVIEW, SMALL_PREVIEW
 from ..errors import Cancelled, RunError
 from ..flare import file as flare_file
 from ..flare.file import FlareFile
-from ..gaussians.ply import write_ply
 from ..look import TrainedCamera, store_elements
 from ..system.files import atomic_path, remove_file, remove_partials_below
 from ..system.folder_lock import folder_lock
 from ..system.progress import Progress
 from ..system.reading import append_text, parse_json, read_text
 from . import checkpoint
+from .flare_trainer import FlareTrainer
 from .initial_points import ensure_points
 from .metering import resolve_white
+from .plate_trainer import PlateTrainer
 from .preview import preview_row, spread_indices, write_preview, write_small_preview
-from .rendering import render
 from .run import Run
 from .settings import FitSettings
 from .trainer import Trainer
@@ -55,7 +55,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
                 progress.say(f"The fit in {folder} is finished already.")
             else:
                 capture, sentences = ensure_points(capture, run.settings, progress)
-                trainer = Trainer(capture, run.settings, run.exposures)
+                trainer = _trainer(capture, run.settings, run.exposures)
                 remove_partials_below(folder)
                 if (folder / CHECKPOINT).exists():
                     trainer.load_state(checkpoint.load(folder / CHECKPOINT))
@@ -65,7 +65,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
         return run
     settings, warnings = resolve_white(settings.validated(), capture)
     capture, sentences = ensure_points(capture, settings, progress)
-    trainer = Trainer(capture, settings, progress=progress)  # before anything is written: it may refuse the capture
+    trainer = _trainer(capture, settings, progress=progress)  # before anything is written: it may refuse the capture
     with folder_lock(folder):
         run = Run.create(folder, settings, capture.folder, trainer.exposures)
         _report((*warnings, *sentences, *trainer.warnings), run, progress)
@@ -73,7 +73,13 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     return run
 
 
-def _run_to_end(trainer: Trainer, run: Run, progress: Progress) -> None:
+def _trainer(capture: Capture, settings: FitSettings, exposures: Mapping[str, float] | None = None,
+             progress: Progress | None = None) -> FlareTrainer:
+    """Return the trainer for the kind of scene that the settings name."""
+    return (PlateTrainer if settings.uses_plates else Trainer)(capture, settings, exposures, progress)
+
+
+def _run_to_end(trainer: FlareTrainer, run: Run, progress: Progress) -> None:
     """Train from the trainer's iteration on, and write the results."""
     folder = run.folder
     _truncate_metrics(folder / METRICS, trainer.iteration)
@@ -86,7 +92,7 @@ def _run_to_end(trainer: Trainer, run: Run, progress: Progress) -> None:
             checkpoint.save(folder / CHECKPOINT, trainer.state())
             _log(run, f"stopped at iteration {trainer.iteration}")
             raise
-        _finish(trainer, run)
+        _finish(trainer, run, progress)
     if len(trainer.losses) == len(trainer.views):  # every view was used
         _report(outlier_warnings(trainer.losses), run, progress)
     _log(run, f"finished at iteration {trainer.iteration}")
@@ -107,7 +113,7 @@ def _check_capture(run: Run, capture: Capture) -> None:
                        "this one.")
 
 
-def _train(trainer: Trainer, run: Run, progress: Progress) -> None:
+def _train(trainer: FlareTrainer, run: Run, progress: Progress) -> None:
     """Run the remaining iterations, with metrics, previews and checkpoints at their intervals."""
     settings, path = run.settings, run.folder / CHECKPOINT
     saved, started, first = time.monotonic(), time.monotonic(), trainer.iteration
@@ -116,7 +122,7 @@ def _train(trainer: Trainer, run: Run, progress: Progress) -> None:
         iteration = trainer.iteration
         if iteration % METRICS_INTERVAL == 0 or iteration == settings.iterations:
             trainer.check_finite()
-            counts = {"scene_gaussians": len(trainer.scene.means),
+            counts = {"scene_gaussians": trainer.scene_size,
                       "flare_gaussians": trainer.flare.count if trainer.flare else 0}
             pace = (time.monotonic() - started) / (iteration - first)
             line = {"iteration": iteration, **figures, **counts, "seconds_per_iteration": round(pace, 5)}
@@ -131,21 +137,21 @@ def _train(trainer: Trainer, run: Run, progress: Progress) -> None:
         progress.advance(1, **figures)
 
 
-def _finish(trainer: Trainer, run: Run) -> None:
+def _finish(trainer: FlareTrainer, run: Run, progress: Progress) -> None:
     """Write the results, the flare last and whole, then delete the checkpoint.
 
     After a kill in between, a resumed fit repeats these steps and loses nothing.
     """
+    sentences = trainer.finish_lights(run.folder)
     _write_previews(trainer, run)
     pixel_grid = PixelGrid.from_focal_lengths(trainer.frames.camera(view).focal_length for view in trainer.views)
-    if not run.settings.scene.frozen:
-        trainer.scene.pixel_grid = pixel_grid
-    write_ply(run.folder / SCENE, trainer.scene)
+    trainer.finish(run.folder, pixel_grid, progress)
+    _report(sentences, run, progress)
     if trainer.flare is not None:
         camera = trainer.views[0].camera
         lens = TrainedCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         poses = [torch.from_numpy(view.camera.world_to_camera) for view in trainer.views]
-        training_views = trainer.flare.training_views(poses)
+        training_views = trainer.flare.training_views(poses, [view.name for view in trainer.views])
         with atomic_path(run.folder / FLARE) as unnamed:
             flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, training_views=training_views,
                                                pixel_grid=pixel_grid))
@@ -155,16 +161,12 @@ def _finish(trainer: Trainer, run: Run) -> None:
 
 
 @torch.no_grad()
-def _write_previews(trainer: Trainer, run: Run) -> None:
+def _write_previews(trainer: FlareTrainer, run: Run) -> None:
     """Write previews of some held-out views, or of some of all where none is held out."""
     _, held_out = trainer.capture.split(run.settings.holdout)
     views = held_out or trainer.views
-    rows = []
-    for index in spread_indices(len(views), PREVIEW_ROWS):
-        camera, frame, _ = trainer.frames.targets(views[index])
-        view = render(trainer.scene, trainer.flare, run.settings.blend, camera, run.settings.kernels,
-                      visibility=run.settings.flare.active_visibility)
-        rows.append(preview_row(frame, view))
+    rows = [preview_row(trainer.frames.frame(views[index]), trainer.render_view(views[index]))
+            for index in spread_indices(len(views), PREVIEW_ROWS)]
     write_preview(run.folder / PREVIEW, rows)
     if rows:
         write_small_preview(run.folder / SMALL_PREVIEW, rows[len(rows) // 2])

@@ -47,6 +47,7 @@ class FlareRates:
     ring: float = 5e-3
     arc: float = 5e-3
     latent: float = 5e-3
+    brightness: float = 0.03
     final_ratio: float = 1.0
 
 
@@ -99,14 +100,16 @@ class FlareSettings:
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """The scene: 3DGS from the capture's points, with one of two strategies of densification.
+    """The scene: 3DGS from the capture's points, with one of two strategies of densification, or plates.
 
-    sh_every: iterations between degrees of spherical harmonics. reorder_every: iterations between sorts along the
-    Morton curve, which keeps neighbours together in memory. start: a 3DGS PLY in the capture's world to start from
-    instead of the points. frozen: keep that scene unchanged and fit only the flare. far_layer: add a far layer where
-    the frames show something beyond the parallax of the capture (`far_layer`).
+    kind: "plates" takes an estimated plate a frame for the scene, and needs no cameras; all else here is for
+    "gaussians". sh_every: iterations between degrees of spherical harmonics. reorder_every: iterations between sorts
+    along the Morton curve, which keeps neighbours together in memory. start: a 3DGS PLY in the capture's world to start
+    from instead of the points. frozen: keep that scene unchanged and fit only the flare.
+    far_layer: add a far layer where the frames show something beyond the parallax of the capture (`far_layer`).
     """
 
+    kind: Literal["gaussians", "plates"] = "gaussians"
     start: str = ""
     frozen: bool = False
     strategy: Literal["classic", "mcmc"] = "classic"
@@ -157,6 +160,41 @@ class SplitSettings:
 
 
 @dataclass(frozen=True)
+class BrightnessSettings:
+    """The brightness of each light in each frame, an unknown of the fit for lights that move or change.
+
+    roughness_weight: of the absolute change between neighbouring frames, in the loss. prior_weight: of the squared
+    difference from the brightness in lights.json, where it has one. solve_every: share of the iterations after which
+    the brightness is solved for all frames at once; in between it follows the gradient.
+    """
+
+    solve_every: float = 0.15
+    roughness_weight: float = 1e-4
+    prior_weight: float = 1e-3
+
+
+@dataclass(frozen=True)
+class PlateSettings:
+    """A fit over plates.
+
+    squares_until: share of the iterations in which the loss is that of squares alone; L1 from the start ends with no
+    flare, since most pixels have none. squares_weight: of the squares, l1_weight: of L1 and SSIM beside them later.
+    excess_weight: factor on squares where the frame is brighter than the composite, relative to the rest: estimated
+    plates rather hold flare than lack light.
+
+    aligned: improve estimated plates by aligned neighbours (`plate_estimates`), at the start, and at the share
+    `refine_at` of the iterations again with the fitted flare subtracted; 1 leaves the second out.
+    """
+
+    squares_until: float = 0.3
+    squares_weight: float = 5.0
+    l1_weight: float = 1.0
+    excess_weight: float = 1.0
+    aligned: bool = True
+    refine_at: float = 0.4
+
+
+@dataclass(frozen=True)
 class FitSettings:
     """All settings of a fit. width: largest working width in pixels; 0 keeps the frames' own size.
 
@@ -185,6 +223,13 @@ class FitSettings:
     flare: FlareSettings = field(default_factory=FlareSettings)
     scene: SceneSettings = field(default_factory=SceneSettings)
     split: SplitSettings = field(default_factory=SplitSettings)
+    brightness: BrightnessSettings = field(default_factory=BrightnessSettings)
+    plates: PlateSettings = field(default_factory=PlateSettings)
+
+    @property
+    def uses_plates(self) -> bool:
+        """True if the scene is one plate a frame."""
+        return self.scene.kind == "plates"
 
     @property
     def supervised(self) -> bool:
@@ -257,7 +302,8 @@ BOUNDS: dict[str, Bounds] = {
     "flare.density.prune_below": _UNIT, "flare.density.max_gaussians": Bounds(0, MAX_GAUSSIANS),
     **dict.fromkeys((f"flare.rates.{name}" for name in (
         "network", "features", "opacity", "scale", "rotation", "offset", "ring", "arc", "latent")), _NON_NEGATIVE),
-    **dict.fromkeys(("flare.rates.grids", "flare.rates.position", "flare.rates.position_final"), _POSITIVE),
+    **dict.fromkeys((f"flare.rates.{name}" for name in ("brightness", "grids", "position", "position_final")),
+                    _POSITIVE),
     "flare.rates.final_ratio": Bounds(0, 1, exclusive_minimum=True),
     "flare.visibility.radius": Bounds(1e-6, 1), "flare.visibility.margin": _UNIT,
     "flare.visibility.pixels": Bounds(1, 1024),
@@ -280,6 +326,11 @@ BOUNDS: dict[str, Bounds] = {
         "converged_ratio", "diverged_ratio", "far_flare_penalty", "scene_weight", "near_scene_penalty")),
         _NON_NEGATIVE),
     "split.low_sh_until": _UNIT, "split.sh_degree": Bounds(0, 3),
+
+    "brightness.roughness_weight": _NON_NEGATIVE, "brightness.prior_weight": _NON_NEGATIVE,
+    "brightness.solve_every": Bounds(0, 1, exclusive_minimum=True), "plates.squares_until": _UNIT,
+    "plates.squares_weight": _NON_NEGATIVE, "plates.l1_weight": _NON_NEGATIVE, "plates.excess_weight": _POSITIVE,
+    "plates.refine_at": _UNIT,
 }
 """Range of each numeric setting, by its dotted name; some may be None or text instead."""
 
@@ -330,6 +381,15 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
         density = replace(settings.flare.density, clone_above=5e-4, prune_below=2e-4)
         settings = replace(settings, flare=replace(settings.flare, opacity=0.01, density=density))
     return settings.validated()
+
+
+def over_plates(settings: FitSettings) -> FitSettings:
+    """Return the settings for a scene of plates: nothing in it hides lights, and no scene is fitted before the flare.
+    """
+    length, density = settings.iterations, settings.flare.density
+    density = replace(density, start=max(round(length * 0.1), density.every))
+    flare = replace(settings.flare, occlusion=False, snap_lights=False, scene_only_until=0.0, density=density)
+    return replace(settings, scene=replace(settings.scene, kind="plates"), flare=flare)
 
 
 def _scale_schedule(settings: FitSettings, factor: float) -> FitSettings:

@@ -12,29 +12,33 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import nullcontext
+from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
 
 from ..capture import Capture, View
 from ..capture.discs import light_disc_mask
 from ..colour.srgb_torch import clip_straight_through
+from ..conventions.pixel_grid import PixelGrid
+from ..conventions.run_files import SCENE
 from ..errors import CaptureError, RunError
 from ..flare.compositing import composite
-from ..flare.density import clone_and_prune
 from ..flare.visibility import clear_visibilities, occlusion_loss
 from ..gaussians import Splats
 from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.ordering import morton_order
+from ..gaussians.ply import write_ply
+from ..gaussians.scene import SceneGaussians
 from ..gaussians.spherical_harmonics import MAX_DEGREE
 from ..system.progress import Progress
 from . import metering
 from .checkpoint import FitInputs, State
 from .far_layer import far_layer_sentences
+from .flare_trainer import FlareTrainer, load_parameters
 from .frames import Frames, Targets, masked, subsample
-from .initialise import initial_flare, initial_scene
+from .initialise import has_frame_lights, initial_flare, initial_scene
 from .optimisers import Optimisers
 from .parallax_losses import (
     MAX_EXCESS_RATIO,
@@ -57,7 +61,7 @@ SAMPLED_VIEWS = 40
 """Approximate number of views used for clear visibilities and the test of convergence."""
 
 
-class Trainer:
+class Trainer(FlareTrainer):
     """Scene and flare of a capture under optimisation: `step` by `step`, with `state` and `load_state`.
 
     Raises CaptureError where the capture lacks what the mode needs, Cancelled after a requested stop.
@@ -66,11 +70,7 @@ class Trainer:
     def __init__(self, capture: Capture, settings: FitSettings, exposures: Mapping[str, float] | None = None,
                  progress: Progress | None = None) -> None:
         """exposures: of the views, by name, if they are known; measured otherwise."""
-        torch.manual_seed(settings.seed)
-        self.settings = settings
-        self.iteration = 0
-        self.losses: dict[str, float] = {}
-        """Last loss of each view, by name."""
+        super().__init__(settings)
         self.fits_scene = not settings.scene.frozen
         self._excess_ratio = MAX_EXCESS_RATIO
         """`parallax_losses.excess_ratio` of the scene when its flare starts, in a fit by parallax."""
@@ -82,8 +82,8 @@ class Trainer:
             is_measured = settings.exposure == "measured"
             exposures = metering.measure_exposures(capture, self.frames, progress) if is_measured else {}
         self.exposures = exposures
-        """Exposure of each view relative to the median frame; empty if all are equal."""
-        self.capture = capture = capture.with_exposures(exposures)
+        capture = capture.with_exposures(exposures)
+        self.capture = capture = capture.with_frame_names() if has_frame_lights(capture) else capture
         self.views, _ = capture.split(settings.holdout)
         self.extent = capture.extent
         if settings.needs_clean_frames and not self.frames.reference and self.fits_scene:
@@ -91,7 +91,7 @@ class Trainer:
                                "or fit with --mode split.")
 
         # Models, made from the inputs.
-        self.scene = initial_scene(capture, settings, self.views, self.frames)
+        self._scene = initial_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else initial_flare(capture, self.views, self.frames, settings)
         self.warnings = (*self.frames.warnings, *far_layer_sentences(self.scene),
                          *metering.exposure_warnings(self.exposures),
@@ -103,6 +103,22 @@ class Trainer:
         # Optimisers and strategy hold the parameters of the models.
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
         self.strategy = self._strategy()
+
+    @property
+    def scene(self) -> SceneGaussians:
+        """The Gaussians of the scene."""
+        return self._scene
+
+    @property
+    def scene_size(self) -> int:
+        """Number of Gaussians in the scene."""
+        return len(self._scene.means)
+
+    def finish(self, folder: Path, pixel_grid: PixelGrid, progress: Progress) -> None:  # noqa: ARG002
+        """Write the scene."""
+        if not self.settings.scene.frozen:
+            self._scene.pixel_grid = pixel_grid
+        write_ply(folder / SCENE, self._scene)
 
     # ---- one iteration ----------------------------------------------------------------------------
 
@@ -143,9 +159,9 @@ class Trainer:
             raise RunError(f"The fit diverged at iteration {self.iteration}; start it anew with lower learning rates.")
         if self.fits_scene:
             loss = loss + self.strategy.regulariser()
-        if flare is not None and self.flare is not None and settings.flare.correction_weight:
+        if flare is not None and self.flare is not None:
             pose = torch.from_numpy(targets.camera.world_to_camera)
-            loss = loss + settings.flare.correction_weight * self.flare.light_corrections(pose).square().sum()
+            loss = loss + self._flare_penalty(pose, targets.camera.frame)
         occlusion_loss = self._occlusion_loss(targets)
         if occlusion_loss is not None:
             loss = loss + occlusion_loss
@@ -185,20 +201,15 @@ class Trainer:
         return (self.fits_scene and settings.scene.strategy == "classic"
                 and settings.flare.active_visibility is None)
 
-    def _view(self) -> View:
-        """Return the view of this iteration: every view once a round, in a random order that depends on seed and round.
-        """
-        done = self.iteration - 1
-        order = torch.randperm(len(self.views), generator=self._generator(done // len(self.views), 1))
-        return self.views[int(order[done % len(self.views)])]
-
     def _update_clear_visibility(self) -> None:
         """Update at intervals how visible each light is behind the scene where nothing hides it."""
         visibility = self.settings.flare.active_visibility
         if self.flare is None or visibility is None or self.iteration % CLEAR_INTERVAL != 1:
             return
-        poses = [torch.from_numpy(view.camera.world_to_camera) for view in subsample(self.views, SAMPLED_VIEWS)]
-        self.flare.clear.copy_(clear_visibilities(self.scene, self.flare, poses, visibility, self.settings.kernels))
+        cameras = [view.camera for view in subsample(self.views, SAMPLED_VIEWS)]
+        poses = [torch.from_numpy(camera.world_to_camera) for camera in cameras]
+        self.flare.clear.copy_(clear_visibilities(self.scene, self.flare, poses, visibility, self.settings.kernels,
+                                                  [camera.frame for camera in cameras]))
 
     @torch.no_grad()
     def _test_scene_converged(self) -> None:
@@ -221,7 +232,7 @@ class Trainer:
         visibility = self.settings.flare.active_visibility
         if self.flare is None or visibility is None or not self.fits_scene or bool((self.flare.clear > 0).all()):
             return None
-        visible = [light for light in self.flare.positions[self.flare.clear <= 0]
+        visible = [light for light in self.flare.positions_in(targets.camera.frame)[self.flare.clear <= 0]
                    if light_disc_mask(targets.frame.numpy(), targets.camera, light[None].numpy()).any()]
         eye = torch.from_numpy(targets.camera.position)
         return occlusion_loss(self.scene, eye, visible, visibility, self.settings.kernels)
@@ -258,7 +269,8 @@ class Trainer:
         clean = targets.frame if settings.uses_parallax else targets.clean if settings.supervised else None
         if settings.blend != "add" or self.flare is None or clean is None:
             return None
-        discs = torch.from_numpy(light_disc_mask(clean.numpy(), targets.camera, self.flare.positions.numpy()))
+        discs = torch.from_numpy(light_disc_mask(clean.numpy(), targets.camera,
+                                                 self.flare.positions_in(targets.camera.frame).numpy()))
         return discs if self.frames.display_white == 1 else discs & (targets.frame - clean < MIN_DIFFERENCE).all(-1)
 
     def _joint_target(self, targets: Targets, picture: Tensor, light_discs: Tensor | None) -> Tensor:
@@ -282,7 +294,8 @@ class Trainer:
         settings = self.settings
         if self.flare is None or self._is_scene_only(targets):
             return quantile_loss(scene, targets.frame, settings.split.excess_weight)
-        lights, progress = self.flare.positions.numpy(), self.iteration / settings.iterations
+        lights = self.flare.positions_in(targets.camera.frame).numpy()
+        progress = self.iteration / settings.iterations
         loss = scene_loss(scene, targets, lights, light_discs, settings.split, progress)
         if targets.clean is not None:
             loss = loss + estimate_loss(scene, targets.clean, settings.ssim_share, progress)
@@ -301,11 +314,6 @@ class Trainer:
         is_low = self.settings.uses_parallax and self.iteration <= split.low_sh_until * self.settings.iterations
         return min(split.sh_degree if is_low else MAX_DEGREE, self.iteration // self.settings.scene.sh_every)
 
-    def _generator(self, number: int, purpose: int) -> torch.Generator:
-        """Return a random generator for one purpose and one number, such as an iteration."""
-        mixed = (self.settings.seed * 1_000_003 + purpose) * 1_000_003 + number
-        return torch.Generator().manual_seed(mixed % (1 << 62))
-
     # ---- density ----------------------------------------------------------------------------------
 
     def _strategy(self) -> Strategy:
@@ -320,35 +328,12 @@ class Trainer:
             self.optimisers.scene.keep_rows(order)
             self.strategy.reorder(order)
 
-    def _change_flare_density(self) -> None:
-        settings = self.settings.flare.density
-        adam = self.optimisers.flare
-        if self.flare is None or adam is None or not settings.is_due(self.iteration):
-            return
-        for number, light in enumerate(self.flare.lights):
-            names = {name: f"{number}.gaussians.{name}" for name in light.gaussians}
-            clone_and_prune(light, adam, names, settings, self._generator(self.iteration, 2 + number))
-
-    def check_finite(self) -> None:
-        """Raise RunError if a parameter is NaN or infinite: rasterizers skip those and hide them."""
-        models = (self.scene,) if self.flare is None else (self.scene, self.flare)
-        for model in models:
-            for name, parameter in model.named_parameters():
-                if not parameter.detach().sum().isfinite():
-                    raise RunError(f"The fit diverged before iteration {self.iteration} ({name} is not finite); start "
-                                   "it anew with lower learning rates.")
-
     # ---- state ------------------------------------------------------------------------------------
 
     def state(self) -> State:
         """Return all that a resumed fit needs, in the form of `checkpoint.save`."""
-        state: State = {"iteration": self.iteration, "excess_ratio": self._excess_ratio,
-                        "losses": [[name, loss] for name, loss in self.losses.items()],
-                        "scene": dict(self.scene.state_dict()), "strategy": self.strategy.state_dict(),
-                        **self.optimisers.state(), **self._inputs.state()}
-        if self.flare is not None:
-            state["flare"] = dict(self.flare.state_dict())
-        return state
+        return {**self._flare_state(), "excess_ratio": self._excess_ratio, "scene": dict(self.scene.state_dict()),
+                "strategy": self.strategy.state_dict(), **self._inputs.state()}
 
     def _read_excess_ratio(self, state: State) -> float:
         """Return the excess ratio of a state; formats before 1 name it `times_found`, or store only a verdict."""
@@ -362,21 +347,9 @@ class Trainer:
         """Restore a state. Raises RunError if it does not fit the capture and settings, or the inputs have changed."""
         try:
             self._inputs.check(state)
-            self.iteration = int(state["iteration"])
+            load_parameters(dict(self.scene.named_parameters()), state["scene"])
+            self._load_flare_state(state)
             self._excess_ratio = self._read_excess_ratio(state)
-            self.losses = {name: float(loss) for name, loss in state.get("losses", [])}
-            _load_parameters(dict(self.scene.named_parameters()), state["scene"])
-            if self.flare is not None:
-                _load_parameters(dict(self.flare.named_parameters()), state["flare"])
-                self.flare.positions.copy_(state["flare"]["positions"])
-                self.flare.clear.copy_(state["flare"]["clear"])
-            self.optimisers.load_state(state)
             self.strategy.load_state_dict(state["strategy"])
         except (KeyError, RuntimeError, TypeError, ValueError) as problem:
             raise RunError(f"The checkpoint does not fit this fit ({problem}); start it anew.") from problem
-
-
-def _load_parameters(parameters: dict[str, Parameter], state: State) -> None:
-    """Load values of any number of rows: Gaussians are added and removed during a fit."""
-    for name, parameter in parameters.items():
-        parameter.data = state[name].clone().to(parameter.dtype)

@@ -40,7 +40,7 @@ MAX_NAMES = 5
 def footage_warnings(capture: Capture, settings: FitSettings, views: Sequence[View], frames: Frames) -> tuple[str, ...]:
     """Return sentences on footage from which a flare can hardly be separated."""
     warnings = []
-    if settings.uses_parallax and capture.is_rotation_only:
+    if settings.uses_parallax and not settings.uses_plates and capture.is_rotation_only:
         warnings.append("The camera only turns: without parallax scene and flare cannot be told apart; give clean "
                         "frames in removed/, or footage in which the camera moves.")
     if settings.mode != "3dgs" and len(views) < MIN_VIEWS:
@@ -75,6 +75,8 @@ def outlier_warnings(losses: Mapping[str, float]) -> tuple[str, ...]:
 
 def moved_light_warnings(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
     """Return a sentence for each light that the fit moved from its position in the capture."""
+    if flare.frame_lights is not None:
+        return ()
     distances = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
             zip(capture.lights, flare.positions.numpy(), strict=True)]
     return tuple(f"The light {light.name!r} was moved to its flare, {distance:.3g} units from where lights.json has it."

@@ -20,6 +20,7 @@ from ..look.plane import PLANE_DEPTH
 from ..system.files import round_for_text
 from . import placement
 from .deformation import DeformationNetwork, QueryRange
+from .frame_lights import FrameLights
 from .placement import PlaneGaussians
 
 MIN_TRAINING_VISIBILITY = 0.2
@@ -180,18 +181,20 @@ class FlareModel(nn.Module):
 
     clear: (lights,) the visibility of each light behind the fitted scene where nothing hides it, 0..1. It is less than
     1, since Gaussians that show the lamp itself, or a sky nearer than the sun, stand before it. 0: unknown, and
-    visibilities are 1.
+    visibilities are 1. frame_lights: places and brightness by frame, where lights move or change; a .flare has none.
     """
 
     positions: Tensor
     clear: Tensor
 
-    def __init__(self, names: Sequence[str], positions: Tensor, flares: Sequence[LightFlare]) -> None:
+    def __init__(self, names: Sequence[str], positions: Tensor, flares: Sequence[LightFlare],
+                 frame_lights: FrameLights | None = None) -> None:
         super().__init__()
         self.names = tuple(names)
         self.register_buffer("positions", positions.double())  # (lights, 3), world units
         self.register_buffer("clear", torch.ones(len(positions)))
         self.flares = nn.ModuleList(flares)
+        self.frame_lights = frame_lights
 
     @property
     def lights(self) -> list[LightFlare]:
@@ -203,47 +206,64 @@ class FlareModel(nn.Module):
         """Number of Gaussians in all flares."""
         return sum(flare.count for flare in self.lights)
 
-    def views(self, world_to_camera: Tensor) -> list[ViewOfLight]:
-        """Return every light seen from one pose (4, 4)."""
-        return [ViewOfLight.of(world_to_camera, xyz) for xyz in self.positions]
+    def positions_in(self, frame: str) -> Tensor:
+        """Return the places (lights, 3) of the lights in a frame, world units."""
+        places = None if self.frame_lights is None else self.frame_lights.positions_in(frame)
+        return self.positions if places is None else places
 
-    def training_views(self, poses: Sequence[Tensor]) -> dict[str, list[list[float]]]:
+    def views(self, world_to_camera: Tensor, frame: str = "") -> list[ViewOfLight]:
+        """Return every light seen from one pose (4, 4), at its place in `frame`."""
+        return [ViewOfLight.of(world_to_camera, xyz) for xyz in self.positions_in(frame)]
+
+    def training_views(self, poses: Sequence[Tensor], frames: Sequence[str] = ()) -> dict[str, list[list[float]]]:
         """Return by light camera x, y, z and normalised light x, y in each of these poses (4, 4) that has it in front.
+
+        frames: names of their frames, where lights move.
         """
         views_by_light: dict[str, list[list[float]]] = {name: [] for name in self.names}
-        for pose in poses:
-            for name, view in zip(self.names, self.views(pose), strict=True):
+        for pose, frame in zip(poses, frames or [""] * len(poses), strict=True):
+            for name, view in zip(self.names, self.views(pose, frame), strict=True):
                 if view.depth > 0:
                     views_by_light[name].append([round_for_text(value)
                                                  for value in (*view.camera.tolist(), *view.light.tolist())])
         return views_by_light
 
-    def light_corrections(self, world_to_camera: Tensor) -> Tensor:
+    def light_corrections(self, world_to_camera: Tensor, frame: str = "") -> Tensor:
         """Return delta_l (n, 2) of the n lights in front of one pose (4, 4), normalised coordinates.
 
         Its gradient stops at the view's features, which the whole flare shares: rows of the grids that only a view with
         a hidden light touches would move by full steps because of it.
         """
+        views = self.views(world_to_camera, frame)
         corrections = [flare.network.light_correction(flare.network.view_features(view.camera, view.light).detach())
-                       for flare, view in zip(self.lights, self.views(world_to_camera), strict=True) if view.depth > 0]
+                       for flare, view in zip(self.lights, views, strict=True) if view.depth > 0]
         return torch.stack(corrections) if corrections else torch.zeros(0, 2)
 
-    def forward(self, world_to_camera: Tensor,
-                visibilities: Mapping[str, Tensor] | None = None) -> dict[str, PlaneGaussians]:
+    def forward(self, world_to_camera: Tensor, visibilities: Mapping[str, Tensor] | None = None,
+                frame: str = "") -> dict[str, PlaneGaussians]:
         """Return the Gaussians of every light in front of the camera, by the light's name.
 
-        visibilities: of each light, 0..1 (see `visibility`); they scale the opacities. A light below
-        MIN_TRAINING_VISIBILITY gives no gradient to its flare: there is next to nothing to learn, and Adam would learn
-        it at full rate, from the error of the visibility.
+        visibilities: of each light, 0..1 (see `visibility`); they scale the opacities, as the brightness of each light
+        in `frame` does. A light below MIN_TRAINING_VISIBILITY gives no gradient to its flare: there is next to nothing
+        to learn, and Adam would learn it at full rate, from the error of the visibility.
         """
-        lights = zip(self.names, self.lights, self.views(world_to_camera), strict=True)
+        lights = zip(self.names, self.lights, self.views(world_to_camera, frame), strict=True)
         flares = {name: flare(view) for name, flare, view in lights if view.depth > 0}
-        if visibilities is None:
+        shares = self.shares(visibilities, frame)
+        if shares is None:
             return flares
-        flares = {name: gaussians if visibilities[name] >= MIN_TRAINING_VISIBILITY else _detached(gaussians)
+        flares = {name: gaussians if shares[name] >= MIN_TRAINING_VISIBILITY else _detached(gaussians)
                   for name, gaussians in flares.items()}
-        return {name: gaussians._replace(opacities=gaussians.opacities * visibilities[name])
+        return {name: gaussians._replace(opacities=gaussians.opacities * shares[name])
                 for name, gaussians in flares.items()}
+
+    def shares(self, visibilities: Mapping[str, Tensor] | None, frame: str) -> Mapping[str, Tensor] | None:
+        """Return visibility times brightness of each light; None where neither is known."""
+        brightness = None if self.frame_lights is None else self.frame_lights.brightness_in(frame)
+        if brightness is None:
+            return visibilities
+        shares = dict(zip(self.names, brightness, strict=True))
+        return shares if visibilities is None else {name: share * visibilities[name] for name, share in shares.items()}
 
 
 def _detached(gaussians: PlaneGaussians) -> PlaneGaussians:

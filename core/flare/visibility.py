@@ -46,12 +46,15 @@ class VisibilitySettings:
 
 
 def light_visibilities(scene: SceneGaussians, model: FlareModel, world_to_camera: Tensor, settings: VisibilitySettings,
-                       kernels: Kernels = "auto") -> dict[str, Tensor]:
-    """Return the visibility of each light from a pose (4, 4), by the light's name, relative to `FlareModel.clear`."""
+                       kernels: Kernels = "auto", frame: str = "") -> dict[str, Tensor]:
+    """Return the visibility of each light from a pose (4, 4), by the light's name, relative to `FlareModel.clear`.
+
+    frame: name of the frame, for lights that move.
+    """
     pose = world_to_camera.double()
     camera = -pose[:3, :3].T @ pose[:3, 3]
     return {name: relative_to_clear(light_visibility(scene, camera, light, settings, kernels), clear)
-            for name, light, clear in zip(model.names, model.positions, model.clear, strict=True)}
+            for name, light, clear in zip(model.names, model.positions_in(frame), model.clear, strict=True)}
 
 
 def relative_to_clear(visibility: Tensor, clear: Tensor | float) -> Tensor:
@@ -97,17 +100,20 @@ def visibility_behind(scene: SceneGaussians, world_to_camera: NDArray[np.float64
 
 @torch.no_grad()
 def clear_visibilities(scene: SceneGaussians, model: FlareModel, poses: Sequence[Tensor], settings: VisibilitySettings,
-                       kernels: Kernels = "auto") -> Tensor:
+                       kernels: Kernels = "auto", frames: Sequence[str] = ()) -> Tensor:
     """Return (lights,), the visibility of each light where nothing hides it: that in the clearest tenth of these poses
-    (4,     4).
+    (4, 4). frames: names of their frames, where lights move.
 
     0 where even those see less than MIN_CLEAR: a scene that hides a light from everywhere, such as one that the light
     was placed inside of, says nothing about it, and its visibilities are 1.
     """
     cameras = [-pose[:3, :3].double().T @ pose[:3, 3].double() for pose in poses]
+    places = [model.positions_in(frame) for frame in frames or [""] * len(poses)]
     quantiles = []
-    for light in model.positions:
-        visibilities = torch.stack([light_visibility(scene, camera, light, settings, kernels) for camera in cameras])
+    for number in range(len(model.names)):
+        visibilities = torch.stack([
+            light_visibility(scene, camera, lights[number], settings, kernels)
+            for camera, lights in zip(cameras, places, strict=True)])
         quantiles.append(visibilities.quantile(CLEAR_QUANTILE))
     clear = torch.stack(quantiles).clamp(max=1)
     return clear.masked_fill(clear < MIN_CLEAR, 0)

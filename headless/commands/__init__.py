@@ -15,12 +15,13 @@ from . import (
     lights,
     make_flare,
     remove,
+    shot,
     solve,
     train_removal,
     transfer,
 )
 
-_MODULES = (demo, solve, lights, remove, fit, evaluate, bake, compose, transfer, export, make_flare, train_removal,
-            eval_removal, engine)
+_MODULES = (demo, shot, solve, lights, remove, fit, evaluate, bake, compose, transfer, export, make_flare,
+            train_removal, eval_removal, engine)
 
 COMMANDS: dict[str, Command] = {module.COMMAND.name: module.COMMAND for module in _MODULES}

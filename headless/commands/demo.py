@@ -75,7 +75,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     result = evaluate.score_run(run_.folder, progress)
     cameras = {view.name: view.camera for view in run_.capture(need_frames=False).views}
     bake(run_, number_views(cameras), cameras, out / "layers", progress=progress, overwrite=True)
-    _write_sheet(capture, run_.settings.holdout, out)
+    write_sheet(capture, run_.settings.holdout, out)
     progress.say(f"The run, the layers of {len(cameras)} frames (EXR) and {SHEET} are in {out}; "
                  f"{time.monotonic() - began:.0f} s.")
     return {**result, "run": str(run_.folder), "layers": str(out / "layers"), "sheet": str(out / SHEET)}
@@ -120,7 +120,7 @@ def _describe_supervision(capture: Capture, mode: Mode) -> str:
     return "There are no clean frames."
 
 
-def _write_sheet(capture: Capture, holdout: str | int | None, out: Path) -> None:
+def write_sheet(capture: Capture, holdout: str | int | None, out: Path) -> None:
     """Write the contact sheet of up to SHEET_ROWS held-out views (of all views where none is held out)."""
     from ...core.bake.bake import read_manifest
     from ...core.bake.exr import read_layers

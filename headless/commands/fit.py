@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from ...core.choices import Blend, Mode, Model, Preset
-from ...core.errors import SettingsError
+from ...core.errors import CaptureError, SettingsError
 from ...core.system.progress import Progress
 from ...core.system.reading import UTF8_SIG, read_text
 from ...core.typed import MAX_INT_DIGITS
@@ -21,13 +21,16 @@ if TYPE_CHECKING:
     from ...core.fit import FitSettings
 
 DECODED_CACHE_BYTES = 1 << 26
+SCENE_KINDS = ("gaussians", "plates")
+"""Values of --scene that are no file."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments to a parser."""
     parser.add_argument("capture", type=Path, metavar="CAPTURE", nargs="?",
                         help="folder with images/, sparse/0/ (or transforms.json), lights.json, and removed/ or "
-                             "truth/scene/; a missing lights.json is made from the frames")
+                             "truth/scene/; a missing lights.json is made from the frames; without a camera solve, "
+                             "the frames of a shot")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder for the run")
     parser.add_argument("--list", type=Path, metavar="FILE", dest="list_file",
                         help="instead of CAPTURE: a text file with the folder of a capture on each line; --out is then "
@@ -56,9 +59,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=int, metavar="WIDTH", help="width in pixels to fit at (default: the frames')")
     parser.add_argument("--iterations", type=int, metavar="N", help="length of the fit; every schedule scales with it")
     parser.add_argument("--seed", type=parse_seed, metavar="N", help="random seed (default 0)")
-    parser.add_argument("--scene", type=Path, metavar="PLY",
+    parser.add_argument("--scene", type=Path, metavar="PLY_OR_KIND",
                         help="start from this 3DGS scene, trained elsewhere in the capture's world (INRIA's layout, as "
-                             "gsplat, nerfstudio, Brush and Postshot write it, or PlayCanvas's compressed one)")
+                             "gsplat, nerfstudio, Brush and Postshot write it, or PlayCanvas's compressed one); or "
+                             "the kind of scene: gaussians, or plates, one clean frame for each frame, which needs no "
+                             "cameras (default: plates where CAPTURE has no camera solve)")
     parser.add_argument("--freeze-scene", action="store_true",
                         help="keep the scene of --scene unchanged and fit the flare alone; needs no clean frames")
     plate_space.add_option(parser)
@@ -89,7 +94,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         Run.check_free(out)
     plate_space.record(args, folder)
     # The fit has its own cache, of smaller pictures.
-    capture = Capture.open(folder, cache_bytes=DECODED_CACHE_BYTES)
+    capture = Capture.open(folder, cache_bytes=DECODED_CACHE_BYTES, need_cameras=False)
     tallies.report_capture(capture, progress)
     settings = Run.open(out).settings if is_resumed else fit_settings(args, capture, progress)
     if settings.mode != "3dgs":
@@ -105,13 +110,16 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress) -> FitSettings:
     """Return the settings from the arguments. Raises SettingsError."""
-    from ...core.fit.settings import override_settings, preset
+    from ...core.fit.settings import over_plates, override_settings, preset
 
+    kind = scene_kind(args.scene, capture, progress)
     overrides = {"model": args.model} if args.model else {}
     mode = args.mode or default_mode(capture, args.freeze_scene, progress)
     settings = preset(args.preset, mode=mode, blend=args.blend, iterations=args.iterations, **overrides)
+    if kind == "plates":
+        settings = over_plates(settings)
     changes = {"width": args.size, "seed": args.seed, "holdout": parse_holdout(args.holdout)}
-    if args.scene:
+    if args.scene and str(args.scene) not in SCENE_KINDS:
         if not args.scene.is_file():
             raise SettingsError(f"--scene {args.scene} is missing.")
         changes["scene.start"] = str(args.scene.resolve())
@@ -120,11 +128,26 @@ def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress)
     return override_settings(settings, {**changes, **dict(map(parse_setting, args.changes))}, progress)
 
 
+def scene_kind(scene: Path | None, capture: Capture, progress: Progress) -> str:
+    """Return the kind of scene of a fit, "gaussians" or "plates", by the option or by the capture.
+
+    Raises CaptureError for Gaussians without a camera solve.
+    """
+    if not capture.has_cameras:
+        if scene is not None and str(scene) != "plates":
+            raise CaptureError(f"{capture.folder} has no camera solve, which a scene of Gaussians needs; run solve "
+                               "first, or leave out --scene.")
+        progress.say(f"{capture.folder} has no camera solve: its scene is plates, one clean frame for each frame. The "
+                     f"focal length is {capture.views[0].camera.focal_length:.0f} pixels, {capture.focal_source}.")
+        return "plates"
+    return "plates" if str(scene) == "plates" else "gaussians"
+
+
 def with_supervision(capture: Capture, settings: FitSettings, progress: Progress) -> Capture:
     """Return the capture with the clean frames that a fit with these settings needs; they are made where missing."""
     exact = settings.supervised and capture.has_truth
     needed = settings.needs_clean_frames and not settings.scene.frozen and not exact
-    return with_removed(capture, progress) if needed else capture
+    return with_removed(capture, progress, is_flared=settings.uses_plates) if needed else capture
 
 
 def default_mode(capture: Capture, frozen: bool, progress: Progress) -> Mode:
@@ -136,8 +159,9 @@ def default_mode(capture: Capture, frozen: bool, progress: Progress) -> Mode:
 
     if frozen or has_exact_clean_frames(capture):
         return "default"
-    progress.say(f"{capture.folder} has no exact clean frames: the mode is estimated, which separates scene and flare "
-                 "by the clean frames that `remove` makes (removed/) and by parallax.")
+    if capture.has_cameras:
+        progress.say(f"{capture.folder} has no exact clean frames: the mode is estimated, which separates scene and "
+                     "flare by the clean frames that `remove` makes (removed/) and by parallax.")
     return "estimated"
 
 
@@ -199,5 +223,6 @@ COMMAND = Command(
 flare.flare, scene.ply, preview.png, metrics.jsonl. --resume continues a fit that was stopped.
 
   run.py fit sample_scenes/desk --out build/desk --preset draft
-  run.py fit my_capture --out my_run --size 960 --holdout 0 --resume""",
+  run.py fit my_capture --out my_run --size 960 --holdout 0 --resume
+  run.py fit my_shot --out my_run             # frames without a camera solve: the scene is plates""",
     arguments, (Step("fit", "engine", run),), resume_rule="resumes with --resume")

@@ -180,10 +180,11 @@ def _make_model(args: argparse.Namespace, size: int) -> Remover:
     return DiffusionRemover(args.base, args.weights, working_size=size)
 
 
-def with_removed(capture: Capture, progress: Progress) -> Capture:
+def with_removed(capture: Capture, progress: Progress, *, is_flared: bool = False) -> Capture:
     """Return the capture with clean frames; they are made and written to its folder where it has none.
 
-    Raises CaptureError where its clean frames were made from other frames.
+    is_flared: the lights of the capture are known to flare, so predicted flares are removed wherever one is on. Raises
+    CaptureError where its clean frames were made from other frames.
     """
     from ...core.removal.inference.remover import Remover
     from ...core.removal.jobs.capture import clean_capture
@@ -193,7 +194,9 @@ def with_removed(capture: Capture, progress: Progress) -> Capture:
         check_clean_frames_current(capture)
         return capture
     progress.say(f"{capture.folder} has no removed/; making clean frames there.")
-    clean_capture(capture, Remover(glow="remove"), progress)
+    flared = [view.name for view in capture.views if is_flared and any(
+        capture.light_state(light, view).on != 0 for light in capture.lights)]
+    clean_capture(capture, Remover(glow="remove"), progress, flared)
     return capture.reopen()
 
 

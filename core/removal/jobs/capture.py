@@ -6,7 +6,10 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Collection
 from pathlib import Path
+
+import numpy as np
 
 from ...capture import REMOVED, Capture
 from ...errors import CaptureError
@@ -24,10 +27,12 @@ UNFINISHED_FOLDER = "removed.unfinished"
 _JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 
 
-def clean_capture(capture: Capture, remover: Remover, progress: Progress) -> Path:
+def clean_capture(capture: Capture, remover: Remover, progress: Progress,
+                  flared: Collection[str] = ()) -> Path:
     """Clean every frame into the capture's removed/ and return that folder; frames of an interrupted call are kept.
 
-    JPEG frames are written as PNG. remover: one that removes all of a glow, if the frames are for a fit.
+    JPEG frames are written as PNG. remover: one that removes all of a glow, if the frames are for a fit. flared: names
+    of views that are known to show a flare, since a light is on; what is predicted there is removed with confidence 1.
 
     Raises CaptureError where removed/ exists already, where the folder cannot be written to and where two frames would
     have one clean file; FrameError for a frame that cannot be read; Cancelled.
@@ -44,11 +49,16 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress) -> Pat
                          [safe_join(work, str(names[view.name]), CaptureError)])
               for view in sorted(capture.views, key=lambda view: shot_sort_key(capture.frame_path(view)))]
 
+    with_flare = {names[name] for name in flared}
+
     def digest(frame: CleanFrame) -> str:
-        return digest_inputs(remover.cache_key, [frame.source, *predictor.dependencies(frame.source)])
+        settings = f"{remover.cache_key} flared" if frame.name in with_flare else remover.cache_key
+        return digest_inputs(settings, [frame.source, *predictor.dependencies(frame.source)])
 
     def clean(frame: CleanFrame) -> WriteFn:
         plate, prediction = predictor.predict(frame.source)
+        if frame.name in with_flare:
+            prediction = prediction._replace(confidence=np.float32(1))
         (_, first), *others = split_views(plate)
         return lambda: write_view_results(frame.results, plate, [
             remover.remove(first, prediction=prediction), *(remover.remove(view) for _, view in others)])

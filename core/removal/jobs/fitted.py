@@ -28,12 +28,11 @@ from ...images.exr import read_data_window
 from ...images.plates import Plate, clean_name, finite_light, read_plate, write_results
 from ...images.views import split_views
 from ...system.files import check_no_overwrite, safe_join
+from ...system.least_squares import robust_bounded_fit
 from ...system.progress import Progress
 from ..inference.plate_light import CLIPPING_LEVEL
 from .clean_frames import CleanFrame, WriteFn, write_clean_frames
 from .manifest import Manifest, digest_inputs
-
-Floats = NDArray[np.float64]
 
 MAX_SAMPLES = 100_000
 """Approximate number of a frame's pixels by which the gains of the flares are estimated."""
@@ -42,10 +41,6 @@ DIM_FLARE = 0.5
 MAX_SCENE_GAIN = 1.25
 """Largest factor by which a frame's scene may be brighter or darker than it was fitted: what `core.fit.metering`
 leaves."""
-REWEIGHTINGS, DESCENT_SWEEPS = 8, 50
-"""Reweightings of the least squares, and sweeps of coordinate descent in each."""
-L1_EPSILON = 0.01
-"""Linear light; smaller residuals count by their squares."""
 PRIOR_WEIGHT = 1e-4
 """Weight per pixel of the fitted gains of 1; it exceeds the frame's for flares of a thousandth of white."""
 
@@ -164,23 +159,9 @@ def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) 
     light = observed[unclipped].ravel().astype(np.float64)
     columns = np.stack([pixels[unclipped].ravel() for pixels in layers], 1).astype(np.float64)
     low, high = np.array([[1 / MAX_SCENE_GAIN, MAX_SCENE_GAIN], *len(flares) * [[0.0, 1.0]]]).T
-    gains, weights = np.ones(len(layers)), np.ones(len(light))
-    prior = PRIOR_WEIGHT * max(len(light), 1) * np.eye(len(layers))  # alone decides where the whole plate is clipped
-    for _ in range(REWEIGHTINGS):
-        weighted = columns.T * weights
-        gains = _bounded_least_squares(weighted @ columns + prior, weighted @ light + prior.sum(1), gains, low, high)
-        weights = 1 / (np.abs(light - columns @ gains) + L1_EPSILON)
+    # The prior alone decides where the whole plate is clipped.
+    gains = robust_bounded_fit(columns, light, np.ones(len(layers)), low, high, PRIOR_WEIGHT)
     return dict(zip(flares, gains[1:].tolist(), strict=True))
-
-
-def _bounded_least_squares(product: Floats, target: Floats, start: Floats, low: Floats, high: Floats) -> Floats:
-    """Solve product x = target for x (n,) between bounds, by coordinate descent."""
-    solution = start.copy()
-    for _ in range(DESCENT_SWEEPS):
-        for index in range(len(solution)):
-            residual = target[index] - product[index] @ solution + product[index, index] * solution[index]
-            solution[index] = min(max(residual / product[index, index], low[index]), high[index])
-    return solution
 
 
 def _linear_light(plate: Plate) -> Pixels:

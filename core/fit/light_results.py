@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a fit says of its lights in the end: brightness in the frames that it has not seen, shares of the flare, and the
+lights.json of the run.
+
+The trainers call it before a run is written, and `run` reads the file.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from ..capture import Capture, View
+from ..capture.discs import CLIP_LEVEL, DISC_RADIUS, squared_light_distances
+from ..colour.srgb import linear_from_srgb
+from ..conventions.splatting import C0
+from ..flare.frame_lights import FrameLights
+from ..flare.model import FlareModel
+from ..system.files import round_for_text, write_json
+from ..system.least_squares import robust_bounded_fit
+from .frames import Frames, Targets, subsample
+from .rendering import RenderedView
+
+RenderView = Callable[[View], RenderedView]
+
+MIN_SHARE = 0.005
+"""Share of all flare light below which a light counts as one that does not flare."""
+MIN_PEAK = 0.002
+"""Linear light that a flare has to exceed somewhere outside of its light's disc: about half a code of 8 bits."""
+PEAK_QUANTILE = 0.999
+"""Quantile of a flare's pixels that counts as its peak."""
+SAMPLED_VIEWS = 40
+"""Approximate number of views in which shares are measured."""
+MAX_BRIGHTNESS = 4.0
+"""Largest brightness that a frame may give a light, relative to its usual one."""
+PRIOR_WEIGHT = 1e-5
+"""Weight per pixel of the brightness that neighbouring frames give."""
+
+
+@torch.no_grad()
+def measure_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, render_view: RenderView) -> None:
+    """Set the brightness of the lights in views that the fit has not seen.
+
+    The flare stays as it was fitted; only its strength is read off these frames, as `lights` reads the places. Where
+    they do not tell, the neighbouring frames do.
+    """
+    lights = flare.frame_lights
+    if lights is None:
+        return
+    unseen = {lights.rows[view.name] for view in views}
+    known = [row for row in range(len(lights.rows)) if row not in unseen]
+    values = lights.brightness.weight.clamp_min(0)
+    for row in unseen if known else ():
+        for light in range(values.shape[1]):
+            lights.brightness.weight[row, light] = float(np.interp(row, known, values[known, light].numpy()))
+    solve_brightness(flare, views, frames, render_view)
+
+
+@torch.no_grad()
+def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, render_view: RenderView) -> None:
+    """Set the brightness of the lights in these views by least errors of frame - scene over the present flares."""
+    lights = flare.frame_lights
+    if lights is None:
+        return
+    weight = lights.brightness.weight
+    for view in views:
+        row = lights.rows[view.name]
+        start = weight[row].clamp(0, MAX_BRIGHTNESS).numpy().astype(np.float64)
+        weight[row] = 1.0  # so that the layers have their usual strength
+        rendered = render_view(view)
+        columns = [rendered.layers.flares[name].numpy() if name in rendered.layers.flares else None
+                   for name in flare.names]
+        solved = _solve(frames.targets(view), rendered.layers.scene.numpy(), columns, start)
+        weight[row] = torch.from_numpy(solved).float()
+
+
+def _solve(targets: Targets, scene: NDArray[np.float32], flares: Sequence[NDArray[np.float32] | None],
+           start: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the strengths (lights,) of flares (height, width, 3), linear light, in a frame over its scene."""
+    solved = start.copy()
+    present = [number for number, flare in enumerate(flares) if flare is not None and flare.max() > 0]
+    if not present:
+        return solved
+    frame = targets.frame.numpy()
+    usable = (frame < CLIP_LEVEL).all(-1)
+    light = (linear_from_srgb(frame) - scene)[usable].ravel().astype(np.float64)
+    columns = np.stack([np.asarray(flares[number])[usable].ravel() for number in present], 1).astype(np.float64)
+    solved[present] = robust_bounded_fit(columns, light, start[present], 0.0, MAX_BRIGHTNESS, PRIOR_WEIGHT)
+    return solved
+
+
+@torch.no_grad()
+def normalise_brightness(flare: FlareModel, views: Sequence[View]) -> None:
+    """Scale each light so that its brightness is 1 in the brightest of these views, and its flare to match.
+
+    Views in which the light lies in the frame decide, if there are any: outside of it little says how bright it is.
+    """
+    lights = flare.frame_lights
+    if lights is None:
+        return
+    for number, light in enumerate(flare.lights):
+        inside = [lights.rows[view.name] for view in views if view.camera.contains(
+            *view.camera.project(lights.positions[lights.rows[view.name], number].numpy()))[0]]
+        rows = inside or [lights.rows[view.name] for view in views]
+        brightest = float(lights.brightness.weight[rows, number].max())
+        if brightest <= 0:
+            continue
+        lights.brightness.weight[:, number] /= brightest
+        _scale_colours(light.gaussians["sh"], light.network.head, light.network.names, light.network.widths, brightest)
+
+
+def _scale_colours(sh: torch.Tensor, head: nn.Linear, names: Sequence[str], widths: Sequence[int],
+                   factor: float) -> None:
+    """Multiply the colours 0.5 + C0 (sh + change) + ... of Gaussians, and what the network changes of them."""
+    sh *= factor
+    sh[:, :3] += (factor - 1) * 0.5 / C0
+    first = sum(widths[:names.index("sh")])
+    rows = slice(first, first + widths[names.index("sh")])
+    head.weight[rows] *= factor
+    head.bias[rows] *= factor
+
+
+@torch.no_grad()
+def flare_shares(flare: FlareModel, views: Sequence[View], frames: Frames,
+                 render_view: RenderView) -> dict[str, tuple[float, float]]:
+    """Return by light its share of all flare light, 0..1, and the peak of its own, linear light.
+
+    Both are outside of the lights' discs: a lamp that is only seen is no flare.
+    """
+    sums, peaks = dict.fromkeys(flare.names, 0.0), dict.fromkeys(flare.names, 0.0)
+    for view in subsample(views, SAMPLED_VIEWS):
+        camera = frames.targets(view).camera
+        outside = squared_light_distances(camera, flare.positions_in(camera.frame).numpy()) > DISC_RADIUS**2
+        for name, layer in render_view(view).layers.flares.items():
+            light = np.abs(layer.numpy()).mean(-1)[outside]
+            if light.size:
+                sums[name] += float(light.mean())
+                peaks[name] = max(peaks[name], float(np.quantile(light, PEAK_QUANTILE)))
+    total = sum(sums.values())
+    return {name: (sums[name] / total if total else 0.0, peaks[name]) for name in flare.names}
+
+
+def select_flaring(shares: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Return the names of the lights that flare; the one with the largest share if none does."""
+    flaring = [name for name, (share, peak) in shares.items() if share >= MIN_SHARE and peak >= MIN_PEAK]
+    return flaring or [max(shares, key=lambda name: shares[name])]
+
+
+def share_sentences(shares: Mapping[str, tuple[float, float]], flaring: Sequence[str]) -> list[str]:
+    """Return what the user should know of the lights' shares."""
+    listed = ", ".join(f"{name} {100 * share:.1f} %" for name, (share, _) in
+                       sorted(shares.items(), key=lambda item: -item[1][0]))
+    sentences = [f"Shares of the flare by light: {listed}."]
+    if left_out := [name for name in shares if name not in flaring]:
+        sentences.append(f"Left out of the .flare, since they do not flare (less than {100 * MIN_SHARE:g} % of the "
+                         f"flare, or below {MIN_PEAK:g} of white everywhere): {', '.join(left_out)}.")
+    return sentences
+
+
+def without_other_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:
+    """Return the model with these lights alone, in its order."""
+    rows = [row for row, name in enumerate(flare.names) if name in names]
+    lights = flare.frame_lights
+    if lights is not None:
+        selected = FrameLights(list(lights.rows), lights.positions[:, rows], lights.prior[:, rows])
+        with torch.no_grad():
+            selected.brightness.weight.copy_(lights.brightness.weight[:, rows])
+        lights = selected
+    model = FlareModel([flare.names[row] for row in rows], flare.positions[rows],
+                       [flare.lights[row] for row in rows], lights)
+    model.clear.copy_(flare.clear[rows])
+    return model
+
+
+def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
+    """Write lights.json of a run: the lights of the capture with their brightness as fitted, by frame."""
+    lights = flare.frame_lights
+    if lights is None:
+        return
+    brightness = lights.brightness.weight.detach().clamp(0, 1).numpy()
+    entries: list[dict[str, Any]] = []
+    for light in capture.lights:
+        entry: dict[str, Any] = {"name": light.name}
+        frames: dict[str, Any] = {}
+        for name, row in lights.rows.items():
+            state = capture.light_state(light, capture.view(name))
+            place = "xy" if light.is_on_picture else "xyz"
+            frames[name] = {place: [round_for_text(float(value)) for value in getattr(state, place)]}
+            if light.name in flare.names:
+                frames[name]["on"] = round_for_text(float(brightness[row, flare.names.index(light.name)]))
+            if state.confidence < 1:
+                frames[name]["confidence"] = state.confidence
+        entries.append({**entry, "frames": frames})
+    write_json(path, {"lights": entries})
+
+
+def read_frame_lights(capture: Capture, names: Sequence[str]) -> FrameLights:
+    """Return places and brightness of these lights of a capture, in every view; 1 where it is not known."""
+    by_name = {light.name: light for light in capture.lights}
+    states = [[capture.light_state(by_name[name], view) for name in names] for view in capture.views]
+    positions = torch.tensor(np.array([[state.xyz for state in row] for row in states]), dtype=torch.float64)
+    prior = torch.tensor([[np.nan if state.on is None else state.on for state in row] for row in states])
+    return FrameLights([view.name for view in capture.views], positions, prior)

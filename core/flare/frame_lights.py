@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Place and brightness of each light in each frame of a shot.
+
+A light that moves has a place in each frame, and one that is dimmed, switched or hidden has a brightness in each frame.
+Places are inputs of a fit; brightness is an unknown. A `FlareModel` without these has lights that stand and stay on.
+`core.fit` makes and optimises them, and writes them as the lights.json of a run.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+
+class FrameLights(nn.Module):
+    """Places and brightnesses of lights by frame.
+
+    positions: (frames, lights, 3) world units. brightness: of each light relative to its usual one, a sparse table, so
+    that a step changes only the frame that it is made from. prior: (frames, lights) brightness that the lights' file
+    has, NaN where it has none.
+    """
+
+    positions: Tensor
+    prior: Tensor
+
+    def __init__(self, frames: Sequence[str], positions: Tensor, prior: Tensor) -> None:
+        super().__init__()
+        self.rows = {name: row for row, name in enumerate(frames)}
+        """Row of each frame, by its name, in the order of the shot."""
+        self.register_buffer("positions", positions.double())
+        self.register_buffer("prior", prior.float())
+        self.brightness = nn.Embedding(prior.shape[0], prior.shape[1], sparse=True)
+        with torch.no_grad():
+            self.brightness.weight.copy_(prior.nan_to_num(1.0))
+
+    def brightness_in(self, frame: str) -> Tensor | None:
+        """Return the brightness (lights,) of a frame, 0 or more; None for a frame that is not listed."""
+        row = self.rows.get(frame)
+        values: Tensor | None = None if row is None else self.brightness(torch.tensor(row)).clamp_min(0)
+        return values
+
+    def positions_in(self, frame: str) -> Tensor | None:
+        """Return the places (lights, 3) in a frame; None for a frame that is not listed."""
+        row = self.rows.get(frame)
+        return None if row is None else self.positions[row]
+
+    def roughness(self, frame: str) -> Tensor:
+        """Return the sum of |change of brightness| between a frame and the ones before and after it.
+
+        Absolute values allow steps, as of a switch, and smooth what nothing determines.
+        """
+        row, last = self.rows[frame], len(self.rows) - 1
+        near = torch.tensor([max(row - 1, 0), row, min(row + 1, last)])
+        values = self.brightness(near)
+        total: Tensor = values.diff(dim=0).abs().sum()
+        return total
+
+    def deviation(self, frame: str) -> Tensor:
+        """Return the sum of squared differences from the brightness that the lights' file has for a frame."""
+        prior = self.prior[self.rows[frame]]
+        difference: Tensor = self.brightness(torch.tensor(self.rows[frame])) - prior.nan_to_num(0)
+        return difference.square()[prior.isfinite()].sum()

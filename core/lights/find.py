@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..capture import LIGHTS, Capture, read_lights
 from ..errors import SettingsError
@@ -22,6 +22,7 @@ from .file import write_lights
 from .found_light import FAR, FoundLight
 from .ghosts import find_blobs, locate_by_ghosts
 from .lifted import lift_to_gaussians
+from .surroundings import brightness_map, split_gaps
 from .tracks import TrackFindings
 from .triangulation import TriangulationSettings, triangulate_lights
 
@@ -56,8 +57,11 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
     views = [(view.name, view.camera) for view in capture.views]
     detections: list[list[Detection]] = []
     progress.stage("look for lights", len(views))
+    maps: dict[str, NDArray[np.bool_]] = {}
     for view in capture.views:
-        detections.append(detector.detect(capture.frame(view)))
+        frame = capture.frame(view)
+        detections.append(detector.detect(frame))
+        maps[view.name] = brightness_map(frame)
         progress.advance(1, found=sum(map(len, detections)))
     views_with_lights = sum(bool(in_view) for in_view in detections)
     messages = [f"{sum(map(len, detections))} detections in {views_with_lights} of {len(views)} views."]
@@ -72,8 +76,12 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
     else:
         permissive = replace(settings, min_views=2, max_nfa=np.inf, min_share=0.0)
         candidates = triangulate_lights(views, detections, capture.extent, permissive)
-        lights = [light for light in candidates if _is_well_supported(light, min_views, settings)]
-        doubtful = [light for light in candidates if not _is_well_supported(light, min_views, settings)]
+        supported = [light for light in candidates if _is_well_supported(light, min_views, settings)]
+        lights, gaps = split_gaps(supported, dict(views), maps)
+        doubtful = [*gaps, *(light for light in candidates if not _is_well_supported(light, min_views, settings))]
+        if gaps:
+            messages.append(f"{len(gaps)} places are gaps through which a bright far surrounding shows, and no lights; "
+                            "`lights/report.json` lists them as doubtful.")
     if not lights and len(views) > 1:
         lights = _find_by_ghosts(capture, progress, settings.seed)
         if lights:

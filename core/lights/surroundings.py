@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Tells lamps from gaps through which a bright far surrounding shows, by the views together. `find` calls it.
+
+Detections in gaps between near things can agree on a place, that of the gap. But the light comes from far away: other
+views see it in the same direction, wherever they stand, if nothing hides it there. A lamp is elsewhere in those views.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture.camera import Camera, Floats
+from ..images.picture import Picture
+from .found_light import FoundLight
+
+MAP_WIDTH = 160
+"""Largest width of a brightness map, pixels."""
+CLIPPED, MIN_CLIPPED_SHARE = 0.96, 0.5
+"""Display value of the largest channel from which a pixel is bright, and the share of a map's pixel that must be."""
+SEPARATION = 4.0
+"""Distance between the place and the direction of a detection, in radii of the light, from which a view can tell."""
+MIN_SEPARATION = 0.02
+"""The same as a share of the frame's width, at least."""
+MIN_TESTS = 6
+"""Number of pairs of a detection and another view below which nothing is decided."""
+MIN_EXPLAINED, MIN_EXCESS = 0.4, 0.15
+"""Share of the tests in which the surrounding is bright, from which it explains a light, and by how much that exceeds
+the bright share of the frames: in over-exposed frames every direction is bright."""
+
+
+def brightness_map(picture: Picture) -> NDArray[np.bool_]:
+    """Return a small map (height, width) of where a picture is bright."""
+    width = min(MAP_WIDTH, picture.size[0])
+    height = max(round(picture.size[1] * width / picture.size[0]), 1)
+    bright = (picture.display().max(axis=2, keepdims=True) >= CLIPPED).astype(np.float32)
+    shares = Picture(np.repeat(bright, 3, axis=2), "linear").resized(width, height).pixels[..., 0]
+    return np.asarray(shares >= MIN_CLIPPED_SHARE)
+
+
+def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
+                    maps: Mapping[str, NDArray[np.bool_]]) -> float | None:
+    """Return the share, 0..1, of the tests in which the far surrounding is bright where a light was detected.
+
+    cameras, maps: of each view, by name. None where too few views can tell: the light is far itself, or nearly in the
+    same direction from all.
+    """
+    if light.far:
+        return None
+    bright = []
+    for name, detection in light.detections:
+        direction = cameras[name].rays(detection.xy[None])[0]
+        for other, camera in cameras.items():
+            if other == name:
+                continue
+            at = _project_direction(camera, direction)
+            if at is None:
+                continue
+            place, depth = camera.project(light.xyz[None])
+            clearance = max(SEPARATION * light.radius * camera.width / cameras[name].width,
+                            MIN_SEPARATION * camera.width)
+            if depth[0] > 0 and np.linalg.norm(place[0] - at) < clearance:
+                continue
+            height, width = maps[other].shape
+            x, y = (at / camera.size * (width, height)).astype(int)
+            bright.append(bool(maps[other][min(y, height - 1), min(x, width - 1)]))
+    return float(np.mean(bright)) if len(bright) >= MIN_TESTS else None
+
+
+def split_gaps(lights: Sequence[FoundLight], cameras: Mapping[str, Camera],
+               maps: Mapping[str, NDArray[np.bool_]]) -> tuple[list[FoundLight], list[FoundLight]]:
+    """Return the lights, and those that a bright far surrounding explains: gaps."""
+    threshold = max(MIN_EXPLAINED, MIN_EXCESS + float(np.mean([bright.mean() for bright in maps.values()])))
+    lamps: list[FoundLight] = []
+    gaps: list[FoundLight] = []
+    for light in lights:
+        share = explained_share(light, cameras, maps)
+        (gaps if share is not None and share >= threshold else lamps).append(light)
+    return lamps, gaps
+
+
+def _project_direction(camera: Camera, direction: Floats) -> Floats | None:
+    """Return the pixel (2,) at which a camera sees a direction (3,); None outside of its frame."""
+    local = camera.world_to_camera[:3, :3] @ direction
+    if local[2] <= 1e-6:
+        return None
+    pixel = local[:2] / local[2] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    return np.asarray(pixel) if camera.contains(pixel[None])[0] else None

@@ -73,6 +73,11 @@ def is_blend(args: argparse.Namespace | TargetOptions) -> bool:
     return bool(args.to[0].suffix.lower() == ".blend")
 
 
+def is_shot_file(options: TargetOptions) -> bool:
+    """Return whether the target is a shot file, which holds its own edits."""
+    return bool(options.to[0].suffix.lower() == ".json")
+
+
 def shot_path(options: TargetOptions) -> Path:
     """Return the file that the Blender step writes the shot to; each range of frames has its own."""
     if options.shot:

@@ -144,6 +144,13 @@ class LookEdits:
                 result[name] = edit.matrix
         return result
 
+    def placed(self, sources: Mapping[str, str]) -> LookEdits:
+        """Return the edits of a look's lights for placed lights, whose sources are given by their names."""
+        lights = {name: self.lights[source] for name, source in sources.items() if source in self.lights}
+        elements = {(name, part): edit for name, source in sources.items()
+                    for (light, part), edit in self.elements.items() if light == source}
+        return LookEdits(self.master, lights, elements)
+
     # ---- as text -----------------------------------------------------------------------------------
 
     @classmethod

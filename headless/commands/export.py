@@ -52,7 +52,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     source = args.flare / FLARE if args.flare.is_dir() else args.flare
     check_no_overwrite([source], [args.out])
     look = read(source)
-    edits = LookEdits.parse(args.edit_texts, look.names, look.element_names)
+    edits = LookEdits.parse([*look.edits.texts(), *args.edit_texts], look.names, look.element_names)
     capture = Capture.open(folder, need_frames=False)
     if args.flare.is_dir():
         capture = capture.with_exposures(Run.open(args.flare).exposures)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -177,7 +178,13 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     if args.jobs != 1:
         extra = ["--shot", str(targets.shot_path(options))] if targets.is_blend(options) else []
         jobs.run_jobs(args, step, [frame.number for frame in selected], progress, extra)
-    record = transfer.bake(args.out, selected, layers.bake_settings(args), progress, overwrite=args.overwrite)
+    bake_settings = layers.bake_settings(args)
+    sources = {light.name: light.source for frame in target.frames for light in frame.shot.lights}
+    stored = () if targets.is_shot_file(options) else transfer.look.edits.placed(sources).texts()
+    if stored:
+        progress.say(f"The edits that {flare} stores are applied: {', '.join(stored)}.")
+        bake_settings = replace(bake_settings, edits=(*stored, *bake_settings.edits))
+    record = transfer.bake(args.out, selected, bake_settings, progress, overwrite=args.overwrite)
     return layers.report_layers(selected, args.out, len(record["frames"]), progress, targets.left_out(options, target))
 
 

@@ -145,6 +145,6 @@ def test_area_lights_flare_as_areas(facts: Any) -> None:
     assert facts["half hidden"] == pytest.approx(0.5, abs=0.06)
     assert facts["from behind"] == 0
     assert facts["as a point"]
-    assert facts["as a sphere"] == ["sphere", 0.5]
+    assert facts["as a sphere"] == ["sphere", pytest.approx(0.5)]
     assert facts["as a mesh"] == ["points", [4, 0, 1]]
     assert "choose Point as its extent" in facts["an area of nothing"]

@@ -660,3 +660,28 @@ def test_the_source_query_lies_within_the_trained_range(tmp_path: Path) -> None:
     found, reach = network_query(light, far, "source").light, light.query_range.light_high
     assert np.linalg.norm(found) <= reach[2] + 1e-5
     assert (np.abs(found) <= reach[:2] + 1e-5).all()
+
+
+def test_a_flare_stores_edits_of_its_lights(tmp_path: Path) -> None:
+    from core.look.look import write_annotated
+
+    saved(tmp_path / "a.flare")
+    plain = read(tmp_path / "a.flare")
+    first, second = plain.names
+    part = plain.lights[0].elements[0].name
+    edits = LookEdits.parse(["*.intensity=2", f"{first}.rotation=30", f"{second}.mute=1", f"{first}/{part}.scale=1.5"],
+                            plain.names, plain.element_names)
+    write_annotated(tmp_path / "a.flare", tmp_path / "b.flare", notes="", licence="", edits=edits)
+    look = read(tmp_path / "b.flare")
+    assert plain.edits.is_neutral
+    assert sorted(look.edits.texts()) == sorted(edits.texts())
+    placed = look.edits.placed({"key": first, "rim": first, "moon": second})
+    assert placed.lights["key"] == placed.lights["rim"] == edits.lights[first]
+    assert placed.lights["moon"].mute and placed.elements["rim", part].scale == 1.5 and placed.master == edits.master
+    tensors, metadata = read_tensors(tmp_path / "b.flare")
+    for wrong in ('["nobody.intensity=2"]', "[1]", '"text"'):
+        stored = json.loads(metadata["fit_flare"]) | {"edits": json.loads(wrong)}
+        rewrite_metadata(tmp_path / "b.flare", tmp_path / "c.flare", {"fit_flare": json.dumps(stored)})
+        with pytest.raises(FlareFileError, match="damaged"):
+            _ = read(tmp_path / "c.flare").edits
+    assert len(tensors) > 2

@@ -268,3 +268,23 @@ def test_the_animated_camera_of_a_blend_is_a_capture(run: Run, blend: Path, tmp_
     pixels, _ = found.views[0].camera.project(found.lights[0].xyz)
     np.testing.assert_allclose(pixels[0], (48 + 96 * 50 / 36 * 0.1, 27 - 96 * 50 / 36 * 0.12), atol=1e-3)
     assert found.frame(found.views[2]).display()[0, 0, 0] == pytest.approx(0.3, abs=0.01)
+
+
+def test_edits_that_a_flare_stores_are_applied_and_named(run: Run, tmp_path: Path) -> None:
+    from core.look import LookEdits
+    from core.look.look import write_annotated
+
+    save_flare(tmp_path / "plain.flare", FlareFile(some_flare(count=20, lights=1), "add",
+                                                   TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5)))
+    look = read(tmp_path / "plain.flare")
+    write_annotated(tmp_path / "plain.flare", tmp_path / "edited.flare", notes="", licence="",
+                    edits=LookEdits.parse([f"{look.names[0]}.intensity=0.25"], look.names))
+    write_png(tmp_path / "plate.png", np.zeros((40, 64, 3), np.float32))
+    light, said = {}, {}
+    for name in ("plain", "edited"):
+        events = run("transfer", tmp_path / f"{name}.flare", "--to", tmp_path / "plate.png", "--light", "20,12",
+                     "--query", "source", "--out", tmp_path / name)
+        light[name] = read_layers(next((tmp_path / name).glob("layers.*.exr"))).flare.sum()
+        said[name] = [event["text"] for event in events if "stores are applied" in event.get("text", "")]
+    assert light["edited"] == pytest.approx(0.25 * light["plain"], rel=2e-3) and light["plain"] > 0
+    assert said["plain"] == [] and "intensity=0.25" in said["edited"][0]

@@ -418,8 +418,7 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
 
 
 def has_display_footage(camera: Any) -> bool:
-    """Return whether footage is shown behind or before a camera that Blender does not put through the view transform.
-    """
+    """Return whether a camera shows footage, behind or in front of the scene, that bypasses the view transform."""
     if not camera.data.show_background_images:
         return False
     return any(back.alpha > 0 and not (back.source == "IMAGE" and back.image is not None

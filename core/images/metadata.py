@@ -46,17 +46,16 @@ _CLAIMS = ("http://ns.adobe.com/hdr-gain-map/1.0/", "http://ns.google.com/photos
 
 
 def copy_metadata(encoded: bytes, source: Path, *, has_alpha: bool) -> bytes:
-    """Return an encoded PNG, JPEG or TIFF with what describes the picture in `source`, where that is of the same
-    format."""
+    """Return an encoded PNG, JPEG or TIFF with the metadata of `source`, if that has the same format."""
     data = read_bytes(source)
     if encoded[:2] == b"\xff\xd8" == data[:2]:
         return _copy_to_jpeg(encoded, data)
     if encoded[:8] == png.SIGNATURE == data[:8]:
-        was_grey, is_grey = (not header[25] & 2 for header in (data, encoded))
+        was_grey, is_grey = (not header[_COLOUR_TYPE_OFFSET] & 2 for header in (data, encoded))
         left_out = (b"iCCP",) if was_grey != is_grey else ()
         chunks = b"".join(png.make_chunk(name, content) for name, content in png.chunks(io.BytesIO(data), KEPT_CHUNKS)
                           if name not in left_out)
-        return encoded[:33] + chunks + encoded[33:]  # behind the header chunk
+        return encoded[:_HEADER_END] + chunks + encoded[_HEADER_END:]
     if encoded[:4] in (b"II*\0", b"MM\0*") and data[:4] in (b"II*\0", b"MM\0*"):
         return _copy_to_tiff(encoded, data, has_alpha)
     return encoded

@@ -120,8 +120,8 @@ def remove_file(path: Path) -> None:
 def remove_folder(folder: Path) -> None:
     """Remove a folder if it exists, with its contents.
 
-    It disappears as a whole, or OSError is raised and it is unchanged, since Windows has a file of it in use. Contents
-    that cannot be deleted after the folder was moved aside are deleted by the next call.
+    It disappears as a whole. Where a file of it is in use on Windows, it stays unchanged and OSError is raised.
+    Contents that cannot be deleted after the folder was moved aside are deleted by the next call.
     """
     for old in folder.parent.glob(f"{glob.escape(folder.name)}{_TRASH}*"):
         shutil.rmtree(old, ignore_errors=True)

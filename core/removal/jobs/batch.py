@@ -24,7 +24,7 @@ from ...system.progress import Progress
 from ...system.tally import Tally, list_first
 from ..inference.neighbours import ShotPredictor, shot_sort_key
 from ..inference.remover import Remover
-from .clean_frames import CleanFrame, WriteFn, write_clean_frames
+from .clean_frames import CleanFrame, PreparedResults, write_clean_frames
 from .manifest import MANIFEST, Manifest, digest_inputs
 from .mattes import Mattes
 from .video_frames import VIDEO_MANIFEST
@@ -159,20 +159,19 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         matte = [mattes.path(frame.name)] if mattes else []
         return digest_inputs(remover.cache_key, [frame.source, *predictor.dependencies(frame.source), *matte])
 
-    def clean(frame: CleanFrame) -> WriteFn:
-        """Predict a plate's flare; return the function that writes its results."""
+    def clean(frame: CleanFrame) -> PreparedResults:
+        """Predict a plate's flare, and prepare its results."""
         plate, prediction = predictor.predict(frame.source)
         matte = mattes.read(frame.name, read_data_window(frame.source), read_exif(frame.source)[0]) if mattes else None
 
-        def write() -> float | None:
+        def write() -> None:
             (_, first), *others = split_views(plate)  # the eyes of a stereo picture; the first one is predicted above
             cleaned = [remover.remove(first, matte, prediction), *(remover.remove(view, matte) for _, view in others)]
             write_view_results(frame.results, plate, cleaned)
             if plate.warning:
                 progress.say(plate.warning)
-            return float(prediction.confidence) if matte is None else None
 
-        return write
+        return PreparedResults(write, float(prediction.confidence) if matte is None else None)
 
     def leave_out(frame: CleanFrame, error: Exception) -> None:
         """Note a plate that cannot be cleaned; raise an error that concerns all plates."""

@@ -19,7 +19,7 @@ from ...system.files import retry_while_locked, safe_join
 from ...system.progress import Progress
 from ..inference.neighbours import ShotPredictor, shot_sort_key
 from ..inference.remover import Remover
-from .clean_frames import CleanFrame, WriteFn, write_clean_frames
+from .clean_frames import CleanFrame, PreparedResults, write_clean_frames
 from .manifest import Manifest, digest_inputs
 
 UNFINISHED_FOLDER = "removed.unfinished"
@@ -55,13 +55,14 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress,
         settings = f"{remover.cache_key} flared" if frame.name in with_flare else remover.cache_key
         return digest_inputs(settings, [frame.source, *predictor.dependencies(frame.source)])
 
-    def clean(frame: CleanFrame) -> WriteFn:
+    def clean(frame: CleanFrame) -> PreparedResults:
         plate, prediction = predictor.predict(frame.source)
         if frame.name in with_flare:
             prediction = prediction._replace(confidence=np.float32(1))
         (_, first), *others = split_views(plate)
-        return lambda: write_view_results(frame.results, plate, [
-            remover.remove(first, prediction=prediction), *(remover.remove(view) for _, view in others)])
+        return PreparedResults(lambda: write_view_results(frame.results, plate, [
+            remover.remove(first, prediction=prediction), *(remover.remove(view) for _, view in others)]),
+            float(prediction.confidence))
 
     try:
         write_clean_frames(frames, Manifest(work), progress, digest=digest, clean=clean, keep_finished=True,

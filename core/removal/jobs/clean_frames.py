@@ -14,10 +14,6 @@ from typing import NamedTuple
 from ...system.progress import Progress
 from .manifest import KeepReason, Manifest
 
-WriteFn = Callable[[], float | None]
-"""Writes the results of a frame; returns the confidence that its flare is one, 0..1, or None where nothing judged it.
-"""
-
 
 class CleanFrame(NamedTuple):
     """One frame to clean.
@@ -31,15 +27,25 @@ class CleanFrame(NamedTuple):
     results: list[Path]
 
 
+class PreparedResults(NamedTuple):
+    """The results of a frame before they are written.
+
+    write: writes them. confidence: that the removed flare is a flare, 0..1; None where nothing judged it.
+    """
+
+    write: Callable[[], None]
+    confidence: float | None = None
+
+
 def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progress: Progress, *,
-                       digest: Callable[[CleanFrame], str], clean: Callable[[CleanFrame], WriteFn],
+                       digest: Callable[[CleanFrame], str], clean: Callable[[CleanFrame], PreparedResults],
                        keep_finished: bool, overwrite: bool,
                        on_error: Callable[[CleanFrame, Exception], None] | None = None
                        ) -> tuple[int, Counter[KeepReason]]:
     """Write every frame that is not finished; return how many were written, and how many were kept for which reason.
 
-    digest: a text that changes whenever the result would (`digest_inputs`). clean: reads and cleans a frame and returns
-    a function that writes its results (`WriteFn`); nothing is deleted if it raises. keep_finished: keep results that
+    digest: a text that changes whenever the result would (`digest_inputs`). clean: reads and cleans a frame;
+    nothing is deleted if it raises. keep_finished: keep results that
     are up to date, and edited ones unless `overwrite`. overwrite: replace files that are not in the manifest or were
     edited.
     on_error: called with an exception; it raises it, or returns so that the next frame follows. Without it the first
@@ -53,10 +59,10 @@ def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progres
             if reason is not None and not (overwrite and reason == "edited"):
                 kept_counts[reason] += 1
             else:
-                write = clean(frame)
-                manifest.begin(frame.name, frame.source, key, frame.results, overwrite)
-                confidence = write()
-                manifest.finish(frame.results, None if confidence is None else {frame.name: confidence})
+                prepared = clean(frame)
+                manifest.begin(frame.name, frame.source, key, frame.results, overwrite, prepared.confidence)
+                prepared.write()
+                manifest.finish(frame.results)
                 written += 1
         except Exception as error:
             if on_error is None:

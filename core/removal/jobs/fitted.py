@@ -31,7 +31,7 @@ from ...system.files import check_no_overwrite, safe_join
 from ...system.least_squares import robust_bounded_fit
 from ...system.progress import Progress
 from ..inference.plate_light import CLIPPING_LEVEL
-from .clean_frames import CleanFrame, WriteFn, write_clean_frames
+from .clean_frames import CleanFrame, PreparedResults, write_clean_frames
 from .manifest import Manifest, digest_inputs
 
 MAX_SAMPLES = 100_000
@@ -74,14 +74,14 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
         camera = views_by_name[frame.name].camera
         return digest_inputs(repr((fit_digest, camera.numbers, lights)), [frame.source])
 
-    def clean(frame: CleanFrame) -> WriteFn:
+    def clean(frame: CleanFrame) -> PreparedResults:
         plate, codes, flare, gains = _clean_view(renderer, capture, views_by_name[frame.name], above_white)
 
         def write() -> None:
             write_results(frame.results, plate, codes, flare)
             dim.update(light for light, gain in gains.items() if gain < DIM_FLARE)
 
-        return write
+        return PreparedResults(write)
 
     written, kept = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
                                        keep_finished=not overwrite, overwrite=overwrite)

@@ -73,8 +73,11 @@ class Manifest:
                      and tables["sources"].get(name.as_posix()) == content_hash(source))
         return "edited" if is_edited else None
 
-    def begin(self, name: Path, source: Path, digest: str, results: Sequence[Path], overwrite: bool) -> None:
+    def begin(self, name: Path, source: Path, digest: str, results: Sequence[Path], overwrite: bool,
+              confidence: float | None = None) -> None:
         """Enter a frame before its files are written, and delete those that were made with another digest.
+
+        confidence: that its flare is one, 0..1; None where nothing judged it.
 
         A process that is killed afterwards leaves no old file under the new digest. Raises FrameError for a file that
         the manifest does not list or that was edited, unless `overwrite`.
@@ -96,19 +99,19 @@ class Manifest:
             for path in results:
                 new["written"].pop(_relative_path(self._folder, path), None)
             new["confidence"].pop(key, None)
+            if confidence is not None:
+                new["confidence"][key] = f"{confidence:.2f}"
             for path, table in zip(results, ("plates", "flares_made"), strict=False):
                 if old[table].get(key) != digest:
                     remove_file(path)
             if new != old:
                 self._write(new)
 
-    def finish(self, results: Sequence[Path], confidence: dict[Path, float] | None = None) -> None:
-        """Enter the content of a frame's files after they were written; confidence: of its flare, by the frame."""
+    def finish(self, results: Sequence[Path]) -> None:
+        """Enter the content of a frame's files after they were written."""
         with file_lock(self._folder / LOCK):
             tables = self._read()
             tables["written"] |= {_relative_path(self._folder, path): content_hash(path) for path in results}
-            for name, value in (confidence or {}).items():
-                tables["confidence"][name.as_posix()] = f"{value:.2f}"
             self._write(tables)
 
     def confidence(self, names: Iterable[Path]) -> dict[str, float]:

@@ -14,7 +14,7 @@ from ..images.listing import SUFFIXES, pictures_below, pictures_in
 from ..system.file_names import canonical_name, find_entry
 from ..system.files import safe_join
 
-_SUFFIX_ORDER = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
+_SUFFIX_ORDER = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".jfif", ".jpe")
 """Suffixes in the order in which they are tried where a name's own is not there: the deepest first."""
 _SUFFIXES = (*_SUFFIX_ORDER, *sorted(SUFFIXES - set(_SUFFIX_ORDER)))
 

@@ -28,6 +28,7 @@ from .decoders import Description, describe, file_kind
 from .exr import foreign_strings, has_chroma, missing_rgb, read_exr_parts, read_luminance_chroma
 from .formats import png, tiff
 from .formats.exif import upright_block
+from .formats.kinds import JPEG_SUFFIXES
 from .formats.kinds import SUFFIXES as SUFFIX_KINDS
 from .listing import SUFFIXES
 from .metadata import copy_metadata, dropped_parts, with_colour_chunks, with_description
@@ -43,7 +44,7 @@ _UNWRITTEN = ("heif", "avif", "jxl", "jp2", "gif", "psd")
 """Formats whose clean plates are PNG."""
 _DESCRIBED_ELSEWHERE = ("png", "jpeg", "tiff", "exr", "")
 _JPEG_QUALITY = 97
-_JPEGS, _TIFFS = (".jpg", ".jpeg"), (".tif", ".tiff")
+_JPEGS, _TIFFS = JPEG_SUFFIXES, (".tif", ".tiff")
 _DEPTHS: dict[str, tuple[type, ...]] = {".png": (np.uint8, np.uint16), **dict.fromkeys(_JPEGS, (np.uint8,))}
 """Pixel types by suffix, for formats that cannot hold every plate; OpenCV would convert others to 8 bit silently."""
 
@@ -322,7 +323,8 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
     stored: NDArray[Any] = codes[..., 0] if plate.grey and plate.alpha is None else codes[..., ::-1]
     if plate.alpha is not None:
         stored = np.concatenate([stored, plate.alpha[..., None]], -1)
-    done, data = cv2.imencode(suffix, np.ascontiguousarray(stored), _encoder_options(suffix, codes.dtype))
+    done, data = cv2.imencode(".jpg" if suffix in _JPEGS else suffix, np.ascontiguousarray(stored),
+                              _encoder_options(suffix, codes.dtype))
     if not done:
         raise FrameError(f"{path} could not be encoded as {suffix[1:].upper()}.")
     encoded = copy_metadata(data.tobytes(), plate.path, has_alpha=plate.alpha is not None)

@@ -5,7 +5,6 @@ Libraries are imported where they are used, because Blender's own Python has few
 """
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -177,7 +176,7 @@ def decode(path: Path, flags: int) -> NDArray[Any] | None:
     import cv2
 
     data = read_bytes(path)
-    if png.is_truncated(io.BytesIO(data)):
+    if png.is_truncated(data):
         return None
     if data[:4] in (b"II*\0", b"MM\0*"):
         data = tiff.without_reader_changes(data)

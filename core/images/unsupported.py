@@ -56,13 +56,14 @@ def unsupported_reason(path: Path) -> str:
 
 def needs_openimageio(path: Path) -> bool:
     """True for a TIFF that OpenCV decodes as something else, or not at all: BigTIFF, 16 bit floats, 16 bit planes, 0
-    for white, grey with alpha, and compressions that it is built without."""
+    for white, grey with alpha, other depths than 8 and 16 bits, and compressions that it is built without."""
     with open_regular(path) as stream:
         if stream.read(4) in tiff.BIG_TIFF:
             return True
         tags = _tags(stream)
     bits, samples = tags.get(tiff.BITS, 1), tags.get(tiff.SAMPLES, 1)
-    return (tags.get(tiff.COMPRESSION) in tiff.UNSUPPORTED_COMPRESSIONS or samples == 2
+    return (bits not in (1, 8, 16, 32, 64) or samples == 2
+            or tags.get(tiff.COMPRESSION) in tiff.UNSUPPORTED_COMPRESSIONS
             or (bits, tags.get(tiff.SAMPLE_FORMAT)) == (16, tiff.FLOATS)
             or (bits > 8 and (tags.get(tiff.PHOTOMETRIC) == tiff.WHITE_IS_0
                               or (tags.get(tiff.PLANES) == tiff.PLANAR and samples > 1))))

@@ -148,6 +148,8 @@ WRITERS: dict[str, tuple[str, str, Callable[[Path, NDArray[np.float32]], None]]]
     "half TIFF": ("a.tif", "", lambda path, light: by_oiio(path, light, oiio.HALF)),
     "planar TIFF": ("a.tif", "", lambda path, light: by_oiio(path, _encoded(light, "srgb"), oiio.UINT16,
                                                              {"planarconfig": "separate"})),
+    "10 bit TIFF": ("a.tif", "", lambda path, light: by_oiio(path, _encoded(light, "srgb"), oiio.UINT16,
+                                                             {"oiio:BitsPerSample": 10})),
     "BigTIFF": ("a.tif", "", lambda path, light: by_oiio(path, _encoded(light, "srgb"), oiio.UINT16,
                                                          {"tiff:bigtiff": 1})),
     "JPEG 2000": ("a.jp2", "", lambda path, light: path.write_bytes(cv2.imencode(".jp2", (

@@ -81,6 +81,15 @@ def test_a_file_is_read_as_what_it_is_not_as_it_is_named(tmp_path: Path) -> None
     np.testing.assert_allclose(read_picture(named).linear().mean(), scene().mean(), rtol=0.01)
 
 
+def test_a_jpeg_of_a_browser_is_a_jpeg(tmp_path: Path) -> None:
+    """Windows names them .jfif."""
+    path, _ = write("P3 JPEG", tmp_path, scene())
+    named = path.rename(tmp_path / "a.jfif")
+    plate = read_plate(named)
+    write_plate(tmp_path / "b.jfif", plate, plate.codes // 2)
+    np.testing.assert_allclose(read_plate(tmp_path / "b.jfif").codes.mean(), plate.codes.mean() / 2, rtol=0.01)
+
+
 def test_a_jpeg_whose_data_end_early_or_are_corrupt_is_refused(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (96, 128, 3)).astype(np.uint8)
     data = cv2.imencode(".jpg", noise)[1].tobytes()

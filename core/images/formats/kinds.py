@@ -10,12 +10,15 @@ Kind = Literal["png", "jpeg", "tiff", "exr", "webp", "dpx", "cineon", "psd", "bm
 HEAD_BYTES = 32
 """First bytes of a file that `kind_of` needs."""
 SUFFIXES: dict[str, Kind] = {
-    ".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".tif": "tiff", ".tiff": "tiff", ".exr": "exr",
+    ".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".jfif": "jpeg", ".jpe": "jpeg", ".tif": "tiff", ".tiff": "tiff",
+    ".exr": "exr",
     ".webp": "webp", ".dpx": "dpx", ".cin": "cineon", ".psd": "psd", ".psb": "psd", ".bmp": "bmp", ".hdr": "hdr",
     ".tga": "tga", ".gif": "gif", ".jp2": "jp2", ".j2k": "jp2", ".j2c": "jp2", ".jxl": "jxl", ".heic": "heif",
     ".heif": "heif", ".hif": "heif", ".avif": "avif",
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"), "raw")}
 """The formats that are read, by suffix in lower case."""
+JPEG_SUFFIXES = tuple(suffix for suffix, kind in SUFFIXES.items() if kind == "jpeg")
+"""Suffixes of JPEGs; Windows names those of its browsers .jfif."""
 _MAGIC: tuple[tuple[bytes, Kind], ...] = (
     (b"\x89PNG\r\n\x1a\n", "png"), (b"\xff\xd8", "jpeg"), (b"\x76\x2f\x31\x01", "exr"), (b"SDPX", "dpx"),
     (b"XPDS", "dpx"), (b"\x80\x2a\x5f\xd7", "cineon"), (b"\xd7\x5f\x2a\x80", "cineon"), (b"8BPS", "psd"),

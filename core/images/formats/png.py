@@ -2,7 +2,6 @@
 """Reads and makes the chunks of a PNG (PNG specification, chapter 5): metadata beside the pixels."""
 from __future__ import annotations
 
-import os
 import zlib
 from collections.abc import Container, Iterator
 from typing import BinaryIO
@@ -28,17 +27,19 @@ def chunks(stream: BinaryIO, names: Container[bytes], *, before_pixels: bool = F
             yield name, content
 
 
-def is_truncated(stream: BinaryIO) -> bool:
-    """True if a chunk of a PNG claims more than the file holds.
+def is_truncated(data: bytes) -> bool:
+    """True if a chunk of a PNG claims more than the file holds; False for other files.
 
     OpenCV allocates as much as a chunk claims, gigabytes for a damaged length in a small file.
     """
-    end = stream.seek(0, os.SEEK_END)
-    for name, length in _chunk_headers(stream):
-        if stream.tell() + length + 4 > end:
+    at, end = len(SIGNATURE), len(data) if data.startswith(SIGNATURE) else 0
+    while at + 8 <= end:
+        after = at + 12 + int.from_bytes(data[at:at + 4], "big")
+        if after > end:
             return True
-        if name == b"IEND":  # what follows is no part of it
-            break
+        if data[at + 4:at + 8] == b"IEND":  # what follows is no part of it
+            return False
+        at = after
     return False
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...capture import REMOVED, Capture
 from ...errors import CaptureError
+from ...images.formats.kinds import JPEG_SUFFIXES
 from ...images.plates import clean_name
 from ...images.views import split_views, write_view_results
 from ...system.files import retry_while_locked, safe_join
@@ -24,7 +25,6 @@ from .manifest import Manifest, digest_inputs
 
 UNFINISHED_FOLDER = "removed.unfinished"
 """Holds the clean frames until all exist: an incomplete removed/ would be read as a complete one."""
-_JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 
 
 def clean_capture(capture: Capture, remover: Remover, progress: Progress,
@@ -88,7 +88,7 @@ def _clean_names(capture: Capture) -> dict[str, Path]:
     views: dict[str, str] = {}
     for view in capture.views:
         name = Path(view.name)
-        name = name.with_suffix(".png") if name.suffix.lower() in _JPEG_SUFFIXES else clean_name(name)
+        name = name.with_suffix(".png") if name.suffix.lower() in JPEG_SUFFIXES else clean_name(name)
         key = name.as_posix().casefold()
         if key in views:
             raise CaptureError(f"The frames {views[key]} and {view.name} of {capture.folder} would both have "

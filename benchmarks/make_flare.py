@@ -77,7 +77,7 @@ def main() -> int:
             print(problem, file=sys.stderr)
             continue
         traced = trace(settings, setup, spread_places(settings), progress, "trace")
-        model = fit_traced(settings, traced, progress)
+        model = fit_traced(settings, setup, traced, progress)
         seconds = time.monotonic() - began
         path = trace(settings, setup, path_places(settings), progress, "measure")
         progress.close()

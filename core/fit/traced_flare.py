@@ -38,6 +38,7 @@ from ..system.processes import available_cores
 from ..system.progress import Progress
 from .optimisers import FlareOptimisers
 from .settings import FitSettings, preset
+from .traced_ghosts import measure_ghosts, start_at_ghosts
 from .traced_settings import REFERENCE_REACH, TracedFlareSettings
 
 Pictures = NDArray[np.float32]
@@ -55,8 +56,11 @@ PROBES = (0.15, 0.12), (-0.4, 0.3), (0.6, -0.5), (0.85, 0.8), (-0.1, -0.8), (-0.
 """Places of the light at which the level of the ghosts is measured, relative to the frame's half width and height."""
 PLACE_STEPS = 0.7548776662, 0.5698402910
 """Steps of the R2 sequence (Roberts 2018): 1 / g and 1 / g^2, g the plastic number."""
-SHARE_AT_LIGHT = 0.4
-"""Share of the initial Gaussians that lie about the light, as rays."""
+CENTRE_POWER = 1.5
+"""Power of a place's distance from the centre, against an even spread: 1 is even."""
+SHARE_AT_LIGHT, SHARE_AT_GHOSTS = 0.35, 0.55
+"""Shares of the initial Gaussians that lie about the light, as rays, and in the ghosts; the others are spread along the
+line."""
 RAY_LENGTHS = 0.004, 0.9
 """Smallest and largest distance of the rays from the light, relative to half the frame's width."""
 CORE_GAUSSIANS, CORE_SIZES, CORE_OPACITY = 24, (0.3, 4.0), 0.2
@@ -95,7 +99,7 @@ def make_flare(settings: TracedFlareSettings, out: Path, progress: Progress, *, 
     settings = settings.validated()
     camera, setup = traced_camera(settings), exposed_setup(settings)
     traced = trace(settings, setup, spread_places(settings), progress, "trace")
-    model = fit_traced(settings, traced, progress)
+    model = fit_traced(settings, setup, traced, progress)
     path = trace(settings, setup, path_places(settings), progress, "measure")
     errors = relative_errors(model, camera, path)
     write_flare(out, model, camera, traced.places, notes or describe(settings), licence)
@@ -144,9 +148,13 @@ def _in_frame(settings: TracedFlareSettings, fractions: Sequence[Sequence[float]
 
 
 def spread_places(settings: TracedFlareSettings) -> Places:
-    """Return places (n, 2) of the light, spread evenly over the frame and beyond it, normalised coordinates."""
+    """Return places (n, 2) of the light, spread over the frame and beyond it, normalised coordinates.
+
+    They are denser towards the centre, where ghosts lie over each other and change fastest."""
     numbers = np.arange(1, settings.tracing.positions + 1)[:, None] * np.array(PLACE_STEPS)
-    return _in_frame(settings, (numbers % 1 * 2 - 1) * settings.tracing.field)
+    even = numbers % 1 * 2 - 1
+    far = np.abs(even).max(1, keepdims=True)
+    return _in_frame(settings, even * far ** (CENTRE_POWER - 1) * settings.tracing.field)
 
 
 def path_places(settings: TracedFlareSettings) -> Places:
@@ -186,13 +194,15 @@ def _fit_settings(settings: TracedFlareSettings) -> FitSettings:
                                        opacity=0.02))
 
 
-def fit_traced(settings: TracedFlareSettings, traced: TracedPictures, progress: Progress) -> FlareModel:
-    """Fit a flare model to traced pictures; the same settings and pictures give the same model."""
+def fit_traced(settings: TracedFlareSettings, setup: LensSetup, traced: TracedPictures, progress: Progress
+               ) -> FlareModel:
+    """Fit a flare model to traced pictures; the same settings and pictures give the same model. setup: of the tracer.
+    """
     fit = _fit_settings(settings)
     generator = torch.Generator().manual_seed(settings.fit.seed)
     with torch.random.fork_rng():
         torch.manual_seed(settings.fit.seed)
-        model = _new_model(settings, fit, traced, generator)
+        model = _new_model(settings, setup, fit, traced, generator)
     flare, camera = model.lights[0], traced_camera(settings)
     optimisers = FlareOptimisers(model, fit.flare.rates)
     names = {name: next(key for key in optimisers.dense.parameters if key.endswith(f"gaussians.{name}"))
@@ -218,19 +228,25 @@ def fit_traced(settings: TracedFlareSettings, traced: TracedPictures, progress: 
     return model
 
 
-def _new_model(settings: TracedFlareSettings, fit: FitSettings, traced: TracedPictures, generator: torch.Generator
-               ) -> FlareModel:
+def _new_model(settings: TracedFlareSettings, setup: LensSetup, fit: FitSettings, traced: TracedPictures,
+               generator: torch.Generator) -> FlareModel:
     """Return the model before the fit, with the light on the camera's axis."""
     cameras = torch.tensor([[-CAMERA_RANGE] * 3, [CAMERA_RANGE] * 3])
     corner = math.hypot(settings.reach, settings.reach * settings.height / settings.tracing.width)
     query_range = QueryRange.of(cameras, torch.tensor(traced.places, dtype=torch.float32), corner)
     flare = LightFlare(fit.flare.form, query_range, fit.flare.count, generator, fit.flare.opacity)
-    _start_at_light(flare, settings.reach, 2 * settings.reach / settings.tracing.width, generator)
+    order = torch.randperm(flare.count, generator=generator)
+    at_light, at_ghosts = (round(flare.count * share) for share in (SHARE_AT_LIGHT, SHARE_AT_GHOSTS))
+    _start_at_light(flare, order[:at_light], settings.reach, 2 * settings.reach / settings.tracing.width, generator)
+    if setup.ghosts.count:
+        ghosts = measure_ghosts(setup, traced_camera(settings), _in_frame(settings, PROBES), settings.colour)
+        start_at_ghosts(flare, order[at_light:at_light + at_ghosts], ghosts, generator)
     return FlareModel([LIGHT], torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), [flare])
 
 
-def _start_at_light(flare: LightFlare, reach: float, pixel: float, generator: torch.Generator) -> None:
-    """Move a share of the initial Gaussians to the light, as rays of log-uniform length, and scale all to the frame.
+def _start_at_light(flare: LightFlare, chosen: Tensor, reach: float, pixel: float, generator: torch.Generator) -> None:
+    """Move the chosen rows of the initial Gaussians to the light, as rays of log-uniform length, and scale all to the
+    frame.
 
     Starburst and glow have most of a flare's light and stay at the light, where few of the Gaussians along the line
     would lie. reach: half the frame's width, pixel: width of a pixel of the traced pictures, normalised coordinates.
@@ -238,7 +254,6 @@ def _start_at_light(flare: LightFlare, reach: float, pixel: float, generator: to
     rows = flare.gaussians
     with torch.no_grad():
         rows["log_scales"] += math.log(reach / REFERENCE_REACH)
-        chosen = torch.randperm(flare.count, generator=generator)[:round(flare.count * SHARE_AT_LIGHT)]
         low, high = (math.log(bound) for bound in RAY_LENGTHS)
         distance = torch.exp(low + (high - low) * torch.rand(len(chosen), generator=generator)) * reach
         angle = 2 * math.pi * torch.rand(len(chosen), generator=generator)

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Measures each ghost of a lens, and starts the Gaussians of a fit at the ghosts; called by `traced_flare`.
+
+A fit that starts with Gaussians spread along the line misses small ghosts: no Gaussian lies near enough to them to
+learn. Each ghost is therefore drawn alone for some places of the light, which gives its place on the line, size,
+brightness and colour.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..conventions.splatting import C0
+from ..flare.model import LightFlare
+from ..optics.flare import Camera, LensSetup, build_optics
+from ..optics.ghosts import draw_ghosts
+
+Floats = NDArray[np.float64]
+
+CANVAS_WIDTH, CANVAS_REACH = 192, 3.0
+"""Width of the pictures of single ghosts, pixels, and their field relative to the frame's."""
+MIN_LIGHT = 1e-9
+"""Total light of a ghost over the frame below which it counts as absent."""
+ENERGY_POWER = 0.35
+"""Power of a ghost's light over the frame by which Gaussians are shared among ghosts."""
+MIN_SHARE, MAX_SHARE = 0.008, 0.15
+"""Range of the share of a ghost."""
+OVERLAP = 0.75
+"""Standard deviation of a Gaussian in a ghost, relative to the distance of its neighbours."""
+OPACITIES = 0.002, 0.3
+"""Range of the first opacities."""
+
+
+@dataclass(frozen=True)
+class MeasuredGhost:
+    """A ghost, averaged over places of the light. place: on the line, 0 at the principal point and 1 at the light.
+    radius: normalised coordinates. level: linear RGB inside it. light: its root mean square over the frame."""
+
+    place: float
+    radius: float
+    level: tuple[float, float, float]
+    light: float
+
+
+def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Sequence[float]) -> list[MeasuredGhost]:
+    """Return the ghosts of a setup that reach the frame, the brightest first; lights (n, 2): normalised coordinates."""
+    optics, pairs = build_optics(setup)
+    height = round(CANVAS_WIDTH * camera.height / camera.width)
+    scale = CANVAS_WIDTH / CANVAS_REACH / camera.width
+    focal, centre = (camera.fx * scale, camera.fy * scale), (CANVAS_WIDTH / 2, height / 2)
+    x, y = np.meshgrid((np.arange(CANVAS_WIDTH) + 0.5 - centre[0]) / focal[0],
+                       (np.arange(height) + 0.5 - centre[1]) / focal[1])
+    is_in_frame = (abs(x) < camera.width / 2 / camera.fx) & (abs(y) < camera.height / 2 / camera.fy)
+    drawing = replace(setup.ghosts, bands=min(setup.ghosts.bands, 3), supersample=1)
+    ghosts = []
+    for pair in pairs:
+        seen, weights = [], []
+        for light in lights:
+            picture = draw_ghosts(optics, [pair], drawing, (light[0] / setup.squeeze, light[1]),
+                                  (focal[0] * setup.squeeze, focal[1]), centre, CANVAS_WIDTH, height)
+            picture = picture.astype(np.float64) * np.asarray(colour)
+            inside = math.sqrt(float(np.square(picture[is_in_frame]).mean()))
+            total = picture.sum(-1)
+            if inside <= MIN_LIGHT or total.sum() <= 0:
+                continue
+            share = total / total.sum()
+            middle = np.array([(share * x).sum(), (share * y).sum()])
+            variance = float((share * ((x - middle[0]) ** 2 + (y - middle[1]) ** 2)).sum()) / 2
+            mean_level = (picture * share[..., None]).sum((0, 1))
+            seen.append([middle @ light, light @ light, variance, *mean_level])
+            weights.append(inside)
+        if seen:
+            rows, mix = np.array(seen), np.array(weights)
+            along, squared, variance, *level = (mix[:, None] * rows).sum(0) / mix.sum()
+            pixel = 0.5 / focal[0]
+            ghosts.append(MeasuredGhost(float(along / max(squared, 1e-12)), 2 * math.sqrt(max(variance, pixel**2)),
+                                        (level[0], level[1], level[2]), float(np.sqrt((mix**2).sum() / len(lights)))))
+    return sorted(ghosts, key=lambda ghost: -ghost.light)
+
+
+def start_at_ghosts(flare: LightFlare, rows: torch.Tensor, ghosts: Sequence[MeasuredGhost],
+                    generator: torch.Generator) -> None:
+    """Move the Gaussians of these rows to the ghosts, as even discs; each ghost has a latent code of its own.
+
+    The last two numbers of a code are the Gaussian's place in the ghost, so that the network can move, stretch and clip
+    a ghost as one. Rows that remain keep their places.
+    """
+    if not ghosts or not len(rows):
+        return
+    shares = np.array([ghost.light for ghost in ghosts]) ** ENERGY_POWER
+    shares = np.clip(shares / shares.sum(), MIN_SHARE, MAX_SHARE)
+    counts = np.floor(shares / max(shares.sum(), 1.0) * len(rows)).astype(int)
+    parts = torch.split(rows[:int(counts.sum())], counts.tolist())
+    table = flare.gaussians
+    with torch.no_grad():
+        for ghost, part in zip(ghosts, parts, strict=True):
+            count = len(part)
+            if not count:
+                continue
+            index = torch.arange(count) + 0.5
+            radius, angle = (index / count).sqrt(), index * (math.pi * (3 - math.sqrt(5)))
+            place = radius[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
+            size = OVERLAP * ghost.radius * math.sqrt(math.pi / count)
+            inner = max(ghost.radius - size, 0.3 * ghost.radius)
+            level = np.maximum(ghost.level, 1e-6)
+            # A disc of level L: opacity x colour x 2 pi size^2 x count = L pi radius^2, with colours about 0.5.
+            brightness = float(level.mean()) * ghost.radius**2 / (2 * size**2 * count)
+            opacity = min(max(2 * brightness, OPACITIES[0]), OPACITIES[1])
+            table["positions"][part] = ghost.place
+            table["offsets"][part] = inner * place
+            table["log_scales"][part] = math.log(size)
+            table["opacity_logits"][part] = math.log(opacity / (1 - opacity))
+            table["rings"][part] = 0.0
+            table["sh"][part, :3] = torch.tensor((0.5 * level / level.mean() - 0.5) / C0, dtype=torch.float32)
+            code = torch.randn(table["latent"].shape[1], generator=generator)
+            table["latent"][part] = 0.3 * code
+            table["latent"][part, -2:] = 0.3 * place

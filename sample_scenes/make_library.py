@@ -47,8 +47,7 @@ class LibraryLook:
     @property
     def settings(self) -> TracedFlareSettings:
         """The settings of the look."""
-        return TracedFlareSettings().override({"ghosts.count": 14, "tracing.positions": 48, "fit.iterations": 1200,
-                                               **self.values})
+        return TracedFlareSettings().override({**SHORT_FIT, "ghosts.count": 14, **self.values})
 
 
 def _streak(gain: float, turn: float, colour: tuple[float, float, float], *, length: float = 0.06, width: float = 0.004,
@@ -57,6 +56,10 @@ def _streak(gain: float, turn: float, colour: tuple[float, float, float], *, len
             "mirror": mirror}
 
 
+SHORT_FIT = {"tracing.positions": 48, "fit.iterations": 1200, "fit.gaussians": 800, "fit.max_gaussians": 1600}
+"""Settings of the fits of looks whose light is mostly at the light itself."""
+GHOST_FIT = {"tracing.positions": 96, "fit.iterations": 1500, "fit.gaussians": 1600, "fit.max_gaussians": 2000}
+"""Settings of the fits of looks with strong ghosts."""
 BARE = (0.0,)
 WHITE, BLUE, AMBER = (1.0, 1.0, 1.0), (0.2, 0.45, 1.0), (1.0, 0.55, 0.2)
 
@@ -69,11 +72,11 @@ LOOKS = (
                  "ghosts.level": 0.008, "streaks": [_streak(1.6, 0, BLUE, length=0.05, power=0.7, mirror=0.1),
                                                     _streak(0.25, 0, BLUE, length=0.3, width=0.011, mirror=0.3)]}),
     LibraryLook("Old Uncoated Prime", "A lens of the 1930s without coatings: a warm veil over the whole frame.",
-                {"lens": "US1998704", "glass.coating": BARE, "iris.blades": 12, "iris.roundness": 0.6,
+                {**GHOST_FIT, "lens": "US1998704", "glass.coating": BARE, "iris.blades": 12, "iris.roundness": 0.6,
                  "ghosts.level": 0.035, "glow.gain": 0.4, "glow.wide_gain": 0.07, "starburst.gain": 200.0,
                  "colour": (1.0, 0.86, 0.66)}),
     LibraryLook("Zoom with Large Ghosts", "Twenty-one surfaces: large soft ghosts on both sides of the light.",
-                {"lens": "US3856386", "ghosts.level": 0.03, "ghosts.count": 30, "iris.blades": 6,
+                {**GHOST_FIT, "lens": "US3856386", "ghosts.level": 0.03, "ghosts.count": 30, "iris.blades": 6,
                  "glass.coating": (0.42, 0.66, 0.50, 0.58, 0.46, 0.70)}),
     LibraryLook("Star Filter", "A cross filter: four long thin rays.",
                 {"lens": "GB850117", "ghosts.level": 0.004, "ghosts.count": 8, "starburst.gain": 60.0,
@@ -82,9 +85,9 @@ LOOKS = (
                 {"lens": "DE2205380", "ghosts.level": 0.01, "starburst.gain": 200.0,
                  "rings": [{"gain": 0.3, "radius": 0.25, "width": 0.05, "dispersion": 0.4}]}),
     LibraryLook("Telephone", "A small lens behind smeared plastic: a wide veil, a slanting streak, one violet ghost.",
-                {"lens": "FR1066698", "focal_length": 5.0, "sensor": 6.4, "iris.blades": 24, "iris.roundness": 1.0,
-                 "glass.coating": (0.54, 0.40, 0.55), "ghosts.level": 0.025, "glow.gain": 0.35, "glow.wide_gain": 0.05,
-                 "starburst.gain": 150.0,
+                {**GHOST_FIT, "lens": "FR1066698", "focal_length": 5.0, "sensor": 6.4, "iris.blades": 24,
+                 "iris.roundness": 1.0, "glass.coating": (0.54, 0.40, 0.55), "ghosts.level": 0.025, "glow.gain": 0.35,
+                 "glow.wide_gain": 0.05, "starburst.gain": 150.0,
                  "streaks": [_streak(0.25, 70, WHITE, length=0.1, width=0.008)]}),
     LibraryLook("Dirty Window", "Dust and scratches: a grey veil, and rays in all directions.",
                 {"lens": "GB850117", "iris.blades": 16, "iris.roundness": 0.9, "glass.dust": 500,
@@ -107,18 +110,18 @@ LOOKS = (
                  "ghosts.level": 0.012, "starburst.gain": 1800.0, "colour": (0.85, 0.93, 1.0),
                  "rings": [{"gain": 0.08, "radius": 0.18, "width": 0.03, "dispersion": 0.6}]}),
     LibraryLook("Six-Point Star", "Six straight blades at f/11: six pointed rays.",
-                {"lens": "US3576360", "iris.f_number": 11.0, "iris.blades": 6, "iris.roundness": 0.0,
+                {**GHOST_FIT, "lens": "US3576360", "iris.f_number": 11.0, "iris.blades": 6, "iris.roundness": 0.0,
                  "iris.rotation": 0.0, "iris.unevenness": 0.004, "ghosts.level": 0.006, "ghosts.count": 10,
                  "starburst.gain": 5000.0, "starburst.peak": 12.0}),
     LibraryLook("Rainbow Ring", "Two rings in the colours of the spectrum about the light.",
-                {"lens": "US4099850", "ghosts.level": 0.006, "ghosts.count": 8, "starburst.gain": 150.0,
+                {**GHOST_FIT, "lens": "US4099850", "ghosts.level": 0.006, "ghosts.count": 8, "starburst.gain": 150.0,
                  "rings": [{"gain": 0.16, "radius": 0.3, "width": 0.025},
                            {"gain": 0.1, "radius": 0.15, "width": 0.04}]}),
     LibraryLook("Cold Ghosts", "A cold light with large, faint, blue-grey ghosts.",
-                {"lens": "GB978797", "glass.coating": (0.38, 0.72), "iris.blades": 5, "iris.f_number": 6.0,
+                {**GHOST_FIT, "lens": "GB978797", "glass.coating": (0.38, 0.72), "iris.blades": 5, "iris.f_number": 6.0,
                  "ghosts.level": 0.025, "starburst.gain": 400.0}),
     LibraryLook("Portrait Telephoto", "A long lens wide open: large soft discs.",
-                {"lens": "US1998704", "focal_length": 135.0, "iris.f_number": 2.2, "iris.blades": 15,
+                {**GHOST_FIT, "lens": "US1998704", "focal_length": 135.0, "iris.f_number": 2.2, "iris.blades": 15,
                  "iris.roundness": 0.9, "ghosts.level": 0.025, "ghosts.rim": 0.1, "starburst.gain": 80.0,
                  "glow.gain": 0.3}),
 )

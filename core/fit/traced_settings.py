@@ -78,7 +78,7 @@ class TracingSettings:
     pixel."""
 
     width: int = 240
-    positions: int = 64
+    positions: int = 96
     field: float = 1.25
     bands: int = 6
     supersample: int = 1
@@ -89,8 +89,8 @@ class TracedFit:
     """The fit. gaussians: initial number. max_gaussians: largest number."""
 
     iterations: int = 1500
-    gaussians: int = 800
-    max_gaussians: int = 1600
+    gaussians: int = 1600
+    max_gaussians: int = 2000
     seed: int = 0
 
 

@@ -46,6 +46,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--colour", metavar="R,G,B", help="colour of the light, linear (default 1,1,1)")
     parser.add_argument("--ghosts", type=float, metavar="LEVEL",
                         help="root mean square of the ghosts over the frame, 1 is white (default 0.02)")
+    parser.add_argument("--dispersion", choices=("on", "off"),
+                        help="whether the glass splits the colours of ghosts (default on)")
     parser.add_argument("--starburst", type=float, metavar="GAIN", help="brightness of the starburst (default 700)")
     parser.add_argument("--glow", type=float, metavar="GAIN", help="brightness of the glow (default 0.2)")
     parser.add_argument("--ring", type=float, metavar="GAIN",
@@ -99,6 +101,8 @@ def read_settings(args: argparse.Namespace) -> TracedFlareSettings:
                "glass.seed": args.seed, "ghosts.level": args.ghosts, "starburst.gain": args.starburst,
                "glow.gain": args.glow}
     values |= {name: value for name, value in options.items() if value is not None}
+    if args.dispersion is not None:
+        values["ghosts.dispersion"] = args.dispersion == "on"
     if args.coating is not None:
         values["glass.coating"] = [number / 1000 for number in _parse_numbers("--coating", args.coating)]
     if args.colour is not None:

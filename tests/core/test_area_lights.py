@@ -10,13 +10,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.bake.shot import ShotRenderer
 from core.capture import LightExtent, read_lights, sample_curve, sample_surface
 from core.capture.light_extent import CELLS, SAMPLES
 from core.errors import CaptureError, SettingsError
 from core.flare.model import PAPER
+from core.flare.visibility import VisibilitySettings, visibility_behind
 from core.look import Look, LookEdits, PlacedLight, PlaneGaussians, draw, read
 from core.look.shot import Shot, ShotFrame
+from core.transfer.target import shot_target
+from core.transfer.transfer import Transfer, TransferSettings
 from tests.core.flared import cameras
+from tests.core.test_flare_visibility import wall
 from tests.core.test_look import SMALL, saved
 
 POSE = cameras(3)[1].world_to_camera
@@ -253,3 +258,40 @@ def test_edits_apply_to_every_cell(tmp_path: Path) -> None:
     edits = LookEdits.parse(["a.intensity=3"], ["a"])
     bright = look.evaluate_lights(POSE, [placed(RECTANGLE)], edits)["a"]
     assert total(bright) == pytest.approx(3 * total(flare_of(look, placed(RECTANGLE))), rel=1e-4)
+
+
+# ---- behind splats, and in a transfer -------------------------------------------------------------
+
+
+def test_splats_hide_the_cells_behind_them() -> None:
+    light = PlacedLight("a", "b", np.array([0.0, 0.0, 4.0]),
+                        extent=LightExtent.rectangle([[0.3, 0, 0], [0, 0.2, 0]]))
+    settings = VisibilitySettings()
+    visibility, shares = visibility_behind(wall(x=0.5), np.eye(4), light, settings)  # hides the half with x > 0
+    assert visibility == 1 and shares is not None
+    centres = light.extent.sampled(light.xyz, np.eye(4)).centres  # type: ignore[union-attr]
+    hidden = np.array(shares)[centres[:, 0] > 0.1], np.array(shares)[centres[:, 0] < -0.1]
+    assert hidden[0].max() < 0.05 and hidden[1].min() > 0.95
+    assert np.mean(shares) == pytest.approx(0.5, abs=0.03)
+    half = replace(light, shares=(0.0,) * 8 + (1.0,) * 8)
+    assert visibility_behind(wall(x=0.5), np.eye(4), half, settings)[1][:8] == (0.0,) * 8  # type: ignore[index]
+    point = visibility_behind(wall(), np.eye(4), replace(light, extent=None), settings)
+    assert point[0] < 0.01 and point[1] is None
+
+
+def test_a_transfer_and_a_bake_show_the_same_extended_light(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", SMALL, 1)
+    camera = cameras(3)[1]
+    shares = tuple(np.linspace(0, 1, CELLS).round(3).tolist())
+    light = placed(RECTANGLE, factor=(1.0, 0.5, 0.2), reference_distance=3.0)
+    shot = Shot(tmp_path / "a.flare", (ShotFrame(1, "Camera", camera, (replace(light, shares=shares),)),), "target")
+    baked = ShotRenderer(shot).render(shot.frames[0], camera).flare_by_light["a"]
+    look = read(tmp_path / "a.flare")
+    transfer = Transfer(tmp_path / "a.flare", shot_target(shot, look, {}), TransferSettings("target"))
+    frame = transfer.target.frames[0]
+    moved = transfer.frame_renderer(frame.frame).render(camera).flare_by_light["a"]
+    overlay = draw([look.evaluate_lights(POSE, shot.frames[0].lights)["a"]], camera.intrinsics, camera.width,
+                   camera.height)
+    assert baked.max() > 0.02
+    np.testing.assert_allclose(baked, overlay, atol=2e-4 * float(baked.max()))
+    assert np.linalg.norm(moved - baked) < 0.1 * np.linalg.norm(baked)  # another world: the query's camera differs

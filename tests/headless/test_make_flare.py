@@ -24,7 +24,7 @@ def test_make_flare_writes_a_flare_and_its_error(tmp_path: Path, capsys: pytest.
     settings.write_text('sensor = 24.0\n[iris]\nblades = 5\nrotation = 3.0\n')
     changes = [part for change in TINY for part in ("--set", change)]
     assert run(lens, "--out", out, "--settings", settings, "--blades", 6, "--streak", 0.8, "--colour", "1,0.8,0.5",
-               "--coating", "520,0", "--notes", "mine", *changes) == 0
+               "--coating", "520,0", "--dispersion", "off", "--notes", "mine", *changes) == 0
     look = read(out)
     assert look.notes == "mine" and look.camera.width == 48
     text = capsys.readouterr()

@@ -26,11 +26,15 @@ UNLIKELY_GATE = 0.4
 """Factor on the tolerance for a source that hardly looks like a lamp, of a track that does."""
 MAX_WAIT, MAX_GAP = 2, 24
 """Frames to the next source of a track, first without and then with knowledge of what comes later."""
-SIZE_COST, COLOUR_COST, EVIDENCE_COST, GAP_COST = 0.4, 0.3, 0.5, 0.02
+SIZE_COST, COLOUR_COST, EVIDENCE_COST, GAP_COST = 0.4, 0.3, 0.5, 0.06
 """Weights of the change of size (logarithm), colour and evidence, and of a frame without a source, beside distance over
 gate."""
 TYPICAL = 9
 """Number of sources at the end of a track whose median size is compared."""
+DISTANCE_SCALE = 0.1
+"""Distance, diagonals, that costs as much as the whole gate, when tracks are joined: gates of fast things are wide."""
+MAX_SINGLE_GAP = 6
+"""Largest gap to a track of one frame."""
 MAX_DIFFERENCE = 1.0
 """Largest sum of these changes."""
 LIKELY = 0.25
@@ -129,6 +133,8 @@ def _cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | 
         if gap > 1 or source.detection.radius > 1.3 * last.detection.radius:
             return None
         gate *= UNLIKELY_GATE
+    elif source.evidence >= LIKELY > chain.evidence:
+        gate *= UNLIKELY_GATE
     distance = float(np.linalg.norm(chain.predict(frame) - source.xy))
     difference = _difference(last, source)
     if distance > gate or difference > MAX_DIFFERENCE:
@@ -166,12 +172,13 @@ def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
     gap = second.frames[0] - first.frames[-1]
     if not 0 < gap <= MAX_GAP or min(first.evidence, second.evidence) < LIKELY:
         return None
-    if len(first.frames) + len(second.frames) < 4:
+    is_single = 1 in (len(first.frames), len(second.frames))
+    if is_single and (gap > MAX_SINGLE_GAP or len(first.frames) + len(second.frames) < 4):
         return None
     acceleration = max(first.acceleration(diagonal), second.acceleration(diagonal))
     gate = BASE_GATE * diagonal + acceleration * gap * gap / 3
     speeds = [float(np.linalg.norm(chain.velocity(at_end))) for chain, at_end in ((first, True), (second, False))]
-    if 1 in (len(first.frames), len(second.frames)):  # a single frame has no velocity; it may have the other's
+    if is_single:  # a single frame has no velocity; it may have the other's
         gate += 0.5 * gap * max(speeds)
     # Half the way by each: the velocities need not agree, only the places in the middle.
     middle = first.frames[-1] + gap / 2
@@ -181,7 +188,7 @@ def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
     difference = _difference(_typical(first, at_end=True), _typical(second, at_end=False))
     if distance > gate or difference > MAX_DIFFERENCE:
         return None
-    return distance / gate + difference + GAP_COST * gap
+    return distance / gate + distance / (DISTANCE_SCALE * diagonal) + difference + GAP_COST * gap
 
 
 def _typical(chain: Chain, at_end: bool) -> Source:

@@ -33,18 +33,24 @@ HARD, SOFT = 0.04, 0.16
 NEAR, FAR = (1.5, 3.5), (9.0, 16.0)
 """Rings of the softness: distances from the spot's edge, pixels of a frame with a diagonal of REFERENCE."""
 REFERENCE = 550.0
-PROFILE_RADII = (3.0, 4.5, 6.5, 9.0, 12.0, 16.0, 21.0, 27.0, 34.0, 42.0)
+PROFILE_RADII = (1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 10.0, 11.5, 13.5, 16.0, 19.0, 23.0, 28.0, 34.0)
 """Edges of the rings of the brightness, pixels from the centre, as above."""
+CLIPPED_RING = 0.85
+"""Linear light of a ring from which parts of it are clipped."""
 SECTORS = 12
 """Sectors of a ring; the median over them leaves out ghosts, streaks and what stands beside the light."""
+SIDE_QUANTILE = 0.35
+"""Quantile of the softness over the sectors: a lamp is soft all round, but for what hides it on one side."""
+LONG, COMPACT = 4.5, 2.8
+"""Ratio of the sides of a spot that is no lamp, and up to which it may be one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
     """A candidate for a light in one frame.
 
-    detection: place, radius, colour and mask. evidence: 0..1, how much it looks like a lamp. profile: (9,) linear light
-    in the rings of PROFILE_RADII, NaN where a ring is clipped or out of the frame.
+    detection: place, radius, colour and mask. evidence: 0..1, how much it looks like a lamp. profile: (rings,) linear
+    light in the rings of PROFILE_RADII, NaN where a ring is clipped or out of the frame.
     """
 
     detection: Detection
@@ -82,7 +88,7 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
             found = measure_detection(mask, corner, picture, scaled, shape)
             if picture.encoding == "linear":
                 found = _at_flux(found, linear)
-            sources.append(Source(found, shape * soft, measure_profile(luminance, found.xy)))
+            sources.append(Source(found, shape * soft * _roundness(mask), measure_profile(luminance, found.xy)))
     return sorted(sources, key=lambda source: -source.evidence)
 
 
@@ -153,11 +159,30 @@ def _softness(mask: Mask, corner: tuple[int, int], luminance: NDArray[np.float32
     area[y:y + mask.shape[0], x:x + mask.shape[1]][mask] = 0
     distance = np.asarray(cv2.distanceTransform(area, cv2.DIST_L2, 5))
     around = luminance[top:bottom, left:right]
-    near, far = (around[(distance > low * scale) & (distance <= high * scale)] for low, high in (NEAR, FAR))
-    if not len(near) or not len(far):
-        return 0.0
-    outside = float(np.median(far))
-    return (float(np.median(near)) - outside) / max(1 - outside, 1e-3)
+    v, u = np.mgrid[:bottom - top, :right - left]
+    sector = _sectors(u - x - 0.5 * mask.shape[1], v - y - 0.5 * mask.shape[0])
+    values = []
+    for number in range(SECTORS):
+        near, far = (around[(distance > low * scale) & (distance <= high * scale) & (sector == number)]
+                     for low, high in (NEAR, FAR))
+        if len(near) and len(far):
+            outside = float(np.median(far))
+            values.append((float(np.median(near)) - outside) / max(1 - outside, 1e-3))
+    return float(np.quantile(values, SIDE_QUANTILE)) if values else 0.0
+
+
+def _sectors(u: Floats, v: Floats) -> NDArray[np.int64]:
+    """Return the sector, 0 to SECTORS - 1, of offsets (u, v) from a centre."""
+    return np.asarray((np.arctan2(v, u) / (2 * np.pi) % 1.0) * SECTORS, np.int64) % SECTORS
+
+
+def _roundness(mask: Mask) -> float:
+    """Return 1 for compact masks, 0 for long ones, such as the lit edge of a shirt."""
+    import cv2
+
+    outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    sides = np.sort(np.asarray(cv2.minAreaRect(np.concatenate(outline))[1]) + 1.0)
+    return smoothstep(float(sides[1] / sides[0]), LONG, COMPACT)
 
 
 def measure_profile(luminance: NDArray[np.float32], xy: Floats) -> Floats:
@@ -176,7 +201,7 @@ def measure_profile(luminance: NDArray[np.float32], xy: Floats) -> Floats:
     v, u = np.mgrid[top:bottom, left:right] + 0.5
     u, v = u - xy[0], v - xy[1]
     ring = np.digitize(np.hypot(u, v), radii) - 1
-    sector = ((np.arctan2(v, u) / (2 * np.pi) % 1.0) * SECTORS).astype(int) % SECTORS
+    sector = _sectors(u, v)
     inside = (ring >= 0) & (ring < len(profile))
     index = (ring * SECTORS + sector)[inside]
     pixels = luminance[top:bottom, left:right][inside]
@@ -185,7 +210,8 @@ def measure_profile(luminance: NDArray[np.float32], xy: Floats) -> Floats:
     for number in range(len(profile)):
         seen = count[number] > 0
         if seen.sum() >= SECTORS // 2:
-            means = total[number][seen] / count[number][seen]
-            level = float(np.median(means))
-            profile[number] = level if level < 0.85 else np.nan
+            profile[number] = float(np.median(total[number][seen] / count[number][seen]))
+    # The ring beyond the clipped ones holds the disc's own edge, whose size says nothing of the glow.
+    clipped = np.flatnonzero(profile >= CLIPPED_RING)
+    profile[:clipped[-1] + 2 if len(clipped) else 0] = np.nan
     return profile

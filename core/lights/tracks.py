@@ -32,12 +32,21 @@ GHOST_ERROR, MIN_GHOST_MOTION = 0.008, 0.03
 """Largest median distance of a ghost from the line through its light, and the least motion of that light, diagonals."""
 TOLERATED_ERROR = 3.0
 """Expected error, pixels of a frame with a diagonal of 550, at which a place is as good as doubtful."""
+RECOVERY, MAX_RECOVERY = 0.012, 0.06
+"""Distance of a spot from a light's path within which it is the light, beside the path's expected error; diagonals."""
 MAX_BEYOND = 12
 """Number of frames by which a path continues before and after those that show the light."""
 OUT_MARGIN = 0.25
 """Distance out of the frame, diagonals, at which a path ends."""
 BRIGHTNESS_STEPS = 40
-DARK = 0.03
+"""Alternations between the brightness of the frames and the profile."""
+BACKGROUND_RINGS = 5
+"""Outer rings whose median is the background."""
+BACKGROUND_NOISE, GLOW_NOISE, PRIOR = 0.04, 0.15, 0.4
+"""Standard deviations: of the background (linear light), of the glow (relative), and of the brightness over frames."""
+CLIPPED_ON = 0.15
+"""Least brightness of a light that clips: its glow may drown in what stands behind it."""
+DARK = 0.08
 """Brightness below which a light is out."""
 
 
@@ -86,6 +95,7 @@ def track_lights(capture: Capture, progress: Progress | None = None) -> TrackFin
     camera = views[0].camera
     diagonal = float(np.hypot(*camera.size))
     chains = follow(sources, diagonal)
+    recover(chains, sources, np.array(camera.size, np.float64), diagonal)
     enough = max(MIN_FRAMES, len(views) // 10) if len(views) >= MIN_FRAMES else 1
     long = [chain for chain in chains if len(chain.frames) >= enough]
     lamps = [chain for chain in long if chain.evidence >= MIN_EVIDENCE]
@@ -176,15 +186,44 @@ def _to_light(chain: Chain, capture: Capture, diagonal: float) -> TrackedLight:
     for frame, place, error, on in zip(frames, places, errors, brightness, strict=True):
         confidence = 1 / (1 + (error / tolerated) ** 2)
         inside = bool(((place > 0) & (place < size)).all())
-        known = None if np.isnan(on) else float(on)
-        if frame not in shown:
+        known = None if np.isnan(on) else float(on) if on >= DARK else 0.0
+        if frame in shown:
+            known = None if known is None or shown[frame].detection.is_cut else max(known, CLIPPED_ON)
+        else:
             # A place that is off its light shows no glow, so only a dark one is believed where the place is doubtful.
-            known = (0.0 if known is None or known < DARK or confidence < DOUBTFUL else known) if inside else None
+            known = (0.0 if known is None or confidence < DOUBTFUL else known) if inside else None
         keys[capture.views[frame].name] = LightKey(None, place, known, float(confidence))
     colour = np.median([source.detection.colour for source in chain.sources], axis=0)
     return TrackedLight(keys, tuple(capture.views[frame].name for frame in chain.frames), chain.evidence,
                         colour / max(float(colour.max()), 1e-6),
                         float(np.median([source.detection.radius for source in chain.sources])))
+
+
+def recover(chains: Sequence[Chain], sources: Sequence[Sequence[Source]], size: Floats, diagonal: float) -> None:
+    """Add to chains of lamps the sources that lie on their paths and that none has, such as half hidden lamps."""
+    lamps = [chain for chain in chains if chain.evidence >= MIN_EVIDENCE and len(chain.frames) >= MIN_FRAMES]
+    used = {id(source) for chain in lamps for source in chain.sources}
+    for chain in lamps:
+        radius = float(np.median([source.detection.radius for source in chain.sources]))
+        while True:  # each source makes the path to the next one more certain
+            frames, places, errors = _fill(chain, len(sources), size, diagonal)
+            best: tuple[float, int, Source] | None = None
+            for frame, place, error in zip(frames, places, errors, strict=True):
+                if frame in chain.frames:
+                    continue
+                reach = min(RECOVERY * diagonal + error, MAX_RECOVERY * diagonal)
+                for source in sources[frame]:
+                    found = source.detection
+                    away = float(np.linalg.norm(source.xy - place)) / reach
+                    fits = found.score >= 0.5 and (found.is_cut or 0.4 * radius < found.radius < 1.5 * radius)
+                    if id(source) not in used and fits and away < 1 and (best is None or away < best[0]):
+                        best = (away, frame, source)
+            if best is None:
+                break
+            used.add(id(best[2]))
+            index = int(np.searchsorted(chain.frames, best[1]))
+            chain.frames.insert(index, best[1])
+            chain.sources.insert(index, best[2])
 
 
 def _fill(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple[list[int], Floats, Floats]:
@@ -276,24 +315,32 @@ def _outlier(chain: Chain, index: int, acceleration: float) -> float:
 def fit_brightness(profiles: Floats, shown: NDArray[np.bool_]) -> Floats:
     """Return the brightness (n,) of a light from its profiles (n, rings): 0..1, NaN where no ring is usable.
 
-    shown: (n,) frames in which the light is seen; only they shape the common profile.
+    shown: (n,) frames in which the light is seen; only they shape the common profile. The background is the median of
+    the outer rings. Where the glow hardly stands out of it, the brightness is drawn to that of the other frames.
     """
-    light = profiles[:, :-1] - profiles[:, -1:]
+    outer = profiles[:, -BACKGROUND_RINGS:]
+    seen = np.isfinite(outer).any(axis=1)
+    background = np.full(len(profiles), np.nan)
+    background[seen] = np.nanmedian(outer[seen], axis=1)
+    light = profiles[:, :-BACKGROUND_RINGS] - background[:, None]
     usable = np.isfinite(light)
     brightness = np.where(usable.any(axis=1), 1.0, np.nan)
     if not (usable & shown[:, None]).any():
         return brightness
     filled = np.where(usable, light, 0.0)
+    weight = usable / (BACKGROUND_NOISE ** 2 + (GLOW_NOISE * filled) ** 2)
+    shaping = weight * shown[:, None]
     shape = np.full(light.shape[1], 0.1)
+    precision = np.zeros(len(profiles))
     for _ in range(BRIGHTNESS_STEPS):
-        weight = (usable & shown[:, None]).astype(np.float64)
         gain = np.nan_to_num(brightness)[:, None]
-        shape = np.maximum((weight * gain * filled).sum(0) / np.maximum((weight * gain * gain).sum(0), 1e-9), 0)
-        strong = usable * np.sqrt(shape)  # inner rings stand out of the scene's texture
-        total = (strong * shape * shape).sum(1)
+        shape = np.maximum((shaping * gain * filled).sum(0) / np.maximum((shaping * gain * gain).sum(0), 1e-9), 0)
+        precision = (weight * shape * shape).sum(1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            brightness = np.where(total > 1e-9, np.maximum((strong * filled * shape).sum(1), 0) / total, np.nan)
-        peak = np.nanmax(np.where(shown, brightness, np.nan)) if np.isfinite(brightness[shown]).any() else 1.0
-        brightness = brightness / max(float(peak), 1e-9)
-    return np.clip(brightness, 0, 1)
-
+            brightness = np.where(usable.any(axis=1),
+                                  np.maximum((weight * filled * shape).sum(1), 0) / np.maximum(precision, 1e-9), np.nan)
+        brightest = brightness[shown & np.isfinite(brightness)]
+        brightness = brightness / max(float(np.quantile(brightest, 0.9)) if len(brightest) else 1.0, 1e-9)
+    prior = np.where(shown, float(np.nanmedian(np.where(shown, brightness, np.nan))), 0.0)
+    drawn = (precision * np.minimum(brightness, 1.2) + prior / PRIOR ** 2) / (precision + 1 / PRIOR ** 2)
+    return np.where(np.isfinite(brightness), np.clip(drawn, 0, 1), np.nan)

@@ -8,6 +8,7 @@
     jobs.py             processes of the engine                  fits.py            fits, light search, clean frames
     capture/            captures into and out of Blender         cameras.py         Blender's cameras and the core's
     lights.py           light objects                            objects.py         matrices of objects
+    light_paths.py      lights that move, and tracks of clips
     looks.py            the look of a scene, its flares          occlusion.py       visibility of lights
     overlay.py          the flare in the viewport                points.py          the point cloud in the viewport
     shots.py            scenes as shots                          baking.py          bakes

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ..core.capture import LIGHTS, read_lights
 from ..core.errors import CaptureError
 from ..core.system.files import follow_link, read_json, round_for_text, write_json
-from . import cameras
+from . import cameras, light_paths
 from .capture.importer import add_light
 from .objects import depsgraph_of, view_layer_of, world_matrix
 from .paths import absolute
@@ -119,12 +119,19 @@ def write_to_capture(scene: Any, folder: Path) -> int:
     path = folder / LIGHTS
     data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
     known = {entry.get("name"): entry for entry in data.get("lights", []) if isinstance(entry, dict)}
-    lights, depsgraph = [known[name] for name in new_names(scene, folder)], depsgraph_of(scene)
+    lights = [known[name] for name in new_names(scene, folder)]
     eye = scene.camera.matrix_world.translation if scene.camera is not None else objects[0].matrix_world.translation
+
+    def place(item: Any) -> Any:
+        """Return the light's place (3,) in the capture at the current frame of the scene."""
+        graph = depsgraph_of(scene)
+        return cameras.point_in_capture(light_position(item, world_matrix(item, graph), eye), scene.fit_flare.root,
+                                        graph)
+
+    paths = light_paths.world_paths(scene, dict(zip(names, objects, strict=True)), folder, place)
     for item, name in zip(objects, names, strict=True):
-        position = light_position(item, world_matrix(item, depsgraph), eye)
-        xyz = cameras.point_in_capture(position, scene.fit_flare.root, depsgraph)
-        lights.append({**known.get(name, {}), "name": name, "xyz": [round_for_text(float(value)) for value in xyz]})
+        xyz = [round_for_text(float(value)) for value in place(item)]
+        lights.append(light_paths.merge_entry(known.get(name, {}), name, xyz, paths.get(name, {})))
     if lights != data.get("lights"):
         write_json(follow_link(path), {**data, "lights": lights})
     remember_names(scene)
@@ -176,8 +183,11 @@ def import_new(scene: Any, folder: Path) -> int:
     new_lights = [light for light in read_lights(folder / LIGHTS) if names is None or light.name in names]
     collection = _collection_of(scene)
     size = max((item.empty_display_size for item in existing if item.type == "EMPTY"), default=0.2)
+    keyed = light_paths.keyed_capture(folder, new_lights)
     for light in new_lights:
-        add_light(collection, scene.fit_flare.root, light.name, light.xyz, size)
+        item = add_light(collection, scene.fit_flare.root, light.name, np.nan_to_num(light.xyz), size)
+        if keyed is not None and light.moves:
+            light_paths.key_path(item, light, *keyed)
     remember_names(scene)
     return len(new_lights)
 

@@ -22,7 +22,7 @@ from ...core.capture.camera import Camera, quaternion_from_rotation
 from ...core.conventions.frame_numbers import number_views
 from ...core.errors import CaptureError
 from ...core.removal.jobs.provenance import has_exact_clean_frames
-from .. import cameras, fcurves
+from .. import cameras, fcurves, light_paths
 from ..cameras import FLIP_YZ
 from ..compositor.setup import footage_nodes
 from ..images import load_image
@@ -96,7 +96,12 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     camera_objects = _add_cameras(collection, root, capture, extent, settings, scene, notes)
     if settings.points and len(capture.points):
         _add_points(collection, root, capture.points)
-    lights = tuple(add_light(collection, root, light.name, light.xyz, 0.02 * extent) for light in capture.lights)
+    lights = tuple(add_light(collection, root, light.name, np.nan_to_num(light.xyz), 0.02 * extent)
+                   for light in capture.lights)
+    scene_frames = {frame.view: frame.number for frame in number_views(view.name for view in capture.views)}
+    for item, light in zip(lights, capture.lights, strict=True):
+        if light.moves:
+            light_paths.key_path(item, light, capture, scene_frames)
     state = scene.fit_flare
     if state.root is not None:
         state.root.fit_flare.is_root = True  # earlier versions did not store it

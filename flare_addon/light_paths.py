@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Paths of lights between lights.json, animated objects of the scene, and tracks of the Movie Clip Editor.
+
+A lamp or empty that moves, by keys, drivers, constraints or its parents, is written as a path in the world, with the
+brightness of an animated lamp. A path of lights.json becomes an empty with keys, which an artist can correct. For
+footage without a camera solve, each track of a movie clip is a light on the picture, in both directions; muted markers
+are places that are doubtful. `lights.py` and `operators/light_paths.py` call it.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.capture import LIGHTS, Capture, Light, PictureIndex, read_lights
+from ..core.capture.lights import DOUBTFUL
+from ..core.conventions.frame_numbers import number_views
+from ..core.errors import CaptureError
+from ..core.system.files import follow_link, read_json, round_for_text, write_json
+from .paths import absolute
+
+STANDING = 1e-4
+"""Motion of a light below which it stands, relative to its distance from the origin, or in scene units."""
+
+
+def frame_numbers(folder: Path) -> dict[str, int]:
+    """Return the scene's frame of each picture of a capture, by the picture's name; {} without a folder images/."""
+    images = folder / "images"
+    if not images.is_dir():
+        return {}
+    return {frame.view: frame.number for frame in number_views(PictureIndex(images).names)}
+
+
+def moves(item: Any, root: Any) -> bool:
+    """Return whether an object may move: by animation, constraints, or a parent below `root` that does."""
+    while item is not None and item != root:
+        if item.animation_data is not None or item.constraints or item.parent_type != "OBJECT":
+            return True
+        item = item.parent
+    return False
+
+
+def has_animated_light(item: Any) -> bool:
+    """Return whether an object is a lamp whose settings are animated."""
+    return item.type == "LIGHT" and item.data.animation_data is not None
+
+
+def world_paths(scene: Any, items: Mapping[str, Any], folder: Path, place: Callable[[Any], Any]
+                ) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return the keys of the lights that move or change, by name and by frame: {"xyz": [x, y, z], "on": 0..1}.
+
+    items: light objects by name. place: returns the place (3,) of an object at the scene's current frame, in the
+    capture's coordinates. A light that stands has keys without xyz. The scene's frame is restored.
+    """
+    numbers = frame_numbers(folder)
+    animated = {name: item for name, item in items.items()
+                if moves(item, scene.fit_flare.root) or has_animated_light(item)}
+    if not animated or not numbers:
+        return {}
+    places: dict[str, list[Any]] = {name: [] for name in animated}
+    powers: dict[str, list[float]] = {name: [] for name in animated}
+    before, subframe = scene.frame_current, scene.frame_subframe
+    try:
+        for number in numbers.values():
+            scene.frame_set(number)
+            for name, item in animated.items():
+                places[name].append(np.asarray(place(item), np.float64))
+                powers[name].append(_power(item))
+    finally:
+        scene.frame_set(before, subframe=subframe)
+    return {name: keys for name in animated if (keys := _keys(list(numbers), places[name], powers[name]))}
+
+
+def _power(item: Any) -> float:
+    """Return the power of a lamp at the current frame; 1 for other objects, 0 for one that is not rendered."""
+    if item.hide_render:
+        return 0.0
+    return float(item.data.energy * max(item.data.color)) if item.type == "LIGHT" else 1.0
+
+
+def _keys(names: Sequence[str], places: Sequence[Any], powers: Sequence[float]) -> dict[str, dict[str, Any]]:
+    xyz = np.array(places)
+    is_standing = np.ptp(xyz, axis=0).max() <= STANDING * max(1.0, float(np.abs(xyz).max()))
+    is_constant = max(powers) - min(powers) <= 1e-6 * max(max(powers), 1e-9)
+    if is_standing and is_constant:
+        return {}
+    keys: dict[str, dict[str, Any]] = {name: {} for name in names}
+    for name, place, power in zip(names, places, powers, strict=True):
+        if not is_standing:
+            keys[name]["xyz"] = [round_for_text(float(value)) for value in place]
+        if not is_constant:
+            keys[name]["on"] = round(max(power, 0.0) / max(max(powers), 1e-9), 4)
+    return keys
+
+
+def merge_entry(known: Mapping[str, Any], name: str, xyz: Sequence[float], keys: Mapping[str, Mapping[str, Any]]
+                ) -> dict[str, Any]:
+    """Return the entry of a light for lights.json. known: its entry so far, whose other values stay.
+
+    Brightness and confidence of the entry stay where the scene does not animate them. A place that an artist corrected
+    is no longer doubtful.
+    """
+    earlier = known.get("frames") or {}
+    moved = any("xyz" in key for key in keys.values())
+    entry = {**known, "name": name}
+    frames: dict[str, Any] = {}
+    for frame in dict.fromkeys((*earlier, *keys)):
+        key = {label: value for label, value in (earlier.get(frame) or {}).items() if label not in ("xyz", "xy")}
+        new = keys.get(frame, {})
+        before = (earlier.get(frame) or {}).get("xyz")
+        if "xyz" in new and before is not None and not np.allclose(before, new["xyz"], rtol=1e-3, atol=1e-4):
+            key.pop("confidence", None)
+        merged = {**key, **new}
+        if {"xyz", "on"} & merged.keys():
+            frames[frame] = merged
+    for label in ("frames", "xyz", "xy"):
+        entry.pop(label, None)
+    if not moved:
+        entry["xyz"] = list(xyz)
+    if frames:
+        entry["frames"] = frames
+    return entry
+
+
+def key_path(item: Any, light: Light, capture: Capture, scene_frames: Mapping[str, int]) -> None:
+    """Insert keys of an empty's location, a child of the root, for the path of a light of lights.json.
+
+    A path on the picture lies on the rays of its pixels. scene_frames: frame of each view, by its name.
+    """
+    for view in capture.views:
+        state = capture.light_state(light, view)
+        item.location = [float(value) for value in state.xyz]
+        item.keyframe_insert("location", frame=scene_frames[view.name])
+
+
+def keyed_capture(folder: Path, lights: Sequence[Light]) -> tuple[Capture, dict[str, int]] | None:
+    """Return the capture and the frame of each view where some light moves, else None. Raises CaptureError."""
+    if not any(light.moves for light in lights):
+        return None
+    capture = Capture.open(folder, need_frames=False)
+    return capture, {frame.view: frame.number for frame in number_views(view.name for view in capture.views)}
+
+
+# ---- tracks of the Movie Clip Editor --------------------------------------------------------------
+
+
+def clip_folder(clip: Any) -> Path:
+    """Return the folder for the lights.json of a clip: that of the capture whose images/ it shows, or of the pictures.
+
+    Raises CaptureError for a video, whose frames have no names.
+    """
+    path = absolute(clip.filepath, clip.library)
+    if clip.source != "SEQUENCE":
+        raise CaptureError(f"The clip {clip.name!r} is a video, whose frames have no names; load the frames that solve "
+                           "or shot wrote.")
+    return path.parent.parent if path.parent.name.casefold() == "images" else path.parent
+
+
+def _picture_names(clip: Any) -> dict[int, str]:
+    """Return the names of a clip's pictures by frame of the clip, which begins at 1 with the file that it names."""
+    path = absolute(clip.filepath, clip.library)
+    numbered = {frame.view: frame.number for frame in number_views(PictureIndex(path.parent).names)
+                if "/" not in frame.view}
+    if path.name not in numbered:
+        raise CaptureError(f"{path} is missing; load the clip again.")
+    first = numbered[path.name] + clip.frame_offset
+    return {number - first + 1: name for name, number in numbered.items() if number >= first}
+
+
+def write_tracks(clip: Any, only_selected: bool = False) -> int:
+    """Write the tracks of a clip as lights on the picture into lights.json; return their number.
+
+    Entries of the same name keep brightness by frame; other entries stay. Raises CaptureError without tracks.
+    """
+    names, (width, height) = _picture_names(clip), tuple(clip.size)
+    tracks = [track for track in clip.tracking.tracks if track.select or not only_selected]
+    path = clip_folder(clip) / LIGHTS
+    read_lights(path)  # checks it
+    data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
+    entries = {str(entry["name"]): entry for entry in data.get("lights", [])}
+    count = 0
+    for track in tracks:
+        known = entries.get(track.name, {})
+        earlier, frames = known.get("frames") or {}, {}
+        for marker in track.markers:
+            name = names.get(marker.frame)
+            if name is not None and not marker.mute:
+                place = [round(marker.co[0] * width, 3), round((1 - marker.co[1]) * height, 3)]
+                before = earlier.get(name) or {}
+                same = before.get("xy") is not None and np.allclose(before["xy"], place, atol=0.02)
+                kept = before if same else {label: value for label, value in before.items() if label == "on"}
+                frames[name] = {**kept, "xy": before["xy"] if same else place}
+        if frames:
+            on_only = {name: {"on": key["on"]} for name, key in earlier.items() if name not in frames and "on" in key}
+            rest = {label: value for label, value in known.items() if label not in ("xyz", "xy", "frames")}
+            entries[track.name] = {**rest, "name": track.name, "frames": dict(sorted({**on_only, **frames}.items()))}
+            count += 1
+    if not count:
+        raise CaptureError(f"The clip {clip.name!r} has no {'selected ' if only_selected else ''}tracks with markers; "
+                           "track the lights first.")
+    write_json(follow_link(path), {**data, "lights": list(entries.values())})
+    return count
+
+
+def read_tracks(clip: Any) -> int:
+    """Add the paths on the picture of lights.json as tracks of a clip; return their number.
+
+    A track of the same name is replaced. Markers of doubtful places are muted. Raises CaptureError where there are
+    none.
+    """
+    names, (width, height) = _picture_names(clip), tuple(clip.size)
+    path = clip_folder(clip) / LIGHTS
+    lights = [light for light in read_lights(path) if light.is_on_picture and light.keys]
+    if not lights:
+        raise CaptureError(f"{path} has no lights on the picture; find them in the frames first.")
+    tracking = clip.tracking
+    for light in lights:
+        markers = [(frame, light.keys[name]) for frame, name in sorted(names.items())
+                   if name in light.keys and light.keys[name].xy is not None]
+        for old in [track for track in tracking.tracks if track.name == light.name]:
+            old.name = f"{light.name} (before)"
+        track = tracking.tracks.new(name=light.name, frame=markers[0][0] if markers else 1)
+        for frame, key in markers:
+            assert key.xy is not None
+            marker = track.markers.insert_frame(frame, co=(key.xy[0] / width, 1 - key.xy[1] / height))
+            marker.mute = key.confidence < DOUBTFUL
+    return len(lights)

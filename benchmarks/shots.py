@@ -6,9 +6,9 @@
 
 Each shot is rendered by `sample_scenes/render_shot.py` into FOLDER, where results of an earlier call are used again.
 `--tracks lights`: the lights are found by the command `lights`, and nothing is given. `--plates exact` gives the exact
-scene layers: the bound of a fit over plates. Printed by shot: the flare of held-out frames in dB and its relative error
-in linear light, for no flare, the network by itself frame by frame, and the fit; the largest error of the brightness of
-lights in the frame; and the clean frames in dB, as filmed, by the network, and by the fit.
+scene layers: the bound of a fit over plates. It prints, for each shot: the flare of held-out frames in dB and its
+relative error in linear light, for no flare, for the network on single frames, and for the fit; the largest error of
+the brightness of lights in the frame; and the clean frames in dB, as filmed, by the network, and by the fit.
 """
 from __future__ import annotations
 
@@ -102,8 +102,7 @@ def prepare(out: Path, name: str, seed: int, tracks: str) -> Path:
                            stdout=subprocess.DEVNULL)
     capture = Capture.open(folder, need_cameras=False)
     if not (folder / NETWORK).is_dir():
-        made = clean_capture(capture, Remover(glow="remove"), Progress())
-        made.rename(folder / NETWORK)
+        clean_capture(capture, Remover(glow="remove"), Progress()).rename(folder / NETWORK)
     if not (folder / "removed").is_dir():
         flared = [view.name for view in capture.views
                   if any(capture.light_state(light, view).on != 0 for light in capture.lights)]
@@ -164,7 +163,7 @@ def _brightness_error(run: Run, capture: Capture, folder: Path) -> float:
                      for path in paths]
         path = paths[int(np.argmin(distances))]
         inside = [bool(view.camera.contains(state.xy)[0]) for view, state in zip(capture.views, path, strict=True)]
-        ours, true = (np.array([state.on or 0.0 for state, shown in zip(each, inside, strict=True) if shown])
+        ours, true = (np.array([state.on or 0.0 for state, is_inside in zip(each, inside, strict=True) if is_inside])
                       for each in (states, path))
         if len(ours):
             scale = float(ours @ true / max(float(ours @ ours), 1e-9))

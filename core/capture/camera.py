@@ -21,8 +21,8 @@ ASPECT_TOLERANCE = 0.02
 class Camera:
     """A pinhole camera: size in pixels, intrinsics in pixels, and `world_to_camera` (4, 4), a rigid motion.
 
-    exposure: factor of the frame's light relative to the capture's median frame. frame: name of the frame, where its
-    lights or its plate belong to it alone; else empty.
+    exposure: factor of the frame's light relative to the capture's median frame. frame: name of the frame, if it has
+    lights or a plate of its own; else empty.
     """
 
     width: int

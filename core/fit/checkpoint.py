@@ -169,5 +169,5 @@ def _describe_change(old: list[Any], new: list[Any], tolerance: float) -> str:
         if moved:
             return f"{name!r} was at {old_position}, and is at {new_position} now"
         if old_path != new_path:
-            return f"the path or the brightness of {name!r} is another now"
+            return f"the path or the brightness of {name!r} has changed"
     return ""

@@ -89,8 +89,10 @@ class FlareTrainer(abc.ABC):
                       self.settings.kernels, visibility=self.settings.flare.active_visibility)
 
     def finish_lights(self, folder: Path) -> Sequence[str]:
-        """Measure the lights' brightness in held-out views and their shares, leave out those that do not flare, and
-        write the lights by frame, if they change; return sentences for the user."""
+        """Measure the lights' brightness in held-out views and their shares; return sentences for the user.
+
+        Lights that do not flare are left out. Lights that move or change are written by frame.
+        """
         if self.flare is None:
             return ()
         _, held_out = self.capture.split(self.settings.holdout)
@@ -103,8 +105,7 @@ class FlareTrainer(abc.ABC):
         return share_sentences(shares, flaring)
 
     def _view(self) -> View:
-        """Return the view of this iteration: every view once a round, in a random order that depends on seed and round.
-        """
+        """Return the view of this iteration: each view once per round, in a random order given by seed and round."""
         done = self.iteration - 1
         order = torch.randperm(len(self.views), generator=self._generator(done // len(self.views), 1))
         return self.views[int(order[done % len(self.views)])]
@@ -115,6 +116,7 @@ class FlareTrainer(abc.ABC):
         return torch.Generator().manual_seed(mixed % (1 << 62))
 
     def _change_flare_density(self) -> None:
+        """Clone and prune the flare's Gaussians, at the iterations that the settings name."""
         settings = self.settings.flare.density
         adam = self.optimisers.flare
         if self.flare is None or adam is None or not settings.is_due(self.iteration):
@@ -152,6 +154,7 @@ class FlareTrainer(abc.ABC):
         return state
 
     def _load_flare_state(self, state: State) -> None:
+        """Restore the entries of `_flare_state`."""
         self.iteration = int(state["iteration"])
         self.losses = {name: float(loss) for name, loss in state.get("losses", [])}
         if self.flare is not None:

@@ -30,8 +30,8 @@ SAMPLED_POINTS = 10_000
 MIN_SHARE_OF_SEEING_VIEWS = 0.5
 """Share of the views that must have a Gaussian of a scene from elsewhere on their frames."""
 CAMERA_RANGE = 1e6
-"""Half the side of the model's camera range in a fit over plates, world units: appearance follows the place of the
-light in the picture alone, so all cameras fall on one point of the grid."""
+"""Half the side of the model's camera range in a fit over plates, world units: so large that all cameras fall on one
+point of the grid, and appearance follows only the place of the light in the picture."""
 SNAP_WIDTH, SNAP_VIEWS = 160, 40
 """Width in pixels of the frames by which lights are moved, and the approximate number of frames."""
 
@@ -129,7 +129,7 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
 
 
 def has_frame_lights(capture: Capture) -> bool:
-    """True if some light moves, or has a brightness of its own in each frame."""
+    """True if a light moves, or has a brightness by frame."""
     return any(light.moves or light.keys for light in capture.lights)
 
 

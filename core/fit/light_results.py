@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a fit says of its lights in the end: brightness in the frames that it has not seen, shares of the flare, and the
-lights.json of the run.
+"""The results of a fit about its lights: brightness in held-out frames, shares of the flare, the run's lights.json.
 
 The trainers call it before a run is written, and `run` reads the file.
 """
@@ -31,7 +30,7 @@ RenderView = Callable[[View], RenderedView]
 MIN_SHARE = 0.005
 """Share of all flare light below which a light counts as one that does not flare."""
 MIN_PEAK = 0.002
-"""Linear light that a flare has to exceed somewhere outside of its light's disc: about half a code of 8 bits."""
+"""Linear light that a flare has to exceed somewhere outside its light's disc: about half a code of 8 bits."""
 PEAK_QUANTILE = 0.999
 """Quantile of a flare's pixels that counts as its peak."""
 SAMPLED_VIEWS = 40
@@ -46,8 +45,8 @@ PRIOR_WEIGHT = 1e-5
 def measure_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, render_view: RenderView) -> None:
     """Set the brightness of the lights in views that the fit has not seen.
 
-    The flare stays as it was fitted; only its strength is read off these frames, as `lights` reads the places. Where
-    they do not tell, the neighbouring frames do.
+    The flare stays as fitted. These frames give only its strength, as they give `lights` the places; where they do not
+    show it, the neighbouring frames give it.
     """
     lights = flare.frame_lights
     if lights is None:
@@ -63,7 +62,7 @@ def measure_brightness(flare: FlareModel, views: Sequence[View], frames: Frames,
 
 @torch.no_grad()
 def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, render_view: RenderView) -> None:
-    """Set the brightness of the lights in these views by least errors of frame - scene over the present flares."""
+    """Set the brightness of the lights in these views to the one whose flares are nearest to frame - scene."""
     lights = flare.frame_lights
     if lights is None:
         return
@@ -98,7 +97,7 @@ def _solve(targets: Targets, scene: NDArray[np.float32], flares: Sequence[NDArra
 def normalise_brightness(flare: FlareModel, views: Sequence[View]) -> None:
     """Scale each light so that its brightness is 1 in the brightest of these views, and its flare to match.
 
-    Views in which the light lies in the frame decide, if there are any: outside of it little says how bright it is.
+    Views with the light in the frame decide, if there are any: elsewhere its brightness is uncertain.
     """
     lights = flare.frame_lights
     if lights is None:
@@ -128,9 +127,9 @@ def _scale_colours(sh: torch.Tensor, head: nn.Linear, names: Sequence[str], widt
 @torch.no_grad()
 def flare_shares(flare: FlareModel, views: Sequence[View], frames: Frames,
                  render_view: RenderView) -> dict[str, tuple[float, float]]:
-    """Return by light its share of all flare light, 0..1, and the peak of its own, linear light.
+    """Return (share of all flare light 0..1, peak in linear light) of each light's flare, by the light's name.
 
-    Both are outside of the lights' discs: a lamp that is only seen is no flare.
+    Both are measured outside the lights' discs: the picture of a lamp is no flare.
     """
     sums, peaks = dict.fromkeys(flare.names, 0.0), dict.fromkeys(flare.names, 0.0)
     for view in subsample(views, SAMPLED_VIEWS):
@@ -152,7 +151,7 @@ def select_flaring(shares: Mapping[str, tuple[float, float]]) -> list[str]:
 
 
 def share_sentences(shares: Mapping[str, tuple[float, float]], flaring: Sequence[str]) -> list[str]:
-    """Return what the user should know of the lights' shares."""
+    """Return sentences for the user about the lights' shares."""
     listed = ", ".join(f"{name} {100 * share:.1f} %" for name, (share, _) in
                        sorted(shares.items(), key=lambda item: -item[1][0]))
     sentences = [f"Shares of the flare by light: {listed}."]
@@ -163,7 +162,7 @@ def share_sentences(shares: Mapping[str, tuple[float, float]], flaring: Sequence
 
 
 def without_other_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:
-    """Return the model with these lights alone, in its order."""
+    """Return the model with only these lights, in the model's order."""
     rows = [row for row, name in enumerate(flare.names) if name in names]
     lights = flare.frame_lights
     if lights is not None:
@@ -178,7 +177,7 @@ def without_other_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:
 
 
 def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
-    """Write lights.json of a run: the lights of the capture with their brightness as fitted, by frame."""
+    """Write lights.json of a run: the lights of the capture with their fitted brightness, by frame."""
     lights = flare.frame_lights
     if lights is None:
         return
@@ -200,7 +199,7 @@ def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
 
 
 def read_frame_lights(capture: Capture, names: Sequence[str]) -> FrameLights:
-    """Return places and brightness of these lights of a capture, in every view; 1 where it is not known."""
+    """Return places and brightness of these lights of a capture, in every view; an unknown brightness starts at 1."""
     by_name = {light.name: light for light in capture.lights}
     states = [[capture.light_state(by_name[name], view) for name in names] for view in capture.views]
     positions = torch.tensor(np.array([[state.xyz for state in row] for row in states]), dtype=torch.float64)

@@ -24,7 +24,7 @@ class Optimisers:
 
     def __init__(self, scene: SceneGaussians | None, flare: FlareModel | None, settings: FitSettings, extent: float,
                  display_white: float) -> None:
-        """scene: None for plates, of which nothing is learned. extent: of the capture, world units. display_white:
+        """scene: None for plates, which a fit does not change. extent: of the capture, world units. display_white:
         largest display value of the frames."""
         self._settings, self._extent = settings, extent
         rates = settings.scene.rates

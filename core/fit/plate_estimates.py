@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Improves the plates of a shot by what neighbouring frames show of the same background.
 
-The removal network cleans each frame with the errors of that frame. Where the background stands still, or the camera
-only turns, other frames show it without flare there. So every frame is compared with the median of its neighbours'
-plates, aligned by homographies straight to it. In a small window a local line, frame = gain * background + flare,
-separates the two: a flare adds light that does not depend on the background's texture, and a light on the walls changes
-the gain. Where the background has no texture, or something hides it, nothing is certain, and the network's plate stays.
+The removal network cleans each frame by itself, and errs differently in each. Where the background stands still, or the
+camera only turns, other frames show it without flare. So every frame is compared with the median of its neighbours'
+plates, each aligned to it by a homography. In a small window a local line, frame = gain * background + flare, separates
+the two: a flare adds light that does not depend on the background's texture, and light on the walls changes the gain.
+Where the background has no texture, or something hides it, nothing is certain, and the network's plate stays.
 
 `plate_trainer` calls it before a fit, and once more with the frames minus the fitted flare.
 """
@@ -24,16 +24,16 @@ Pixels = NDArray[np.float32]
 Matrix = NDArray[np.float64]
 
 NEIGHBOUR_OFFSETS = (2, 4, 6, 9, 12, 16, 20, 25)
-"""Frames to either side that a plate is compared with: a flare soon lies elsewhere, a background stays."""
+"""Distances in frames, before and after, of the neighbours of a plate: by then a flare is elsewhere, a background is
+not."""
 WINDOW_SHARE = 0.02
 """Standard deviation of the window of the local line, as a share of the frame's width."""
 NOISE = 0.004
 """Noise of display values, as a standard deviation."""
 GAIN_TOLERANCE = 0.3
-"""Deviation of the local gain from 1 at which a background counts as half certain: lights on it change it."""
+"""Deviation of the local gain from 1 at which a background counts as half certain: light on it changes the gain."""
 FEATURES, MATCH_RATIO, MIN_INLIERS, MIN_INLIER_SHARE, MAX_ERROR_PX = 800, 0.8, 25, 0.4, 1.5
 """Features of a frame, ratio test, and what a homography between two frames needs; errors in pixels of the fit."""
-MAX_CONFIDENCE = 1.0
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class PlateEstimator:
     def estimate(self, name: str, cleaned: Mapping[str, Pixels] | None = None) -> Pixels:
         """Return the plate of a frame, display values.
 
-        cleaned: frames minus the fitted flare, in place of the network's plates; they tell more once there is a fit.
+        cleaned: frames minus the fitted flare, in place of the network's plates; they are better once there is a fit.
         """
         shot = self._shot
         own, plates = shot.plates[name], shot.plates if cleaned is None else cleaned
@@ -148,8 +148,8 @@ def local_line(frame: Pixels, background: Pixels) -> tuple[Pixels, Pixels]:
     """Return gain * background (height, width, 3) of the local line frame = gain * background + flare, and how certain
     it is (height, width, 1), 0..1.
 
-    frame, background: linear light. The channels share one gain. It is drawn to 1 where the texture of the background
-    says little; where it then is far from 1, the background is hidden.
+    frame, background: linear light. The channels share one gain. Where the background has little texture, the gain
+    tends to 1; a gain far from 1 says that something hides the background.
     """
     import cv2
 
@@ -172,5 +172,5 @@ def local_line(frame: Pixels, background: Pixels) -> tuple[Pixels, Pixels]:
     texture = variance / (variance + 10 * noise)
     near_one = 1 / (1 + ((gain - 1) / GAIN_TOLERANCE) ** 4)
     fits = variance / (variance + 0.5 * unexplained + noise)
-    confidence = np.asarray(MAX_CONFIDENCE * texture * near_one * fits, np.float32)[..., None]
+    confidence = np.asarray(texture * near_one * fits, np.float32)[..., None]
     return np.asarray(np.clip(gain, 0.5, 1.5)[..., None] * background, np.float32), confidence

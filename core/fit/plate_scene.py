@@ -23,10 +23,9 @@ ReadPlate = Callable[[str], Picture | None]
 
 
 class PlateScene:
-    """Plates by the name of the frame. `render_frame` shows the one of a camera's frame, as `SceneGaussians` shows what
-    a camera sees.
+    """Plates by the name of the frame; `render_frame` returns the one of a camera's frame.
 
-    cameras: of the whole frames. read: reads the plate of a frame, of any size, None where there is none.
+    cameras: of the whole frames. read: reads the plate of a frame, of any size; None where there is none.
     """
 
     def __init__(self, cameras: Mapping[str, Camera], read: ReadPlate, display_white: float = 1.0) -> None:
@@ -35,7 +34,8 @@ class PlateScene:
     @classmethod
     def from_folder(cls, folder: Path, cameras: Mapping[str, Camera], display_white: float,
                     space: ColourSpace | None = None) -> PlateScene:
-        """Open the plates of a folder: a picture for each frame, of its name with any suffix. space: of their codes."""
+        """Open the plates of a folder: a picture for each frame, of its name with any suffix. space: of the pictures.
+        """
         files = {path.with_suffix("").relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.*"))}
 
         def read(frame: str) -> Picture | None:
@@ -53,8 +53,8 @@ class PlateScene:
         whole = self._cameras.get(camera.frame)
         plate = None if whole is None else self._read(camera.frame)
         if whole is None or plate is None:
-            raise RunError(f"The scene of this fit is one plate a frame, and there is none for {camera.frame or 'a '}"
-                           f"{'' if camera.frame else 'camera of its own'}; use the frames of the fitted shot.")
+            raise RunError("The scene of this fit is one plate per frame, and there is none for "
+                           f"{camera.frame or 'this camera'}; use the frames of the fitted shot.")
         scale_x, scale_y = camera.fx / whole.fx, camera.fy / whole.fy
         size = max(round(whole.width * scale_x), 1), max(round(whole.height * scale_y), 1)
         left, top = round(whole.cx * scale_x - camera.cx), round(whole.cy * scale_y - camera.cy)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The fit of a flare over plates: shots whose cameras are not solved, or that hold what moves.
+"""The fit of a flare over plates, for shots whose cameras are not solved, or in which something moves.
 
     L = |P_t + sum_l b_lt F(x_lt) - I_t|        frame t: plate P, flare F at the light's place x, brightness b
 
-Squares come first: with absolute values from the start the flare dies, since it is nothing in most pixels. The plates
-are estimates of the removal network, or exact clean frames; the brightness of each light in each frame is an unknown.
-`run_loop` calls it where `settings.uses_plates`.
+The loss starts with squares: with absolute values from the start, the flare vanishes, since most pixels have none. The
+plates are estimates of the removal network, or exact clean frames; the brightness of each light in each frame is an
+unknown. `run_loop` calls it where `settings.uses_plates`.
 """
 from __future__ import annotations
 
@@ -70,10 +70,11 @@ class PlateTrainer(FlareTrainer):
         self._estimate_plates()
 
     def _make_estimator(self) -> PlateEstimator:
-        shown = {view.name: self.frames.frame(view).numpy() for view in self.capture.views}
+        """Return an estimator over the capture's frames and clean frames."""
+        frames = {view.name: self.frames.frame(view).numpy() for view in self.capture.views}
         plates = {view.name: clean.numpy() for view in self.capture.views
                   if (clean := self.frames.clean(view)) is not None}
-        return PlateEstimator(ShotFrames(shown, plates))
+        return PlateEstimator(ShotFrames(frames, plates))
 
     @torch.no_grad()
     def _estimate_plates(self, flare: FlareModel | None = None) -> None:
@@ -148,6 +149,7 @@ class PlateTrainer(FlareTrainer):
             solve_brightness(self.flare, self.views, self.frames, self.render_view)
 
     def _loss(self, picture: Tensor, frame: Tensor) -> Tensor:
+        """Return the loss of a composite against its frame: squares alone at first, then with L1 and SSIM."""
         settings = self.settings.plates
         error = picture - frame
         weight = torch.where(error > 0, 1 / settings.excess_weight, 1.0)

@@ -26,7 +26,7 @@ from ..look import PlaneGaussians as LookGaussians
 from .plate_scene import PlateScene
 
 Scene = SceneGaussians | PlateScene
-"""The scene of a fit: Gaussians, or one plate a frame."""
+"""The scene of a fit: Gaussians, or one plate per frame."""
 
 MIN_ALPHA = 1e-6
 """Smallest alpha by which a depth is divided: where nothing is, it stays 0."""
@@ -131,7 +131,7 @@ def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels
 
 
 def _evaluate_edited(look: Look, flare: FlareModel, edits: LookEdits, camera: Camera,
-            visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
+                     visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
     """Return each light's Gaussians under an artist's edits, with places and brightness of the camera's frame."""
     shares = flare.shares(visibilities, camera.frame) or {}
     places = dict(zip(flare.names, flare.positions_in(camera.frame).numpy(), strict=True))

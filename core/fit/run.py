@@ -5,7 +5,7 @@
     capture.txt     the capture's folder
     exposures.json  exposure of each frame relative to the median frame, where they differ
     flare.flare     the flare            scene.ply   the scene, standard 3DGS
-    plates/         in place of scene.ply, a plate a frame, for a shot without a camera solve
+    plates/         in place of scene.ply, one plate per frame, for a shot without a camera solve
     lights.json     places and fitted brightness of the lights by frame, where they move or change
     checkpoint/     state.safetensors    the state that a resumed fit needs
     metrics.jsonl   one line of figures at intervals; preview.png, preview_small.png; eval.json; log.txt
@@ -133,12 +133,12 @@ class Run:
         return capture.with_lights_at(dict(zip(model.names, model.positions.numpy().astype(np.float64), strict=True)))
 
     def _with_lights(self, capture: Capture) -> Capture:
-        """Return the capture with the lights of the run by frame, where it has such; cameras then name their frames."""
+        """Return the capture with the run's lights by frame, if it has them; its cameras then name their frames."""
         path = self.folder / FRAME_LIGHTS
         return capture.with_lights(read_lights(path)).with_frame_names() if path.is_file() else capture
 
     def _capture(self) -> Capture:
-        """Return the capture as it was opened last."""
+        """Return the capture that was opened last; opens it if there is none."""
         return self._opened or self.capture(need_frames=False)
 
     def find_capture(self, folder: Path | None) -> Path:
@@ -173,7 +173,7 @@ class Run:
 
     @cached_property
     def scene(self) -> Scene:
-        """The fitted scene: Gaussians, or one plate a frame. Raises RunError."""
+        """The fitted scene: Gaussians, or one plate per frame. Raises RunError."""
         if not self.settings.uses_plates:
             return read_ply(self._require(SCENE))
         if not (self.folder / PLATES).is_dir():
@@ -187,7 +187,7 @@ class Run:
         """The fitted scene as Gaussians. Raises RunError for a scene of plates."""
         if isinstance(self.scene, SceneGaussians):
             return self.scene
-        raise RunError(f"The scene of {self.folder} is one plate a frame: it has no 3D, and other cameras cannot see "
+        raise RunError(f"The scene of {self.folder} is one plate per frame: it has no 3D, and other cameras cannot see "
                        "it; use its flare alone (flare.flare).")
 
     @cached_property

@@ -102,10 +102,10 @@ class FlareSettings:
 class SceneSettings:
     """The scene: 3DGS from the capture's points, with one of two strategies of densification, or plates.
 
-    kind: "plates" takes an estimated plate a frame for the scene, and needs no cameras; all else here is for
-    "gaussians". sh_every: iterations between degrees of spherical harmonics. reorder_every: iterations between sorts
-    along the Morton curve, which keeps neighbours together in memory. start: a 3DGS PLY in the capture's world to start
-    from instead of the points. frozen: keep that scene unchanged and fit only the flare.
+    kind: "plates" uses one plate per frame as the scene, and needs no cameras; the other settings are for "gaussians".
+    sh_every: iterations between degrees of spherical harmonics. reorder_every: iterations between sorts along the
+    Morton curve, which keeps neighbours together in memory. start: a 3DGS PLY in the capture's world to start from
+    instead of the points. frozen: keep that scene unchanged and fit only the flare.
     far_layer: add a far layer where the frames show something beyond the parallax of the capture (`far_layer`).
     """
 
@@ -177,13 +177,13 @@ class BrightnessSettings:
 class PlateSettings:
     """A fit over plates.
 
-    squares_until: share of the iterations in which the loss is that of squares alone; L1 from the start ends with no
-    flare, since most pixels have none. squares_weight: of the squares, l1_weight: of L1 and SSIM beside them later.
-    excess_weight: factor on squares where the frame is brighter than the composite, relative to the rest: estimated
-    plates rather hold flare than lack light.
+    squares_until: share of the iterations, at the start, in which the loss has squares alone; with L1 the flare would
+    vanish there, since most pixels have none. squares_weight: of the squares. l1_weight: of L1 and SSIM, which join
+    them later. excess_weight: factor on squares where the frame is brighter than the composite, relative to the rest:
+    estimated plates more often contain flare than lack light.
 
     aligned: improve estimated plates by aligned neighbours (`plate_estimates`), at the start, and at the share
-    `refine_at` of the iterations again with the fitted flare subtracted; 1 leaves the second out.
+    `refine_at` of the iterations again with the fitted flare subtracted; 1 leaves the second time out.
     """
 
     squares_until: float = 0.3
@@ -228,7 +228,7 @@ class FitSettings:
 
     @property
     def uses_plates(self) -> bool:
-        """True if the scene is one plate a frame."""
+        """True if the scene is one plate per frame."""
         return self.scene.kind == "plates"
 
     @property

@@ -14,11 +14,11 @@ from torch import Tensor, nn
 
 
 class FrameLights(nn.Module):
-    """Places and brightnesses of lights by frame.
+    """Places and brightness of lights by frame.
 
-    positions: (frames, lights, 3) world units. brightness: of each light relative to its usual one, a sparse table, so
-    that a step changes only the frame that it is made from. prior: (frames, lights) brightness that the lights' file
-    has, NaN where it has none.
+    positions: (frames, lights, 3) world units. brightness: of each light relative to its usual one; a sparse table, so
+    that a step changes only the frame that it uses. prior: (frames, lights) brightness in the lights' file, NaN where
+    it has none.
     """
 
     positions: Tensor
@@ -48,7 +48,7 @@ class FrameLights(nn.Module):
     def roughness(self, frame: str) -> Tensor:
         """Return the sum of |change of brightness| between a frame and the ones before and after it.
 
-        Absolute values allow steps, as of a switch, and smooth what nothing determines.
+        Absolute values allow steps, as of a switch, and smooth the brightness where no frame decides it.
         """
         row, last = self.rows[frame], len(self.rows) - 1
         near = torch.tensor([max(row - 1, 0), row, min(row + 1, last)])
@@ -57,7 +57,7 @@ class FrameLights(nn.Module):
         return total
 
     def deviation(self, frame: str) -> Tensor:
-        """Return the sum of squared differences from the brightness that the lights' file has for a frame."""
+        """Return the sum of squared differences of a frame's brightness from that in the lights' file."""
         prior = self.prior[self.rows[frame]]
         difference: Tensor = self.brightness(torch.tensor(self.rows[frame])) - prior.nan_to_num(0)
         return difference.square()[prior.isfinite()].sum()

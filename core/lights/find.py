@@ -80,7 +80,7 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
         lights, gaps = split_gaps(supported, dict(views), maps)
         doubtful = [*gaps, *(light for light in candidates if not _is_well_supported(light, min_views, settings))]
         if gaps:
-            messages.append(f"{len(gaps)} places are gaps through which a bright far surrounding shows, and no lights; "
+            messages.append(f"{len(gaps)} places are no lights but gaps through which a bright far surrounding shows; "
                             "`lights/report.json` lists them as doubtful.")
     if not lights and len(views) > 1:
         lights = _find_by_ghosts(capture, progress, settings.seed)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tells lamps from gaps through which a bright far surrounding shows, by the views together. `find` calls it.
+"""Separates lamps from gaps through which a bright far surrounding shows, by all views together. `find` calls it.
 
-Detections in gaps between near things can agree on a place, that of the gap. But the light comes from far away: other
-views see it in the same direction, wherever they stand, if nothing hides it there. A lamp is elsewhere in those views.
+Detections in a gap between near things can agree on one place, that of the gap. But their light comes from far away:
+other views see it in the same direction, unless something hides it there. They see a lamp in another direction.
 """
 from __future__ import annotations
 
@@ -18,20 +18,22 @@ from .found_light import FoundLight
 MAP_WIDTH = 160
 """Largest width of a brightness map, pixels."""
 CLIPPED, MIN_CLIPPED_SHARE = 0.96, 0.5
-"""Display value of the largest channel from which a pixel is bright, and the share of a map's pixel that must be."""
+"""Smallest value of the largest channel of a bright pixel, display values, and the smallest share of bright pixels in a
+bright pixel of a map."""
 SEPARATION = 4.0
-"""Distance between the place and the direction of a detection, in radii of the light, from which a view can tell."""
+"""Smallest distance in a view between a light's place and a detection's direction, in radii of the light, at which the
+view decides."""
 MIN_SEPARATION = 0.02
-"""The same as a share of the frame's width, at least."""
+"""Lower bound of that distance, as a share of the frame's width."""
 MIN_TESTS = 6
 """Number of pairs of a detection and another view below which nothing is decided."""
 MIN_EXPLAINED, MIN_EXCESS = 0.4, 0.15
-"""Share of the tests in which the surrounding is bright, from which it explains a light, and by how much that exceeds
-the bright share of the frames: in over-exposed frames every direction is bright."""
+"""A light is a gap if the surrounding is bright in at least this share of the tests, and if that share exceeds the
+bright share of the frames by so much: in over-exposed frames, every direction is bright."""
 
 
 def brightness_map(picture: Picture) -> NDArray[np.bool_]:
-    """Return a small map (height, width) of where a picture is bright."""
+    """Return a small map (height, width), true where a picture is bright."""
     width = min(MAP_WIDTH, picture.size[0])
     height = max(round(picture.size[1] * width / picture.size[0]), 1)
     bright = (picture.display().max(axis=2, keepdims=True) >= CLIPPED).astype(np.float32)
@@ -43,8 +45,8 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
                     maps: Mapping[str, NDArray[np.bool_]]) -> float | None:
     """Return the share, 0..1, of the tests in which the far surrounding is bright where a light was detected.
 
-    cameras, maps: of each view, by name. None where too few views can tell: the light is far itself, or nearly in the
-    same direction from all.
+    cameras, maps: of each view, by name. None if too few views decide: the light itself is far, or nearly in the same
+    direction from all.
     """
     if light.far:
         return None
@@ -70,7 +72,7 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
 
 def split_gaps(lights: Sequence[FoundLight], cameras: Mapping[str, Camera],
                maps: Mapping[str, NDArray[np.bool_]]) -> tuple[list[FoundLight], list[FoundLight]]:
-    """Return the lights, and those that a bright far surrounding explains: gaps."""
+    """Return the lamps among lights, and the gaps, which a bright far surrounding explains."""
     threshold = max(MIN_EXPLAINED, MIN_EXCESS + float(np.mean([bright.mean() for bright in maps.values()])))
     lamps: list[FoundLight] = []
     gaps: list[FoundLight] = []
@@ -81,7 +83,7 @@ def split_gaps(lights: Sequence[FoundLight], cameras: Mapping[str, Camera],
 
 
 def _project_direction(camera: Camera, direction: Floats) -> Floats | None:
-    """Return the pixel (2,) at which a camera sees a direction (3,); None outside of its frame."""
+    """Return the pixel (2,) at which a camera sees a direction (3,); None outside its frame."""
     local = camera.world_to_camera[:3, :3] @ direction
     if local[2] <= 1e-6:
         return None

@@ -145,7 +145,7 @@ class LookEdits:
         return result
 
     def placed(self, sources: Mapping[str, str]) -> LookEdits:
-        """Return the edits of a look's lights for placed lights, whose sources are given by their names."""
+        """Return these edits for placed lights. sources: the look's light that each placed light shows, by name."""
         lights = {name: self.lights[source] for name, source in sources.items() if source in self.lights}
         elements = {(name, part): edit for name, source in sources.items()
                     for (light, part), edit in self.elements.items() if light == source}

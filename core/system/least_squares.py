@@ -15,7 +15,7 @@ L1_EPSILON = 0.01
 
 def robust_bounded_fit(columns: Floats, values: Floats, start: Floats, low: ArrayLike, high: ArrayLike,
                        prior_weight: float) -> Floats:
-    """Return x (n,) within bounds for which columns (m, n) x is nearest to values (m,), by least absolute errors.
+    """Return x (n,) within bounds that brings columns (m, n) @ x nearest to values (m,), by least absolute errors.
 
     prior_weight: per value, of the squared distance from `start`, which decides where the values do not.
     """

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 DECODED_CACHE_BYTES = 1 << 26
 SCENE_KINDS = ("gaussians", "plates")
-"""Values of --scene that are no file."""
+"""Values of --scene that name no file."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,8 +62,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", type=Path, metavar="PLY_OR_KIND",
                         help="start from this 3DGS scene, trained elsewhere in the capture's world (INRIA's layout, as "
                              "gsplat, nerfstudio, Brush and Postshot write it, or PlayCanvas's compressed one); or "
-                             "the kind of scene: gaussians, or plates, one clean frame for each frame, which needs no "
-                             "cameras (default: plates where CAPTURE has no camera solve)")
+                             "the kind of scene: gaussians, or plates (one clean frame per frame), which need no "
+                             "cameras (default: plates if CAPTURE has no camera solve)")
     parser.add_argument("--freeze-scene", action="store_true",
                         help="keep the scene of --scene unchanged and fit the flare alone; needs no clean frames")
     plate_space.add_option(parser)
@@ -137,7 +137,7 @@ def scene_kind(scene: Path | None, capture: Capture, progress: Progress) -> str:
         if scene is not None and str(scene) != "plates":
             raise CaptureError(f"{capture.folder} has no camera solve, which a scene of Gaussians needs; run solve "
                                "first, or leave out --scene.")
-        progress.say(f"{capture.folder} has no camera solve: its scene is plates, one clean frame for each frame. The "
+        progress.say(f"{capture.folder} has no camera solve: its scene is plates, one clean frame per frame. The "
                      f"focal length is {capture.views[0].camera.focal_length:.0f} pixels, {capture.focal_source}.")
         return "plates"
     return "plates" if str(scene) == "plates" else "gaussians"

@@ -27,7 +27,7 @@ SCENES = ("auto", "gaussians", "plates")
 FRAMES, SOLVED, RUN, LAYERS, CLEAN = "shot", "capture", "run", "layers", "clean"
 """Folders below DIR: frames without cameras, frames with solved cameras, and the results."""
 MIN_SOLVED_SHARE = 0.95
-"""Share of the frames that a camera solve has to place; a shot lacks the others."""
+"""Share of the frames that a camera solve has to place; below it, the scene is plates."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +36,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="a video, a folder of frames, or a capture")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for all results")
     parser.add_argument("--scene", choices=SCENES, default="auto",
-                        help="gaussians: solve the camera and fit a 3D scene. plates: one clean frame for each frame, "
+                        help="gaussians: solve the camera and fit a 3D scene. plates: one clean frame per frame, "
                              "without cameras. auto: gaussians if the camera can be solved and the lights stand, else "
                              "plates (default auto)")
     parser.add_argument("--focal", type=float, metavar="PIXELS",
@@ -91,10 +91,10 @@ def _open_capture(args: argparse.Namespace, progress: Progress) -> tuple[Capture
             if not moving or args.scene == "gaussians":
                 progress.say("The camera is solved: the scene is Gaussians in 3D.")
                 return capture, "gaussians"
-            reason = f"{', '.join(moving)} moves"
+            reason = f"lights move ({', '.join(moving)})."
         elif args.scene == "gaussians":
             raise CaptureError(f"The camera cannot be solved: {reason}")
-        progress.say(f"The scene is plates, one clean frame for each frame: {reason}")
+        progress.say(f"The scene is plates, one clean frame per frame: {reason}")
     folder = _frames_folder(args, progress)
     if args.focal is not None:
         width = Capture.open(folder, need_cameras=False).views[0].camera.width
@@ -147,7 +147,7 @@ def _frames_folder(args: argparse.Namespace, progress: Progress) -> Path:
 
 
 def _settings(args: argparse.Namespace, kind: str, capture: Capture, progress: Progress) -> Any:
-    """Return the settings of the fit; those of a run that is there already."""
+    """Return the settings of the fit: those of an existing run, else new ones."""
     from ...core.conventions.run_files import CONFIG
     from ...core.fit import Run, preset
     from ...core.fit.settings import over_plates, override_settings
@@ -182,7 +182,7 @@ COMMAND = Command(
     "shot", "Runs all steps on a clip: frames, lights, clean frames, fit, layers, compositor.",
     f"""Makes a flare and its layers from any shot: a still or moving camera, lights that stand, move, dim or go out.
 Writes DIR/{RUN} (with flare.flare), DIR/{LAYERS} (EXR), DIR/{CLEAN} (frames without the flare), DIR/{SHEET} and
-DIR/compositor/{compose.BLEND}, and says what it chose. Run again, it goes on where it was stopped.
+DIR/compositor/{compose.BLEND}, and says what it chose. If it is run again, it continues where it stopped.
 
   run.py shot clip.mp4 --out build/clip
   run.py shot frames/sh010 --out build/sh010 --scene plates --focal 1800""",

@@ -32,7 +32,7 @@ HELD_OUT = "0006.png"
 
 
 def _flare(place: np.ndarray, colour: tuple[float, float, float]) -> np.ndarray:
-    """A glow about the light and a ghost mirrored through the middle, linear light."""
+    """A glow around the light and a ghost mirrored through the middle, linear light."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     middle = np.array([WIDTH, HEIGHT]) / 2
     ghost = middle - 0.6 * (place - middle)
@@ -160,7 +160,7 @@ def test_a_stopped_fit_continues_as_if_it_had_not_stopped(shot: Path, tmp_path: 
 
 def test_plates_show_no_other_camera(run: Run) -> None:
     camera = run.capture().views[0].camera
-    with pytest.raises(RunError, match="one plate a frame"):
+    with pytest.raises(RunError, match="one plate per frame"):
         run.render(type(camera)(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
                                 camera.world_to_camera))
     with pytest.raises(RunError, match="it has no 3D"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A gap through which a bright far surrounding shows is no light, and a lamp before it stays one."""
+"""A gap through which a bright far surrounding shows is no light, and a lamp in front of a board stays one."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -69,7 +69,7 @@ def test_a_sun_in_a_bright_sky_is_not_taken_for_a_gap(cameras: dict[str, Camera]
     white = {name: np.ones(SIZE[::-1], bool) for name in cameras}
     assert explained_share(light(cameras, far=True), cameras, white) is None
     still = dict.fromkeys(cameras, cameras["0000.png"])
-    assert explained_share(light(still), still, white) is None, "without parallax no view can tell"
+    assert explained_share(light(still), still, white) is None, "without parallax no view decides"
 
 
 class Fixed:

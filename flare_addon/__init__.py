@@ -12,6 +12,7 @@
     looks.py            the look of a scene, its flares          occlusion.py       visibility of lights
     overlay.py          the flare in the viewport                points.py          the point cloud in the viewport
     shots.py            scenes as shots                          baking.py          bakes
+    lamp_drive.py       power of lamps as a factor               light_extents.py   areas of lights
     views.py            3D views                                 compositor/        the layers in the compositor
     library.py          the library of flares                    paths.py           paths of a .blend that moves
     fcurves.py          animation of list items                  render_settings.py   rendering and saving

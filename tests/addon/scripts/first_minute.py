@@ -288,7 +288,7 @@ def factor(scene, frame=None):
 scene, (lamp,) = scene_with((0.5, 8, 0.4))
 lamp.data.energy, scene.frame_end = 100, 9
 select(scene, lamp)
-ops.add_library_flare()
+ops.apply_flare(filepath=flare)
 item = scene.fit_flare.lights[0]
 bright = brightness(scene)
 lamp.data.energy, lamp.data.color = 50, (1, 0.5, 1)
@@ -325,7 +325,7 @@ lamp.data.type, lamp.data.shape = "AREA", "RECTANGLE"
 lamp.data.size, lamp.data.size_y = 2.0, 1.0
 lamp.rotation_euler = (-np.pi / 2, 0, 0)  # its -Z looks at the camera
 select(scene, lamp)
-ops.add_library_flare(look=path_of["Clean Prime"])
+ops.apply_flare(filepath=flare)
 item = scene.fit_flare.lights[0]
 wall = object_in(scene, "Wall", bpy.data.meshes.new("Wall"), (0, 0, 0))
 wall.data.from_pydata([(-9, 6, -9), (0, 6, -9), (0, 6, 9), (-9, 6, 9)], [], [(0, 1, 2, 3)])

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import bpy
 
-from . import fits, jobs, looks, operators, overlay, panels, paths, points, preferences, properties
+from . import baking, fits, jobs, looks, operators, overlay, panels, paths, points, preferences, properties
 from .compositor import drivers
 
 _MODULES = (properties, preferences, operators, panels, points, overlay, paths)
@@ -31,6 +31,7 @@ _MODULES = (properties, preferences, operators, panels, points, overlay, paths)
 @bpy.app.handlers.persistent
 def _after_load(_path: str) -> None:
     """After a file is loaded: clear the caches of the previous one, and migrate data of earlier versions."""
+    baking.abandon()
     looks.clear_cache()
     points.clear_cache()
     overlay.last_error = ""

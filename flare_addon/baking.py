@@ -185,9 +185,14 @@ def _on_finished(job: jobs.Job) -> None:
 jobs.ON_FINISHED["bake"] = _on_finished
 
 
-def unregister() -> None:
-    """Stop reading a scene."""
+def abandon() -> None:
+    """Forget the scene that is read, since its file is closed."""
     global _preparation
     _preparation = None
+
+
+def unregister() -> None:
+    """Stop reading a scene."""
+    abandon()
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)

@@ -115,6 +115,8 @@ def test_a_scene_is_read_a_frame_at_a_time(facts: Any) -> None:
     assert facts["read one"] == [1, 3, 1]
     assert facts["restored"] == 1
     assert "was deleted while" in facts["camera deleted while it reads"]
+    during, ended = facts["another file is opened"]
+    assert "A bake is running" in during and ended
 
 
 def test_a_single_picture_is_rendered_with_its_flare(facts: Any) -> None:

@@ -274,6 +274,10 @@ try:
 except part("core.errors").FitFlareError as problem:
     facts["camera deleted while it reads"] = str(problem)
 scene.camera = lens
+baking._preparation = baking.Preparation(reading, False, folder)
+during = refusal(ops.bake)
+bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+facts["another file is opened"] = [during, baking.preparation() is None]
 
 # ---- lamps drive their flares ---------------------------------------------------------------------------
 def factor(scene, frame=None):

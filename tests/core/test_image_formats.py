@@ -135,6 +135,17 @@ def test_a_jpeg_keeps_comment_density_and_iptc_but_no_gain_map_nor_its_claim(tmp
     assert not read_plate(tmp_path / "b.jpg").warning
 
 
+def test_a_clip_behind_a_jpeg_is_named(tmp_path: Path) -> None:
+    data = cv2.imencode(".jpg", np.full((32, 32, 3), 128, np.uint8))[1].tobytes()
+    for name, tail, is_named in (("a.jpg", b"", False), ("b.jpg", bytes(300), False),
+                                 ("c.jpg", b"MotionPhoto_Data\0\0\0\x18ftypmp42" + bytes(9000) + b"SEFT", True)):
+        (tmp_path / name).write_bytes(data + tail)
+        plate = read_plate(tmp_path / name)
+        assert ("data behind its picture" in plate.warning) == is_named
+        write_plate(tmp_path / "clean.jpg", plate, plate.codes // 2)
+        assert b"ftypmp42" not in (tmp_path / "clean.jpg").read_bytes()
+
+
 def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rawpy", None)
     (tmp_path / "a.dng").write_bytes(b"II*\0" + bytes(60))

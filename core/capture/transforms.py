@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..errors import CaptureError
 from ..images.listing import SUFFIXES
 from ..images.size import picture_size
-from ..system.file_names import canonical_name, find_entry
+from ..system.file_names import canonical_name, find_entry, name_below
 from ..system.files import read_json, safe_join
 from .camera import Floats, is_rotation
 from .colmap import MAX_MAGNITUDE, PointCloud, PosedFrame, check_lens, read_model
@@ -104,7 +104,7 @@ def _read_frame(path: Path, number: int, meta: dict[str, Any], frame: Any, lense
     result.frames.append(PosedFrame(name, lens, _read_pose(frame, where)))
     mask = frame.get("mask_path")
     if isinstance(mask, str):
-        file = safe_join(path.parent, mask, CaptureError)
+        file = safe_join(path.parent, name_below(path.parent, mask), CaptureError)
         mask_file = find_entry(path.parent, file.relative_to(path.parent).as_posix())
         if mask_file is None or not mask_file.is_file():
             raise CaptureError(f"{where} its mask {file} is missing; put it there, or remove mask_path.")
@@ -149,7 +149,7 @@ def _read_lists(path: Path, meta: dict[str, Any], result: Transforms) -> None:
 
 def _with_suffix(folder: Path, name: str) -> str:
     """Return the path of a frame below the folder; NeRF's synthetic scenes leave its suffix out."""
-    name = Path(name.replace("\\", "/")).as_posix()  # drops a leading "./"
+    name = Path(name_below(folder, name).replace("\\", "/")).as_posix()  # drops a leading "./"
     path = safe_join(folder, name, CaptureError)
     if path.suffix.lower() not in SUFFIXES:
         for suffix in sorted(SUFFIXES):
@@ -250,7 +250,7 @@ def _read_points(path: Path, meta: dict[str, Any], result: Transforms) -> PointC
     """Return the points that a transforms.json names, else those of a COLMAP model beside it, moved to its world."""
     folder, name = path.parent, meta.get("ply_file_path")
     if isinstance(name, str):
-        file = safe_join(folder, Path(name).as_posix(), CaptureError)
+        file = safe_join(folder, Path(name_below(folder, name)).as_posix(), CaptureError)
         cloud_file = find_entry(folder, file.relative_to(folder).as_posix())
         if cloud_file is None or not cloud_file.is_file():
             raise CaptureError(f"{file} is missing, which {path} names as its points.")

@@ -11,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path, PurePath, PurePosixPath
 
 _DIGITS = re.compile(r"(\d+)")
+_DRIVE = re.compile(r"[A-Za-z]:")
 _MAX_DIGITS = 4000
 """Digits that Python converts to an integer."""
 
@@ -37,6 +38,19 @@ def canonical_name(name: PurePath | str) -> str:
     """
     path = PurePosixPath(unicodedata.normalize("NFC", str(name).replace("\\", "/")))
     return str(path.with_suffix(path.suffix.lower())) if path.suffix else str(path)
+
+
+def name_below(folder: Path, name: str) -> str:
+    """Return a name as it stands in a folder, where it is the absolute path of another machine and the folder has its
+    last folders: "C:/work/shot/images/1.png" is images/1.png. Other names as they are."""
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    if not parts or ".." in parts or not (parts[0] == "/" or _DRIVE.fullmatch(parts[0])):
+        return name
+    for start in range(1, len(parts)):
+        inside = find_entry(folder, "/".join(parts[start:-1] or parts[start:]))
+        if inside is not None:
+            return "/".join(parts[start:])
+    return name
 
 
 def find_entry(folder: Path, name: str) -> Path | None:

@@ -90,6 +90,20 @@ def test_the_model_with_the_most_images_is_used(tmp_path: Path, places: tuple[st
     assert f"{places[1]} with 4 frames is used" in sentence and f"{places[0]} 2)" in sentence
 
 
+@pytest.mark.parametrize("elsewhere", ["C:/work/shot", "C:\\work\\shot", "/home/ada/shot"])
+def test_absolute_names_of_another_machine_are_found_by_their_end(elsewhere: str, tmp_path: Path) -> None:
+    folder = make_transforms(tmp_path / "c")
+    data = json.loads((folder / "transforms.json").read_text())
+    for frame in data["frames"]:
+        frame["file_path"] = f"{elsewhere}/{frame['file_path'].removeprefix('./')}"
+    (folder / "transforms.json").write_text(json.dumps(data))
+    assert [view.name for view in Capture.open(folder).views] == ["0000.png", "0001.png", "0002.png"]
+    data["frames"][0]["file_path"] = "/etc/passwd"
+    (folder / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(CaptureError, match="not inside the folder"):
+        Capture.open(folder)
+
+
 def test_a_model_in_another_place_is_named(tmp_path: Path) -> None:
     """COLMAP's automatic reconstruction writes dense/0/sparse."""
     folder = make_capture(tmp_path / "c")

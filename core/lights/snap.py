@@ -6,7 +6,8 @@ view. A flare is brightest around its light. So each light moves to the brightes
 (Comaniciu and Meer 2002) under windows that narrow, whose steps in the pictures become one step in the world by least
 squares. Pixels are shared among the lights by their windows, so that two do not climb one flare.
 
-A light that is accurate already sits on a peak, and is left unchanged. So is one that finds no clear peak.
+A light that is accurate already sits on a peak, and is left unchanged. So is one that finds no clear peak, and one in a
+clipped sky, which hides the peak.
 """
 from __future__ import annotations
 
@@ -36,15 +37,24 @@ below MAX_SHIFT of the window.
 DISC_WINDOW, DISC_GAIN = 0.03, 10.0
 """Brightness of a clipped light disc, which hides its flare: DISC_GAIN times the flare under a window of this
 deviation."""
+MAX_DISC_RADIUS = 0.035
+"""Radius, in frame widths, of the largest disc in a clean frame; larger clipped areas are sky."""
+MAX_HIDDEN_SHARE, MIN_FLARE = 0.5, 0.25
+"""Share of the views that have a light in frame, in a clipped sky, above which it is not moved; and the light of a view
+relative to the mean of all from which it counts as one with a flare."""
 DAMPING = 3e-3
 """Damping of the least squares, relative to the mean curvature: the line of sight is weakly determined."""
 
 
 class FlareView(NamedTuple):
-    """A camera, and the brightness of a flare in its picture: (height, width), linear, not negative."""
+    """A camera, and the brightness of a flare in its picture: (height, width), linear, not negative.
+
+    observed: (height, width), False where the picture says nothing of the flare; None if it does everywhere.
+    """
 
     camera: Camera
     flare: NDArray[np.float32]
+    observed: NDArray[np.bool_] | None = None
 
 
 def flare_view(camera: Camera, frame: NDArray[np.float32], clean: NDArray[np.float32]) -> FlareView:
@@ -53,15 +63,38 @@ def flare_view(camera: Camera, frame: NDArray[np.float32], clean: NDArray[np.flo
 
     added = (linear_from_srgb(frame) - linear_from_srgb(clean)).clip(min=0).mean(-1)
     glow = cv2.GaussianBlur(added, (0, 0), DISC_WINDOW * camera.width)
-    disc = (frame >= CLIP_LEVEL).all(-1)
-    return FlareView(camera, np.asarray(added + disc * glow * np.float32(DISC_GAIN), np.float32))
+    clipped = (frame >= CLIP_LEVEL).all(-1)
+    # A clipped sky hides the flare as a light's disc does, but its middle is no light.
+    hidden = _components_with(clipped, _large_components((clean >= CLIP_LEVEL).all(-1), MAX_DISC_RADIUS * camera.width))
+    disc = clipped & ~hidden
+    flare = np.asarray(added + disc * glow * np.float32(DISC_GAIN), np.float32)
+    return FlareView(camera, np.where(hidden, np.float32(0), flare), ~hidden if hidden.any() else None)
+
+
+def _large_components(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """Return the connected parts of a mask (height, width) whose area is that of a larger disc, radius in pixels."""
+    import cv2
+
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    return np.asarray(mask & (statistics[:, cv2.CC_STAT_AREA] > np.pi * radius * radius)[labels])
+
+
+def _components_with(mask: NDArray[np.bool_], seeds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the connected parts of a mask (height, width) that touch the seeds."""
+    import cv2
+
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    touched = np.zeros(count, bool)
+    touched[np.unique(labels[seeds & mask])] = True
+    touched[0] = False
+    return np.asarray(touched[labels])
 
 
 def snap_lights(views: Sequence[FlareView], lights: ArrayLike) -> Floats:
     """Return the positions of the lights (n, 3), world coordinates, on their flares; unchanged where there is no clear
     peak."""
     initial = np.array(lights, np.float64).reshape(-1, 3)
-    positions, is_on_peak = initial.copy(), _are_on_peaks(views, initial)
+    positions, is_on_peak = initial.copy(), _are_on_peaks(views, initial) | _are_unobserved(views, initial)
     for first in reversed(range(len(WINDOWS) - 2)):
         if is_on_peak.all():
             break
@@ -108,6 +141,23 @@ def _are_on_peaks(views: Sequence[FlareView], positions: Floats) -> NDArray[np.b
     return on_peak
 
 
+def _are_unobserved(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
+    """Return (n,), which lights stand where most views with a flare that have them in frame hide it in a clipped sky.
+    """
+    unobserved = np.zeros(len(positions), bool)
+    levels = [float(view.flare.mean()) for view in views]
+    flaring = [view for view, level in zip(views, levels, strict=True) if level >= MIN_FLARE * np.mean(levels)]
+    for light, position in enumerate(positions):
+        hidden = []
+        for camera, flare, observed in flaring:
+            pixel, depth = camera.project(position[None])
+            if camera.contains(pixel, depth)[0]:
+                x, y = np.minimum(pixel[0].astype(int), np.array(flare.shape[::-1]) - 1)
+                hidden.append(observed is not None and not observed[y, x])
+        unobserved[light] = bool(hidden) and float(np.mean(hidden)) > MAX_HIDDEN_SHARE
+    return unobserved
+
+
 class _Observation(NamedTuple):
     """A light under its window in one view.
 
@@ -137,7 +187,7 @@ def _observe(views: Sequence[FlareView], positions: Floats, window: float) -> li
     window: standard deviation in frame widths. Returns the observations by light.
     """
     by_light: list[list[_Observation]] = [[] for _ in positions]
-    for camera, flare in views:
+    for camera, flare, observed in views:
         height, width = flare.shape
         deviation = window * width
         across, down = np.arange(width) + 0.5, np.arange(height) + 0.5
@@ -149,6 +199,8 @@ def _observe(views: Sequence[FlareView], positions: Floats, window: float) -> li
         total_window = sum(windows.values(), np.full((height, width), 1e-12))
         for light, window_pixels in windows.items():
             support = window_pixels * window_pixels / total_window
+            if observed is not None:
+                support = support * observed
             weights = support * flare
             window_sum, weight_sum = support.sum(), weights.sum()
             if weight_sum <= 1e-12 * max(window_sum, 1e-12):
@@ -164,7 +216,7 @@ def _observe(views: Sequence[FlareView], positions: Floats, window: float) -> li
 def _are_merged(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
     """Return (n,), which lights coincide with another in most views."""
     coincident_views = np.zeros((len(positions), len(positions)))
-    for camera, _ in views:
+    for camera, _, _ in views:
         pixels, _ = camera.project(positions)
         coincident_views += np.linalg.norm(pixels[:, None] - pixels, axis=-1) < PEAK_WINDOW * camera.width
     coincident_views -= np.diag(np.diag(coincident_views))
@@ -177,7 +229,7 @@ def _are_in_reach(views: Sequence[FlareView], initial: Floats, positions: Floats
     Farther ones are ghosts of a light out of frame.
     """
     in_reach = np.zeros(len(initial), bool)
-    projections = [(camera.width, *camera.project(initial), *camera.project(positions)) for camera, _ in views]
+    projections = [(camera.width, *camera.project(initial), *camera.project(positions)) for camera, _, _ in views]
     for light in range(len(initial)):
         offsets = [float(np.linalg.norm(moved_pixels[light] - initial_pixels[light])) / width
                    for width, initial_pixels, initial_depth, moved_pixels, moved_depth in projections

@@ -82,6 +82,28 @@ def test_an_accurate_light_is_unchanged_beside_a_brighter_one() -> None:
     assert (snap_lights(seen, [LAMP, near]) == [LAMP, near]).all()
 
 
+def sun(small: Camera, light: NDArray[np.float64]) -> FlareView:
+    """A sun in a clipped part of the sky, whose middle is beside it, with glow and a ghost."""
+    camera = small.scaled(SCALE * WIDTH, SCALE * HEIGHT)
+    across, down = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
+    (pixel,), _ = camera.project(light)
+    away = np.hypot(across - pixel[0], down - pixel[1])
+    sky = np.hypot(across - pixel[0] - 0.07 * camera.width, down - pixel[1]) < 0.12 * camera.width
+    ghost = np.hypot(across - pixel[0], down - pixel[1] - 0.2 * camera.width) < 0.02 * camera.width
+    return seen_by(camera, np.where(sky, 3.0, 0.1), 0.2 / (1 + (away / 8) ** 2) + 0.2 * ghost)
+
+
+def test_a_sun_in_a_clipped_sky_stays_where_it_is() -> None:
+    far = np.array([3.0, -6.0, 80.0])
+    views = [sun(camera, far) for camera in cameras(9)]
+    assert any(view.observed is not None for view in views)
+    assert (snap_lights(views, [far])[0] == far).all()
+
+
+def test_a_lamp_of_a_usual_size_hides_nothing() -> None:
+    assert all(view.observed is None for view in sights((LAMP, 1.0)))
+
+
 def test_two_lights_find_one_flare_each() -> None:
     seen = sights((LAMP, 1.0), (SPOT, 0.5))
     given = np.add([LAMP, SPOT], [[0.2, 0.25, 0.1], [0.15, -0.3, 0.2]])

@@ -66,7 +66,7 @@ Length = Callable[..., FitSettings]
 Results = dict[str, dict[str, dict[str, dict[str, Any]]]]
 """Scores by study, by row, by capture."""
 STUDIES = ("form", "comparison", "robustness", "robustness-ours", "supervision", "known", "extrapolation",
-           "reconstruction")
+           "reconstruction", "far layer")
 
 
 @dataclass(frozen=True)
@@ -149,6 +149,9 @@ def experiments(length: Length) -> list[Experiment]:
                                "none: unsup": ours(length, "unsup")})
     result += [Experiment("supervision", "what remove makes, for exact", ours(length), frames="cleaned"),
              Experiment("supervision", "what remove makes: estimated", ours(length, "estimated"), frames="cleaned")]
+    for mode, title in (("default", "exact flare-free frames"), ("split", "none: split")):
+        result += variants_of("far layer", {
+            title: ours(length, mode), f"{title}, without a far layer": ours(length, mode, scene__far_layer=False)})
     many = {"flare.count": 900, "flare.density.max_gaussians": 900}  # of each light, from the beginning to the end
     alone = override_settings(ours(length), {**many, "flare.occlusion": False})
     result += [Experiment("known", "ours", alone, known_scene=True),

@@ -3,8 +3,8 @@
 
 A lamp or empty that moves, by keys, drivers, constraints or its parents, is written as a path in the world, with the
 brightness of an animated lamp. A path of lights.json becomes an empty with keys, which an artist can correct. For
-footage without a camera solve, each track of a movie clip is a light on the picture, in both directions; muted markers
-are places that are doubtful. `lights.py` and `operators/light_paths.py` call it.
+footage without a camera solve, tracks of a movie clip become lights on the picture, and such lights become tracks;
+muted markers are doubtful places. `lights.py` and `operators/light_paths.py` call it.
 """
 from __future__ import annotations
 
@@ -81,6 +81,7 @@ def _power(item: Any) -> float:
 
 
 def _keys(names: Sequence[str], places: Sequence[Any], powers: Sequence[float]) -> dict[str, dict[str, Any]]:
+    """Return the keys of a light by frame; {} if it neither moves nor changes."""
     xyz = np.array(places)
     is_standing = np.ptp(xyz, axis=0).max() <= STANDING * max(1.0, float(np.abs(xyz).max()))
     is_constant = max(powers) - min(powers) <= 1e-6 * max(max(powers), 1e-9)
@@ -125,7 +126,7 @@ def merge_entry(known: Mapping[str, Any], name: str, xyz: Sequence[float], keys:
 
 
 def key_path(item: Any, light: Light, capture: Capture, scene_frames: Mapping[str, int]) -> None:
-    """Insert keys of an empty's location, a child of the root, for the path of a light of lights.json.
+    """Key the location of an empty, a child of the root, along the path of a light of lights.json.
 
     A path on the picture lies on the rays of its pixels. scene_frames: frame of each view, by its name.
     """
@@ -190,8 +191,8 @@ def write_tracks(clip: Any, only_selected: bool = False) -> int:
                 place = [round(marker.co[0] * width, 3), round((1 - marker.co[1]) * height, 3)]
                 before = earlier.get(name) or {}
                 same = before.get("xy") is not None and np.allclose(before["xy"], place, atol=0.02)
-                kept = before if same else {label: value for label, value in before.items() if label == "on"}
-                frames[name] = {**kept, "xy": before["xy"] if same else place}
+                values = before if same else {label: value for label, value in before.items() if label == "on"}
+                frames[name] = {**values, "xy": before["xy"] if same else place}
         if frames:
             on_only = {name: {"on": key["on"]} for name, key in earlier.items() if name not in frames and "on" in key}
             rest = {label: value for label, value in known.items() if label not in ("xyz", "xy", "frames")}

@@ -57,10 +57,11 @@ PROBES = (0.15, 0.12), (-0.4, 0.3), (0.6, -0.5), (0.85, 0.8), (-0.1, -0.8), (-0.
 PLACE_STEPS = 0.7548776662, 0.5698402910
 """Steps of the R2 sequence (Roberts 2018): 1 / g and 1 / g^2, g the plastic number."""
 CENTRE_POWER = 1.5
-"""Power of a place's distance from the centre, against an even spread: 1 is even."""
+"""Exponent of the distances from the centre of evenly spread places: 1 keeps them even, more makes the centre denser.
+"""
 SHARE_AT_LIGHT, SHARE_AT_GHOSTS = 0.35, 0.55
-"""Shares of the initial Gaussians that lie about the light, as rays, and in the ghosts; the others are spread along the
-line."""
+"""Shares of the initial Gaussians that lie around the light, as rays, and in the ghosts; the others are spread along
+the line."""
 RAY_LENGTHS = 0.004, 0.9
 """Smallest and largest distance of the rays from the light, relative to half the frame's width."""
 CORE_GAUSSIANS, CORE_SIZES, CORE_OPACITY = 24, (0.3, 4.0), 0.2
@@ -150,7 +151,8 @@ def _in_frame(settings: TracedFlareSettings, fractions: Sequence[Sequence[float]
 def spread_places(settings: TracedFlareSettings) -> Places:
     """Return places (n, 2) of the light, spread over the frame and beyond it, normalised coordinates.
 
-    They are denser towards the centre, where ghosts lie over each other and change fastest."""
+    They are denser towards the centre, where ghosts lie over each other and change fastest.
+    """
     numbers = np.arange(1, settings.tracing.positions + 1)[:, None] * np.array(PLACE_STEPS)
     even = numbers % 1 * 2 - 1
     far = np.abs(even).max(1, keepdims=True)
@@ -196,7 +198,7 @@ def _fit_settings(settings: TracedFlareSettings) -> FitSettings:
 
 def fit_traced(settings: TracedFlareSettings, setup: LensSetup, traced: TracedPictures, progress: Progress
                ) -> FlareModel:
-    """Fit a flare model to traced pictures; the same settings and pictures give the same model. setup: of the tracer.
+    """Fit a flare model to traced pictures; the same settings and pictures give the same model. setup: the traced lens.
     """
     fit = _fit_settings(settings)
     generator = torch.Generator().manual_seed(settings.fit.seed)

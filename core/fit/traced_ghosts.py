@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Measures each ghost of a lens, and starts the Gaussians of a fit at the ghosts; called by `traced_flare`.
 
-A fit that starts with Gaussians spread along the line misses small ghosts: no Gaussian lies near enough to them to
-learn. Each ghost is therefore drawn alone for some places of the light, which gives its place on the line, size,
+A fit that starts with Gaussians spread along the line misses small ghosts, because no Gaussian is near enough to learn
+them. Each ghost is therefore drawn alone for some places of the light, which gives its place on the line, size,
 brightness and colour.
 """
 from __future__ import annotations
@@ -27,9 +27,9 @@ CANVAS_WIDTH, CANVAS_REACH = 192, 3.0
 MIN_LIGHT = 1e-9
 """Total light of a ghost over the frame below which it counts as absent."""
 ENERGY_POWER = 0.35
-"""Power of a ghost's light over the frame by which Gaussians are shared among ghosts."""
+"""Exponent of a ghost's light over the frame, to which its share of the Gaussians is proportional."""
 MIN_SHARE, MAX_SHARE = 0.008, 0.15
-"""Range of the share of a ghost."""
+"""Range of a ghost's share of the Gaussians."""
 OVERLAP = 0.75
 """Standard deviation of a Gaussian in a ghost, relative to the distance of its neighbours."""
 OPACITIES = 0.002, 0.3
@@ -38,8 +38,11 @@ OPACITIES = 0.002, 0.3
 
 @dataclass(frozen=True)
 class MeasuredGhost:
-    """A ghost, averaged over places of the light. place: on the line, 0 at the principal point and 1 at the light.
-    radius: normalised coordinates. level: linear RGB inside it. light: its root mean square over the frame."""
+    """A ghost, averaged over places of the light.
+
+    place: on the line, 0 at the principal point and 1 at the light. radius: normalised coordinates. level: linear RGB
+    inside it. light: its root mean square over the frame.
+    """
 
     place: float
     radius: float
@@ -48,7 +51,7 @@ class MeasuredGhost:
 
 
 def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Sequence[float]) -> list[MeasuredGhost]:
-    """Return the ghosts of a setup that reach the frame, the brightest first; lights (n, 2): normalised coordinates."""
+    """Return the ghosts of a setup that reach the frame, brightest first. lights: (n, 2) normalised coordinates."""
     optics, pairs = build_optics(setup)
     height = round(CANVAS_WIDTH * camera.height / camera.width)
     scale = CANVAS_WIDTH / CANVAS_REACH / camera.width

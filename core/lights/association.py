@@ -32,11 +32,11 @@ gate."""
 TYPICAL = 9
 """Number of sources at the end of a track whose median size is compared."""
 DISTANCE_SCALE = 0.1
-"""Distance, diagonals, that costs as much as the whole gate, when tracks are joined: gates of fast things are wide."""
+"""Distance, diagonals, that costs as much as the whole gate when tracks are joined: gates of fast lights are wide."""
 MAX_SINGLE_GAP = 6
-"""Largest gap to a track of one frame."""
+"""Largest gap, frames, to a track of one frame."""
 MAX_DIFFERENCE = 1.0
-"""Largest sum of these changes."""
+"""Largest sum of the weighted changes of size, colour and evidence."""
 LIKELY = 0.25
 """Evidence from which a source looks like a lamp."""
 

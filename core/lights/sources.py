@@ -36,13 +36,13 @@ REFERENCE = 550.0
 PROFILE_RADII = (1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 10.0, 11.5, 13.5, 16.0, 19.0, 23.0, 28.0, 34.0)
 """Edges of the rings of the brightness, pixels from the centre, as above."""
 CLIPPED_RING = 0.85
-"""Linear light of a ring from which parts of it are clipped."""
+"""Linear light from which a ring counts as partly clipped."""
 SECTORS = 12
 """Sectors of a ring; the median over them leaves out ghosts, streaks and what stands beside the light."""
 SIDE_QUANTILE = 0.35
-"""Quantile of the softness over the sectors: a lamp is soft all round, but for what hides it on one side."""
+"""Quantile of the softness over the sectors: a lamp is soft on all sides, unless something hides one of them."""
 LONG, COMPACT = 4.5, 2.8
-"""Ratio of the sides of a spot that is no lamp, and up to which it may be one."""
+"""Ratio of a spot's sides from which it is no lamp, and up to which it may be one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +211,7 @@ def measure_profile(luminance: NDArray[np.float32], xy: Floats) -> Floats:
         seen = count[number] > 0
         if seen.sum() >= SECTORS // 2:
             profile[number] = float(np.median(total[number][seen] / count[number][seen]))
-    # The ring beyond the clipped ones holds the disc's own edge, whose size says nothing of the glow.
+    # The ring beyond the clipped ones holds the disc's own edge, whose size says nothing about the glow.
     clipped = np.flatnonzero(profile >= CLIPPED_RING)
     profile[:clipped[-1] + 2 if len(clipped) else 0] = np.nan
     return profile

@@ -6,7 +6,7 @@ lamps in most frames and it is no ghost of another light. Between the frames tha
 through places and velocities; beyond them it goes on at constant velocity until it is well out of the frame. Each
 interpolated place has an expected error, from the light's own acceleration, which becomes its confidence.
 
-Brightness is the height of the glow round the light's place in unclipped rings, with one profile for the whole shot:
+Brightness is the height of the glow around the light's place in unclipped rings, with one profile for the whole shot:
 I[t, r] = on[t] G[r] + background[t], by alternating least squares.
 """
 from __future__ import annotations
@@ -33,7 +33,8 @@ GHOST_ERROR, MIN_GHOST_MOTION = 0.008, 0.03
 TOLERATED_ERROR = 3.0
 """Expected error, pixels of a frame with a diagonal of 550, at which a place is as good as doubtful."""
 RECOVERY, MAX_RECOVERY = 0.012, 0.06
-"""Distance of a spot from a light's path within which it is the light, beside the path's expected error; diagonals."""
+"""Distance from a light's path within which a spot is the light, in addition to the path's expected error, and the
+largest sum of both; diagonals."""
 MAX_BEYOND = 12
 """Number of frames by which a path continues before and after those that show the light."""
 OUT_MARGIN = 0.25
@@ -45,7 +46,7 @@ BACKGROUND_RINGS = 5
 BACKGROUND_NOISE, GLOW_NOISE, PRIOR = 0.04, 0.15, 0.4
 """Standard deviations: of the background (linear light), of the glow (relative), and of the brightness over frames."""
 CLIPPED_ON = 0.15
-"""Least brightness of a light that clips: its glow may drown in what stands behind it."""
+"""Least brightness of a light that clips: a bright background may hide its glow."""
 DARK = 0.08
 """Brightness below which a light is out."""
 
@@ -200,7 +201,7 @@ def _to_light(chain: Chain, capture: Capture, diagonal: float) -> TrackedLight:
 
 
 def recover(chains: Sequence[Chain], sources: Sequence[Sequence[Source]], size: Floats, diagonal: float) -> None:
-    """Add to chains of lamps the sources that lie on their paths and that none has, such as half hidden lamps."""
+    """Add to chains of lamps the unused sources that lie on their paths, such as half hidden lamps."""
     lamps = [chain for chain in chains if chain.evidence >= MIN_EVIDENCE and len(chain.frames) >= MIN_FRAMES]
     used = {id(source) for chain in lamps for source in chain.sources}
     for chain in lamps:
@@ -213,9 +214,9 @@ def recover(chains: Sequence[Chain], sources: Sequence[Sequence[Source]], size: 
                     continue
                 reach = min(RECOVERY * diagonal + error, MAX_RECOVERY * diagonal)
                 for source in sources[frame]:
-                    found = source.detection
+                    spot = source.detection
                     away = float(np.linalg.norm(source.xy - place)) / reach
-                    fits = found.score >= 0.5 and (found.is_cut or 0.4 * radius < found.radius < 1.5 * radius)
+                    fits = spot.score >= 0.5 and (spot.is_cut or 0.4 * radius < spot.radius < 1.5 * radius)
                     if id(source) not in used and fits and away < 1 and (best is None or away < best[0]):
                         best = (away, frame, source)
             if best is None:

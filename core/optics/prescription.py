@@ -221,8 +221,8 @@ def parse_prescription(text: str, name: str, where: str = "The lens") -> Prescri
     if len(rows) < 3:
         raise SettingsError(f"{where} is not a lens; it needs two surfaces at least and a line that starts with stop.")
     if stop < 0:
-        raise SettingsError(f"{where} has no line that starts with stop, as converters, attachments and mirror lenses; "
-                            "add the aperture stop, or choose another lens.")
+        raise SettingsError(f"{where} has no line that starts with stop, like converters, attachments and mirror "
+                            "lenses; add the aperture stop, or choose another lens.")
     radius, thickness, index, abbe, diameter = np.array(rows).T
     curvature = np.divide(1.0, radius, out=np.zeros_like(radius), where=radius != 0)
     return Prescription(name, curvature, thickness, index, abbe, diameter / 2, stop)

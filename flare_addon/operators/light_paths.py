@@ -22,7 +22,7 @@ class _ClipOperator(GuardedOperator):
 
 
 class FITFLARE_OT_lights_from_tracks(_ClipOperator, bpy.types.Operator):
-    """Write the tracks of this clip to the lights.json beside its frames; a track is a light, named after it"""
+    """Write the tracks of this clip to the lights.json beside its frames; each track becomes a light of its name"""
 
     bl_idname = "fit_flare.lights_from_tracks"
     bl_label = "Tracks to Lights"
@@ -31,7 +31,7 @@ class FITFLARE_OT_lights_from_tracks(_ClipOperator, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         count = light_paths.write_tracks(_clip(context), self.only_selected)
-        self.report({"INFO"}, f"{count} tracks are lights now")
+        self.report({"INFO"}, f"Tracks written as lights: {count}")
 
 
 class FITFLARE_OT_tracks_from_lights(_ClipOperator, bpy.types.Operator):
@@ -43,7 +43,7 @@ class FITFLARE_OT_tracks_from_lights(_ClipOperator, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         count = light_paths.read_tracks(_clip(context))
-        self.report({"INFO"}, f"{count} lights are tracks now")
+        self.report({"INFO"}, f"Lights added as tracks: {count}")
 
 
 class FITFLARE_PT_clip_lights(bpy.types.Panel):

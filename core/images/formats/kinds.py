@@ -18,7 +18,7 @@ SUFFIXES: dict[str, Kind] = {
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"), "raw")}
 """The formats that are read, by suffix in lower case."""
 JPEG_SUFFIXES = tuple(suffix for suffix, kind in SUFFIXES.items() if kind == "jpeg")
-"""Suffixes of JPEGs; Windows names those of its browsers .jfif."""
+"""Suffixes of JPEGs; browsers on Windows save them as .jfif."""
 _MAGIC: tuple[tuple[bytes, Kind], ...] = (
     (b"\x89PNG\r\n\x1a\n", "png"), (b"\xff\xd8", "jpeg"), (b"\x76\x2f\x31\x01", "exr"), (b"SDPX", "dpx"),
     (b"XPDS", "dpx"), (b"\x80\x2a\x5f\xd7", "cineon"), (b"\xd7\x5f\x2a\x80", "cineon"), (b"8BPS", "psd"),

@@ -44,12 +44,10 @@ def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progres
                        ) -> tuple[int, Counter[KeepReason]]:
     """Write every frame that is not finished; return how many were written, and how many were kept for which reason.
 
-    digest: a text that changes whenever the result would (`digest_inputs`). clean: reads and cleans a frame;
-    nothing is deleted if it raises. keep_finished: keep results that
-    are up to date, and edited ones unless `overwrite`. overwrite: replace files that are not in the manifest or were
-    edited.
-    on_error: called with an exception; it raises it, or returns so that the next frame follows. Without it the first
-    exception is raised.
+    digest: a text that changes whenever the result would (`digest_inputs`). clean: reads and cleans a frame; nothing is
+    deleted if it raises. keep_finished: keep results that are up to date, and edited ones unless `overwrite`.
+    overwrite: replace files that are not in the manifest or were edited. on_error: called with an exception; it raises
+    it, or returns so that the next frame follows. Without it, the first exception is raised.
     """
     written, kept_counts = 0, Counter[KeepReason]()
     for frame in frames:

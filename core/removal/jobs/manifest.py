@@ -77,7 +77,7 @@ class Manifest:
               confidence: float | None = None) -> None:
         """Enter a frame before its files are written, and delete those that were made with another digest.
 
-        confidence: that its flare is one, 0..1; None where nothing judged it.
+        confidence: that the removed flare is a flare, 0..1; None where nothing judged it.
 
         A process that is killed afterwards leaves no old file under the new digest. Raises FrameError for a file that
         the manifest does not list or that was edited, unless `overwrite`.

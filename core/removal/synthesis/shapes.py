@@ -50,7 +50,7 @@ def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Arra
     width, opening = log_uniform(random, 0.002, 0.04), log_uniform(random, 0.003, 0.15)
     reach, power, end = log_uniform(random, 0.03, 1.5), random.uniform(0.7, 3), log_uniform(random, 0.25, 4)
     other_side = 1.0 if random.random() < 0.6 else random.random() * (random.random() < 0.5)
-    form, level = random.random(), log_uniform(random, 0.1, 1) if fainter else 1.0
+    profile_draw, level = random.random(), log_uniform(random, 0.1, 1) if fainter else 1.0
     rays = _draw_ray_profile(random) if random.random() < 0.5 else None
     colour = random_tint(random, 0.15) + (random_tint(random, 0.5) - 1) * np.clip(r / end, 0, 1)[..., None]
     falloff = (1 + (0.25 / reach) ** power) / (1 + (r / reach) ** power) * np.exp(-((r / end) ** 2))
@@ -60,7 +60,8 @@ def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Arra
         deviation = angle - direction - rotation - bend * r
         deviation = np.arctan2(np.sin(deviation), np.cos(deviation))
         u = np.minimum(np.abs(deviation), 1.5) * r / spread
-        profile = np.exp(-(u**2)) if form < 0.4 else 1 / (1 + u**2) ** 1.5 if form < 0.7 else np.exp(-(u**4))
+        profile = (np.exp(-(u**2)) if profile_draw < 0.4 else 1 / (1 + u**2) ** 1.5 if profile_draw < 0.7 else
+                   np.exp(-(u**4)))
         if rays is not None:
             profile = profile * rays(deviation / max(opening, 0.01))
         light += np.minimum(strength * profile * falloff, 30)

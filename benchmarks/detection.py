@@ -144,7 +144,7 @@ def _print(method: str, tallies: dict[float, Tally], number: int) -> None:
     """Print precision, recall, F1 and IoU of each threshold."""
     print(f"{method}, {number} pictures, {next(iter(tallies.values())).lights} lights")
     print("          |        shape             |        glare             | by light")
-    print("threshold |  P     R     F1    IoU   |  P     R     F1    IoU   | recall  precision  false a picture")
+    print("threshold |  P     R     F1    IoU   |  P     R     F1    IoU   | recall  precision  false per picture")
     for threshold, tally in tallies.items():
         cells = " | ".join(" ".join(f"{x:.3f}" for x in tally.row(truth)) + " " for truth in ("shape", "glare"))
         precision = tally.detected / max(tally.detected + tally.false, 1)

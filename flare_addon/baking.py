@@ -186,7 +186,7 @@ jobs.ON_FINISHED["bake"] = _on_finished
 
 
 def abandon() -> None:
-    """Forget the scene that is read, since its file is closed."""
+    """Drop the scene that is being read, because its file is closed."""
     global _preparation
     _preparation = None
 

@@ -38,7 +38,7 @@ _XMP = b"http://ns.adobe.com/xap/1.0/\0"
 _HEIF_GAIN_MAPS = (b"aux:hdrgainmap", b"urn:iso:std:iso:ts:21496:-1", b"tmap")
 """Names of gain maps in the header of HEIC and AVIF: Apple's, and that of ISO 21496-1."""
 _TAIL_BYTES = 1 << 12
-"""Bytes at the end of a file in which the picture's last marker is looked for, behind padding."""
+"""Bytes at the end of a file that are searched for the picture's last marker, which padding may follow."""
 _HEAD_BYTES = 1 << 16
 """Bytes of a file in which its header is looked for."""
 _CLAIMS = ("http://ns.adobe.com/hdr-gain-map/1.0/", "http://ns.google.com/photos/1.0/container/",
@@ -103,8 +103,8 @@ def dropped_parts(path: Path) -> str:
                         "the flare; the clean picture goes without it, and without the tags that claim it.")
         stream.seek(-min(_TAIL_BYTES, stream.seek(0, 2)), 2)
         if not stream.read().rstrip(b"\0\r\n ").endswith(b"\xff\xd9"):  # Samsung's motion photos
-            return (f"{path} holds data behind its picture (a clip, say), which would still show the flare; the clean "
-                    "picture goes without it.")
+            return (f"{path} has data after its picture, such as a clip, which would still show the flare; the clean "
+                    "picture does not have it.")
     return ""
 
 

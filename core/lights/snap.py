@@ -40,8 +40,8 @@ deviation."""
 MAX_DISC_RADIUS = 0.035
 """Radius, in frame widths, of the largest disc in a clean frame; larger clipped areas are sky."""
 MAX_HIDDEN_SHARE, MIN_FLARE = 0.5, 0.25
-"""Share of the views that have a light in frame, in a clipped sky, above which it is not moved; and the light of a view
-relative to the mean of all from which it counts as one with a flare."""
+"""A light is not moved if it stands in a clipped sky in more than this share of the views that show it. Only views
+count whose flare has at least this light, relative to the mean of all."""
 DAMPING = 3e-3
 """Damping of the least squares, relative to the mean curvature: the line of sight is weakly determined."""
 
@@ -49,7 +49,7 @@ DAMPING = 3e-3
 class FlareView(NamedTuple):
     """A camera, and the brightness of a flare in its picture: (height, width), linear, not negative.
 
-    observed: (height, width), False where the picture says nothing of the flare; None if it does everywhere.
+    observed: (height, width), False where the picture does not show the flare; None if it shows it everywhere.
     """
 
     camera: Camera
@@ -72,7 +72,7 @@ def flare_view(camera: Camera, frame: NDArray[np.float32], clean: NDArray[np.flo
 
 
 def _large_components(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    """Return the connected parts of a mask (height, width) whose area is that of a larger disc, radius in pixels."""
+    """Return the connected parts of a mask (height, width) with more area than a disc of this radius, pixels."""
     import cv2
 
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
@@ -142,8 +142,7 @@ def _are_on_peaks(views: Sequence[FlareView], positions: Floats) -> NDArray[np.b
 
 
 def _are_unobserved(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
-    """Return (n,), which lights stand where most views with a flare that have them in frame hide it in a clipped sky.
-    """
+    """Return (n,), True for lights that stand in a clipped sky in most views that have a flare and show them."""
     unobserved = np.zeros(len(positions), bool)
     levels = [float(view.flare.mean()) for view in views]
     flaring = [view for view, level in zip(views, levels, strict=True) if level >= MIN_FLARE * np.mean(levels)]

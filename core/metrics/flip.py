@@ -37,7 +37,7 @@ _RELATIVE_XYZ_FROM_RGB = (_XYZ_FROM_RGB / _WHITE[:, None]).astype(np.float32)
 
 
 def flip_map(image: Planes, target: Planes) -> Plane:
-    """Return the error (height, width), 0 to 1, of sRGB pictures (height, width, 3) at 67 pixels a degree.
+    """Return the error (height, width), 0 to 1, of sRGB pictures (height, width, 3) at 67 pixels per degree.
 
     Values beyond 0..1 are clipped.
     """

@@ -98,7 +98,7 @@ def _blur(picture: NDArray[np.float64], borders: Borders) -> NDArray[np.float64]
 
 
 def flip(image: Array, target: Array, mask: Array | None = None) -> float:
-    """Return the mean LDR-FLIP (Andersson et al. 2020), 0 for equal pictures, up to 1, at 67 pixels a degree.
+    """Return the mean LDR-FLIP (Andersson et al. 2020), 0 for equal pictures, up to 1, at 67 pixels per degree.
 
     mask: as in `psnr`.
     """

@@ -41,8 +41,10 @@ def canonical_name(name: PurePath | str) -> str:
 
 
 def name_below(folder: Path, name: str) -> str:
-    """Return a name as it stands in a folder, where it is the absolute path of another machine and the folder has its
-    last folders: "C:/work/shot/images/1.png" is images/1.png. Other names as they are."""
+    """Return the end of an absolute path of another machine that lies in a folder; other names as they are.
+
+    "C:/work/shot/images/1.png" is images/1.png if the folder has images/.
+    """
     parts = PurePosixPath(name.replace("\\", "/")).parts
     if not parts or ".." in parts or not (parts[0] == "/" or _DRIVE.fullmatch(parts[0])):
         return name

@@ -225,7 +225,7 @@ class TerminalProgress(Progress):
 
 
 class JsonProgress(Progress):
-    """Writes one JSON object per line to stdout, at most ten progress lines a second."""
+    """Writes one JSON object per line to stdout, at most ten progress lines per second."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         super().__init__()
@@ -261,7 +261,7 @@ class JsonProgress(Progress):
 class OpenJdProgress(Progress):
     """Writes lines of the Open Job Description to stdout: openjd_progress (per cent), openjd_status, openjd_fail.
 
-    At most one progress line a second, and each per cent once.
+    At most one progress line per second, and each per cent once.
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:

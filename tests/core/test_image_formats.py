@@ -141,7 +141,7 @@ def test_a_clip_behind_a_jpeg_is_named(tmp_path: Path) -> None:
                                  ("c.jpg", b"MotionPhoto_Data\0\0\0\x18ftypmp42" + bytes(9000) + b"SEFT", True)):
         (tmp_path / name).write_bytes(data + tail)
         plate = read_plate(tmp_path / name)
-        assert ("data behind its picture" in plate.warning) == is_named
+        assert ("data after its picture" in plate.warning) == is_named
         write_plate(tmp_path / "clean.jpg", plate, plate.codes // 2)
         assert b"ftypmp42" not in (tmp_path / "clean.jpg").read_bytes()
 

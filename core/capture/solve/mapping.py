@@ -295,8 +295,8 @@ def _run_mapper(pycolmap: Any, work: Path, database: Path, frames: int, settings
     failures: list[Exception] = []
 
     def step(count: int) -> None:
-        # pycolmap cannot pass an exception on: the token ends the mapping, and the exception is raised afterwards.
         """Report `count` placed frames; on a requested stop cancel the mapping."""
+        # pycolmap cannot pass an exception on: the token ends the mapping, and the exception is raised afterwards.
         nonlocal placed
         placed += count
         try:

@@ -41,11 +41,10 @@ class GuidedFilterMaps:
 
 
 def fit_guided_filter(display: Pixels, flare: Pixels) -> GuidedFilterMaps:
-    """Fit the maps to a flare in linear light, both (h, w, 3) at the working size: the flare itself as the offset, but
-    about clipped pixels the guided filter, channel by channel.
+    """Fit the maps to a flare in linear light, both (h, w, 3) at the working size.
 
-    Its maps are box means over a window, averaged over the windows about a pixel in which those with an edge weigh
-    more.
+    The offset is the flare itself; around clipped pixels, the maps are those of a guided filter of each channel. It
+    fits each window, and averages the fits of the windows around a pixel; windows with an edge have more weight.
     """
     import cv2
 

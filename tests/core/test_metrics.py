@@ -216,9 +216,12 @@ def test_what_a_mask_leaves_out_of_the_fit_is_not_scored(pair: tuple[np.ndarray,
     scores = [score_view(light, light, Picture(frame, "srgb"), Picture(frame, "srgb"), counted=mask)
               for frame, mask in ((target, counted), (passer_by, counted), (passer_by, None))]
     for layer in ("composite", "scene"):
-        assert scores[0][layer] == pytest.approx(scores[1][layer], rel=1e-6)
-        assert scores[2][layer]["psnr"] < scores[1][layer]["psnr"] - 3
-        assert scores[2][layer]["ssim"] < scores[1][layer]["ssim"]
+        alone, passed, unmasked = ({name: scores[index][layer][name] or 0.0 for name in ("psnr", "ssim")}
+                                   for index in range(3))
+        assert alone["psnr"] == pytest.approx(passed["psnr"], rel=1e-6)
+        assert alone["ssim"] == pytest.approx(passed["ssim"], abs=0.02)  # windows reach over the edge of the mask
+        assert unmasked["psnr"] < passed["psnr"] - 3
+        assert unmasked["ssim"] < passed["ssim"] - 0.05
     none = np.zeros_like(counted)
     assert math.isnan(score_view(light, light, Picture(target, "srgb"), None, counted=none)["composite"]["psnr"])
 

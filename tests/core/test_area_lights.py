@@ -295,3 +295,25 @@ def test_a_transfer_and_a_bake_show_the_same_extended_light(tmp_path: Path) -> N
     assert baked.max() > 0.02
     np.testing.assert_allclose(baked, overlay, atol=2e-4 * float(baked.max()))
     assert np.linalg.norm(moved - baked) < 0.1 * np.linalg.norm(baked)  # another world: the query's camera differs
+
+
+def test_fall_off_of_a_transfer_starts_at_the_distance_of_the_first_frame(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", SMALL, 1)
+    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    away = replace(camera, world_to_camera=camera.world_to_camera + np.outer([0, 0, 4, 0], [0, 0, 0, 1]))
+    frames = tuple(ShotFrame(number, "Camera", each, (placed(),)) for number, each in ((1, camera), (2, away)))
+    target = shot_target(Shot(tmp_path / "a.flare", frames), look, {})
+
+    def light(fall_off: float | None) -> list[float]:
+        transfer = Transfer(tmp_path / "a.flare", target, TransferSettings(fall_off=fall_off))
+        return [float(transfer.frame_renderer(each.frame).render(each.shot.camera).flare_by_light["a"].sum())
+                for each in target.frames]
+
+    first, second = (float(np.linalg.norm(each.camera.position - PLACE)) for each in frames)
+    plain, dimmed, named = light(None), light(0.0), light(2 * first)
+    assert dimmed[0] == pytest.approx(plain[0], rel=1e-3)
+    assert dimmed[1] == pytest.approx(plain[1] * (first / second) ** 2, rel=1e-3)
+    assert named[0] == pytest.approx(4 * plain[0], rel=1e-3)
+    texts = {Transfer(tmp_path / "a.flare", target, TransferSettings(fall_off=value)).fingerprint_of(1)
+             for value in (None, 0.0, 2 * first)}
+    assert len(texts) == 3  # layers of other settings are not mistaken for these

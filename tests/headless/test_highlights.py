@@ -80,7 +80,8 @@ def test_a_transfer_adds_a_flare_at_every_highlight(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [["--highlights", "0"], ["--highlight-gain", "2"],
-                                   ["--highlights", "--light", "3,3"], ["--highlights", "--highlight-gain", "-1"]])
+                                   ["--fall-off"], ["--highlights", "--light", "3,3"],
+                                   ["--highlights", "--highlight-gain", "-1"]])
 def test_options_that_make_no_sense_are_refused(words: list[str], tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
     write_png(tmp_path / "p.png", np.zeros((9, 16, 3), np.float32))

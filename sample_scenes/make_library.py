@@ -2,8 +2,8 @@
 """Makes the library in the box: `python sample_scenes/make_library.py [NAME ...]`, and `--sheet FILE` for its sheet.
 
 Each look is traced through a prescription that comes with the program and fitted (`core.fit.traced_flare`), one after
-the other. It leaves NAME.flare, its thumbnail NAME.png, and its entry in looks.json. A look that is there with the same
-settings is kept, so a second run resumes.
+the other. It leaves NAME.flare, its thumbnail NAME.png, and its entry in looks.json; `--table` prints the errors there.
+A look that is there with the same settings is kept, so a second run resumes.
 """
 from __future__ import annotations
 
@@ -174,8 +174,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="looks to make (default: all)")
     parser.add_argument("--out", type=Path, default=LIBRARY, metavar="FOLDER", help="default: the extension's library")
+    parser.add_argument("--table", action="store_true", help="print the errors of the looks, and make none")
     parser.add_argument("--sheet", type=Path, metavar="FILE", help="write the sheet of the looks, and make none")
     args = parser.parse_args()
+    if args.table:
+        print("| look | lens | mean error |\n| --- | --- | ---: |")
+        for name, entry in read_index(args.out).items():
+            print(f"| {name} | {entry['lens']} | {entry['error']:.3f} |")
+        return 0
     if args.sheet:
         write_sheet(args.out, args.sheet)
         return 0

@@ -31,7 +31,7 @@ PICTURES = {
     "imported": ("03_imported", VIEW), "fitting": ("04_fitting", VIEW), "flare": ("05_flare", VIEW),
     "look": ("06_look_and_bake", (325, 75, 1312, 600)),
     "compositor": ("07_compositor", (0, 0, 1600, 1000)),
-    "library": ("03_added", VIEW), "first_render": ("09_rendered", VIEW),
+    "library": ("05_another_look", VIEW), "first_render": ("first_render", (0, 0, 960, 540)),
     "transferred": ("08_transferred", VIEW), "hidden": ("09_hidden", VIEW)}
 """The handbook's pictures: of which screenshot, and which part (left, top, right, bottom) at 1600x1000."""
 

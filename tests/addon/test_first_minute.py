@@ -93,7 +93,7 @@ def test_the_first_render_shows_the_flare(facts: Any) -> None:
     """Block of first_minute.py: "bake without an engine"."""
     assert facts["set up by itself"] and facts["is seen"]
     assert max(facts["first render"]) < 2e-3
-    assert facts["live"] == pytest.approx(1, abs=2e-3)
+    assert facts["live"] < 2e-3
     assert facts["left alone"], "with Composite after Bake switched off"
 
 

@@ -259,7 +259,7 @@ def _render_picture(tree: Any) -> Any:
     In a stack of effects it is the picture that comes into the effect.
     """
     render = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
-    if render is None and (incoming := trees.incoming_picture(tree)) is not None:
+    if render is None and (incoming := trees.incoming_picture(tree, RENDER)) is not None:
         return incoming
     return (render or _set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)).outputs["Image"]
 
@@ -289,7 +289,7 @@ def _tree_state(tree: Any) -> dict[str, Any]:
     end = _output_input(tree, make=False)
     feeder = _feeding_socket(end)
     return {"nodes": "\n".join(node.name for node in tree.nodes if node.name not in (GROUP, LAYERS)),
-            "drivers": tree.animation_data is not None,
+            "drivers": tree.animation_data is not None, "inputs": len(trees.input_sockets(tree)),
             "from": feeder.node.name if feeder else "", "socket": feeder.identifier if feeder else ""}
 
 
@@ -336,6 +336,8 @@ def remove(scene: Any) -> None:
                     tree.nodes.remove(extra)
         if not GROUPS_ARE_TREES:
             scene.use_nodes = bool(state["use_nodes"])
+    if state["tree"]:
+        trees.remove_incoming(tree, state.get("inputs", len(trees.input_sockets(tree))))
     if STATE_PROPERTY in scene:
         del scene[STATE_PROPERTY]
     if group is not None and not group.users:

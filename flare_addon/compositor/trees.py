@@ -98,14 +98,30 @@ def is_off_in_renders(scene: Any) -> bool:
     return effect is not None and NODE in effect.node_group.nodes and not effect.enable_for_render
 
 
-def incoming_picture(tree: Any) -> Any:
-    """Return the socket of the picture that comes into an effect's tree; None before 5.3."""
+def input_sockets(tree: Any) -> list[Any]:
+    """Return the inputs in the interface of a tree; [] before 5.0."""
+    return [item for item in tree.interface.items_tree if getattr(item, "in_out", "") == "INPUT"] \
+        if GROUPS_ARE_TREES else []
+
+
+def incoming_picture(tree: Any, name: str) -> Any:
+    """Return the socket of the picture that comes into an effect's tree; None before 5.3.
+
+    A node for it has this name where the tree has none.
+    """
     if not HAS_EFFECTS:
         return None
-    if not any(getattr(item, "in_out", "") == "INPUT" for item in tree.interface.items_tree):
+    if not input_sockets(tree):
         tree.interface.new_socket("Image", in_out="INPUT", socket_type="NodeSocketColor")
     node = next((node for node in tree.nodes if node.bl_idname == "NodeGroupInput"), None)
     if node is None:
         node = tree.nodes.new("NodeGroupInput")
-        node.location = (-880, 220)
+        node.name, node.location = name, (-880, 220)
     return node.outputs[0]
+
+
+def remove_incoming(tree: Any, count: int) -> None:
+    """Remove the inputs of a tree beyond the first `count`, if no node uses the inputs."""
+    if HAS_EFFECTS and not any(node.bl_idname == "NodeGroupInput" for node in tree.nodes):
+        for item in input_sockets(tree)[count:]:
+            tree.interface.remove(item)

@@ -30,8 +30,9 @@ PITCH_PX = 1.7
 """Distance of neighbouring directions of the sweep, pixels of its pictures."""
 PATCH_PITCHES = 3.0
 """Distance of neighbouring patches, which are decided as a whole, in distances of directions."""
-PARALLAXES_PX = (4.0, 7.0, 12.0, 20.0)
-"""Radii of the near spheres, as the parallax of their points over the spread of the cameras, pixels of the pictures."""
+BARE_PARALLAX_PX, PARALLAXES_PX = 2.0, (4.0, 7.0, 12.0, 20.0)
+"""Radii of the spheres, as the parallax of their points over the spread of the cameras, pixels of the pictures. A far
+patch must agree better on the infinite sphere than on that of bare parallax; the others are the near ones."""
 MAX_DIFFERENCE = 0.05
 """Difference, display values, up to which two views agree."""
 MIN_VIEWS, MIN_SEEN_SHARE = 3, 0.5
@@ -46,7 +47,7 @@ the views must differ there by so much less on the infinite sphere than on near 
 MAX_COST = 0.3
 """Share of views that differ on the infinite sphere up to which a patch with contrast is far then: mostly plain ones
 that something hides in some views."""
-MIN_FAR_SHARE, MIN_FAR_PATCHES = 0.08, 12
+MIN_FAR_SHARE, MIN_FAR_PATCHES = 0.12, 12
 """Share and number of the patches with contrast that must be far for a capture to have a far layer."""
 RADIUS_FACTOR, MAX_PARALLAX_PX = 20.0, 0.25
 """Smallest radius of the far sphere relative to the distance of the farthest points, and the largest parallax of its
@@ -86,7 +87,7 @@ def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) ->
     sampled = subsample(views, SWEEP_VIEWS)
     cameras = [view.camera.scaled(min(SWEEP_WIDTH, view.camera.width)) for view in sampled]
     extent = _spread(cameras)
-    if not len(capture.points) or not extent:
+    if not len(capture.points) or not extent or capture.is_rotation_only:
         return None
     patches = decide_patches([_sweep_view(view, frames) for view in sampled])
     if patches is None:
@@ -120,19 +121,19 @@ class Patches:
 
 def decide_patches(views: list[SweepView]) -> Patches | None:
     """Decide which patches of directions are far; None where too few are for a far layer."""
-    directions, costs, misaligned = sweep_patches(views)
+    directions, costs, bare, misaligned = sweep_patches(views)
     has_contrast = misaligned >= MIN_CONTRAST
-    is_far = has_contrast & (costs < DECISIVE_RATIO * misaligned)
+    is_far = has_contrast & (costs < DECISIVE_RATIO * misaligned) & (costs <= bare)
     if is_far.sum() < max(MIN_FAR_PATCHES, MIN_FAR_SHARE * has_contrast.sum()):
         return None
     return Patches(directions, _fill(directions, costs, misaligned))
 
 
-def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats]:
+def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats, Floats]:
     """Sweep spheres about the cameras of views.
 
-    Returns directions (n, 3) of patches, the share (n,) of the views that differ there on the infinite sphere, and the
-    median share (n,) on near ones.
+    Returns directions (n, 3) of patches, and the share (n,) of the views that differ there: on the infinite sphere, on
+    that of bare parallax, and the median of the near ones.
     """
     cameras = [view.camera for view in views]
     focal = float(np.median([camera.focal_length for camera in cameras]))
@@ -141,14 +142,15 @@ def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats]:
     patch_directions = _seen_directions(cameras, PATCH_PITCHES * pitch)
     patch_of = _nearest(directions, patch_directions)
     members = np.bincount(patch_of, minlength=len(patch_directions))
-    costs = np.full((len(PARALLAXES_PX) + 1, len(patch_directions)), np.nan)
-    for row, parallax in zip(costs, (0.0, *PARALLAXES_PX), strict=True):
+    spheres = (0.0, BARE_PARALLAX_PX, *PARALLAXES_PX)
+    costs = np.full((len(spheres), len(patch_directions)), np.nan)
+    for row, parallax in zip(costs, spheres, strict=True):
         cost, seen = _disagreement(views, directions, parallax / focal / _spread(cameras))
         sums = np.bincount(patch_of, np.where(seen, cost, 0), len(patch_directions))
         numbers = np.bincount(patch_of, seen, len(patch_directions))
         row[:] = np.where((numbers > 0) & (numbers >= MIN_SEEN_SHARE * members), sums / np.maximum(numbers, 1), np.nan)
-    usable = np.isfinite(costs[0]) & np.isfinite(costs[1:]).any(0)
-    return patch_directions[usable], costs[0, usable], np.nanmedian(costs[1:, usable], axis=0)
+    usable = np.isfinite(costs[:2]).all(0) & np.isfinite(costs[2:]).any(0)
+    return patch_directions[usable], *costs[:2, usable], np.nanmedian(costs[2:, usable], axis=0)
 
 
 def _fill(directions: Floats, costs: Floats, misaligned: Floats) -> Booleans:
@@ -197,10 +199,11 @@ def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: fl
     numbers = np.isfinite(values[..., 0]).sum(0)
     seen = numbers >= MIN_VIEWS
     cost = np.zeros(len(directions))
-    part = torch.from_numpy(values[:, seen])
-    best = torch.zeros(part.shape[1])
-    for row in part:  # comparisons with NaN are false
-        agree = ((part - row).abs() <= MAX_DIFFERENCE).all(-1).sum(0)
+    red, green, blue = torch.from_numpy(np.ascontiguousarray(values[:, seen].transpose(2, 0, 1)))
+    best = torch.zeros(red.shape[1], dtype=torch.int32)
+    for r, g, b in zip(red, green, blue, strict=True):
+        difference = (red - r).abs_().maximum((green - g).abs_()).maximum((blue - b).abs_())
+        agree = (difference <= MAX_DIFFERENCE).sum(0, dtype=torch.int32)  # comparisons with NaN are false
         best = torch.maximum(best, agree)
     cost[seen] = 1 - (best.numpy() - 1) / (numbers[seen] - 1)
     return cost, seen

@@ -76,6 +76,7 @@ def test_a_surrounding_without_parallax_is_far_and_a_room_is_not() -> None:
     assert patches is not None
     assert patches.contain(np.array([[0.5, 0.05, 0.9], [-0.5, 0.0, 0.9], [0.0, -0.35, 0.95]])).all()
     assert decide_patches(sweep(8.0)) is None
+    assert decide_patches(sweep(70.0)) is None, "a parallax of two pixels is one"
     assert decide_patches(sweep(8.0, plain=True)) is None, "a plain wall says nothing"
 
 

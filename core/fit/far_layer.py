@@ -178,7 +178,7 @@ def _sweep_view(view: View, frames: Frames) -> SweepView:
     counts = None
     if mask is not None:
         share = Picture(mask.numpy().astype(np.float32), "linear").resized(*small.size).pixels
-        counts = np.asarray(share.min(axis=2) > 0.99)
+        counts = np.asarray(share > 0.99)
     return SweepView(small, values, counts)
 
 

@@ -18,6 +18,8 @@ from .sources import Source
 
 BASE_GATE, SPEED_GATE, FIRST_GATE = 0.032, 0.4, 0.15
 """Tolerance of a prediction: share of the diagonal, plus share of the speed; and that of a track of one frame."""
+MAX_REACH = 0.35
+"""Distance of a prediction, diagonals, beyond which no source is compared."""
 FAINT_FIRST_GATE = 0.03
 """Tolerance of a track of one frame for a source that hardly looks like a lamp."""
 MIN_ACCELERATION, MAX_ACCELERATION = 0.003, 0.03
@@ -120,6 +122,9 @@ def _cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | 
     """Return the cost of joining a chain to a source of a later frame; None beyond the gate."""
     gap = frame - chain.frames[-1]
     last = chain.sources[-1]
+    distance = float(np.linalg.norm(chain.predict(frame) - source.xy))
+    if distance > MAX_REACH * diagonal:
+        return None
     if len(chain.frames) < 2:
         likely = min(last.evidence, source.evidence) >= LIKELY
         gate = (FIRST_GATE if likely else FAINT_FIRST_GATE) * diagonal * gap
@@ -135,7 +140,6 @@ def _cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | 
         gate *= UNLIKELY_GATE
     elif source.evidence >= LIKELY > chain.evidence:
         gate *= UNLIKELY_GATE
-    distance = float(np.linalg.norm(chain.predict(frame) - source.xy))
     difference = _difference(last, source)
     if distance > gate or difference > MAX_DIFFERENCE:
         return None
@@ -153,24 +157,29 @@ def _difference(first: Source, second: Source) -> float:
 
 def _join(chains: list[Chain], diagonal: float) -> list[Chain]:
     """Join chains where one ends before another begins and both extrapolations meet, the best pair first."""
-    while True:
-        best: tuple[float, int, int] | None = None
-        for i, first in enumerate(chains):
-            for j, second in enumerate(chains):
-                if i != j and (cost := _join_cost(first, second, diagonal)) is not None \
-                        and (best is None or cost < best[0]):
-                    best = (cost, i, j)
-        if best is None:
-            return sorted(chains, key=lambda chain: -len(chain.frames))
-        _, i, j = best
-        joined = Chain(chains[i].frames + chains[j].frames, chains[i].sources + chains[j].sources)
-        chains = [chain for number, chain in enumerate(chains) if number not in (i, j)] + [joined]
+    likely = {number: chain for number, chain in enumerate(chains) if chain.evidence >= LIKELY}
+    others = [chain for number, chain in enumerate(chains) if number not in likely]
+    costs = {(i, j): cost for i, first in likely.items() for j, second in likely.items()
+             if i != j and (cost := _join_cost(first, second, diagonal)) is not None}
+    following = len(chains)
+    while costs:
+        i, j = min(costs, key=lambda pair: (costs[pair], pair))
+        first, second = likely.pop(i), likely.pop(j)
+        joined = Chain(first.frames + second.frames, first.sources + second.sources)
+        costs = {pair: cost for pair, cost in costs.items() if i not in pair and j not in pair}
+        for number, chain in likely.items():
+            for pair, ends in (((following, number), (joined, chain)), ((number, following), (chain, joined))):
+                if (cost := _join_cost(*ends, diagonal)) is not None:
+                    costs[pair] = cost
+        likely[following] = joined
+        following += 1
+    return sorted([*likely.values(), *others], key=lambda chain: -len(chain.frames))
 
 
 def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
     """Return the cost of taking two chains for one thing; None where that cannot be."""
     gap = second.frames[0] - first.frames[-1]
-    if not 0 < gap <= MAX_GAP or min(first.evidence, second.evidence) < LIKELY:
+    if not 0 < gap <= MAX_GAP:
         return None
     is_single = 1 in (len(first.frames), len(second.frames))
     if is_single and (gap > MAX_SINGLE_GAP or len(first.frames) + len(second.frames) < 4):

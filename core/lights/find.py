@@ -23,10 +23,12 @@ from .found_light import FAR, FoundLight
 from .ghosts import find_blobs, locate_by_ghosts
 from .lifted import lift_to_gaussians
 from .surroundings import brightness_map, split_gaps
-from .tracks import TrackFindings
+from .tracks import TrackedLight, TrackFindings, track_lights
 from .triangulation import TriangulationSettings, triangulate_lights
 
 SHEETS, REPORT = "lights", "report.json"
+STANDING = 0.006
+"""Median distance of a light from the projections of one place, diagonals, below which it stands."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,17 +99,51 @@ def _is_well_supported(light: FoundLight, min_views: int, settings: Triangulatio
             and light.nfa <= settings.max_nfa)
 
 
-def write_findings(capture: Capture, findings: Findings, keep: bool = False) -> dict[str, Any]:
-    """Write lights.json, overlay sheets and a report into the capture; returns the report.
+def moving_lights(capture: Capture, standing: Sequence[FoundLight], progress: Progress | None = None) -> TrackFindings:
+    """Follow the lights of a solved capture whose frames are consecutive; return those that do not stand.
+
+    A light that keeps to the projections of a standing one is left out.
+    """
+    findings = track_lights(capture, progress)
+    moving = [light for light in findings.lights if not _stands(capture, light, standing)]
+    left_out = len(findings.lights) - len(moving)
+    message = f"{len(moving)} lights move and have a path; {left_out} that were followed stand."
+    return replace(findings, lights=moving, messages=[message])
+
+
+def _stands(capture: Capture, light: TrackedLight, standing: Sequence[FoundLight]) -> bool:
+    """True if a light that was followed keeps to the projections of a standing one."""
+    views = [(view.name, view.camera) for view in capture.views if view.name in light.support]
+    pixels = np.array([light.keys[name].xy for name, _ in views])
+    for found in standing:
+        distances = []
+        for (_, camera), pixel in zip(views, pixels, strict=True):
+            projected, depth = camera.project(found.xyz)
+            distances.append(float(np.linalg.norm(projected[0] - pixel)) if depth[0] > 0 else np.inf)
+        if np.median(distances) < STANDING * float(np.hypot(*views[0][1].size)) + 0.5 * light.radius:
+            return True
+    return False
+
+
+def write_findings(capture: Capture, findings: Findings, keep: bool = False, tracked: TrackFindings | None = None
+                   ) -> dict[str, Any]:
+    """Write lights.json, overlay sheets and a report into the capture; returns the report. tracked: lights on paths.
 
     lights/sheetN.png shows every view; lights/report.json lists support, residuals, and doubtful lights.
     """
     from .overlay import write_overlay_sheets
 
     views = [(view.name, view.camera) for view in capture.views]
-    entries = write_lights(capture.folder / LIGHTS, findings.lights, views, keep)
-    lights_by_name = [(str(entry["name"]), _light_of_entry(entry, findings.lights)) for entry in entries]
-    sheets = write_overlay_sheets(capture.folder / SHEETS, capture, findings.detections, lights_by_name)
+    entries = write_lights(capture.folder / LIGHTS, findings.lights, views, keep, tracked.lights if tracked else ())
+    lights_by_name = [(str(entry["name"]), _light_of_entry(entry, findings.lights)) for entry in entries
+                      if "xyz" in entry]
+    if tracked is None:
+        sheets = write_overlay_sheets(capture.folder / SHEETS, capture, findings.detections, lights_by_name)
+    else:
+        from .track_sheet import write_track_sheets
+
+        lit = capture.with_lights(read_lights(capture.folder / LIGHTS))
+        sheets = write_track_sheets(capture.folder / SHEETS, lit, tracked.sources)
     report = {
         "lights": entries, "says": findings.messages,
         "doubtful": [{"xyz": light.xyz.round(5).tolist(), "far": light.far, "support": list(light.support),

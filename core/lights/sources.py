@@ -37,6 +37,8 @@ PROFILE_RADII = (1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 10.0, 11.5, 13.5, 16.0,
 """Edges of the rings of the brightness, pixels from the centre, as above."""
 CLIPPED_RING = 0.85
 """Linear light from which a ring counts as partly clipped."""
+MAX_SOURCES = 40
+"""Sources of a frame, those that look most like lamps: a street at night has hundreds of lit signs."""
 SECTORS = 12
 """Sectors of a ring; the median over them leaves out ghosts, streaks and what stands beside the light."""
 SIDE_QUANTILE = 0.35
@@ -89,7 +91,7 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
             if picture.encoding == "linear":
                 found = _at_flux(found, linear)
             sources.append(Source(found, shape * soft * _roundness(mask), measure_profile(luminance, found.xy)))
-    return sorted(sources, key=lambda source: -source.evidence)
+    return sorted(sources, key=lambda source: (-source.evidence, -source.detection.radius))[:MAX_SOURCES]
 
 
 def _parts(region: Mask, largest: float) -> Iterator[tuple[Mask, tuple[int, int]]]:

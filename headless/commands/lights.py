@@ -42,6 +42,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", type=Path, metavar="SCENE.PLY",
                         help="a fitted scene (RUN/scene.ply) on whose Gaussians to place the detections, as the paper "
                              "does")
+    parser.add_argument("--follow", action="store_true",
+                        help="in a capture with a camera solve, follow lights from frame to frame too: those that move "
+                             "get a path; the frames must be consecutive")
     parser.add_argument("--focal", type=float, metavar="PIXELS",
                         help=f"focal length of frames without a camera solve (default: {CAMERA}, Exif data, or a usual "
                              f"one); {CAMERA} records it")
@@ -69,7 +72,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     gaussians = _read_gaussians(args.scene) if args.scene else None
     if not args.keep:
         check_replaceable(capture.folder / LIGHTS)
-    report = _find_and_record(capture, detector, progress, settings, gaussians=gaussians, keep=args.keep)
+    report = _find_and_record(capture, detector, progress, settings, gaussians=gaussians, keep=args.keep,
+                              follow=args.follow)
     return {"lights": report["lights"], "file": str(capture.folder / LIGHTS),
             "sheets": [str(capture.folder / sheet) for sheet in report["sheets"]],
             **tallies.report_tally(tallies.tally_capture(capture, "searched"), progress)}
@@ -127,18 +131,21 @@ def with_lights(capture: Capture, progress: Progress) -> Capture:
 
 def _find_and_record(capture: Capture, detector: Detector, progress: Progress,
                      settings: TriangulationSettings | None = None, *, gaussians: tuple[Any, Any] | None = None,
-                     keep: bool = False) -> dict[str, Any]:
+                     keep: bool = False, follow: bool = False) -> dict[str, Any]:
     """Find the lights, write lights.json and the sheets, and report them; return the report.
+
+    follow: follow lights that move from frame to frame as well.
 
     Raises CaptureError, before the search, where the folder cannot be written.
     """
     from ...core.lights import find_lights, write_findings
-    from ...core.lights.find import REPORT, SHEETS
+    from ...core.lights.find import REPORT, SHEETS, moving_lights
 
     _check_writable(capture)
     findings = find_lights(capture, detector, progress, settings, gaussians=gaussians)
-    report = write_findings(capture, findings, keep=keep)
-    for sentence in findings.messages:
+    tracked = moving_lights(capture, findings.lights, progress) if follow else None
+    report = write_findings(capture, findings, keep=keep, tracked=tracked)
+    for sentence in [*findings.messages, *(tracked.messages if tracked else [])]:
         progress.say(sentence)
     for light in report["lights"]:
         progress.say(_describe_light(light))
@@ -164,6 +171,8 @@ def _check_writable(capture: Capture) -> None:
 
 def _describe_light(light: dict[str, Any]) -> str:
     """Return a sentence on one light: position, uncertainty, number of views."""
+    if "xyz" not in light:
+        return f"{light['name']}: on a path, with places in {len(light.get('frames', ()))} frames."
     x, y, z = light["xyz"]
     if "support" not in light:
         return f"{light['name']}: at {x:.3g}, {y:.3g}, {z:.3g}, by hand."

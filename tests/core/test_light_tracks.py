@@ -18,9 +18,11 @@ from core.errors import CaptureError
 from core.images.picture import Picture
 from core.images.write import write_png
 from core.lights.file import check_replaceable
-from core.lights.find import write_tracks
+from core.lights.find import moving_lights, write_tracks
+from core.lights.found_light import FoundLight
 from core.lights.sources import find_sources
 from core.lights.tracks import TrackFindings, fit_brightness, track_lights
+from tests.core.captures import make_capture
 
 SIZE = (320, 180)
 Lamp = tuple[float, float, float]
@@ -127,6 +129,21 @@ class TestFollowing:
         findings = track_lights(make_shot(
             tmp_path, 8, lambda i: np.clip(lit([(60 + 20 * i, 90, 1.0)]), 0, 1) * 0.8))
         assert len(findings.lights) == 1 and len(findings.lights[0].support) == 8
+
+
+def test_in_a_solved_capture_only_lights_that_move_get_a_path(tmp_path: Path) -> None:
+    capture = Capture.open(make_capture(tmp_path / "room", 12, size=SIZE))
+    standing = np.array([0.3, -0.4, 0.5])
+    for index, view in enumerate(capture.views):
+        at = view.camera.project(standing)[0][0]
+        light = lit([(float(at[0]), float(at[1]), 1.0), (40.0 + 20 * index, 130.0 - 4 * index, 1.0)])
+        write_png(capture.frame_path(view), srgb_from_linear(np.clip(light, 0, 1)))
+    capture = capture.reopen()
+    found = FoundLight(standing, False, (), 12, 0.0, 0.0, np.ones(3), 4.0)
+    findings = moving_lights(capture, [found])
+    (light,) = findings.lights
+    np.testing.assert_allclose(places(findings)[[0, -1]], [(40, 130), (260, 86)], atol=1)
+    assert "1 that were followed stand" in findings.messages[0]
 
 
 def test_light_above_white_places_a_source_by_its_flux() -> None:

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Accuracy of the lights that are followed in the sample shots, whose paths and brightness are known.
+
+    python benchmarks/tracks.py [--shots FOLDER] [--seeds 0 1] [--only torch]
+
+Renders the sample shots where they are missing and prints, for each light: frames in which at least 30 % of its disc
+are visible in the frame; how many of these were followed; the error in pixels of 480x270 (median, 95 %, largest) over
+these frames; the same over all frames whose place is not doubtful; frames that are doubtful, and the largest error that
+was not called doubtful; the error of the brightness, where it is known and the light not out of the frame (median, 95
+%). A line for each shot counts the
+lights that were reported without being one.
+"""
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from core.capture import Capture, Light, read_lights
+from core.capture.lights import DOUBTFUL
+from core.errors import CaptureError
+from core.lights.tracks import TrackedLight, track_lights
+from core.system.files import read_json
+from core.system.progress import Progress
+from sample_scenes.render_shot import CACHE, make_shot
+from sample_scenes.shot_scenes import SHOTS
+
+MIN_VISIBLE = 0.3
+
+
+def measure(capture: Capture, truth: Light, visible: dict[str, float], light: TrackedLight) -> dict[str, Any]:
+    """Return the figures of one light. visible: share of its disc that is visible, by frame."""
+    size = np.array(capture.views[0].camera.size)
+    errors, shown, brightness = {}, [], []
+    for name, key in truth.keys.items():
+        found = light.keys.get(name)
+        assert key.xy is not None and key.on is not None
+        inside = bool(((key.xy > 0) & (key.xy < size)).all())
+        if inside and visible[name] >= MIN_VISIBLE and key.on > 0:
+            shown.append(name)
+        if found is None or found.xy is None:
+            continue
+        errors[name] = float(np.linalg.norm(found.xy - key.xy))
+        if found.on is not None and inside:
+            brightness.append(abs(found.on - key.on))
+    sure = [error for name, error in errors.items() if light.keys[name].confidence >= DOUBTFUL]
+    seen = [errors[name] for name in shown if name in errors]
+    return {"visible": len(shown), "followed": sum(name in light.support for name in shown), "seen": seen, "sure": sure,
+            "doubtful": len(light.doubtful), "keys": len(light.keys), "brightness": brightness,
+            "doubtful_visible": sum(light.keys[name].confidence < DOUBTFUL for name in shown if name in light.keys)}
+
+
+def match(truth: Light, lights: list[TrackedLight]) -> TrackedLight | None:
+    """Return the light that is nearest to a true one in most of the frames that show it."""
+    def near(light: TrackedLight) -> int:
+        return sum(float(np.linalg.norm(light.keys[name].place - truth.keys[name].xy)) < 10 for name in light.support)
+
+    best = max(lights, key=near, default=None)
+    return best if best is not None and near(best) else None
+
+
+def row(values: list[float]) -> str:
+    """Return median, 95th percentile and largest value as text."""
+    if not values:
+        return "    -      -      -"
+    return f"{np.median(values):5.2f} {np.percentile(values, 95):6.2f} {max(values):6.1f}"
+
+
+def main() -> None:
+    """Parse the arguments and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shots", type=Path, default=CACHE, help="folder of the rendered shots, SHOT_SEED")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--only", choices=sorted(SHOTS), action="append")
+    args = parser.parse_args()
+    print("shot     light  visible followed | error, px: median 95 % largest | not doubtful: median 95 % largest | "
+          "doubtful (visible) | brightness: median 95 %")
+    for shot in args.only or SHOTS:
+        for seed in args.seeds:
+            folder = args.shots / f"{shot}_{seed}"
+            make_shot(shot, seed, folder, Progress())
+            capture = Capture.open(folder, need_cameras=False)
+            lights = track_lights(capture).lights
+            entries = read_json(folder / "truth" / "lights.json", CaptureError)["lights"]
+            matched = []
+            for truth, entry in zip(read_lights(folder / "truth" / "lights.json"), entries, strict=True):
+                light = match(truth, lights)
+                if light is None:
+                    print(f"{shot + '_' + str(seed):8s} {truth.name:6s} not found")
+                    continue
+                matched.append(light)
+                visible = {name: key["visible"] for name, key in entry["frames"].items()}
+                figures = measure(capture, truth, visible, light)
+                print(f"{shot + '_' + str(seed):8s} {truth.name:6s} {figures['visible']:7d} {figures['followed']:8d} |"
+                      f"       {row(figures['seen'])}    |       {row(figures['sure'])}          | "
+                      f"{figures['doubtful']:3d} of {figures['keys']:3d} ({figures['doubtful_visible']:d})     |"
+                      f"     {np.median(figures['brightness']):5.2f} {np.percentile(figures['brightness'], 95):5.2f}",
+                      flush=True)
+            false = sum(light not in matched for light in lights)
+            print(f"{shot + '_' + str(seed):8s} {len(lights)} lights, {false} of them false")
+
+
+if __name__ == "__main__":
+    main()

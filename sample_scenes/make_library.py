@@ -2,7 +2,7 @@
 """Makes the library in the box: `python sample_scenes/make_library.py [NAME ...]`, and `--sheet FILE` for its sheet.
 
 Each look is traced through a prescription that comes with the program and fitted (`core.fit.traced_flare`), one after
-the other. It leaves NAME.flare, its thumbnail NAME.png, and its entry in looks.json; `--table` prints the errors there.
+the other. It leaves NAME.flare, its thumbnail NAME.png, and its entry in looks.json; `--table` prints their errors.
 A look that is there with the same settings is kept, so a second run resumes.
 """
 from __future__ import annotations

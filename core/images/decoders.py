@@ -43,6 +43,9 @@ MAX_PIXELS = 500_000_000
 """Largest picture that is opened; a header that claims more is damaged or hostile."""
 MAX_BYTES = 2 << 30
 """Bound of a file that is read whole."""
+_STATED_SIZES = {b"SDPX": (16, 32), b"\x80\x2a\x5f\xd7": (20, 16)}
+"""Places of the sizes of the file and of its user data in the headers of DPX and Cineon, 4 bytes each, by the first
+bytes of those with big-endian numbers."""
 _DPX_ENCODING = 806, 808
 """Bytes of a DPX's header that say whether its pixels are packed as runs (SMPTE 268M, image element 1)."""
 _MAX_RUN_LENGTH = 256
@@ -190,6 +193,7 @@ def open_oiio(path: Path) -> Any:
     """Open a file with OpenImageIO, for its alpha and colours as stored. Raises FrameError; the caller closes it."""
     oiio = _library("OpenImageIO", path)
     check_regular(path)
+    _check_stated_size(path)
     oiio.attribute("limits:imagesize_MB", 8192)
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
@@ -228,17 +232,21 @@ def _oiio_space(spec: Any, kind: Kind) -> ColourSpace | None:
     return None
 
 
-def _check_stated_size(path: Path, kind: Kind) -> None:
-    """Raise FrameError for a DPX or Cineon that is smaller than its header says, which OpenImageIO fills with black."""
-    if kind not in ("dpx", "cineon"):
-        return
+def _check_stated_size(path: Path) -> None:
+    """Raise FrameError for a DPX or Cineon that is smaller than its header says.
+
+    OpenImageIO fills what is missing with black, and takes as many gigabytes as the header states for user data.
+    """
     with open_regular(path) as stream:
-        head = stream.read(24)
+        head = stream.read(36)
         size = stream.seek(0, 2)
-    order: Literal["big", "little"] = "big" if head[:4] in (b"SDPX", b"\x80\x2a\x5f\xd7") else "little"
-    stated = int.from_bytes(head[16:20] if kind == "dpx" else head[20:24], order)
-    if size < stated < 0xFFFFFFFF:
-        raise _damaged(path, f"it has {size} of {stated} bytes")
+    place = _STATED_SIZES.get(head[:4]) or _STATED_SIZES.get(head[3::-1])
+    if place is None:
+        return
+    order: Literal["big", "little"] = "big" if head[:4] in _STATED_SIZES else "little"
+    stated, user_data = (int.from_bytes(head[at:at + 4], order) for at in place)
+    if size < stated < 0xFFFFFFFF or size < user_data < 0xFFFFFFFF:
+        raise _damaged(path, f"it has {size} of {max(stated, user_data)} bytes")
 
 
 def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
@@ -258,7 +266,6 @@ def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
 
 def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
     """Decode a file with OpenImageIO; see `decode_foreign`. Raises FrameError."""
-    _check_stated_size(path, kind)
     opened = open_oiio(path)
     try:
         spec = opened.spec()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import tempfile
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -121,7 +121,7 @@ def _exr_headers(path: Path | str) -> list[dict[str, Any]]:
 
     try:
         with _readable_copy(path) as readable, OpenEXR.File(readable, header_only=True) as file:
-            headers = [dict(part.header) for part in file.parts]
+            headers = [_usable_header(part.header) for part in file.parts]
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
@@ -129,6 +129,22 @@ def _exr_headers(path: Path | str) -> list[dict[str, Any]]:
     if not headers:
         raise FrameError(f"{path} is damaged or truncated; export it again.")
     return headers
+
+
+def _usable_header(header: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a header without the attributes that this program interprets where they are of another type."""
+    return {name: value for name, value in header.items() if name not in _IS_USABLE or _IS_USABLE[name](value)}
+
+
+def _is_chromaticities(value: Any) -> bool:
+    return isinstance(value, tuple) and len(value) == 8 and all(isinstance(number, float) for number in value)
+
+
+_IS_USABLE: dict[str, Callable[[Any], bool]] = {
+    "chromaticities": _is_chromaticities,
+    "pixelAspectRatio": lambda value: isinstance(value, float),
+    "multiView": lambda value: isinstance(value, list) and all(isinstance(name, str) for name in value)}
+"""The standard's types of optional attributes, as the library gives them."""
 
 
 def read_exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
@@ -140,7 +156,7 @@ def read_exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[A
 
     try:
         with _readable_copy(path) as readable, OpenEXR.File(readable, separate_channels=True) as file:
-            parts = [(dict(part.header), {name: channel.pixels for name, channel in part.channels.items()})
+            parts = [(_usable_header(part.header), {name: channel.pixels for name, channel in part.channels.items()})
                      for part in file.parts]
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem

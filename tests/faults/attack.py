@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,23 +40,25 @@ if injection.is_preloaded():  # before the modules of the program
     importlib.import_module("fit_flare.headless.cli")
 
 from core.system.files import write_json  # noqa: E402
-from tests.faults.cases import Case, Inputs, Snapshot, cases, fit_argv, leftovers, snapshot, why_not_whole  # noqa: E402
+from tests.faults.cases import CASES, INPUTS, Case, Snapshot, fit_argv, leftovers, snapshot, why_not_whole  # noqa: E402
 
 UNBROKEN = Fault("none", 0)
 LIMIT_S = 300.0
 """Time after which a command counts as hanging."""
-WARM = ("core.fit.run_loop", "core.bake.bake", "core.transfer.transfer", "core.transfer.export",
-        "core.removal.jobs.batch", "core.removal.jobs.fitted", "core.removal.jobs.clean_video",
-        "core.removal.evaluation", "core.removal.training.run", "core.metrics.evaluation", "core.capture.solve",
-        "core.lights", "core.fit.traced_flare", "headless.targets")
-"""Modules that are loaded once, before the forks."""
+WARM = {"fit": "core.fit.run_loop", "bake": "core.bake.bake", "transfer": "core.transfer.transfer",
+        "export": "core.transfer.export", "remove": "core.removal.jobs.batch",
+        "remove --run": "core.removal.jobs.fitted", "remove a video": "core.removal.jobs.clean_video",
+        "eval": "core.metrics.evaluation", "eval-removal": "core.removal.evaluation",
+        "train-removal": "core.removal.training.run", "lights": "core.lights",
+        "make-flare": "core.fit.traced_flare", "solve": "core.capture.solve"}
+"""Modules of the commands that are loaded once, before the forks."""
 STAYS_HIDDEN = (".solve", ".held")
 """Hidden files that are kept on purpose: the work of a solve; an empty lock file that could not be removed, which the
 next process locks again."""
 
 
-def make_inputs(folder: Path, injector: Injector) -> Inputs:
-    """Make what the commands read, unless an earlier attack in the same folder has made it."""
+def make_inputs(folder: Path, injector: Injector, names: Iterable[str]) -> None:
+    """Make what the commands read, by names of INPUTS, unless an earlier attack in the same folder has made it."""
     from core.images.write import write_png
     from tests.core.captures import orbit
     from tests.core.flared import flared_capture
@@ -64,26 +67,41 @@ def make_inputs(folder: Path, injector: Injector) -> Inputs:
     from tests.core.test_solve import SIZE, shoot
     from tests.core.videos import stripes, write_video
 
-    inputs, whole = Inputs(folder), folder / "whole"
-    if whole.exists():
-        return inputs
-    shutil.rmtree(folder, ignore_errors=True)
-    flared_capture(inputs.capture, count=7, dots=60)
-    lit_capture(inputs.lit, 6, [(0.4, -0.5, 0.3)])
-    (inputs.lit / "lights.json").unlink(missing_ok=True)
-    network_file(inputs.weights, bias=0.2)
-    shoot(inputs.shot, orbit(8, size=SIZE, arc=0.7))
-    write_video(inputs.clip, "ffv1", "yuv444p", [stripes(64) * gain for gain in (1.0, 0.8)], tags=(1, 1, 1))
-    for place in (inputs.backgrounds, inputs.pairs / "gt", inputs.pairs / "input"):
-        for name in ("a.png", "b.png"):
-            write_png(place / name, picture(80, 120).astype("float32") / (300 if place.name == "input" else 400))
-    for argv in (fit_argv(inputs.capture, inputs.run),
-                 ["bake", str(inputs.run), "--out", str(inputs.layers), "--frames", "1-3"]):
+    inputs = {name: folder / file for name, file in INPUTS.items()}
+
+    def run(argv: list[str]) -> None:
         done = injector.run(argv, folder, UNBROKEN, 600)
         if done.status:
             raise RuntimeError(done.text)
-    whole.touch()
-    return inputs
+
+    def write_pictures(place: Path, gain: float) -> None:
+        for name in ("a.png", "b.png"):
+            write_png(place / name, picture(80, 120).astype("float32") * gain / 255)
+
+    def make_pairs() -> None:
+        write_pictures(inputs["pairs"] / "gt", 0.6)
+        write_pictures(inputs["pairs"] / "input", 0.8)
+
+    def make_lit() -> None:
+        lit_capture(inputs["lit"], 6, [(0.4, -0.5, 0.3)])
+        (inputs["lit"] / "lights.json").unlink(missing_ok=True)
+
+    makers: dict[str, Callable[[], object]] = {
+        "capture": lambda: flared_capture(inputs["capture"], count=7, dots=60),
+        "run": lambda: run(fit_argv(inputs["capture"], inputs["run"])),
+        "layers": lambda: run(["bake", str(inputs["run"]), "--out", str(inputs["layers"]), "--frames", "1-3"]),
+        "lit": make_lit, "pairs": make_pairs, "backgrounds": lambda: write_pictures(inputs["backgrounds"], 0.6),
+        "weights": lambda: network_file(inputs["weights"], bias=0.2),
+        "shot": lambda: shoot(inputs["shot"], orbit(8, size=SIZE, arc=0.7)),
+        "clip": lambda: write_video(inputs["clip"], "ffv1", "yuv444p", [stripes(64) * gain for gain in (1.0, 0.8)],
+                                    tags=(1, 1, 1))}
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in dict.fromkeys(names):
+        whole = folder / f"{name}.whole"
+        if not whole.exists():
+            shutil.rmtree(inputs[name], ignore_errors=True)
+            makers[name]()
+            whole.touch()
 
 
 class Journal:
@@ -115,8 +133,8 @@ class Journal:
 class Attack:
     """The attempts on one command, below `folder`."""
 
-    def __init__(self, case: Case, folder: Path, injector: Injector, journal: Journal) -> None:
-        self.case, self._folder, self._injector, self._journal = case, folder, injector, journal
+    def __init__(self, case: Case, inputs: Path, folder: Path, injector: Injector, journal: Journal) -> None:
+        self.case, self._inputs, self._injector, self._journal = case, inputs, injector, journal
         self.out = folder / "out"
         self._failures: list[str] = []
         stored = folder / "unbroken.json"
@@ -161,7 +179,7 @@ class Attack:
 
     def _run_twice(self, fault: Fault) -> str:
         """Return how the run with the fault ended."""
-        argv = self.case.argv(self.out)
+        argv = self.case.argv(self._inputs, self.out)
         ending = self._check_broken(fault, self._injector.run(argv, self.out, fault, LIMIT_S))
         again = self._injector.run(argv, self.out, UNBROKEN, LIMIT_S)
         if again.status:
@@ -208,11 +226,11 @@ class Attack:
     def _reset(self) -> None:
         shutil.rmtree(self.out, ignore_errors=True)
         self.out.mkdir(parents=True)
-        self.case.prepare(self.out)
+        self.case.prepare(self._inputs, self.out)
 
     def _unbroken(self) -> tuple[Snapshot, Outcome]:
         self._reset()
-        outcome = self._injector.run(self.case.argv(self.out), self.out, UNBROKEN, 600)
+        outcome = self._injector.run(self.case.argv(self._inputs, self.out), self.out, UNBROKEN, 600)
         if outcome.status:
             raise RuntimeError(f"{self.case.name}: {outcome.text[-2000:]}")
         return snapshot(self.out), outcome
@@ -225,14 +243,17 @@ def attack(folder: Path, faults: int, kills: int, only: list[str], limit_s: floa
     end = time.monotonic() + limit_s
 
     torch.set_num_threads(1)
-    for name in WARM:
-        importlib.import_module(f"fit_flare.{name}")
     injector, journal = Injector(folder / "log"), Journal(folder / "attempts.jsonl")
-    chosen = [case for case in cases(make_inputs(folder / "inputs", injector)) if not only or case.name in only]
+    inputs = folder / "inputs"
+    chosen = [case for case in CASES if not only or case.name in only]
+    for name in ("fit", "bake", *(case.name for case in chosen)):
+        if name in WARM:
+            importlib.import_module(f"fit_flare.{WARM[name]}")
+    make_inputs(inputs, injector, [name for case in chosen for name in case.reads])
     attacks: list[Attack] = []
     for case in chosen:
         try:
-            attacks.append(Attack(case, folder / case.name.replace(" ", "_"), injector, journal))
+            attacks.append(Attack(case, inputs, folder / case.name.replace(" ", "_"), injector, journal))
             print(f"{case.name}: {len(attacks[-1].reference)} files", flush=True)
         except (RuntimeError, TimeoutError) as problem:
             print(f"FAILED {case.name} without a fault: {problem}", flush=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,114 +20,75 @@ Snapshot = dict[str, str]
 """Hash of each file by its path below a folder."""
 
 
+INPUTS = {
+    "capture": "capture",  # with a flare, clean frames and lights
+    "lit": "lit",  # a capture with lamps in its frames, and no lights.json
+    "run": "run",  # a fit of `capture`
+    "layers": "layers",  # a bake of `run`
+    "weights": "weights.safetensors",  # of a tiny network
+    "shot": "shot",  # frames to solve
+    "clip": "clip.mkv",  # a video of a few frames
+    "backgrounds": "backgrounds",  # pictures without flare
+    "pairs": "pairs"}  # pictures with flare and without
+"""File of each input in the folder of inputs."""
+
+
 class Case(NamedTuple):
-    """A command. argv: its arguments for a folder that takes all it writes. prepare: fills that folder before.
-    resumed: files that an interruption may change, by docs/reproducibility.md."""
+    """A command. reads: names of its inputs, each after those that it is made from. words: its arguments, with {names}
+    of inputs and of {out}, the folder that takes all it writes. copies: an input that lies in that folder before.
+    resumed: files that an interruption may change or add, by docs/reproducibility.md."""
 
     name: str
-    argv: Callable[[Path], list[str]]
-    prepare: Callable[[Path], None] = lambda _: None
+    reads: tuple[str, ...]
+    words: str
+    copies: str = ""
     resumed: frozenset[str] = frozenset()
 
+    def argv(self, inputs: Path, out: Path) -> list[str]:
+        """Return the arguments for a folder."""
+        places = {name: inputs / file for name, file in INPUTS.items()}
+        return [word.format(out=out, **places) for word in self.words.split()]
 
-class Inputs(NamedTuple):
-    """Folder of what the commands read, and its parts."""
+    def prepare(self, inputs: Path, out: Path) -> None:
+        """Fill the folder."""
+        if self.copies:
+            shutil.copytree(inputs / INPUTS[self.copies], out / self.copies)
 
-    folder: Path
 
-    @property
-    def capture(self) -> Path:
-        """Capture with a flare, clean frames and lights."""
-        return self.folder / "capture"
-
-    @property
-    def lit(self) -> Path:
-        """Capture with lamps in its frames, and no lights.json."""
-        return self.folder / "lit"
-
-    @property
-    def run(self) -> Path:
-        """Fit of `capture`."""
-        return self.folder / "run"
-
-    @property
-    def layers(self) -> Path:
-        """Bake of `run`."""
-        return self.folder / "layers"
-
-    @property
-    def weights(self) -> Path:
-        """Weights of a tiny network."""
-        return self.folder / "weights.safetensors"
-
-    @property
-    def shot(self) -> Path:
-        """Frames to solve."""
-        return self.folder / "shot"
-
-    @property
-    def clip(self) -> Path:
-        """Video of a few frames."""
-        return self.folder / "clip.mkv"
-
-    @property
-    def backgrounds(self) -> Path:
-        """Pictures without flare."""
-        return self.folder / "backgrounds"
-
-    @property
-    def pairs(self) -> Path:
-        """Pictures with flare and without, for eval-removal."""
-        return self.folder / "pairs"
+FIT = ("--resume --iterations 4 --preset draft --holdout 3 --set flare.count=24 --set checkpoint_every_s=1")
+"""A tiny fit that saves its state at every iteration."""
+FITTED = ("capture", "run")
+CASES = (
+    Case("export", FITTED, "export {run} --as preset --out {out}/lamp.json"),
+    Case("export ply", FITTED, "export {run} --as ply --out {out}/ply --frames 1-3"),
+    Case("bake", FITTED, "bake {run} --out {out}/layers --frames 1-3"),
+    Case("remove", ("capture", "weights"), "remove {capture}/images --out {out}/clean --flare {out}/flares --weights "
+         "{weights} --frames 1-2 --stills --working-size 256"),
+    Case("remove --run", FITTED, "remove --run {run} --out {out}/clean --frames 1-3"),
+    Case("remove a video", ("clip", "weights"), "remove {clip} --out {out}/clean.mov --weights {weights} --stills "
+         "--working-size 256"),
+    Case("transfer", FITTED, "transfer {run}/flare.flare --to {capture} --out {out}/layers --frames 1-3"),
+    Case("eval", FITTED, "eval {out}/run", copies="run"),
+    Case("eval-removal", ("pairs", "weights"), "eval-removal {pairs} --out {out}/eval --weights {weights} "
+         "--working-size 256"),
+    Case("lights", ("lit",), "lights {out}/lit", copies="lit"),
+    Case("make-flare", (), "make-flare US4099850 --out {out}/made.flare --set tracing.width=48 --set "
+         "tracing.positions=4 --set tracing.bands=1 --set ghosts.count=3 --set fit.iterations=10 --set "
+         "fit.gaussians=60"),
+    Case("fit", ("capture",), "fit {capture} --out {out}/run " + FIT),
+    Case("train-removal", ("backgrounds",), "train-removal --backgrounds {backgrounds} --out {out}/trained --set "
+         "widths=[8,8,8,8,8] --set size_stages=[[1.0,64,64]] --set pixels_per_iteration=1 --set bank_size=2 --set "
+         "canvas_size=64 --iterations 2 --processes 1 --threads 1 --resume",
+         resumed=frozenset({"trained/removal.safetensors", "trained/checkpoint.safetensors"})),
+    Case("solve", ("shot",), "solve {shot} --out {out}/capture --work-size 320 --no-mask"),
+    Case("compose", (*FITTED, "layers"), "compose {layers} --out {out}/frames --frames 1-2",
+         resumed=frozenset({"frames/compositor.blend1"})))
+"""The commands, the quick ones first."""
 
 
 def fit_argv(capture: Path, run: Path) -> list[str]:
-    """Return the arguments of a tiny fit that saves its state at every iteration."""
-    return ["fit", str(capture), "--out", str(run), "--resume", "--iterations", "4", "--preset", "draft", "--holdout",
-            "3", *changes("flare.count=24", "checkpoint_every_s=1")]
-
-
-def changes(*settings: str) -> list[str]:
-    """Return `--set` for each setting."""
-    return [word for setting in settings for word in ("--set", setting)]
-
-
-def cases(inputs: Inputs) -> list[Case]:
-    """Return the commands, the quick ones first."""
-    run, weights = str(inputs.run), str(inputs.weights)
-
-    def copy(source: Path, name: str) -> Callable[[Path], None]:
-        return lambda folder: shutil.copytree(source, folder / name) and None
-
-    trained = [*changes("widths=[8,8,8,8,8]", "size_stages=[[1.0,64,64]]", "pixels_per_iteration=1", "bank_size=2",
-                        "canvas_size=64"), "--iterations", "2", "--processes", "1", "--threads", "1", "--resume"]
-    traced = changes("tracing.width=48", "tracing.positions=4", "tracing.bands=1", "ghosts.count=3",
-                     "fit.iterations=10", "fit.gaussians=60")
-    return [
-        Case("export", lambda out: ["export", run, "--as", "preset", "--out", f"{out}/lamp.json"]),
-        Case("export ply", lambda out: ["export", run, "--as", "ply", "--out", f"{out}/ply", "--frames", "1-3"]),
-        Case("bake", lambda out: ["bake", run, "--out", f"{out}/layers", "--frames", "1-3"]),
-        Case("remove", lambda out: ["remove", str(inputs.capture / "images"), "--out", f"{out}/clean", "--flare",
-                                    f"{out}/flares", "--weights", weights, "--frames", "1-2", "--stills",
-                                    "--working-size", "256"]),
-        Case("remove --run", lambda out: ["remove", "--run", run, "--out", f"{out}/clean", "--frames", "1-3"]),
-        Case("remove a video", lambda out: ["remove", str(inputs.clip), "--out", f"{out}/clean.mov", "--weights",
-                                            weights, "--stills", "--working-size", "256"]),
-        Case("transfer", lambda out: ["transfer", f"{run}/flare.flare", "--to", str(inputs.capture), "--out",
-                                      f"{out}/layers", "--frames", "1-3"]),
-        Case("eval", lambda out: ["eval", f"{out}/run"], copy(inputs.run, "run")),
-        Case("eval-removal", lambda out: ["eval-removal", str(inputs.pairs), "--out", f"{out}/eval", "--weights",
-                                          weights, "--working-size", "256"]),
-        Case("lights", lambda out: ["lights", f"{out}/capture"], copy(inputs.lit, "capture")),
-        Case("make-flare", lambda out: ["make-flare", "US4099850", "--out", f"{out}/made.flare", *traced]),
-        Case("fit", lambda out: fit_argv(inputs.capture, out / "run")),
-        Case("train-removal", lambda out: ["train-removal", "--backgrounds", str(inputs.backgrounds), "--out",
-                                           f"{out}/trained", *trained],
-             resumed=frozenset({"trained/removal.safetensors", "trained/checkpoint.safetensors"})),
-        Case("solve", lambda out: ["solve", str(inputs.shot), "--out", f"{out}/capture", "--work-size", "320",
-                                   "--no-mask"]),
-        Case("compose", lambda out: ["compose", str(inputs.layers), "--out", f"{out}/frames", "--frames", "1-2"]),
-    ]
+    """Return the arguments of a tiny fit."""
+    return ["fit", str(capture), "--out", str(run), *FIT.split()]
 
 
 def snapshot(folder: Path) -> Snapshot:

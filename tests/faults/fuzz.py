@@ -72,6 +72,8 @@ from tests.core.picture_files import WRITERS, scene
 from tests.core.removal_cases import network_file, picture
 from tests.core.test_flare import some_flare
 from tests.core.videos import X265, stripes, write_video
+from tests.faults.media import media
+from tests.faults.records import records
 
 TIME_LIMIT_S = 10
 MEMORY_LIMIT = 1 << 30
@@ -216,6 +218,9 @@ def formats(base: Path) -> list[Format]:
                 options=X265 if codec == "libx265" else {}, alpha=np.ones((64, 64)) if "yuva" in pixels else None))
     add("picture .exr", "a.exr", lambda folder: read_both(folder / "a.exr"), lambda folder: write_exr(
         folder / "a.exr", {channel: np.ones((24, 32), np.float32) for channel in "RGB"}))
+    for other in (*media(), *records()):
+        add(other.name, other.file, lambda folder, other=other: other.read(folder / other.file),  # type: ignore[misc]
+            lambda folder, other=other: other.write(folder / other.file))  # type: ignore[misc]
     return found
 
 

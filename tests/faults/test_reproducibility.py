@@ -2,13 +2,17 @@
 """The first table of docs/reproducibility.md: the same command gives the same bytes, whatever the environment."""
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from core.bake.exr import write_layers
+from core.bake.layers import FrameLayers
 from tests.core.flared import flared_capture
 from tests.core.removal_cases import network_file
 from tests.faults.cases import Snapshot, fit_argv, snapshot
@@ -26,7 +30,7 @@ from fit_flare.headless import cli
 sys.exit(max(cli.main(argv) for argv in json.loads(sys.argv[2])))"""
 
 
-def results(out: Path, capture: Path, weights: Path, **environment: str) -> Snapshot:
+def results(out: Path, capture: Path, weights: Path, working_folder: Path, **environment: str) -> Snapshot:
     """Fit, bake, export, transfer and clean in one process; return the hashes of all files."""
     import json
 
@@ -38,8 +42,10 @@ def results(out: Path, capture: Path, weights: Path, **environment: str) -> Snap
                 ["remove", str(capture / "images"), "--out", f"{out}/clean", "--weights", str(weights), "--frames",
                  "1", "--stills", "--working-size", "256"],
                 ["remove", "--run", run, "--out", f"{out}/subtracted", "--frames", "1"]]
+    working_folder.mkdir(exist_ok=True)
     done = subprocess.run([sys.executable, "-P", "-c", CODE, str(ROOT / "headless" / "run.py"), json.dumps(commands)],
-                          env={**os.environ, **environment}, capture_output=True, text=True, check=False)
+                          cwd=working_folder, env={**os.environ, **environment}, capture_output=True, text=True,
+                          check=False)
     assert done.returncode == 0, done.stderr
     return {name: value for name, value in snapshot(out).items() if name not in VARY}
 
@@ -50,12 +56,34 @@ def test_the_same_commands_give_the_same_bytes(tmp_path: Path) -> None:
     capture, weights = flared_capture(tmp_path / "capture", count=7, dots=60), tmp_path / "weights.safetensors"
     network_file(weights, bias=0.2)
     out = tmp_path / "out"
-    first = results(out, capture, weights, PYTHONHASHSEED="1", TZ="UTC")
+    first = results(out, capture, weights, tmp_path, PYTHONHASHSEED="1", TZ="UTC")
     out.rename(tmp_path / "first")
-    second = results(out, capture, weights, PYTHONHASHSEED="2", TZ="Asia/Tokyo", LANG="C", LC_ALL="C")
+    second = results(out, capture, weights, tmp_path / "elsewhere", PYTHONHASHSEED="2", TZ="Asia/Tokyo", LANG="C",
+                     LC_ALL="C")
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []
     assert {"run/flare.flare", "run/scene.ply", "lamp.json", "layers/layers.0001.exr"} <= first.keys()
+
+
+@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="there is no bpy package (`make setup`)")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no TZ")
+def test_the_same_layers_give_the_same_frames(tmp_path: Path) -> None:
+    """Two Blenders with another hash seed, time zone and working folder write to the same place."""
+    random = np.random.default_rng(0)
+    light = random.random((2, 12, 16, 3), np.float32)
+    write_layers(tmp_path / "layers" / "layers.0001.exr", FrameLayers(light[0], {"lamp": light[1]},
+                                                                      np.ones((12, 16), np.float32)))
+    out, found = tmp_path / "frames", []
+    for seed, zone in (("1", "UTC"), ("2", "Asia/Tokyo")):
+        (tmp_path / zone).mkdir(parents=True)
+        done = subprocess.run([sys.executable, str(ROOT / "headless" / "run.py"), "compose", str(tmp_path / "layers"),
+                               "--out", str(out), "--step", "compose"], cwd=tmp_path / zone, capture_output=True,
+                              env={**os.environ, "PYTHONHASHSEED": seed, "TZ": zone}, text=True, check=False)
+        assert done.returncode in (0, -11), done.stderr  # Blender as a module may crash at its end
+        found.append({name: value for name, value in snapshot(out).items() if not name.startswith("compositor")})
+        out.rename(tmp_path / f"frames of {seed}")
+    assert found[0] == found[1]
+    assert found[0].keys() == {"frame.0001.exr", "frame.0001.png"}
 
 
 def test_the_table_names_tests_that_exist() -> None:

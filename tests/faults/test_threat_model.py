@@ -22,16 +22,22 @@ import pytest
 from core.bake.bake import MANIFEST, read_manifest
 from core.bake.exr import HEADER_ATTRIBUTE, read_description, read_layers
 from core.bake.layers import layer_names
-from core.errors import FitFlareError
+from core.colour.spaces import REC_709
+from core.errors import FitFlareError, FrameError
 from core.fit import checkpoint
 from core.flare.file import load as load_flare
+from core.images.exr import read_data_window, read_exr_header
 from core.images.plates import read_plate
 from core.images.read import read_picture
+from core.images.size import picture_size
+from core.images.views import stereo_views
 from core.images.write import write_exr
 from core.look import read
 from core.metrics import lpips
 from core.removal.jobs.manifest import Manifest
 from core.removal.model import weights
+from tests.core.picture_files import WRITERS, scene
+from tests.faults.media import media
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -88,6 +94,60 @@ def test_a_picture_that_claims_a_huge_size_is_refused(tmp_path: Path, size: tupl
     for reader in (read_picture, read_plate):
         with pytest.raises(FitFlareError):
             reader(path)
+
+
+def _write_film_scan(path: Path) -> None:
+    """Write a DPX or a Cineon."""
+    write = WRITERS["log DPX"][2] if path.suffix == ".dpx" else next(
+        (lambda path, _, other=other: other.write(path)) for other in media() if other.file == path.name)
+    write(path, scene(48, 32))
+
+
+@pytest.mark.parametrize(("file", "width_at"), [("a.dpx", [772]), ("a.cin", [200, 228, 256])])
+def test_a_picture_that_claims_more_pixels_than_its_bytes_is_refused(file: str, width_at: list[int],
+                                                                     tmp_path: Path) -> None:
+    path = tmp_path / file
+    _write_film_scan(path)
+    data = bytearray(path.read_bytes())
+    order = "<" if data[:4] == b"XPDS" else ">"
+    for at in width_at:  # Cineon has a size for each channel
+        data[at:at + 8] = struct.pack(f"{order}II", 20_000, 10_000)
+    path.write_bytes(data)
+    with pytest.raises(FrameError, match=r"claims 20000 x 10000 pixels in"):
+        read_picture(path)
+
+
+@pytest.mark.parametrize(("file", "at"), [("a.dpx", 32), ("a.cin", 16)])
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_picture_that_claims_user_data_beyond_its_end_is_refused(file: str, at: int, swapped: bool,
+                                                                   tmp_path: Path) -> None:
+    path = tmp_path / file
+    _write_film_scan(path)
+    data = bytearray(path.read_bytes())
+    order: Any = "little" if (data[:4] == b"XPDS") != swapped else "big"
+    if swapped:
+        data[:36] = b"".join(data[k:k + 4][::-1] for k in range(0, 36, 4))
+    data[at:at + 4] = (0xF0000000).to_bytes(4, order)
+    path.write_bytes(data)
+    for reader in (read_picture, picture_size):
+        with pytest.raises(FrameError, match=r"of 4026531840 bytes"):
+            reader(path)
+
+
+@pytest.mark.parametrize("name", ["chromaticities", "pixelAspectRatio", "multiView"])
+def test_header_entries_of_an_exr_with_another_type_are_ignored(tmp_path: Path, name: str) -> None:
+    path, header = tmp_path / "a.exr", {"chromaticities": REC_709, "pixelAspectRatio": 2.0,
+                                        "multiView": ["left", "right"]}
+    write_exr(path, {channel: np.ones((4, 4), np.float32) for channel in "RGB"}, header=header)
+    kind = {"chromaticities": b"chromaticities", "pixelAspectRatio": b"float", "multiView": b"stringvector"}[name]
+    start = name.encode() + b"\0"
+    assert path.read_bytes().count(start + kind) == 1
+    path.write_bytes(path.read_bytes().replace(start + kind, start + b"x" * len(kind)))
+    assert type(read_exr_header(path).get(name)) in (type(None), float)  # the library sets a ratio of 1
+    assert read_picture(path).pixels.min() == 1
+    plate = read_plate(path)
+    assert plate.space.name == "linear" and read_data_window(path).size == (4, 4)
+    assert stereo_views(read_exr_header(path), ["R", "G", "B"]) == []
 
 
 @pytest.mark.parametrize("text", ["[" * 5000, "null", '{"lights": 3}', "\x01"])

@@ -17,6 +17,8 @@ from fit_flare.core.removal.jobs.manifest import MANIFEST
 from fit_flare.core.removal.training.run import read_recipe
 from fit_flare.headless import cli
 
+from tests.core.removal_cases import network_file
+
 RUN = Path(__file__).resolve().parents[2] / "headless" / "run.py"
 SMALL = [word for change in ("widths=[8,8,8,8,8]", "size_stages=[[1.0,64,64]]", "pixels_per_iteration=1",
                              "bank_size=2", "canvas_size=64")
@@ -129,7 +131,8 @@ def test_diffusion_needs_a_base_and_its_packages(backgrounds: Path, tmp_path: Pa
 def test_pairs_are_scored(tmp_path: Path, backgrounds: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for kind in ("input", "gt"):
         shutil.copytree(backgrounds, tmp_path / "pairs" / kind)
-    assert cli.main(["eval-removal", str(tmp_path / "pairs"), "--out", str(tmp_path / "eval")]) == 0
+    weights = ["--weights", str(network_file(tmp_path / "net.safetensors", bias=0.1))]
+    assert cli.main(["eval-removal", str(tmp_path / "pairs"), "--out", str(tmp_path / "eval"), *weights]) == 0
     assert "LPIPS is not computed" in capsys.readouterr().err
     scores = json.loads((tmp_path / "eval" / "eval.json").read_text(encoding="utf-8"))
     assert scores["mean"]["count"] == 2
@@ -137,7 +140,7 @@ def test_pairs_are_scored(tmp_path: Path, backgrounds: Path, capsys: pytest.Capt
     assert cli.main(["eval-removal", "--out", str(tmp_path)]) == 2
     assert "--synthetic" in capsys.readouterr().err
     assert cli.main(["eval-removal", "--out", str(tmp_path / "made"), "--synthetic", "1", "--size", "96", "64",
-                     "--backgrounds", str(backgrounds), "--all-backgrounds"]) == 0
+                     "--backgrounds", str(backgrounds), "--all-backgrounds", *weights]) == 0
     assert len(json.loads((tmp_path / "made" / "eval.json").read_text(encoding="utf-8"))["categories"]) == 8
 
 
@@ -146,7 +149,7 @@ def test_unreadable_pairs_do_not_stop_the_scores_of_others(tmp_path: Path, backg
     pairs = tmp_path / "pairs"
     for kind in ("input", "gt"):
         shutil.copytree(backgrounds, pairs / kind)
-    args = ["--out", str(tmp_path / "eval")]
+    args = ["--out", str(tmp_path / "eval"), "--weights", str(network_file(tmp_path / "net.safetensors", bias=0.1))]
     (pairs / "gt" / "b.png").write_bytes((pairs / "gt" / "b.png").read_bytes()[:60])
     assert cli.main(["eval-removal", str(pairs), *args]) == 1
     assert "1 of 2 pairs could not be read; the scores of the others are in" in capsys.readouterr().err
@@ -180,7 +183,10 @@ def test_a_fit_in_mode_split_makes_no_clean_frames(capture: Path, tmp_path: Path
         assert "--run" in capsys.readouterr().err
 
 
-def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+                                          monkeypatch: pytest.MonkeyPatch) -> None:
+    net = network_file(tmp_path / "net.safetensors", bias=0.1)
+    monkeypatch.setattr("fit_flare.core.removal.inference.remover.IN_THE_BOX", net)
     bare = tmp_path / "bare"
     shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
     args = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2"]

@@ -27,6 +27,7 @@ from ...images.video import Video, is_video, write_frame
 from ...images.write import write_png
 from ...system.files import read_json, write_json
 from ...system.progress import Progress
+from ...typed import parse_table, parse_value
 
 RECORD_FILE = "stills.json"
 """File of the chosen frames, below the work folder."""
@@ -126,8 +127,9 @@ def read_record(work: Path) -> tuple[list[SourceFrame], list[str]] | None:
         return None
     data = read_json(work / RECORD_FILE, CaptureError)
     try:
-        return [SourceFrame(**frame) for frame in data["stills"]], list(data["left_out"])
-    except (KeyError, TypeError) as problem:
+        return ([parse_table(SourceFrame, frame) for frame in data["stills"]],
+                [parse_value(str, sentence) for sentence in data["left_out"]])
+    except (KeyError, TypeError, ValueError) as problem:
         raise CaptureError(f"{work / RECORD_FILE} is damaged.") from problem
 
 

@@ -57,7 +57,7 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
     with Video(source) as video:
         name = choose_codec(target, video, codec)
     digest = digest_inputs(name, [source, *clean.values()])
-    record = read_json(folder / RECORD, SettingsError) if (folder / RECORD).is_file() else {}
+    record = _read_record(folder / RECORD)
     if target.exists() and not overwrite:
         present = content_hash(target)
         if present not in (record.get("written"), record.get("replaced")):
@@ -85,3 +85,11 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
         progress.say(sentence)
     progress.say(f"The clean video is {target}.")
     return True
+
+
+def _read_record(path: Path) -> dict[str, object]:
+    """Read which video was written of which frames; {} where none was. Raises SettingsError for a damaged record."""
+    record = read_json(path, SettingsError) if path.is_file() else {}
+    if not isinstance(record, dict):
+        raise SettingsError(f"{path} is damaged; remove it, and the video is written again with --overwrite.")
+    return record

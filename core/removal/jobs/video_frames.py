@@ -56,11 +56,15 @@ def extract_frames(video: Path, folder: Path, progress: Progress, space: str | N
         except OSError:
             if not frames.exists():  # another task of a farm may have extracted them meanwhile
                 raise
-    manifest: dict[str, Any] = read_json(frames / VIDEO_MANIFEST, SettingsError)
+    manifest: Any = read_json(frames / VIDEO_MANIFEST, SettingsError)
+    problems = manifest.get("problems", []) if isinstance(manifest, dict) else None
+    if not isinstance(problems, list):
+        raise SettingsError(f"{frames / VIDEO_MANIFEST} is damaged; delete {frames}, and the frames are extracted "
+                            "again.")
     if manifest.get("content") != content:
         raise SettingsError(f"{frames} holds the frames of another video of that name; choose another folder for the "
                             "clean frames, or delete it.")
-    for sentence in manifest.get("problems", []):
+    for sentence in problems:
         progress.say(str(sentence))
     return frames
 

@@ -185,7 +185,7 @@ class Attack:
         if again.status:
             self._fail(fault, f"the second run ends with {again.status}: {again.text[-600:]}")
             return ending
-        self._compare(fault, "the second run", self.varying | self.case.resumed)
+        self._compare(fault, "the second run")
         left = [name for name in leftovers(self.out) if not any(part in name for part in STAYS_HIDDEN)]
         if left:
             self._fail(fault, f"the second run leaves {left}")
@@ -196,7 +196,7 @@ class Attack:
         ending = "other"
         if outcome.status == 0:
             ending = "harmless"
-            self._compare(fault, "success reported", self.varying)
+            self._compare(fault, "success reported")
         elif killed and outcome.status == -9:
             ending = "killed"
         elif outcome.status in (1, 2):
@@ -211,8 +211,8 @@ class Attack:
                 self._fail(fault, f"{name} is not whole: {reason}")
         return ending
 
-    def _compare(self, fault: Fault, what: str, may_vary: set[str] | frozenset[str]) -> None:
-        now = snapshot(self.out)
+    def _compare(self, fault: Fault, what: str) -> None:
+        now, may_vary = snapshot(self.out), self.varying | self.case.varies
         other = [name for name in sorted({*now, *self.reference} - may_vary)
                  if now.get(name) != self.reference.get(name)]
         other += [name for name in sorted(may_vary & self.reference.keys()) if name not in now]
@@ -299,7 +299,7 @@ def _print_table(attacks: list[Attack], plans: dict[str, list[Fault]], journal: 
                 counts["failed"] += bool(journal.failures[name, str(fault)])
         total += counts
         print(f"| {name} | {' | '.join(str(counts[column]) for column in columns)} | "
-              f"{', '.join(sorted(one.varying | one.case.resumed))} |")
+              f"{', '.join(sorted(one.varying | one.case.varies))} |")
     print(f"| all | {' | '.join(str(total[column]) for column in columns)} | |", flush=True)
     return total["failed"] > 0
 

@@ -36,13 +36,13 @@ INPUTS = {
 class Case(NamedTuple):
     """A command. reads: names of its inputs, each after those that it is made from. words: its arguments, with {names}
     of inputs and of {out}, the folder that takes all it writes. copies: an input that lies in that folder before.
-    resumed: files that an interruption may change or add, by docs/reproducibility.md."""
+    varies: files that a repeated run may change or add, by docs/reproducibility.md."""
 
     name: str
     reads: tuple[str, ...]
     words: str
     copies: str = ""
-    resumed: frozenset[str] = frozenset()
+    varies: frozenset[str] = frozenset()
 
     def argv(self, inputs: Path, out: Path) -> list[str]:
         """Return the arguments for a folder."""
@@ -79,10 +79,11 @@ CASES = (
     Case("train-removal", ("backgrounds",), "train-removal --backgrounds {backgrounds} --out {out}/trained --set "
          "widths=[8,8,8,8,8] --set size_stages=[[1.0,64,64]] --set pixels_per_iteration=1 --set bank_size=2 --set "
          "canvas_size=64 --iterations 2 --processes 1 --threads 1 --resume",
-         resumed=frozenset({"trained/removal.safetensors", "trained/checkpoint.safetensors"})),
-    Case("solve", ("shot",), "solve {shot} --out {out}/capture --work-size 320 --no-mask"),
+         varies=frozenset({"trained/removal.safetensors", "trained/checkpoint.safetensors"})),
+    Case("solve", ("shot",), "solve {shot} --out {out}/capture --work-size 320 --no-mask",
+         varies=frozenset(f"capture/images/{number:03d}.png" for number in range(8))),
     Case("compose", (*FITTED, "layers"), "compose {layers} --out {out}/frames --frames 1-2",
-         resumed=frozenset({"frames/compositor.blend1"})))
+         varies=frozenset({"frames/compositor.blend1"})))
 """The commands, the quick ones first."""
 
 

@@ -57,14 +57,14 @@ def extract_frames(video: Path, folder: Path, progress: Progress, space: str | N
             if not frames.exists():  # another task of a farm may have extracted them meanwhile
                 raise
     manifest: Any = read_json(frames / VIDEO_MANIFEST, SettingsError)
-    problems = manifest.get("problems", []) if isinstance(manifest, dict) else None
-    if not isinstance(problems, list):
+    notes = manifest.get("problems", []) if isinstance(manifest, dict) else None
+    if not isinstance(notes, list):
         raise SettingsError(f"{frames / VIDEO_MANIFEST} is damaged; delete {frames}, and the frames are extracted "
                             "again.")
     if manifest.get("content") != content:
         raise SettingsError(f"{frames} holds the frames of another video of that name; choose another folder for the "
                             "clean frames, or delete it.")
-    for sentence in problems:
+    for sentence in notes:
         progress.say(str(sentence))
     return frames
 

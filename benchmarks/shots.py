@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fits over plates on shots with exact layers, held-out frames: the table of docs/results/shots.md.
+"""Fits over plates on shots with exact layers, scored on held-out frames.
 
     python benchmarks/shots.py --out FOLDER [--shots torch drive pan] [--seeds 0 1] [--tracks lights|exact]
                                [--plates network|exact] [--iterations 1200] [--size 240]

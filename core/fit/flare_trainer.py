@@ -25,10 +25,10 @@ from .checkpoint import State
 from .frames import Frames
 from .light_results import (
     flare_shares,
-    measure_brightness,
     normalise_brightness,
     select_flaring,
     share_sentences,
+    solve_brightness,
     without_other_lights,
     write_frame_lights,
 )
@@ -89,14 +89,12 @@ class FlareTrainer(abc.ABC):
                       self.settings.kernels, visibility=self.settings.flare.active_visibility)
 
     def finish_lights(self, folder: Path) -> Sequence[str]:
-        """Measure the lights' brightness in held-out views and their shares; return sentences for the user.
-
-        Lights that do not flare are left out. Lights that move or change are written by frame.
-        """
+        """Measure the lights' brightness, in held-out views of a shot too, and their shares, leave out those that do
+        not flare, and write the lights by frame, if they change; return sentences for the user."""
         if self.flare is None:
             return ()
-        _, held_out = self.capture.split(self.settings.holdout)
-        measure_brightness(self.flare, held_out, self.frames, self.render_view)
+        if self.settings.uses_plates:
+            solve_brightness(self.flare, self.capture.views, self.frames, self.render_view)
         normalise_brightness(self.flare, self.views)
         shares = flare_shares(self.flare, self.views, self.frames, self.render_view)
         flaring = select_flaring(shares)

@@ -37,60 +37,93 @@ SAMPLED_VIEWS = 40
 """Approximate number of views in which shares are measured."""
 MAX_BRIGHTNESS = 4.0
 """Largest brightness that a frame may give a light, relative to its usual one."""
-PRIOR_WEIGHT = 1e-5
-"""Weight per pixel of the brightness that neighbouring frames give."""
-
-
-@torch.no_grad()
-def measure_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, render_view: RenderView) -> None:
-    """Set the brightness of the lights in views that the fit has not seen.
-
-    The flare stays as fitted. These frames give only its strength, as they give `lights` the places; where they do not
-    show it, the neighbouring frames give it.
-    """
-    lights = flare.frame_lights
-    if lights is None:
-        return
-    unseen = {lights.rows[view.name] for view in views}
-    known = [row for row in range(len(lights.rows)) if row not in unseen]
-    values = lights.brightness.weight.clamp_min(0)
-    for row in unseen if known else ():
-        for light in range(values.shape[1]):
-            lights.brightness.weight[row, light] = float(np.interp(row, known, values[known, light].numpy()))
-    solve_brightness(flare, views, frames, render_view)
+PRIOR_WEIGHT = 1e-6
+"""Weight per pixel of the present brightness."""
+CORRELATION_SHARE = 0.005
+"""Share of a frame's pixels whose errors count as one: those of a plate are alike over a neighbourhood."""
+STEP_SCALE = 0.05
+"""Change of brightness from frame to frame that counts as usual."""
+MIN_CERTAINTY = 1e-3
+"""Certainty of a brightness of which a frame says nothing."""
+TV_REWEIGHTINGS, TV_EPSILON = 30, 1e-3
 
 
 @torch.no_grad()
 def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, render_view: RenderView) -> None:
-    """Set the brightness of the lights in these views to the one whose flares are nearest to frame - scene."""
+    """Set the brightness of the lights in these views, in the order of the shot, by least errors of frame - scene over
+    the present flares; smooth in time, with steps, where single frames are uncertain (`smooth_with_steps`).
+
+    The flare stays as it is. In frames that the fit has not seen, only its strength is read off, as `lights` reads the
+    places.
+    """
     lights = flare.frame_lights
     if lights is None:
         return
     weight = lights.brightness.weight
-    for view in views:
-        row = lights.rows[view.name]
+    rows = [lights.rows[view.name] for view in views]
+    solved, certainty = np.zeros((2, len(views), len(flare.names)))
+    for number, (view, row) in enumerate(zip(views, rows, strict=True)):
         start = weight[row].clamp(0, MAX_BRIGHTNESS).numpy().astype(np.float64)
         weight[row] = 1.0  # so that the layers have their usual strength
         rendered = render_view(view)
         columns = [rendered.layers.flares[name].numpy() if name in rendered.layers.flares else None
                    for name in flare.names]
-        solved = _solve(frames.targets(view), rendered.layers.scene.numpy(), columns, start)
-        weight[row] = torch.from_numpy(solved).float()
+        solved[number], certainty[number] = _solve(frames.targets(view), rendered.layers.scene.numpy(), columns, start)
+    for light in range(len(flare.names)):
+        smooth = smooth_with_steps(solved[:, light], certainty[:, light])
+        weight[rows, light] = torch.from_numpy(smooth.clip(0, MAX_BRIGHTNESS)).float()
+
+
+def smooth_with_steps(values: NDArray[np.float64], certainty: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return x (n,) that minimises sum certainty (x - values)^2 / 2 + sum |change of x| / STEP_SCALE.
+
+    certainty: 1 / variance of each value. It is total variation denoising, by reweighted least squares.
+    """
+    smooth = values.copy()
+    if len(values) < 2:
+        return smooth
+    for _ in range(TV_REWEIGHTINGS):
+        springs = 1 / (STEP_SCALE * (np.abs(np.diff(smooth)) + TV_EPSILON))
+        smooth = _solve_tridiagonal(certainty + MIN_CERTAINTY, springs, (certainty + MIN_CERTAINTY) * values)
+    return smooth
+
+
+def _solve_tridiagonal(weights: NDArray[np.float64], springs: NDArray[np.float64],
+                       target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Solve (diag(weights) + the Laplacian of a chain with these springs) x = target, by elimination."""
+    diagonal = weights.copy()
+    diagonal[:-1] += springs
+    diagonal[1:] += springs
+    right = target.copy()
+    for index in range(1, len(target)):
+        factor = springs[index - 1] / diagonal[index - 1]
+        diagonal[index] -= factor * springs[index - 1]
+        right[index] += factor * right[index - 1]
+    solution = right / diagonal
+    for index in range(len(target) - 2, -1, -1):
+        solution[index] += springs[index] * solution[index + 1] / diagonal[index]
+    return solution
 
 
 def _solve(targets: Targets, scene: NDArray[np.float32], flares: Sequence[NDArray[np.float32] | None],
-           start: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the strengths (lights,) of flares (height, width, 3), linear light, in a frame over its scene."""
-    solved = start.copy()
+           start: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the strengths (lights,) of flares (height, width, 3), linear light, in a frame over its scene, and their
+    certainty, 1 / variance."""
+    solved, certainty = start.copy(), np.zeros(len(start))
     present = [number for number, flare in enumerate(flares) if flare is not None and flare.max() > 0]
-    if not present:
-        return solved
     frame = targets.frame.numpy()
     usable = (frame < CLIP_LEVEL).all(-1)
+    if not present or not usable.any():
+        return solved, certainty
     light = (linear_from_srgb(frame) - scene)[usable].ravel().astype(np.float64)
     columns = np.stack([np.asarray(flares[number])[usable].ravel() for number in present], 1).astype(np.float64)
     solved[present] = robust_bounded_fit(columns, light, start[present], 0.0, MAX_BRIGHTNESS, PRIOR_WEIGHT)
-    return solved
+    residual = light - columns @ solved[present]
+    energies = np.square(columns).sum(0)
+    variances = (np.square(columns) * residual[:, None] ** 2).sum(0) / np.maximum(energies, 1e-12)
+    area = CORRELATION_SHARE * len(light)
+    certainty[present] = energies / (area * variances + 1e-6 * area)
+    return solved, certainty
 
 
 @torch.no_grad()

@@ -75,7 +75,8 @@ class Optimisers:
 
     def load_state(self, state: State) -> None:
         """Restore the moments. Raises KeyError, RuntimeError, TypeError or ValueError where they do not fit."""
-        self.scene.load_state_dict(state["scene_adam"])
+        if self.scene.parameters:  # a checkpoint leaves out what is empty
+            self.scene.load_state_dict(state["scene_adam"])
         if self.flare is not None and self.grids is not None:
             self.flare.load_state_dict(state["flare_adam"])
             _load_moments(self.grids, state.get("grid_adam", {}))

@@ -7,7 +7,7 @@ plates, each aligned to it by a homography. In a small window a local line, fram
 the two: a flare adds light that does not depend on the background's texture, and light on the walls changes the gain.
 Where the background has no texture, or something hides it, nothing is certain, and the network's plate stays.
 
-`plate_trainer` calls it before a fit, and once more with the frames minus the fitted flare.
+`plate_trainer` calls it before a fit, and a few times during it with the fitted flare subtracted.
 """
 from __future__ import annotations
 
@@ -34,6 +34,11 @@ GAIN_TOLERANCE = 0.3
 """Deviation of the local gain from 1 at which a background counts as half certain: light on it changes the gain."""
 FEATURES, MATCH_RATIO, MIN_INLIERS, MIN_INLIER_SHARE, MAX_ERROR_PX = 800, 0.8, 25, 0.4, 1.5
 """Features of a frame, ratio test, and what a homography between two frames needs; errors in pixels of the fit."""
+SMOOTHING_SHARE = 0.006
+"""Standard deviation, as a share of the frame's width, by which differences from a plate are smoothed: those of aligned
+frames have both signs at every edge, those of a flare have one."""
+MIN_EXCESS = 0.006
+"""Display values up to which a difference is no flare."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +71,15 @@ class PlateEstimator:
     def estimate(self, name: str, cleaned: Mapping[str, Pixels] | None = None) -> Pixels:
         """Return the plate of a frame, display values.
 
-        cleaned: frames minus the fitted flare, in place of the network's plates; they are better once there is a fit.
+        cleaned: frames minus the fitted flare; the lower of them and the network's plates counts, since each holds
+        flare that the other lacks.
         """
         shot = self._shot
-        own, plates = shot.plates[name], shot.plates if cleaned is None else cleaned
+        plates: Mapping[str, Pixels] = shot.plates
+        if cleaned is not None:
+            plates = {other: np.minimum(shot.plates[other], cleaned[other])
+                      for other in (name, *self._neighbours(name))}
+        own = plates[name]
         aligned = [warped for other in self._neighbours(name)
                    if (warped := self._aligned(plates[other], other, name)) is not None]
         if not aligned:
@@ -78,12 +88,12 @@ class PlateEstimator:
         with np.errstate(all="ignore"):
             background = np.nanmedian(stack, 0).astype(np.float32)
             count = np.isfinite(stack[..., 0]).sum(0)
-        frame = linear_from_srgb(shot.frames[name])
-        fitted, confidence = local_line(frame, linear_from_srgb(np.nan_to_num(background)))
-        confidence = confidence * np.clip((count - 1) / 3, 0, 1)[..., None]
-        plate = np.minimum(fitted, frame)
-        mixed = confidence * plate + (1 - confidence) * linear_from_srgb(own)
-        return np.clip(srgb_from_linear(np.maximum(mixed, 0)), 0, None).astype(np.float32)
+        fitted, confidence = local_line(linear_from_srgb(shot.frames[name]),
+                                        linear_from_srgb(np.nan_to_num(background)))
+        confidence = confidence * np.clip((count - 1) / 3, 0, 1)[..., None].astype(np.float32)
+        excess = _smooth(own - np.minimum(srgb_from_linear(fitted), shot.frames[name]), confidence)
+        excess = np.sign(excess) * np.maximum(np.abs(excess) - MIN_EXCESS, 0)
+        return np.asarray(np.clip(own - confidence * excess, 0, None), np.float32)
 
     def _neighbours(self, name: str) -> Sequence[str]:
         names = self._shot.names
@@ -142,6 +152,15 @@ class PlateEstimator:
             keys, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(grey, np.array([]))
             self._features[name] = _Features(np.array([key.pt for key in keys], np.float32).reshape(-1, 2), descriptors)
         return self._features[name]
+
+
+def _smooth(values: Pixels, weights: Pixels) -> Pixels:
+    """Return the weighted means of values (height, width, 3) in a small window; weights (height, width, 1)."""
+    import cv2
+
+    sigma = max(SMOOTHING_SHARE * values.shape[1], 0.5)
+    total = cv2.GaussianBlur(weights[..., 0], (0, 0), sigma)[..., None]
+    return np.asarray(cv2.GaussianBlur(weights * values, (0, 0), sigma) / (total + 1e-3), np.float32)
 
 
 def local_line(frame: Pixels, background: Pixels) -> tuple[Pixels, Pixels]:

@@ -42,6 +42,8 @@ from .rendering import render, render_flare
 from .settings import FitSettings
 from .warnings import footage_warnings
 
+MIN_BRIGHTNESS = 0.01
+"""Brightness up to which a light counts as out."""
 PLATE_CODES = 65535
 """Steps of a plate's display values from 0 to 1."""
 
@@ -84,9 +86,19 @@ class PlateTrainer(FlareTrainer):
         cleaned = None if flare is None else {view.name: self._without_flare(view) for view in self.capture.views}
         self._progress.stage("estimate plates", len(self.capture.views))
         for view in self.capture.views:
+            if not self._is_lit(view):  # the frame as filmed has no flare
+                self._plates[view.name] = self.frames.frame(view)
+                self._progress.advance()
+                continue
             plate = torch.from_numpy(self._estimator.estimate(view.name, cleaned))
             self._plates[view.name] = (plate * PLATE_CODES).round() / PLATE_CODES  # as a checkpoint stores it
             self._progress.advance()
+
+    def _is_lit(self, view: View) -> bool:
+        """True unless every light is out in a view."""
+        assert self.flare is not None and self.flare.frame_lights is not None
+        brightness = self.flare.frame_lights.brightness_in(view.name)
+        return brightness is None or bool((brightness > MIN_BRIGHTNESS).any())
 
     def _without_flare(self, view: View) -> Pixels:
         """Return a frame without the fitted flare, display values; where it is clipped, its plate."""
@@ -136,17 +148,18 @@ class PlateTrainer(FlareTrainer):
         (loss + self._flare_penalty(pose, targets.camera.frame)).backward()
         self.optimisers.step(scene=False)
         self._change_flare_density()
-        self._solve_brightness()
-        if self.iteration == round(settings.plates.refine_at * settings.iterations) < settings.iterations:
-            self._estimate_plates(self.flare)
+        self._update()
         return figures
 
-    def _solve_brightness(self) -> None:
-        """Solve the brightness of the lights in all frames of the fit, at a few iterations."""
+    def _update(self) -> None:
+        """Solve the brightness of the lights in all frames, then estimate the plates anew with the flare subtracted, at
+        a few iterations."""
         every = max(round(self.settings.brightness.solve_every * self.settings.iterations), 1)
         if self.iteration % every == 0 and self.iteration < self.settings.iterations:
             assert self.flare is not None
-            solve_brightness(self.flare, self.views, self.frames, self.render_view)
+            solve_brightness(self.flare, self.capture.views, self.frames, self.render_view)
+            if self.iteration >= self.settings.plates.refine_at * self.settings.iterations:
+                self._estimate_plates(self.flare)
 
     def _loss(self, picture: Tensor, frame: Tensor) -> Tensor:
         """Return the loss of a composite against its frame: squares alone at first, then with L1 and SSIM."""

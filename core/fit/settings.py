@@ -47,7 +47,7 @@ class FlareRates:
     ring: float = 5e-3
     arc: float = 5e-3
     latent: float = 5e-3
-    brightness: float = 0.03
+    brightness: float = 0.01
     final_ratio: float = 1.0
 
 
@@ -182,16 +182,16 @@ class PlateSettings:
     them later. excess_weight: factor on squares where the frame is brighter than the composite, relative to the rest:
     estimated plates more often contain flare than lack light.
 
-    aligned: improve estimated plates by aligned neighbours (`plate_estimates`), at the start, and at the share
-    `refine_at` of the iterations again with the fitted flare subtracted; 1 leaves the second time out.
+    aligned: improve estimated plates by aligned neighbours (`plate_estimates`), at the start, and from the share
+    `refine_at` of the iterations on, whenever the brightness is solved, with the fitted flare subtracted.
     """
 
-    squares_until: float = 0.3
+    squares_until: float = 0.5
     squares_weight: float = 5.0
     l1_weight: float = 1.0
-    excess_weight: float = 1.0
+    excess_weight: float = 3.0
     aligned: bool = True
-    refine_at: float = 0.4
+    refine_at: float = 0.3
 
 
 @dataclass(frozen=True)

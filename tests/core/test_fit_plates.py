@@ -41,13 +41,13 @@ def _flare(place: np.ndarray, colour: tuple[float, float, float]) -> np.ndarray:
     return np.asarray((glow + spot)[..., None] * np.array(colour), np.float32)
 
 
-def make_shot(folder: Path, *, second_lamp: bool = False) -> Path:
+def make_shot(folder: Path, *, second_lamp: bool = False, count: int = FRAMES) -> Path:
     """Write a shot of a lamp that moves and goes out, with exact clean frames and its path, without brightness."""
     random = np.random.default_rng(0)
     background = random.uniform(0.05, 0.3, (9, 16, 3)).repeat(6, 0).repeat(6, 1).astype(np.float32)
     keys = {}
-    for number in range(FRAMES):
-        name, share = f"{number + 1:04d}.png", number / (FRAMES - 1)
+    for number in range(count):
+        name, share = f"{number + 1:04d}.png", number / (count - 1)
         place = np.array([15 + 60 * share, 40 - 25 * share + 6 * np.sin(9 * share)])
         scene = np.roll(background, number, 1)
         flare = 0.0 if number in OFF else _flare(place, (1.0, 0.8, 0.5))
@@ -60,7 +60,7 @@ def make_shot(folder: Path, *, second_lamp: bool = False) -> Path:
     if second_lamp:
         lights.append({"name": "dark", "xy": [80.0, 8.0]})
     (folder / "lights.json").write_text(json.dumps({"lights": lights}))
-    (folder / "split.json").write_text(json.dumps({"test": [HELD_OUT]}))
+    (folder / "split.json").write_text(json.dumps({"test": [HELD_OUT] if count >= 6 else []}))
     return folder
 
 

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`shot` goes from frames to the layers of their flare, and goes on where it was stopped."""
+from __future__ import annotations
+
+from pathlib import Path
+
+from core.fit import Run
+from tests.core.test_fit_plates import make_shot
+from tests.headless.test_solve_and_lights import run
+
+FRAMES = 4
+
+
+def test_shot_makes_run_layers_and_clean_frames(tmp_path: Path) -> None:
+    folder, out = make_shot(tmp_path / "frames", count=FRAMES), tmp_path / "out"
+    request = ("shot", folder, "--out", out, "--scene", "plates", "--focal", 90, "--iterations", 20)
+    status, events = run(*request)
+    assert status == 0, events
+    result = events[-1]["data"]
+    assert result["scene"] == "plates" and Path(result["sheet"]).is_file()
+    assert len(list(Path(result["layers"]).glob("layers.*.exr"))) == FRAMES
+    assert len(list(Path(result["clean"]).glob("*.png"))) == FRAMES
+    fitted = Run.open(result["run"])
+    assert fitted.capture().views[0].camera.fx == 90 and fitted.lights == ("lamp",)
+    says = [event["text"] for event in events if event["type"] == "say"]
+    assert any("Shares of the flare by light" in text for text in says)
+    before = fitted.fingerprint
+    status, events = run(*request)
+    assert status == 0 and Run.open(result["run"]).fingerprint == before
+    assert any("finished already" in event["text"] for event in events if event["type"] == "say")
+
+
+def test_shot_names_a_source_that_is_missing(tmp_path: Path) -> None:
+    status, events = run("shot", tmp_path / "none.mp4", "--out", tmp_path / "out")
+    assert status != 0 and "is missing; name a video or a folder of frames" in events[-1]["text"]

@@ -40,11 +40,11 @@ MAX_BRIGHTNESS = 4.0
 PRIOR_WEIGHT = 1e-6
 """Weight per pixel of the present brightness."""
 CORRELATION_SHARE = 0.005
-"""Share of a frame's pixels whose errors count as one: those of a plate are alike over a neighbourhood."""
+"""Share of a frame's pixels whose errors count as one, because neighbouring errors of a plate are alike."""
 STEP_SCALE = 0.05
 """Change of brightness from frame to frame that counts as usual."""
 MIN_CERTAINTY = 1e-3
-"""Certainty of a brightness of which a frame says nothing."""
+"""Certainty of a brightness that a frame does not show."""
 TV_REWEIGHTINGS, TV_EPSILON = 30, 1e-3
 
 

@@ -38,7 +38,7 @@ SMOOTHING_SHARE = 0.006
 """Standard deviation, as a share of the frame's width, by which differences from a plate are smoothed: those of aligned
 frames have both signs at every edge, those of a flare have one."""
 MIN_EXCESS = 0.006
-"""Display values up to which a difference is no flare."""
+"""Largest difference that is no flare, display values."""
 
 
 @dataclass(frozen=True)

@@ -152,8 +152,8 @@ class PlateTrainer(FlareTrainer):
         return figures
 
     def _update(self) -> None:
-        """Solve the brightness of the lights in all frames, then estimate the plates anew with the flare subtracted, at
-        a few iterations."""
+        """At a few iterations, solve the brightness of the lights in all frames, and estimate the plates again with the
+        flare subtracted."""
         every = max(round(self.settings.brightness.solve_every * self.settings.iterations), 1)
         if self.iteration % every == 0 and self.iteration < self.settings.iterations:
             assert self.flare is not None

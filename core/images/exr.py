@@ -132,7 +132,7 @@ def _exr_headers(path: Path | str) -> list[dict[str, Any]]:
 
 
 def _usable_header(header: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a header without the attributes that this program interprets where they are of another type."""
+    """Return a header without those attributes that this program reads but whose type is not the standard's."""
     return {name: value for name, value in header.items() if name not in _IS_USABLE or _IS_USABLE[name](value)}
 
 
@@ -144,7 +144,7 @@ _IS_USABLE: dict[str, Callable[[Any], bool]] = {
     "chromaticities": _is_chromaticities,
     "pixelAspectRatio": lambda value: isinstance(value, float),
     "multiView": lambda value: isinstance(value, list) and all(isinstance(name, str) for name in value)}
-"""The standard's types of optional attributes, as the library gives them."""
+"""Tests of the types of optional attributes, by name; the types are the standard's, as the library gives them."""
 
 
 def read_exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:

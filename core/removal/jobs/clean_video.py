@@ -88,8 +88,8 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
 
 
 def _read_record(path: Path) -> dict[str, object]:
-    """Read which video was written of which frames; {} where none was. Raises SettingsError for a damaged record."""
+    """Read the record of the video that was written; {} if there is none. Raises SettingsError if it is damaged."""
     record = read_json(path, SettingsError) if path.is_file() else {}
     if not isinstance(record, dict):
-        raise SettingsError(f"{path} is damaged; remove it, and the video is written again with --overwrite.")
+        raise SettingsError(f"{path} is damaged; delete it, and write the video again with --overwrite.")
     return record

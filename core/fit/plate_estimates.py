@@ -7,7 +7,7 @@ plates, each aligned to it by a homography. In a small window a local line, fram
 the two: a flare adds light that does not depend on the background's texture, and light on the walls changes the gain.
 Where the background has no texture, or something hides it, nothing is certain, and the network's plate stays.
 
-`plate_trainer` calls it before a fit, and a few times during it with the fitted flare subtracted.
+`plate_trainer` calls it before a fit, and a few times during it with the fitted flare subtracted from the neighbours.
 """
 from __future__ import annotations
 
@@ -71,15 +71,11 @@ class PlateEstimator:
     def estimate(self, name: str, cleaned: Mapping[str, Pixels] | None = None) -> Pixels:
         """Return the plate of a frame, display values.
 
-        cleaned: frames minus the fitted flare; the lower of them and the network's plates counts, since each holds
-        flare that the other lacks.
+        cleaned: frames minus the fitted flare, which show the neighbours' background in place of the network's plates.
+        The frame's own plate stays the network's: a flare subtracted from its own frame would grow.
         """
         shot = self._shot
-        plates: Mapping[str, Pixels] = shot.plates
-        if cleaned is not None:
-            plates = {other: np.minimum(shot.plates[other], cleaned[other])
-                      for other in (name, *self._neighbours(name))}
-        own = plates[name]
+        own, plates = shot.plates[name], shot.plates if cleaned is None else cleaned
         aligned = [warped for other in self._neighbours(name)
                    if (warped := self._aligned(plates[other], other, name)) is not None]
         if not aligned:

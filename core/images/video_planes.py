@@ -164,7 +164,7 @@ def display_matrix(frame: Any) -> list[int] | None:
 
     try:
         data = bytes(frame.side_data[Type.DISPLAYMATRIX])
-    except KeyError:
+    except (KeyError, ValueError):  # none, or PyAV does not know a kind of data beside it
         return None
     return [int(number) for number in np.frombuffer(data[:36], "=i4")] if len(data) >= 36 else None
 

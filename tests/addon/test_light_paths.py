@@ -14,21 +14,25 @@ def facts(run_script: Callable[[str, int], Any]) -> Any:
 
 
 def test_a_lamp_on_a_moving_car_is_written_as_a_path(facts: Any) -> None:
+    """Block of light_paths.py: "parented to something that moves, and dimmed"."""
     assert facts["on a car"] == [[0, 0.5, 0], [2, 0.5, 0]] and facts["between"]
     assert facts["current frame"] and facts["others stand"] == ["lamp"]
 
 
 def test_the_brightness_of_a_dimmed_lamp_is_written(facts: Any) -> None:
+    """Block of light_paths.py: "parented to something that moves, and dimmed"."""
     assert facts["dimmed"] == [1.0, 0.5]
 
 
 def test_a_path_becomes_keys_that_an_artist_corrects(facts: Any) -> None:
+    """Block of light_paths.py: "read back, and corrected"."""
     assert facts["keyed between"] == pytest.approx([0.2, 0, 0.5], abs=1e-4)
     assert facts["corrected"] == [[0, 0, 0.5], [0.4, 0.25, 0.5]]
     assert facts["brightness stays"] == [1.0, 0.5] and facts["no longer doubtful"]
 
 
 def test_lights_are_tracks_of_a_clip_and_back(facts: Any) -> None:
+    """Block of light_paths.py: "the Movie Clip Editor"."""
     assert facts["clip"] == facts["written back"] == ""
     assert facts["markers"] == [[10, 8, False], [12, 9, True], [14, 10, False]]
     places = [place for place, _ in facts["picture"]]

@@ -78,7 +78,10 @@ def test_frames_are_cleaned_by_a_matte_and_otherwise_again(made: tuple[Any, Path
 
 
 def test_the_colour_space_of_the_frames_is_passed_to_the_commands(facts: Any) -> None:
-    """A camera's by its name alone, one of Blender's with its configuration."""
+    """A camera's by its name alone, one of Blender's with its configuration.
+
+    Block of work.py: "clean frames".
+    """
     assert facts["spaces offered"][0] == ["logc3", "logc4"] and facts["spaces offered"][1]
     by_camera, cleaned, by_blender, _, by_files, _ = facts["spaces passed"]
     assert by_camera[-2:] == cleaned[-2:] == ["--plate-space", "LogC4"]

@@ -29,6 +29,7 @@ from tests.core.test_look import saved
 
 
 def a_look(path: Path, blend: Blend) -> Path:
+    torch.manual_seed(0)
     saved(path, lights=1, blend=blend)
     return path
 
@@ -73,7 +74,7 @@ def test_layers_without_an_engine_are_those_of_the_engine(tmp_path: Path, blend:
                         camera.width, camera.height)
     for name, layer in numpy.items():
         np.testing.assert_allclose(layer, engine.flares[name].clamp_min(0).numpy(), atol=1e-3)
-        assert layer.max() > 0.02
+        assert layer.max() > 0.01, "a flare is drawn"
 
 
 def test_a_shot_bakes_without_torch_and_opencv_and_openexr(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -60,12 +60,13 @@ CODECS: dict[str, Encoder] = {
                           keeps=lambda planar: planar.name in ("yuv444p10le", "yuva444p10le")),
     "h264": Encoder("libx264", {"crf": "10", "preset": "medium"}, (".mov", ".mp4", ".m4v", ".mkv"), "yuv444p",
                     deep="yuv444p10le"),
-    "h265": Encoder("libx265", {"crf": "10", "preset": "medium", "x265-params": "log-level=none"},
+    "h265": Encoder("libx265", {"crf": "10", "preset": "medium", "x265-params": "log-level=none:bframes=0"},
                     (".mov", ".mp4", ".m4v", ".mkv"), "yuv444p", deep="yuv444p10le", tag="hvc1"),
     "ffv1": Encoder("ffv1", {"level": "3", "slicecrc": "1"}, (".mkv",), "gbrp16le", alpha="gbrap16le",
                     keeps=lambda planar: planar.bits > 0),
 }
-"""Encoders by the names of the command line."""
+"""Encoders by the names of the command line. x265 with B-frames gives a clip of one frame a random decoding time, which
+most containers refuse."""
 
 
 def choose_codec(target: Path, video: Video, codec: str | None) -> str:

@@ -154,7 +154,7 @@ def test_the_mastering_display_and_light_levels_stay_or_are_named(suffix: str, c
     mastering = ("master-display=G(13250,34500)B(7500,3000)R(34000,16000)WP(15635,16450)L(10000000,50):"
                  "max-cll=1000,400")
     film = write_video(tmp_path / "film.mp4", "libx265", "yuv420p10le", [stripes(96)] * 2, matrix=9, tags=(9, 16, 9),
-                       options={"x265-params": f"log-level=none:{mastering}", "preset": "ultrafast"})
+                       options={"x265-params": f"log-level=none:bframes=0:{mastering}", "preset": "ultrafast"})
     target = tmp_path / f"out{suffix}"
     sentences = rewrite_video(film, target, codec, darkened)
     assert x265_options(frames_of(film)[0].raw) == f":{mastering}"

@@ -15,7 +15,8 @@ PATCHES = np.array([(200, 60, 40), (40, 180, 60), (50, 70, 210), (128, 128, 128)
 """Red, green, blue codes of 8 bits."""
 STRIPE = 32
 LUMA = {1: (0.2126, 0.0722), 4: (0.30, 0.11), 6: (0.299, 0.114), 7: (0.212, 0.087), 9: (0.2627, 0.0593)}
-X265 = {"x265-params": "log-level=none:lossless=1", "preset": "ultrafast"}
+X265 = {"x265-params": "log-level=none:lossless=1:bframes=0", "preset": "ultrafast"}
+"""Without B-frames, with which x265 gives the packet of a clip of one frame a random decoding time."""
 
 
 def stripes(height: int, width: int = 6 * STRIPE, colours: NDArray[Any] = PATCHES / 255) -> NDArray[np.float64]:
@@ -75,8 +76,9 @@ def write_video(path: Path, codec: str, pixels: str, frames: Sequence[NDArray[An
         if rotation is not None:
             stream.set_display_rotation(rotation)
         tone = container.add_stream(sound, rate=48000) if sound else None
-        for signal in frames:
+        for number, signal in enumerate(frames):
             frame = frame_of(signal, pixels, matrix, full, alpha)
+            frame.pts, frame.time_base = number, Fraction(1, rate)
             if tags is not None or full:
                 frame.color_range = 2 if full else 1
             if tags is not None:

@@ -15,12 +15,11 @@ pictures that belong to them, are undistorted to the pinhole camera of their vie
 """
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +38,7 @@ from ..system.files import read_json, safe_join
 from .camera import Camera, Floats
 from .camera_solve import check_geometry, match_frames, read_solve
 from .colmap import PointCloud, PosedFrame
-from .frame_files import mask_pictures, matching_pictures
+from .frame_files import mask_pictures, matching_pictures, view_name
 from .lens import PINHOLES, Lens
 from .lights import Light, LightState, check_places, paths_of, read_lights
 from .orientation import TurnedFrame, find_upright
@@ -142,7 +141,7 @@ class Capture:
             path = path or safe_join(root, frame.name, CaptureError)
             size_of = _checked_size if need_frames else _size_or_model_size
             size = size_of(path, frame.lens, turned_by_name.get(frame.name))
-            name = _view_name(frame.name, root == folder)
+            name = view_name(frame.name, root == folder)
             if name in frames:
                 raise CaptureError(f"{folder}: the frame {name} has two poses; remove one of them.")
             views.append(_to_view(name, frame, size, frame.name in upright))
@@ -360,7 +359,7 @@ class Capture:
 
     def _find_view(self, name: str) -> View | None:
         """Return the view of a name in another form: separators, accents, case of the suffix, "images/" before it."""
-        for key in (lambda text: text, canonical_name, lambda text: canonical_name(_view_name(text, True))):
+        for key in (lambda text: text, canonical_name, lambda text: canonical_name(view_name(text, True))):
             match = next((view for view in self.views if key(view.name) == key(name)), None)
             if match is not None:
                 return match
@@ -425,9 +424,9 @@ class Capture:
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise CaptureError(f'{path} should read {{"test": ["name of a frame", …]}}.')
         views = {name: self._find_view(name) for name in names}
-        without_frame = {canonical_name(_view_name(name, True)) for each in self.left_out.values() for name in each}
+        without_frame = {canonical_name(view_name(name, True)) for each in self.left_out.values() for name in each}
         unknown = [name for name, view in views.items()
-                   if view is None and canonical_name(_view_name(name, True)) not in without_frame]
+                   if view is None and canonical_name(view_name(name, True)) not in without_frame]
         if unknown:
             raise CaptureError(f"{path} names {min(unknown)!r}, which is not a frame of the capture.")
         if len(set(names)) < len(names):
@@ -487,13 +486,6 @@ def _to_turned(posed: PosedFrame, path: Path | None) -> TurnedFrame | None:
         return TurnedFrame(posed, path, orientation, picture_size(path))
     except FrameError:  # the check of its size reports it
         return None
-
-
-def _view_name(name: str, starts_at_capture: bool) -> str:
-    """Return a frame's name with forward slashes and composed accents, below images/ where it starts from there."""
-    text = unicodedata.normalize("NFC", name.replace("\\", "/"))
-    text = str(PurePosixPath(text))
-    return text[len("images/"):] if starts_at_capture and text.casefold().startswith("images/") else text
 
 
 def _to_view(name: str, frame: PosedFrame, size: tuple[int, int], upright: bool) -> View:

@@ -6,6 +6,7 @@ Separators, the form of accents (NFC, NFD), the case of letters and the suffix m
 """
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -82,3 +83,9 @@ def mask_pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         if match is not None:
             masks[name] = safe_join(mask_folder, match, CaptureError)
     return masks
+
+
+def view_name(name: str, starts_at_capture: bool) -> str:
+    """Return a frame's name with forward slashes and composed accents, below images/ where it starts from there."""
+    text = str(PurePosixPath(unicodedata.normalize("NFC", name.replace("\\", "/"))))
+    return text[len("images/"):] if starts_at_capture and text.casefold().startswith("images/") else text

@@ -8,6 +8,8 @@ from __future__ import annotations
 import struct
 from typing import Any
 
+from .video_planes import side_data
+
 _DISPLAY, _LEVELS = "MASTERING_DISPLAY_METADATA", "CONTENT_LIGHT_LEVEL"
 """Names of the side data of a decoded frame."""
 _RATIONALS = struct.Struct("<20i2i")
@@ -18,7 +20,7 @@ _CHROMATICITY_STEPS, _LUMINANCE_STEPS = 50_000, 10_000
 
 def x265_options(frame: Any) -> str:
     """Return x265's parameters for the side data of PyAV's frame, each with a colon before it; "" where it has none."""
-    data = {item.type.name: bytes(item) for item in frame.side_data}
+    data = side_data(frame)
     return _display_option(data.get(_DISPLAY, b"")) + _levels_option(data.get(_LEVELS, b""))
 
 

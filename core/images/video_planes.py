@@ -6,6 +6,7 @@ converted by swscale to planes of the same depth. `video.py` reads planes, `vide
 """
 from __future__ import annotations
 
+import math
 import re
 import threading
 from dataclasses import dataclass
@@ -158,15 +159,27 @@ class Orientation:
         return np.ascontiguousarray(np.swapaxes(pixels, 0, 1) if self.transposed else pixels)
 
 
-def display_matrix(frame: Any) -> list[int] | None:
-    """Return the nine numbers of a PyAV frame's display matrix (ISO/IEC 14496-12, 8.3.2), or None."""
-    from av.sidedata.sidedata import Type
-
+def side_data(frame: Any) -> dict[str, bytes]:
+    """Return the side data of a PyAV frame by its name; none where a frame has a kind that PyAV does not know, such as
+    an Exif block, for which it lists none of them."""
     try:
-        data = bytes(frame.side_data[Type.DISPLAYMATRIX])
-    except (KeyError, ValueError):  # none, or PyAV does not know a kind of data beside it
+        return {item.type.name: bytes(item) for item in frame.side_data}
+    except ValueError:
+        return {}
+
+
+def display_matrix(frame: Any) -> list[int] | None:
+    """Return the nine numbers of a PyAV frame's display matrix (ISO/IEC 14496-12, 8.3.2), or None.
+
+    Where its side data is not listed it is that of the frame's rotation, without a mirroring.
+    """
+    data = side_data(frame).get("DISPLAYMATRIX", b"")
+    if len(data) >= 36:
+        return [int(number) for number in np.frombuffer(data[:36], "=i4")]
+    if not (turn := frame.rotation):
         return None
-    return [int(number) for number in np.frombuffer(data[:36], "=i4")] if len(data) >= 36 else None
+    cosine, sine = (round(65536 * function(math.radians(turn))) for function in (math.cos, math.sin))
+    return [cosine, -sine, 0, sine, cosine, 0, 0, 0, 1 << 30]
 
 
 def orientation_from_matrix(matrix: list[int] | None) -> Orientation:

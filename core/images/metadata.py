@@ -2,7 +2,8 @@
 """Copies what describes a picture from its file to a new one of the same format: profiles, Exif, XMP, IPTC, text, tags.
 
 By hand, because the libraries that encode either write none of it or only what they parse; here it stays byte for byte.
-What no longer fits the new pixels goes together: a gain map or motion clip behind a JPEG, and the XMP that claims it.
+What no longer fits the new pixels goes together: a gain map or motion clip behind a JPEG, and the XMP that claims it;
+likewise the thumbnail in the Exif block, and the picture before refocusing that Google's camera stores in the XMP.
 """
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from ..system.reading import open_regular, read_bytes
 from .formats import jpeg, png, tiff
+from .formats.exif import without_thumbnail
 
 KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"cICP", b"mDCV", b"cLLI", b"mDCv", b"cLLi", b"pHYs", png.EXIF,
                b"tEXt", b"zTXt", b"iTXt", b"tIME", b"sCAL", b"oFFs", b"pCAL", b"sTER")
@@ -35,16 +37,22 @@ _MARKERS = frozenset({jpeg.APP1, jpeg.APP2, 0xED, jpeg.COMMENT, *range(0xE3, 0xE
 _INDEX, _ISO_GAIN_MAP = b"MPF\0", b"urn:iso:std:iso:ts:21496:-1"
 """Segments that describe the pictures behind a JPEG's first one."""
 _XMP = b"http://ns.adobe.com/xap/1.0/\0"
+_EXTENDED_XMP = b"http://ns.adobe.com/xmp/extension/\0"
+_EXIF = b"Exif\0\0"
 _HEIF_GAIN_MAPS = (b"aux:hdrgainmap", b"urn:iso:std:iso:ts:21496:-1", b"tmap")
 """Names of gain maps in the header of HEIC and AVIF: Apple's, and that of ISO 21496-1."""
 _TAIL_BYTES = 1 << 12
 """Bytes at the end of a file that are searched for the picture's last marker, which padding may follow."""
 _HEAD_BYTES = 1 << 16
 """Bytes of a file in which its header is looked for."""
+_ORIGINAL = "http://ns.google.com/photos/1.0/image/"
+"""Name space of XMP of the picture before refocusing, which lies in the segments of extended XMP with its depth."""
 _CLAIMS = ("http://ns.adobe.com/hdr-gain-map/1.0/", "http://ns.google.com/photos/1.0/container/",
-           "http://ns.google.com/photos/1.0/container/item/", "http://ns.google.com/photos/1.0/camera/",
-           "http://ns.apple.com/HDRGainMap/1.0/")
-"""Name spaces of XMP by which a file claims that a gain map or a clip follows its first picture."""
+           "http://ns.google.com/photos/dd/1.0/", "http://ns.google.com/photos/1.0/camera/",
+           "http://ns.apple.com/HDRGainMap/1.0/", _ORIGINAL)
+"""First letters of the name spaces of XMP by which a file claims that it holds more than its first picture."""
+_EXTENDED_CLAIMS = ("http://ns.google.com/photos/1.0/depthmap/", "http://ns.adobe.com/xmp/note/")
+"""Those that go with the segments of extended XMP."""
 
 
 def copy_metadata(encoded: bytes, source: Path, *, has_alpha: bool) -> bytes:
@@ -55,10 +63,10 @@ def copy_metadata(encoded: bytes, source: Path, *, has_alpha: bool) -> bytes:
     if encoded[:8] == png.SIGNATURE == data[:8]:
         was_grey, is_grey = (not header[_COLOUR_TYPE_OFFSET] & 2 for header in (data, encoded))
         left_out = (b"iCCP",) if was_grey != is_grey else ()
-        chunks = b"".join(png.make_chunk(name, content) for name, content in png.chunks(io.BytesIO(data), KEPT_CHUNKS)
-                          if name not in left_out)
+        chunks = b"".join(png.make_chunk(name, without_thumbnail(content) if name == png.EXIF else content)
+                          for name, content in png.chunks(io.BytesIO(data), KEPT_CHUNKS) if name not in left_out)
         return encoded[:_HEADER_END] + chunks + encoded[_HEADER_END:]
-    if encoded[:4] in (b"II*\0", b"MM\0*") and data[:4] in (b"II*\0", b"MM\0*"):
+    if encoded[:4] in (b"II*\0", b"MM\0*") and data[:4] in (b"II*\0", b"MM\0*", *tiff.BIG_TIFF):
         return _copy_to_tiff(encoded, data, has_alpha)
     return encoded
 
@@ -82,7 +90,7 @@ def with_colour_chunks(encoded: bytes, profile: bytes, code_points: tuple[int, i
 def with_description(encoded: bytes, exif: bytes, xmp: bytes) -> bytes:
     """Return an encoded PNG with the Exif block and the XMP of the picture of another format that it was made from;
     without the claims of what the PNG does not hold."""
-    chunks = png.make_chunk(png.EXIF, exif) if exif else b""
+    chunks = png.make_chunk(png.EXIF, without_thumbnail(exif)) if exif else b""
     if packet := _without_claims(_XMP + xmp).removeprefix(_XMP) if xmp else b"":
         chunks += png.make_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + packet)
     return encoded[:_HEADER_END] + chunks + encoded[_HEADER_END:]
@@ -114,12 +122,19 @@ def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
     if encoded[2:4] == b"\xff\xe0":
         at = 4 + int.from_bytes(encoded[4:6], "big")
         header = encoded[2:at]
+    segments = list(jpeg.segments(io.BytesIO(data)))
+    has_original = any(content.startswith(_XMP) and _ORIGINAL.encode() in content for _, content in segments)
     copied = []
-    for marker, content in jpeg.segments(io.BytesIO(data)):
+    for marker, content in segments:
         if marker == 0xE0 and content.startswith(b"JFIF\0") and len(content) >= 14:
             header = jpeg.make_segment(marker, content[:12] + b"\0\0")  # density, without its thumbnail
+        elif has_original and content.startswith(_EXTENDED_XMP):
+            continue
         elif marker in _MARKERS and not content.startswith((_INDEX, _ISO_GAIN_MAP)):
-            content = _without_claims(content) if content.startswith(_XMP) else content
+            if content.startswith(_XMP):
+                content = _without_claims(content)
+            elif content.startswith(_EXIF):
+                content = _EXIF + without_thumbnail(content.removeprefix(_EXIF))
             if content:
                 copied.append(jpeg.make_segment(marker, content))
     return encoded[:2] + header + b"".join(copied) + encoded[at:]
@@ -142,7 +157,8 @@ def _without_claims(segment: bytes) -> bytes:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError):
         return b""
-    claims = tuple(f"{{{name}}}" for name in _CLAIMS)
+    names = (*_CLAIMS, *_EXTENDED_CLAIMS) if _ORIGINAL.encode() in segment else _CLAIMS
+    claims = tuple(f"{{{name}" for name in names)
     for element in root.iter():
         for name in [name for name in element.attrib if name.startswith(claims)]:
             del element.attrib[name]

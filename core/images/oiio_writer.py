@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Writes clean plates of the formats that OpenCV and OpenEXR do not write: lossless, with the header of the plate.
 
-OpenImageIO writes them but WebP, whose profile, Exif and XMP only Pillow writes. `plates.write_plate` calls it.
+OpenImageIO writes them but WebP, whose profile, Exif and XMP only Pillow writes, and those tags of a TIFF that it does
+not know, such as a map's place. `plates.write_plate` calls it.
 """
 from __future__ import annotations
 
@@ -16,6 +17,8 @@ from ..errors import FrameError
 from ..system.files import atomic_path
 from ..system.reading import check_regular
 from .decoders import file_kind, open_oiio
+from .formats.exif import without_thumbnail
+from .metadata import copy_metadata
 from .unsupported import needs_openimageio
 
 OIIO_FORMATS = {".dpx": "dpx", ".webp": "webp", ".bmp": "bmp", ".tga": "targa", ".tif": "tiff", ".tiff": "tiff"}
@@ -65,6 +68,8 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
         if not done:
             raise FrameError(f"{path} could not be encoded as {path.suffix[1:].upper()} "
                              f"({output.geterror() if output is not None else oiio.geterror()}).")
+        if name == "tiff":
+            temporary.write_bytes(copy_metadata(temporary.read_bytes(), source, has_alpha=alpha is not None))
 
 
 def _write_webp(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[Any] | None) -> None:
@@ -75,6 +80,8 @@ def _write_webp(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[An
     try:
         with Image.open(source) as stored:
             kept = {name: stored.info[name] for name in ("icc_profile", "exif", "xmp") if stored.info.get(name)}
+        if "exif" in kept:
+            kept["exif"] = without_thumbnail(kept["exif"].removeprefix(b"Exif\0\0"))
         colours = np.repeat(codes, 3, -1) if codes.shape[2] == 1 else codes
         pixels = colours if alpha is None else np.concatenate([colours, alpha[..., None]], -1)
         encoded = io.BytesIO()

@@ -37,6 +37,8 @@ from .query import TrainingViews
 from .sources import assign_sources
 
 SourceNames = Mapping[str, str]
+_SAMPLED_POINTS = 10_000
+"""Gaussians of a scene that are looked for on the frames before all of them are."""
 _WITH_ALPHA = (".png", ".tif", ".tiff")
 """Suffixes of files whose colours may not be multiplied with their alpha."""
 
@@ -219,7 +221,18 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
                                    light.extent) for light, state in zip(known, states, strict=True))
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)
         frames.append(TargetFrame(frame, shot, path, undistorted, window, space=capture.plate_space))
-    return Target(_share_windows(frames), read_ply(scene) if scene else None, scene_is_background)
+    return Target(_share_windows(frames), _scene_in_view(scene, frames) if scene else None, scene_is_background)
+
+
+def _scene_in_view(path: Path, frames: Sequence[TargetFrame]) -> SceneGaussians:
+    """Read a 3DGS PLY. Raises CaptureError where no camera has one of its Gaussians on its frame."""
+    scene = read_ply(path)
+    means = scene.means.detach().numpy()
+    for points in (means[::max(len(means) // _SAMPLED_POINTS, 1)], means):
+        if any(frame.shot.camera.contains(*frame.shot.camera.project(points)).any() for frame in frames):
+            return scene
+    raise CaptureError(f"{path} is of another world than the cameras: none of {len(frames)} views has one of its "
+                       f"{len(scene)} Gaussians before it; export it in the world of the cameras.")
 
 
 def _undistorted(capture: Capture, view: View) -> Callable[[ColourSpace | None], Picture]:

@@ -2,8 +2,10 @@
 """Which way a photograph is up, and through what lens it was taken."""
 from __future__ import annotations
 
+import io
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,9 +13,10 @@ import pytest
 from PIL import Image, features
 
 from core.images.formats import tiff
-from core.images.formats.exif import apply_orientation, read_exif, undo_orientation
+from core.images.formats.exif import apply_orientation, read_exif, undo_orientation, without_thumbnail
 from core.images.plates import clean_name, read_plate, write_plate
 from core.images.size import picture_size
+from core.images.video import Video
 
 
 def exif_segment(order: str, orientation: int, focal: int) -> bytes:
@@ -104,6 +107,67 @@ def test_a_phones_pictures_give_their_focal_length_and_keep_what_describes_them(
     with Image.open(tmp_path / "clean.png") as clean:
         assert clean.getexif()[0x13B] == "Ada"
         assert "image/heic" in str(clean.info["xmp"]) and "HDRGainMap" not in str(clean.info["xmp"])
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+@pytest.mark.parametrize("order", ["II", "MM"])
+def test_a_clean_picture_has_no_thumbnail_with_the_flare(order: str, suffix: str, tmp_path: Path) -> None:
+    thumbnail = cv2.imencode(".jpg", np.full((20, 30, 3), 250, np.uint8))[1].tobytes()
+    block = exif_segment(order, 6, 27)[10:]
+    first = 34
+    sign: Any = "little" if order == "II" else "big"
+    at, end = len(block), len(block) + 2 + 24 + 4
+    entries = b"".join(tag.to_bytes(2, sign) + (4).to_bytes(2, sign) + (1).to_bytes(4, sign) + value.to_bytes(4, sign)
+                       for tag, value in ((0x201, end), (0x202, len(thumbnail))))
+    block = (block[:first] + at.to_bytes(4, sign) + block[first + 4:] + (2).to_bytes(2, sign) + entries + bytes(4)
+             + thumbnail)
+    path = tmp_path / f"a{suffix}"
+    Image.fromarray(np.full((40, 60, 3), 90, np.uint8)).save(path, exif=b"Exif\0\0" + block, lossless=True)
+    assert thumbnail in path.read_bytes()
+    assert [tiff.page_count(io.BytesIO(each)) for each in (block, without_thumbnail(block))] == [2, 1]
+    plate = read_plate(path)
+    written = tmp_path / f"clean{suffix}"
+    write_plate(written, plate, plate.codes // 2)
+    assert thumbnail not in written.read_bytes() and read_exif(written) == (6, 0.75)
+    np.testing.assert_allclose(read_plate(written).codes, plate.codes // 2, atol=2)
+
+
+def test_damaged_thumbnails_change_nothing() -> None:
+    block = exif_segment("II", 6, 27)[10:]
+    assert without_thumbnail(block) == block and without_thumbnail(b"") == b"" and without_thumbnail(b"II*") == b"II*"
+    far = block[:34] + (9999).to_bytes(4, "little") + block[38:]
+    assert without_thumbnail(far) == block
+    for cut in range(len(far)):
+        without_thumbnail(far[:cut])
+
+
+@pytest.mark.parametrize("endian", ["little", "big"])
+def test_the_orientation_of_a_big_tiff(endian: str, tmp_path: Path) -> None:
+    sign: Any = endian
+    raw = (b"II+\0" if endian == "little" else b"MM\0+") + (8).to_bytes(2, sign) + bytes(2) + (16).to_bytes(8, sign)
+    raw += (1).to_bytes(8, sign) + (274).to_bytes(2, sign) + (3).to_bytes(2, sign) + (1).to_bytes(8, sign)
+    raw += (8).to_bytes(2, sign) + bytes(6) + bytes(8)
+    (tmp_path / "a.tif").write_bytes(raw)
+    assert read_exif(tmp_path / "a.tif") == (8, None)
+    for cut in range(len(raw) - 8):
+        (tmp_path / "a.tif").write_bytes(raw[:cut])
+        assert read_exif(tmp_path / "a.tif") == (1, None)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_frame_is_turned_where_it_has_side_data_that_pyav_does_not_know(orientation: int, tmp_path: Path) -> None:
+    """An AVIF with an Exif block. Without the list of side data its rotation is known, and no mirroring."""
+    if not features.check("avif"):
+        pytest.skip("Pillow is built without AVIF")
+    exif, found = Image.Exif(), []
+    for artist in ("", "Ada"):
+        exif[tiff.ORIENTATION] = orientation
+        if artist:
+            exif[0x13B] = artist
+        Image.fromarray(np.full((40, 60, 3), 90, np.uint8)).save(tmp_path / "a.avif", exif=exif)
+        with Video(tmp_path / "a.avif") as video:
+            found.append(video.orientation)
+    assert found[0] == found[1] or orientation in (2, 4, 5, 7)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

@@ -10,8 +10,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import OpenImageIO as oiio  # noqa: N813 - as its own documents do
 import pytest
-from PIL import features
+from PIL import Image, TiffImagePlugin, features
 
 from core.capture.plate_space import read_plate_space, record_plate_space
 from core.colour import colour_space
@@ -22,7 +23,7 @@ from core.images.plates import Plate, clean_name, read_plate, write_plate
 from core.images.read import has_float_pixels, read_picture
 from core.images.write import write_exr
 from core.removal.inference.plate_light import to_network_plate
-from tests.core.picture_files import WRITERS, png_16, scene, tiff_16
+from tests.core.picture_files import WRITERS, by_oiio, png_16, scene, tiff_16
 
 MISSING = {name for name, package in (("HEIC", "pillow_heif"),) if importlib.util.find_spec(package) is None}
 MISSING |= set() if features.check("avif") else {"PQ AVIF"}
@@ -183,6 +184,53 @@ def test_a_tiff_keeps_text_place_and_exif(tmp_path: Path) -> None:
     exif = tiff.read_tags(data, range(1 << 16), int(kept[34665].values[0]))
     assert exif[0x829A].values.tolist() == [1, 50] and exif[0x9003].values.tobytes() == text[306]
     np.testing.assert_array_equal(read_plate(tmp_path / "b.tif").codes, plate.codes // 2)
+
+
+@pytest.mark.parametrize("kind", ["BigTIFF", "half", "planes"])
+def test_a_tiff_that_opencv_does_not_write_keeps_its_tags(kind: str, tmp_path: Path) -> None:
+    tags = {33550: tiff.Tag(12, np.array([0.5, 0.5, 0.0])), 315: tiff.Tag(2, np.frombuffer(b"Ada\0", np.uint8)),
+            34735: tiff.Tag(3, np.array([1, 1, 0, 1, 1024, 0, 1, 1], np.uint16)),
+            700: tiff.Tag(1, np.frombuffer(b"<x:xmpmeta/>", np.uint8))}
+    path = tmp_path / "a.tif"
+    if kind == "BigTIFF":
+        made = TiffImagePlugin.ImageFileDirectory_v2()
+        for number, tag in tags.items():
+            made.tagtype[number] = tag.kind
+            made[number] = "Ada" if number == 315 else tag.values.tobytes() if number == 700 else tuple(tag.values)
+        Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(path, tiffinfo=made, big_tiff=True)
+        assert path.read_bytes()[:4] in tiff.BIG_TIFF
+    else:
+        by_oiio(path, scene(), oiio.HALF if kind == "half" else oiio.UINT16,
+                {} if kind == "half" else {"planarconfig": "separate"})
+        path.write_bytes(tiff.with_tags(path.read_bytes(), tags))
+    plate = read_plate(path)
+    codes = plate.codes // 2 if plate.codes.dtype.kind == "u" else plate.codes / 2
+    write_plate(tmp_path / "b.tif", plate, codes)
+    kept = tiff.read_tags(io.BytesIO((tmp_path / "b.tif").read_bytes()), tags)
+    for number, tag in tags.items():
+        np.testing.assert_array_equal(kept[number].values, tag.values)
+    np.testing.assert_array_equal(read_plate(tmp_path / "b.tif").codes, codes)
+
+
+def test_the_picture_before_refocusing_goes_with_its_claim(tmp_path: Path) -> None:
+    """Google's camera stores it in the extended XMP, with the depth of the picture."""
+    spaces = " ".join(f'xmlns:{name}="http://ns.google.com/photos/1.0/{place}/"'
+                      for name, place in (("GDepth", "depthmap"), ("GImage", "image")))
+    xmp = (f'http://ns.adobe.com/xap/1.0/\0<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
+           f'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description {spaces} '
+           'xmlns:xmpNote="http://ns.adobe.com/xmp/note/" xmlns:dc="http://purl.org/dc/elements/1.1/" dc:format="f" '
+           'xmpNote:HasExtendedXMP="0123" GDepth:Format="RangeInverse" GImage:Mime="image/jpeg"/></rdf:RDF>'
+           "</x:xmpmeta>").encode()
+    segments = [(jpeg.APP1, xmp), (jpeg.APP1, b"http://ns.adobe.com/xmp/extension/\0" + b"0" * 40 + b"<x:xmpmeta/>")]
+    raw = cv2.imencode(".jpg", np.full((24, 32, 3), 90, np.uint8))[1].tobytes()
+    whole = raw[:2] + b"".join(jpeg.make_segment(*segment) for segment in segments) + raw[2:]
+    (tmp_path / "a.jpg").write_bytes(whole)
+    plate = read_plate(tmp_path / "a.jpg")
+    assert "more than one picture" in plate.warning
+    write_plate(tmp_path / "b.jpg", plate, plate.codes // 2)
+    written = (tmp_path / "b.jpg").read_bytes()
+    assert b"dc:format" in written
+    assert not any(word in written for word in (b"extension", b"HasExtendedXMP", b"GImage", b"GDepth"))
 
 
 @pytest.mark.parametrize(("name", "width", "height"), [

@@ -15,10 +15,10 @@ import torch
 
 from core.bake.bake import MANIFEST, BakeSettings, read_manifest
 from core.bake.exr import read_layers
-from core.capture import Camera, Capture
+from core.capture import Camera, Capture, PointCloud
 from core.colour import colour_space
 from core.colour.srgb import linear_from_srgb, srgb_from_linear
-from core.errors import RunError, SettingsError
+from core.errors import CaptureError, RunError, SettingsError
 from core.flare import file as flare_file
 from core.flare.file import FlareFile
 from core.gaussians import SceneGaussians
@@ -552,6 +552,18 @@ def test_a_capture_is_rendered_in_chunks(flare: Path, look: Look, tmp_path: Path
         assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     with pytest.raises(RunError, match="other settings"):
         Transfer(flare, target, TransferSettings(query="source")).bake(tmp_path / "whole")
+
+
+def test_a_scene_that_no_camera_sees_is_refused(look: Look, tmp_path: Path) -> None:
+    capture = Capture.open(make_capture(tmp_path / "capture", views=3))
+    (tmp_path / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
+    for offset in (0, 1e5):
+        points = PointCloud(capture.points.xyz + np.float32(offset), capture.points.rgb, capture.points.error)
+        write_ply(tmp_path / f"{offset:.0f}.ply", SceneGaussians.from_points(points))
+    capture_target(capture, look, {}, lights=tmp_path / "lights.json", scene=tmp_path / "0.ply")
+    with pytest.raises(CaptureError, match=r"100000\.ply is of another world .* none of 3 views"):
+        capture_target(capture, look, {}, lights=tmp_path / "lights.json", scene=tmp_path / "100000.ply",
+                       scene_is_background=True)
 
 
 @pytest.mark.parametrize(("model", "params"), [("PINHOLE", None), ("OPENCV", (57.6, 57.6, 32, 24, 0.02, 0, 0, 0))])

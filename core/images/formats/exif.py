@@ -14,6 +14,8 @@ from ...system.reading import open_regular
 from . import jpeg, png, tiff, webp
 
 EXIF, FOCAL_35MM = 0x8769, 0xA405
+_THUMBNAIL, _THUMBNAIL_LENGTH = 0x201, 0x202
+"""Tags of the second directory: where its JPEG begins, and its bytes."""
 SWAPS_SIDES = (5, 6, 7, 8)
 """Orientations that swap width and height."""
 _BLOCK = re.compile(rb"Exif\0\0((?:II\*\0|MM\0\*).{0,65536})", re.DOTALL)
@@ -41,7 +43,7 @@ def read_exif(path: Path) -> tuple[int, float | None]:
 def _exif_block(stream: BinaryIO) -> BinaryIO:
     """Return the metadata of a picture as a TIFF stream, the form of every Exif block; empty where it has none."""
     magic = stream.read(8)
-    if magic[:4] in (b"II*\0", b"MM\0*"):
+    if magic[:4] in (b"II*\0", b"MM\0*", *tiff.BIG_TIFF):
         return stream
     if magic[:2] == b"\xff\xd8":
         blocks = (content[6:] for marker, content in jpeg.segments(stream)
@@ -67,6 +69,25 @@ def upright_block(block: bytes) -> bytes:
         at = first + 2 + 12 * number
         if at + 12 <= len(block) and int.from_bytes(block[at:at + 2], order) == tiff.ORIENTATION:
             changed[at + 8:at + 10] = (1).to_bytes(2, order)
+    return bytes(changed)
+
+
+def without_thumbnail(block: bytes) -> bytes:
+    """Return an Exif block without its second directory, which holds a small copy of the picture; damaged ones
+    unchanged. No other offset changes."""
+    order: Literal["little", "big"] = "little" if block[:2] == b"II" else "big"
+    first = int.from_bytes(block[4:8], order)
+    link = first + 2 + 12 * int.from_bytes(block[first:first + 2], order)
+    second = int.from_bytes(block[link:link + 4], order)
+    if block[:4] not in (b"II*\0", b"MM\0*") or not second or link + 4 > len(block):
+        return block
+    changed = bytearray(block)
+    changed[link:link + 4] = bytes(4)
+    tags = tiff.integer_values(tiff.read_tags(io.BytesIO(block), (_THUMBNAIL, _THUMBNAIL_LENGTH), second))
+    start = tags.get(_THUMBNAIL, 0)
+    end = start + tags.get(_THUMBNAIL_LENGTH, 0)
+    if start >= link + 4 and end <= len(block):
+        changed[start:end] = b"" if end == len(block) else bytes(end - start)
     return bytes(changed)
 
 

@@ -35,9 +35,37 @@ ASSOCIATED, UNASSOCIATED = 1, 2
 
 _TYPES = {1: "u1", 2: "u1", 3: "u2", 4: "u4", 5: "u4", 6: "i1", 7: "u1", 8: "i2", 9: "i4", 10: "i4", 11: "f4", 12: "f8"}
 _Order = Literal["<", ">"]
-_NO_DIRECTORY: tuple[_Order, list[bytes]] = ("<", [])
+_BIG_TYPES = {16: "u8", 17: "i8", 18: "u8"}
+"""Types of BigTIFF alone: whole numbers and offsets of 64 bits."""
+_MAX_ENTRIES = 1 << 16
+"""Largest directory that is read of a BigTIFF, whose field has 64 bits."""
 _RATIONALS = (5, 10)
 _MAX_PAGES = 1000
+
+
+class _Layout(NamedTuple):
+    """Byte order, and the formats of a directory's length, of an entry's count, and of an offset."""
+
+    order: _Order
+    length: str
+    offset: str
+
+    def number(self, raw: bytes, kind: str = "") -> int:
+        """Return the offset, or number of this format, at the start of some bytes."""
+        return int(struct.unpack_from(self.order + (kind or self.offset), raw)[0])
+
+    @property
+    def place(self) -> int:
+        """Where the value or its offset begins in an entry, which ends with it."""
+        return 4 + struct.calcsize(self.offset)
+
+    @property
+    def entry(self) -> int:
+        """Bytes of an entry."""
+        return self.place + struct.calcsize(self.offset)
+
+
+_NO_DIRECTORY: tuple[_Layout, list[bytes]] = (_Layout("<", "H", "I"), [])
 
 
 class Tag(NamedTuple):
@@ -53,24 +81,34 @@ def short(value: int) -> Tag:
 
 
 def read_tags(stream: BinaryIO, numbers: Container[int], at: int | None = None) -> dict[int, Tag]:
-    """Read tags of the first page, or of the directory at offset `at`, without damaged ones; none of other files."""
-    order, entries = next(_directories(stream, at), _NO_DIRECTORY)
+    """Read tags of the first page, or of the directory at offset `at`, without damaged ones; none of other files.
+
+    Whole numbers and offsets of 64 bits come as 32 bits, as a TIFF holds them; larger ones are left out.
+    """
+    layout, entries = next(_directories(stream, at), _NO_DIRECTORY)
     tags: dict[int, Tag] = {}
     for entry in entries:
-        number, kind, count = struct.unpack(order + "HHI", entry[:8])
-        if number not in numbers or kind not in _TYPES:
+        number, kind = struct.unpack_from(layout.order + "HH", entry)
+        types = {**_TYPES, **_BIG_TYPES} if layout.offset == "Q" else _TYPES
+        if number not in numbers or kind not in types:
             continue
-        values = np.dtype(_TYPES[kind]).newbyteorder(order)
+        count = layout.number(entry[4:])
+        values = np.dtype(types[kind]).newbyteorder(layout.order)
         length = count * values.itemsize * (2 if kind in _RATIONALS else 1)
-        raw = entry[8:8 + length]
-        if length > 4:
-            start = struct.unpack(order + "I", entry[8:])[0]
+        raw = entry[layout.place:][:length]
+        if length > layout.entry - layout.place:
+            start = layout.number(entry[layout.place:])
             if start + length > stream.seek(0, io.SEEK_END):  # reading asks for all the memory that is claimed
                 continue
             stream.seek(start)
             raw = stream.read(length)
-        if count and len(raw) == length:
-            tags[number] = Tag(kind, np.frombuffer(raw, values).astype(values.newbyteorder("=")))
+        if not count or len(raw) != length:
+            continue
+        found = np.frombuffer(raw, values).astype(values.newbyteorder("="))
+        if kind not in _BIG_TYPES:
+            tags[number] = Tag(kind, found)
+        elif kind != 17 and found.max() < 1 << 32:
+            tags[number] = Tag(4, found.astype(np.uint32))
     return tags
 
 
@@ -82,17 +120,17 @@ def integer_values(tags: Mapping[int, Tag]) -> dict[int, int]:
 def page_count(stream: BinaryIO) -> int:
     """Count the pages, without the thumbnails that some programs add."""
     count = 0
-    for order, entries in _directories(stream):
-        kinds = [struct.unpack(order + "I", entry[8:])[0] for entry in entries
-                 if struct.unpack(order + "H", entry[:2])[0] == SUBFILE]
+    for layout, entries in _directories(stream):
+        kinds = [layout.number(entry[layout.place:], "I") for entry in entries if layout.number(entry, "H") == SUBFILE]
         count += not any(kind & 1 for kind in kinds)
     return count
 
 
 def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
-    """Return a TIFF with these tags in its first page, instead of its own of the same numbers; other data unchanged."""
-    order, entries = next(_directories(io.BytesIO(data)), _NO_DIRECTORY)
-    if not entries or not tags:
+    """Return a TIFF with these tags in its first page, instead of its own of the same numbers; a BigTIFF and other data
+    unchanged."""
+    (order, _, _), entries = next(_directories(io.BytesIO(data)), _NO_DIRECTORY)
+    if not entries or not tags or data[:4] in BIG_TIFF:
         return data
     result = bytearray(data)
     new_entries = [entry for entry in entries if struct.unpack(order + "H", entry[:2])[0] not in tags]
@@ -117,8 +155,8 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
 
 def with_directory(data: bytes, number: int, tags: Mapping[int, Tag]) -> bytes:
     """Return a TIFF with another directory, such as Exif's, to which the tag `number` of its first page points."""
-    order, entries = next(_directories(io.BytesIO(data)), _NO_DIRECTORY)
-    if not entries or not tags:
+    (order, _, _), entries = next(_directories(io.BytesIO(data)), _NO_DIRECTORY)
+    if not entries or not tags or data[:4] in BIG_TIFF:
         return data
     result = bytearray(data + b"\0" * (len(data) % 2))
     listed = []
@@ -150,25 +188,28 @@ def without_reader_changes(data: bytes) -> bytes:
     return with_tags(data, changed)
 
 
-def _directories(stream: BinaryIO, at: int | None = None) -> Iterator[tuple[_Order, list[bytes]]]:
-    """Yield (byte order, entries of 12 bytes) page by page, or from the directory at offset `at`, while the file is
-    intact."""
+def _directories(stream: BinaryIO, at: int | None = None) -> Iterator[tuple[_Layout, list[bytes]]]:
+    """Yield (layout, entries) page by page, or from the directory at offset `at`, while the file is intact."""
     stream.seek(0)
-    head = stream.read(8)
-    if head[:4] not in (b"II*\0", b"MM\0*") or len(head) < 8:
-        return
+    head = stream.read(16)
     order: _Order = "<" if head[:2] == b"II" else ">"
-    at = struct.unpack(order + "I", head[4:])[0] if at is None else at
+    if head[:4] in (b"II*\0", b"MM\0*") and len(head) >= 8:
+        layout, first = _Layout(order, "H", "I"), head[4:8]
+    elif head[:4] in BIG_TIFF and len(head) == 16:
+        layout, first = _Layout(order, "Q", "Q"), head[8:]
+    else:
+        return
+    at = layout.number(first) if at is None else at
     for _ in range(_MAX_PAGES):
-        stream.seek(at)
-        count = stream.read(2)
-        length = 12 * struct.unpack(order + "H", count)[0] if len(count) == 2 else 0
-        entries = stream.read(length)
-        if not length or len(entries) < length:
+        stream.seek(min(at, stream.seek(0, io.SEEK_END)))
+        raw = stream.read(struct.calcsize(layout.length))
+        count = layout.number(raw, layout.length) if len(raw) == struct.calcsize(layout.length) else 0
+        entries = stream.read(count * layout.entry) if count < _MAX_ENTRIES else b""
+        if not count or len(entries) < count * layout.entry:
             return
-        yield order, [entries[k:k + 12] for k in range(0, length, 12)]
-        stream.seek(at + 2 + length)
-        following = stream.read(4)
-        at = struct.unpack(order + "I", following)[0] if len(following) == 4 else 0
+        yield layout, [entries[k:k + layout.entry] for k in range(0, len(entries), layout.entry)]
+        stream.seek(at + len(raw) + len(entries))
+        following = stream.read(struct.calcsize(layout.offset))
+        at = layout.number(following) if len(following) == struct.calcsize(layout.offset) else 0
         if not at:
             return

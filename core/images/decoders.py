@@ -122,7 +122,8 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
         frame = _av1_frame(path) if kind == "avif" and picture.mode == "RGB" else None
         if frame is not None and frame.colour.bits > 8 and (frame.raw.width, frame.raw.height) == picture.size:
             return _bgr(apply_orientation(frame.stored_codes(), orientation))
-        mode = picture.mode if picture.mode in ("L", "RGB", "RGBA") else "RGBA" if "A" in picture.mode else "RGB"
+        is_transparent = picture.has_transparency_data
+        mode = "RGBA" if is_transparent else picture.mode if picture.mode in ("L", "RGB") else "RGB"
         try:
             pixels = np.asarray(picture.convert(mode))
         except Exception as problem:  # the plug-ins raise what their libraries do

@@ -212,6 +212,21 @@ def test_a_tiff_that_opencv_does_not_write_keeps_its_tags(kind: str, tmp_path: P
     np.testing.assert_array_equal(read_plate(tmp_path / "b.tif").codes, codes)
 
 
+@pytest.mark.parametrize("mode", ["P", "L"])
+def test_a_gif_keeps_its_transparency(mode: str, tmp_path: Path) -> None:
+    codes = np.full((20, 30, 3), 60, np.uint8)
+    codes[:6, 20:] = 250
+    picture = Image.fromarray(codes).quantize(4) if mode == "P" else Image.fromarray(codes[..., 0])
+    picture.save(tmp_path / "a.gif", transparency=int(np.asarray(picture)[0, 0]))
+    plate = read_plate(tmp_path / "a.gif")
+    alpha = np.where(codes[..., 0] == 60, 0, 255)
+    np.testing.assert_array_equal(plate.alpha, alpha)
+    write_plate(tmp_path / "b.png", plate, plate.codes // 2)
+    np.testing.assert_array_equal(read_plate(tmp_path / "b.png").alpha, alpha)
+    picture.save(tmp_path / "a.gif")
+    assert read_plate(tmp_path / "a.gif").alpha is None
+
+
 def test_the_picture_before_refocusing_goes_with_its_claim(tmp_path: Path) -> None:
     """Google's camera stores it in the extended XMP, with the depth of the picture."""
     spaces = " ".join(f'xmlns:{name}="http://ns.google.com/photos/1.0/{place}/"'

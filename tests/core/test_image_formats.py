@@ -156,12 +156,13 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_text_of_an_exr_that_is_not_utf8_stays_byte_for_byte(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", np.full((8, 8), 0.5, np.float32)),
-              header={"owner": "Studio Brosse", "comments": "plain"})
+              header={"owner": "Studio Brosse", "comments": "plain", "tags": ["one", "Nacht Stra?e"]})
     data = (tmp_path / "a.exr").read_bytes()
-    (tmp_path / "a.exr").write_bytes(data.replace(b"Studio Brosse", b"Studio Bross\xe9"))
+    data = data.replace(b"Studio Brosse", b"Studio Bross\xe9").replace(b"Stra?e", b"Stra\xdfe")
+    (tmp_path / "a.exr").write_bytes(data)
     plate = read_plate(tmp_path / "a.exr")
     write_plate(tmp_path / "b.exr", plate, plate.codes / np.float16(2))
-    assert foreign_strings(tmp_path / "b.exr") == {"owner": b"Studio Bross\xe9"}
+    assert foreign_strings(tmp_path / "b.exr") == {"owner": b"Studio Bross\xe9", "tags[1]": b"Nacht Stra\xdfe"}
     assert read_exr_header(tmp_path / "b.exr")["comments"] == "plain"
     np.testing.assert_array_equal(read_plate(tmp_path / "b.exr").codes, 0.25)
 

@@ -92,7 +92,8 @@ def is_truncated(stream: BinaryIO) -> bool:
 
 
 def string_places(stream: BinaryIO) -> dict[str, tuple[int, bytes]]:
-    """Return the offset and the bytes of each text attribute of the first header, by name."""
+    """Return the offset and the bytes of each text attribute of the first header, by name; of each text of a list by
+    its name and number, such as "tags[1]"."""
     stream.seek(len(MAGIC) + 4)
     places = {}
     while name := _read_name(stream):
@@ -102,6 +103,12 @@ def string_places(stream: BinaryIO) -> dict[str, tuple[int, bytes]]:
             break
         if kind == b"string" and length <= _MAX_ATTRIBUTE_BYTES:
             places[name.decode("latin-1")] = at, stream.read(length)
+        elif kind == b"stringvector" and length <= _MAX_ATTRIBUTE_BYTES:
+            value, start, number = stream.read(length), 0, 0
+            while start + 4 <= len(value):
+                end = start + 4 + int.from_bytes(value[start:start + 4], "little")
+                places[f"{name.decode('latin-1')}[{number}]"] = at + start + 4, value[start + 4:end]
+                start, number = end, number + 1
         stream.seek(at + length)
     return places
 

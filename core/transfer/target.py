@@ -39,6 +39,7 @@ from .sources import assign_sources
 SourceNames = Mapping[str, str]
 _SAMPLED_POINTS = 10_000
 """Gaussians of a scene that are looked for on the frames before all of them are."""
+_MIN_SHARE_OF_SEEING_VIEWS = 0.5
 _WITH_ALPHA = (".png", ".tif", ".tiff")
 """Suffixes of files whose colours may not be multiplied with their alpha."""
 
@@ -225,14 +226,16 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
 
 
 def _scene_in_view(path: Path, frames: Sequence[TargetFrame]) -> SceneGaussians:
-    """Read a 3DGS PLY. Raises CaptureError where no camera has one of its Gaussians on its frame."""
+    """Read a 3DGS PLY. Raises CaptureError where few cameras have one of its Gaussians on their frames, as a fit does.
+    """
     scene = read_ply(path)
-    means = scene.means.detach().numpy()
+    means, seeing = scene.means.detach().numpy(), 0
     for points in (means[::max(len(means) // _SAMPLED_POINTS, 1)], means):
-        if any(frame.shot.camera.contains(*frame.shot.camera.project(points)).any() for frame in frames):
+        seeing = sum(bool(frame.shot.camera.contains(*frame.shot.camera.project(points)).any()) for frame in frames)
+        if seeing >= _MIN_SHARE_OF_SEEING_VIEWS * len(frames):
             return scene
-    raise CaptureError(f"{path} is of another world than the cameras: none of {len(frames)} views has one of its "
-                       f"{len(scene)} Gaussians before it; export it in the world of the cameras.")
+    raise CaptureError(f"{path} is of another world than the cameras: {len(frames) - seeing} of {len(frames)} views "
+                       f"have none of its {len(scene)} Gaussians before them; export it in the world of the cameras.")
 
 
 def _undistorted(capture: Capture, view: View) -> Callable[[ColourSpace | None], Picture]:

@@ -554,14 +554,14 @@ def test_a_capture_is_rendered_in_chunks(flare: Path, look: Look, tmp_path: Path
         Transfer(flare, target, TransferSettings(query="source")).bake(tmp_path / "whole")
 
 
-def test_a_scene_that_no_camera_sees_is_refused(look: Look, tmp_path: Path) -> None:
+def test_a_scene_of_another_world_is_refused(look: Look, tmp_path: Path) -> None:
     capture = Capture.open(make_capture(tmp_path / "capture", views=3))
     (tmp_path / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
     for offset in (0, 1e5):
         points = PointCloud(capture.points.xyz + np.float32(offset), capture.points.rgb, capture.points.error)
         write_ply(tmp_path / f"{offset:.0f}.ply", SceneGaussians.from_points(points))
     capture_target(capture, look, {}, lights=tmp_path / "lights.json", scene=tmp_path / "0.ply")
-    with pytest.raises(CaptureError, match=r"100000\.ply is of another world .* none of 3 views"):
+    with pytest.raises(CaptureError, match=r"100000\.ply is of another world .* 3 of 3 views have none"):
         capture_target(capture, look, {}, lights=tmp_path / "lights.json", scene=tmp_path / "100000.ply",
                        scene_is_background=True)
 

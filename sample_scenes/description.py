@@ -109,3 +109,17 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
 def camera_positions(world_to_camera: Array) -> Array:
     """Centres (n, 3) of cameras (n, 4, 4)."""
     return -np.einsum("nij,ni->nj", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])
+
+
+def disc_points(centre: Array, eye: Array, radius: float, count: int, up: tuple[float, float, float]) -> Array:
+    """Return points (count, 3), spread evenly over a disc that faces `eye`: a sunflower spiral.
+
+    up: a direction that the line of sight is not parallel to.
+    """
+    axis = (centre - eye) / np.linalg.norm(centre - eye)
+    side = np.cross(axis, up)
+    side /= np.linalg.norm(side)
+    index = np.arange(count) + 0.5
+    distance, angle = radius * np.sqrt(index / count), index * np.pi * (3 - np.sqrt(5))
+    return np.asarray(centre + distance[:, None] * (np.cos(angle)[:, None] * side
+                                                    + np.sin(angle)[:, None] * np.cross(side, axis)))

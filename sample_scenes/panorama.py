@@ -29,7 +29,7 @@ def panorama(rng: np.random.Generator, height: int, sun: tuple[float, float]) ->
         picture = np.where((elevation < ridge)[..., None], hill, picture)
     field = _fields(rng, azimuth, elevation)
     picture = np.where((elevation < 0)[..., None], field, picture)
-    _draw_town(rng, picture, pixel)
+    _draw_skyline(rng, picture, pixel)
     _draw_trees(rng, picture, pixel)
     return np.roll(picture, -width // 4, 1).astype(np.float32)  # until here +y is in the middle
 
@@ -70,7 +70,7 @@ def _fields(rng: np.random.Generator, azimuth: Texture, elevation: Texture) -> T
     return land * (1 - haze) + np.array((0.40, 0.36, 0.31), np.float32) * haze
 
 
-def _draw_town(rng: np.random.Generator, picture: Texture, pixel: float) -> None:
+def _draw_skyline(rng: np.random.Generator, picture: Texture, pixel: float) -> None:
     """Draw houses and towers with windows along the horizon into a panorama; pixel: its size, radians."""
     height, width = picture.shape[:2]
     ground = height // 2 + int(0.008 / pixel)

@@ -6,7 +6,6 @@ the cosine and the square of the distance. Pictures are scene-linear and average
 """
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .description import Array, Pinhole
+from .description import Array, Pinhole, disc_points
 
 Pixels = NDArray[np.float32]
 
@@ -183,15 +182,7 @@ def average(radiance: Pixels, camera: Pinhole) -> Pixels:
 
 def visible_share(lamp: Lamp, eye: Array, quads: Sequence[Quad]) -> float:
     """Return the share of a lamp's disc that no rectangle hides from `eye`, 0..1."""
-    towards = lamp.xyz - eye
-    distance = float(np.linalg.norm(towards))
-    axis = towards / distance
-    side = np.cross(axis, (0.0, 1.0, 0.0))
-    side /= np.linalg.norm(side)
-    up = np.cross(side, axis)
-    index = np.arange(SHARE_SAMPLES) + 0.5
-    radius = lamp.radius * np.sqrt(index / SHARE_SAMPLES)
-    angle = index * np.pi * (3 - math.sqrt(5))
-    points = lamp.xyz + radius[:, None] * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * up)
+    points = disc_points(lamp.xyz, eye, lamp.radius, SHARE_SAMPLES, up=(0.0, 1.0, 0.0))
+    distance = float(np.linalg.norm(lamp.xyz - eye))
     rays = np.asarray((points - eye) / np.linalg.norm(points - eye, axis=1, keepdims=True), np.float32)
     return float((cast(quads, eye, rays).distance >= distance - lamp.radius).mean())

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from core.images.read import read_picture
 
-from .description import Array, LightSource, Pinhole
+from .description import Array, LightSource, Pinhole, disc_points
 
 SHARE_SAMPLES = 512
 Rendered = TypeVar("Layers")
@@ -84,16 +84,7 @@ def visible_share(light: LightSource, eye: Array) -> float:
     """
     scene, depsgraph = bpy.context.scene, bpy.context.evaluated_depsgraph_get()
     centre, origin = np.array(light.xyz), np.asarray(eye, float)
-    towards = centre - origin
-    distance = float(np.linalg.norm(towards))
-    axis = towards / distance
-    side = np.cross(axis, (0.0, 0.0, 1.0))
-    side /= np.linalg.norm(side)
-    up = np.cross(side, axis)
-    index = np.arange(SHARE_SAMPLES) + 0.5
-    radius = light.radius * np.sqrt(index / SHARE_SAMPLES)
-    angle = index * np.pi * (3 - np.sqrt(5))
-    points = centre + radius[:, None] * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * up)
+    points = disc_points(centre, origin, light.radius, SHARE_SAMPLES, up=(0.0, 0.0, 1.0))
     bulbs = [camera_object for camera_object in scene.objects if camera_object.get("light_source")]
     for bulb in bulbs:
         bulb.hide_viewport = True

@@ -7,6 +7,7 @@ is faster and also renders the scene of a fit. Both draw the same picture, so on
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,7 @@ class ShotLayers:
     depth: Pixels
 
 
-class ShotSource:
+class ShotSource(ABC):
     """A shot with its look, as a source of frames for `bake_frames`; subclasses render."""
 
     def __init__(self, shot: Shot) -> None:
@@ -55,9 +56,9 @@ class ShotSource:
         """A digest that changes with all pictures; what belongs to one frame is in its renderer's."""
         return self.shot.fingerprint()
 
+    @abstractmethod
     def render(self, shot_frame: ShotFrame, camera: Camera, edits: LookEdits | None = None) -> RenderedLayers:
         """Render the layers of a frame, under its camera at the size of the layers."""
-        raise NotImplementedError
 
 
 class LookRenderer(ShotSource):

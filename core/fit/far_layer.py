@@ -23,6 +23,7 @@ from ..gaussians.far_sphere import FarSphere
 from ..gaussians.scene import SceneGaussians
 from ..images.picture import Picture
 from .frames import Frames, subsample
+from .sky import fibonacci_directions
 
 SWEEP_VIEWS, SWEEP_WIDTH = 24, 120
 """Approximate number of views of the sweep, and their width in pixels."""
@@ -285,14 +286,10 @@ def _seen_directions(cameras: list[Camera], pitch: float) -> Floats:
              for forward, camera in zip(forwards, cameras, strict=True)]
     lowest = float(np.cos(min(max(reach), np.pi)))
     count = max(int(2 * np.pi * (1 - lowest) / (pitch * pitch)), 1)
-    number = np.arange(count) + 0.5
-    z, azimuth = 1 - (1 - lowest) * number / count, number * np.pi * (3 - np.sqrt(5))
-    flat = np.sqrt(np.maximum(1 - z * z, 0))
     helper = np.eye(3)[int(np.abs(axis).argmin())]
     right = np.cross(helper, axis)
     right /= np.linalg.norm(right)
-    directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z], 1) @ np.stack(
-        [right, np.cross(axis, right), axis])
+    directions = fibonacci_directions(count, lowest) @ np.stack([right, np.cross(axis, right), axis])
     seen = np.zeros(count, bool)
     for camera in cameras:
         seen |= _project(camera, camera.position, directions, 0.0)[0]

@@ -30,7 +30,7 @@ def add_sky_points(capture: Capture, views: tuple[View, ...], frames: Frames) ->
     points = capture.points
     middle = np.mean([view.camera.position for view in views], 0)
     radius = RADIUS_FACTOR * float(np.quantile(np.linalg.norm(points.xyz - middle, axis=1), 0.95))
-    xyz = middle + radius * _fibonacci_directions(SKY_POINTS)
+    xyz = middle + radius * fibonacci_directions(SKY_POINTS)
     sampled = subsample(views, SAMPLED_VIEWS)
     view_colours = np.full((len(sampled), SKY_POINTS, 3), np.nan, np.float32)
     for row, view in zip(view_colours, sampled, strict=True):
@@ -46,9 +46,10 @@ def add_sky_points(capture: Capture, views: tuple[View, ...], frames: Frames) ->
                       np.concatenate([points.error, np.zeros(int(is_seen.sum()), np.float32)]))
 
 
-def _fibonacci_directions(count: int) -> NDArray[np.float64]:
-    """Return unit vectors (count, 3), evenly spread: a Fibonacci lattice (Swinbank and Purser 2006)."""
+def fibonacci_directions(count: int, lowest: float = -1) -> NDArray[np.float64]:
+    """Return unit vectors (count, 3), evenly spread over the part z > lowest of the sphere: a Fibonacci lattice
+    (Swinbank and Purser 2006)."""
     number = np.arange(count) + 0.5
-    z, azimuth = 1 - 2 * number / count, number * np.pi * (3 - np.sqrt(5))
-    flat = np.sqrt(1 - z * z)
+    z, azimuth = 1 - (1 - lowest) * number / count, number * np.pi * (3 - np.sqrt(5))
+    flat = np.sqrt(np.maximum(1 - z * z, 0))
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z], 1)

@@ -91,7 +91,7 @@ def test_the_model_with_the_most_images_is_used(tmp_path: Path, places: tuple[st
 
 
 @pytest.mark.parametrize("elsewhere", ["C:/work/shot", "C:\\work\\shot", "/home/ada/shot"])
-def test_absolute_names_of_another_machine_are_found_by_their_end(elsewhere: str, tmp_path: Path) -> None:
+def test_absolute_names_of_another_machine_resolve_by_their_suffix(elsewhere: str, tmp_path: Path) -> None:
     folder = make_transforms(tmp_path / "c")
     data = json.loads((folder / "transforms.json").read_text())
     for frame in data["frames"]:

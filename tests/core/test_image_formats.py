@@ -265,7 +265,7 @@ def test_a_header_that_claims_more_than_the_file_can_hold_costs_no_memory(
 
 
 @pytest.mark.parametrize("factor", [0.5, 3.0, 8.0])
-def test_a_plate_of_another_exposure_is_shown_alike_to_the_network(factor: float) -> None:
+def test_the_network_input_is_invariant_to_exposure(factor: float) -> None:
     light = scene()
     plates = [to_network_plate(Plate(Path("a.exr"), (light * gain).astype(np.float32), "linear"))[0]
               for gain in (1.0, factor)]

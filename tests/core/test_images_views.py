@@ -49,7 +49,7 @@ RIGHT = ["right.R", "right.G", "right.B"]
     ([*RGB, "diffuse.R", "diffuse.G", "diffuse.B"], {}, []),
     ([*RGB, "scene.right.R", "scene.right.G", "scene.right.B"], {}, []),
 ])
-def test_views_are_known_by_header_and_channels(channels: list[str], header: dict[str, Any],
+def test_views_are_identified_by_header_and_channels(channels: list[str], header: dict[str, Any],
                                                 expected: list[str]) -> None:
     assert [view.name for view in stereo_views(header, channels)] == expected
 

@@ -84,7 +84,7 @@ def test_fit_and_eval_keep_the_space_in_the_capture(filmed: Path, light: NDArray
     assert scores[()] == scores["--plate-space", SPACE] != scores["--plate-space", "auto"]
 
 
-def test_lights_keeps_the_space_and_refuses_an_unknown_one(filmed: Path, run: Run) -> None:
+def test_lights_keeps_the_space_and_refuses_an_undefined_space(filmed: Path, run: Run) -> None:
     run("lights", filmed, "--plate-space", SPACE, "--keep")
     assert read_plate_space(filmed) is not None
     problem = run("lights", filmed, "--plate-space", "no such space", "--keep", status=2)[-1]["text"]
@@ -124,7 +124,7 @@ def test_a_video_with_a_logarithm_is_solved_and_cleaned_as_light(light: NDArray[
 
 
 @pytest.mark.parametrize("command", ["remove", "solve"])
-def test_a_video_that_names_its_own_light_takes_no_other_space(command: str, run: Run, tmp_path: Path) -> None:
+def test_a_video_that_declares_its_transfer_refuses_a_plate_space(command: str, run: Run, tmp_path: Path) -> None:
     video = write_video(tmp_path / "pq.mkv", "ffv1", "yuv444p10le", [stripes(64)] * 3, matrix=9, tags=(9, 16, 9))
     problem = run(command, video, "--out", tmp_path / "out", "--plate-space", SPACE, status=1)[-1]["text"]
     assert "pq.mkv names its own colours (PQ), and --plate-space logc4 others" in problem

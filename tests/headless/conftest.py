@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,3 +27,18 @@ _run.register_package()
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny capture with everything, shared by the tests."""
     return flared_capture(tmp_path_factory.mktemp("capture") / "tiny", count=9, dots=60)
+
+
+@pytest.fixture
+def run(capfd: pytest.CaptureFixture[str]) -> Callable[..., list[dict[str, Any]]]:
+    """Runs a command in this process and returns its events; `status` is the exit status that is expected."""
+    from fit_flare.headless import cli  # after the tree has its name
+
+    def go(*args: object, status: int = 0) -> list[dict[str, Any]]:
+        capfd.readouterr()
+        ended = cli.main([*map(str, args), "--progress", "json"])
+        output = capfd.readouterr()
+        assert ended == status, output.out + output.err
+        return [json.loads(line) for line in output.out.splitlines()]
+
+    return go

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from fit_flare.headless import cli
 from numpy.typing import NDArray
 
 from core.bake.exr import read_layers
@@ -32,18 +31,9 @@ SPACE = "logc4"
 Run = Callable[..., list[dict[str, Any]]]
 
 
-@pytest.fixture
-def run(capfd: pytest.CaptureFixture[str]) -> Run:
-    """Run a command; return its events."""
-    def go(*args: object, status: int = 0) -> list[dict[str, Any]]:
-        torch.set_num_threads(1)
-        capfd.readouterr()
-        ended = cli.main([*map(str, args), "--progress", "json"])
-        output = capfd.readouterr()
-        assert ended == status, output.out + output.err
-        return [json.loads(line) for line in output.out.splitlines()]
-
-    return go
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fit_flare.headless import cli
 
 from core.bake.exr import read_description, read_layers
 from core.capture import Capture
@@ -44,19 +43,6 @@ def made(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 Run = Callable[..., list[dict[str, Any]]]
-
-
-@pytest.fixture
-def run(capfd: pytest.CaptureFixture[str]) -> Run:
-    """The events of a command."""
-    def go(*args: object, status: int = 0) -> list[dict[str, Any]]:
-        capfd.readouterr()
-        ended = cli.main([*map(str, args), "--progress", "json"])
-        output = capfd.readouterr()
-        assert ended == status, output.out + output.err
-        return [json.loads(line) for line in output.out.splitlines()]
-
-    return go
 
 
 def test_transfer_to_a_picture(run: Run, made: Path, tmp_path: Path) -> None:

@@ -31,8 +31,9 @@ class Medium(NamedTuple):
 
 def media() -> Iterator[Medium]:
     """Yield the formats for which no library here writes files, and videos of further codecs."""
-    for file, write in (("a.psd", _write_psd), ("a.cin", _write_cineon), ("a.dng", _write_dng), ("a.jxl", _write_jxl)):
-        if file != "a.jxl" or importlib.util.find_spec("pillow_jxl"):
+    for file, write, library in (("a.psd", _write_psd, "OpenImageIO"), ("a.cin", _write_cineon, "OpenImageIO"),
+                                 ("a.dng", _write_dng, "rawpy"), ("a.jxl", _write_jxl, "pillow_jxl")):
+        if importlib.util.find_spec(library):  # the last two are optional
             yield Medium(f"picture {Path(file).suffix}", file, write, read_picture)
     frames = [stripes(32, 96) * gain for gain in (1.0, 0.8, 0.6)]
     for file, codec, pixels in (("a.avi", "mjpeg", "yuvj420p"), ("a.mov", "v210", "yuv422p10le")):

@@ -2,6 +2,7 @@
 """Tensors on disk: safetensors with text metadata, written atomically. Checkpoints, flares and weights use it."""
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,12 +13,24 @@ from .reading import check_regular
 
 
 def write(path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write tensors and their metadata."""
+    """Write tensors and their metadata: the same bytes for the same arguments."""
     from safetensors.torch import save
 
     with atomic_path(path) as temporary:
         # As bytes: the writer of safetensors makes a temporary file of another name, which a kill would leave behind.
-        temporary.write_bytes(save({name: value.cpu().contiguous() for name, value in tensors.items()}, dict(metadata)))
+        data = save({name: value.cpu().contiguous() for name, value in tensors.items()}, dict(metadata))
+        temporary.write_bytes(_with_sorted_metadata(data))
+
+
+def _with_sorted_metadata(data: bytes) -> bytes:
+    """Return a safetensors file with its metadata in the order of their names: the library's order is random."""
+    body = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:body])
+    if metadata := header.pop("__metadata__", None):
+        header = {"__metadata__": dict(sorted(metadata.items())), **header}
+    text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode("utf-8")
+    text += b" " * (-len(text) % 8)  # the tensors stay aligned
+    return len(text).to_bytes(8, "little") + text + data[body:]
 
 
 def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -23,6 +23,15 @@ def test_written_tensors_are_read_back(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.safetensors"]
 
 
+def test_the_same_tensors_give_the_same_bytes(tmp_path: Path) -> None:
+    """The library writes the metadata in another order each time."""
+    metadata = dict.fromkeys("hgfedcba", "é\n")
+    for number in range(8):
+        tensor_files.write(tmp_path / f"{number}", {"b": torch.ones(3), "a": torch.zeros(2)}, metadata)
+    assert len({(tmp_path / f"{number}").read_bytes() for number in range(8)}) == 1
+    assert tensor_files.read(tmp_path / "0")[1] == metadata
+
+
 @pytest.mark.skipif(not MAPS.exists(), reason="needs a system that tells what is mapped")
 def test_reading_leaves_no_mapping_of_the_file(tmp_path: Path) -> None:
     tensor_files.write(tmp_path / "held.safetensors", {"table": torch.zeros(1000, 1000)}, {})

@@ -13,13 +13,17 @@ import pytest
 
 from core.bake.exr import write_layers
 from core.bake.layers import FrameLayers
+from core.images.write import write_png
 from tests.core.flared import flared_capture
-from tests.core.removal_cases import network_file
+from tests.core.removal_cases import network_file, picture
 from tests.faults.cases import Snapshot, fit_argv, snapshot
 
 ROOT = Path(__file__).resolve().parents[2]
-VARY = {"run/metrics.jsonl", "run/log.txt"}
+VARY = {"run/metrics.jsonl", "run/log.txt", "trained/training.jsonl"}
 """Files with times."""
+TRAINING = ["--set", "widths=[8,8,8,8,8]", "--set", "size_stages=[[1.0,64,64]]", "--set", "pixels_per_iteration=1",
+            "--set", "bank_size=2", "--set", "canvas_size=64", "--iterations", "2", "--processes", "1", "--threads",
+            "1"]
 CODE = """import importlib.util, json, sys, torch
 spec = importlib.util.spec_from_file_location("fit_flare_run", sys.argv[1])
 run = importlib.util.module_from_spec(spec)
@@ -30,8 +34,9 @@ from fit_flare.headless import cli
 sys.exit(max(cli.main(argv) for argv in json.loads(sys.argv[2])))"""
 
 
-def results(out: Path, capture: Path, weights: Path, working_folder: Path, **environment: str) -> Snapshot:
-    """Fit, bake, export, transfer and clean in one process; return the hashes of all files."""
+def results(out: Path, capture: Path, weights: Path, backgrounds: Path, working_folder: Path,
+            **environment: str) -> Snapshot:
+    """Fit, bake, export, transfer, clean and train in one process; return the hashes of all files."""
     import json
 
     run = f"{out}/run"
@@ -41,7 +46,8 @@ def results(out: Path, capture: Path, weights: Path, working_folder: Path, **env
                 ["transfer", f"{run}/flare.flare", "--to", str(capture), "--out", f"{out}/added", "--frames", "1"],
                 ["remove", str(capture / "images"), "--out", f"{out}/clean", "--weights", str(weights), "--frames",
                  "1", "--stills", "--working-size", "256"],
-                ["remove", "--run", run, "--out", f"{out}/subtracted", "--frames", "1"]]
+                ["remove", "--run", run, "--out", f"{out}/subtracted", "--frames", "1"],
+                ["train-removal", "--backgrounds", str(backgrounds), "--out", f"{out}/trained", *TRAINING]]
     working_folder.mkdir(exist_ok=True)
     done = subprocess.run([sys.executable, "-P", "-c", CODE, str(ROOT / "headless" / "run.py"), json.dumps(commands)],
                           cwd=working_folder, env={**os.environ, **environment}, capture_output=True, text=True,
@@ -55,14 +61,17 @@ def test_the_same_commands_give_the_same_bytes(tmp_path: Path) -> None:
     """Two processes with another hash seed, time zone, language and working folder write to the same place."""
     capture, weights = flared_capture(tmp_path / "capture", count=7, dots=60), tmp_path / "weights.safetensors"
     network_file(weights, bias=0.2)
+    backgrounds = tmp_path / "backgrounds"
+    write_png(backgrounds / "a.png", picture(200, 300).astype("float32") / 255)
     out = tmp_path / "out"
-    first = results(out, capture, weights, tmp_path, PYTHONHASHSEED="1", TZ="UTC")
+    first = results(out, capture, weights, backgrounds, tmp_path, PYTHONHASHSEED="1", TZ="UTC")
     out.rename(tmp_path / "first")
-    second = results(out, capture, weights, tmp_path / "elsewhere", PYTHONHASHSEED="2", TZ="Asia/Tokyo", LANG="C",
-                     LC_ALL="C")
+    second = results(out, capture, weights, backgrounds, tmp_path / "elsewhere", PYTHONHASHSEED="2", TZ="Asia/Tokyo",
+                     LANG="C", LC_ALL="C")
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []
-    assert {"run/flare.flare", "run/scene.ply", "lamp.json", "layers/layers.0001.exr"} <= first.keys()
+    assert {"run/flare.flare", "run/scene.ply", "lamp.json", "layers/layers.0001.exr",
+            "trained/removal.safetensors", "trained/checkpoint.safetensors"} <= first.keys()
 
 
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="there is no bpy package (`make setup`)")

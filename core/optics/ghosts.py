@@ -14,9 +14,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..system.kernel_cache import compile_cached
 from .aperture import Aperture, edge_radius
 from .prescription import Prescription
 from .spectrum import responses, wavelengths
@@ -102,7 +102,7 @@ def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.
     return values
 
 
-@njit(cache=True, nogil=True)
+@compile_cached
 def _non_negative_span(start: float, slope: float, left: float, right: float) -> tuple[float, float]:
     """Return the part of left..right where start + slope u is not negative."""
     if slope > 0.0:
@@ -112,7 +112,7 @@ def _non_negative_span(start: float, slope: float, left: float, right: float) ->
     return (left, right) if start >= 0.0 else (1.0, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@compile_cached
 def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: Array, stop_x: Array,
                stop_y: Array, radius: float, edges: Array, rim: float, colour: Array,
                picture: NDArray[np.float32]) -> None:

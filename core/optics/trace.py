@@ -13,8 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..system.kernel_cache import compile_cached
 
 Array = NDArray[np.float64]
 
@@ -28,7 +29,7 @@ FIELDS = 10
 """Length of a traced ray's array: the first four of these indices, then x and y of three passages through the stop."""
 
 
-@njit(cache=True, nogil=True)
+@compile_cached
 def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating: float) -> float:
     """Return the unpolarised reflectance between n0 and n2 at an angle of incidence; 1 for total reflection.
 
@@ -63,7 +64,7 @@ def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating:
     return max(0.5 * total, 0.0)  # where the two waves cancel, rounding may fall below zero
 
 
-@njit(cache=True, nogil=True)
+@compile_cached
 def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvature: Array, vertices: Array,
               index: Array, semi_aperture: Array, coating: Array, stop: int, sensor: float, wavelength: float,
               out: Array) -> bool:
@@ -141,7 +142,7 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
     return True
 
 
-@njit(cache=True, nogil=True)
+@compile_cached
 def trace_grid(xs: Array, ys: Array, slope: float, first: int, second: int, curvature: Array, vertices: Array,
                index: Array, semi_aperture: Array, coating: Array, stop: int, sensor: float,
                wavelength: float) -> tuple[Array, NDArray[np.bool_]]:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CPU kernels: the same result on every machine and thread count, compilation cache, threads and memory."""
+"""The CPU kernels: the same result on every machine and thread count, threads and memory."""
 from __future__ import annotations
 
-import errno
 import math
 import os
 import subprocess
@@ -261,73 +260,6 @@ def test_arm_code_has_vectors_and_no_library_calls(kernel: str) -> None:
     assert len(re.findall(r"\bfmla\b.*\.4s", assembly)) > 20
     called = set(re.findall(r"\bbl\s+(\S+)", assembly))
     assert called <= {"memset", "memcpy", "numba_attempt_nocopy_reshape"}, called
-
-
-COMPILE = """
-    import numpy as np
-    from core.gaussians.cpu import binning, compilation
-    binning.scan_tile_counts(np.ones((2, 3), np.int32), np.zeros(4, np.int64))
-    print(compilation.CACHE_FOLDER)
-    print(sum(binning.scan_tile_counts.stats.cache_hits.values()))
-"""
-
-
-def _compile_elsewhere(environment: dict[str, str]) -> tuple[Path, int]:
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(COMPILE)], cwd=ROOT, env={**os.environ, **environment},
-        check=True, capture_output=True, text=True,
-    )  # fmt: skip
-    folder, hits = done.stdout.split()
-    return Path(folder), int(hits)
-
-
-def test_the_kernel_cache_lies_in_the_configured_folder(tmp_path: Path) -> None:
-    environment = {"FIT_FLARE_CACHE": str(tmp_path)}
-    folder, hits = _compile_elsewhere(environment)
-    assert folder.is_relative_to(tmp_path) and hits == 0
-    assert list(folder.rglob("*.nbc"))
-    assert _compile_elsewhere(environment) == (folder, 1)
-
-
-def test_an_unusable_cache_folder_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("FIT_FLARE_CACHE", str(tmp_path / "file"))
-    folder = compilation._cache_folder()
-    assert not folder.is_relative_to(tmp_path) and os.access(folder, os.W_OK)
-
-
-def test_a_temporary_cache_folder_is_deleted_at_exit(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    (tmp_path / "temporary").mkdir()
-    unusable = {"FIT_FLARE_CACHE": str(tmp_path / "file"), "TMPDIR": str(tmp_path / "temporary")}
-    folder, hits = _compile_elsewhere(unusable)
-    assert folder.parent == tmp_path / "temporary" and hits == 0
-    assert not list((tmp_path / "temporary").glob("fit_flare_*"))
-
-
-def test_kernels_run_when_their_cache_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(compilation, "CACHE_FOLDER", tmp_path)
-    twice = compilation.kernel(doubled)
-    monkeypatch.setattr(twice._cache._cache_file, "save", full)
-    assert twice(2.0) == 4.0
-    assert not list(tmp_path.rglob("*.nbc"))
-
-
-def doubled(value: float) -> float:
-    return 2 * value
-
-
-def test_a_user_without_a_home_gets_a_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
-    for name in ("FIT_FLARE_CACHE", "XDG_CACHE_HOME", "LOCALAPPDATA"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(compilation.Path, "home", none)
-    assert os.access(compilation._cache_folder(), os.W_OK)
 
 
 def test_an_error_in_any_thread_reaches_the_caller() -> None:

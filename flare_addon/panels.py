@@ -13,6 +13,7 @@ import bpy
 from ..core.capture import REMOVED
 from ..core.conventions.run_files import FLARE
 from ..core.errors import FitFlareError
+from ..core.look import Look
 from . import baking, engine, fits, jobs, lamp_drive, library, light_extents, lights, looks, overlay, shots
 from .compositor import drivers, flare_node, setup
 from .layouts import draw_progress, label_lines
@@ -37,12 +38,12 @@ def _settings_column(layout: Any) -> Any:
 
 
 class _FitPanel(_SidebarPanel):
-    """Mixin for panels of a fit, which are out of the way in a scene that only shows a look."""
+    """Mixin for panels of a fit, which a scene without a capture, a run or lights of a capture does not need."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         state = context.scene.fit_flare
-        return bool(not state.flare or state.capture or state.run or lights.scene_lights(context.scene))
+        return bool(state.capture or state.run or lights.scene_lights(context.scene))
 
 
 class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
@@ -72,6 +73,10 @@ class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
 class FITFLARE_PT_lights(_FitPanel, bpy.types.Panel):
     bl_label = "Lights"
     bl_idname = "FITFLARE_PT_lights"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return super().poll(context) or not context.scene.fit_flare.flare
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, scene = self.layout, context.scene
@@ -246,7 +251,7 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
             layout.operator("fit_flare.open_flare", icon="FILE_FOLDER")
             return
         try:
-            looks.look_of(scene)
+            look = looks.look_of(scene)
         except FitFlareError as problem:
             label_lines(layout, str(problem), "ERROR")
             layout.operator("fit_flare.open_flare", icon="FILE_FOLDER")
@@ -284,7 +289,7 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
             layout.operator("fit_flare.remove_lost_flares", text=f"Remove Flares of Deleted Lights ({len(lost)})",
                             icon="TRASH")
         if 0 <= state.light < len(state.lights):
-            _draw_flare(layout, scene, state.lights[state.light])
+            _draw_flare(layout, scene, state.lights[state.light], look)
         row = layout.row(align=True)
         row.operator("fit_flare.reset_look", icon="LOOP_BACK")
         row.operator("fit_flare.open_flare", text="Open", icon="FILE_FOLDER")
@@ -304,7 +309,7 @@ def _draw_sliders(layout: Any, sliders: Any, streak: bool = True) -> None:
         column.prop(sliders, name, slider=name in ("intensity", "scale", "spread", "saturation", "streak"))
 
 
-def _draw_flare(layout: Any, scene: Any, item: Any) -> None:
+def _draw_flare(layout: Any, scene: Any, item: Any, look: Look) -> None:
     """Draw the settings and elements of one flare."""
     box = layout.box()
     box.label(text=item.name, icon="LIGHT_SUN")
@@ -315,7 +320,8 @@ def _draw_flare(layout: Any, scene: Any, item: Any) -> None:
         label_lines(box, f"Choose the light object of {item.name}.", "ERROR")
     elif not looks.is_placed(item, scene):
         label_lines(box, f"{item.target.name} is not in this scene: choose another object.", "ERROR")
-    label_lines(box, f"Look: {item.source}")
+    if len(look.lights) > 1:
+        label_lines(box, f"Look: {item.source}")
     _draw_sliders(box, item)
     column = box.column()
     column.use_property_split = True

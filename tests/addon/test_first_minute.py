@@ -23,21 +23,21 @@ def test_one_button_shows_a_look_of_the_library(facts: Any) -> None:
     """Block of first_minute.py: "add flare"."""
     assert facts["in the box"] >= 12
     assert facts["added"] == ["FINISHED"]
-    assert facts["added rows"] == [["light", "light", "Lamp 1"]]
+    assert facts["added rows"] == [["Lamp 1", "light", "Lamp 1"]]
     assert facts["is lit"]
     assert facts["in the menu"] == ["_draw_menu"]
 
 
 def test_a_flare_is_added_once_for_each_light(facts: Any) -> None:
     """Block of first_minute.py: "add flare"."""
-    assert facts["added again"] == [["light", "light", "Lamp 1"]]
-    assert facts["added at another"] == [["light", "light", "Lamp 1"], ["Lamp 2", "light", "Lamp 2"]]
+    assert facts["added again"] == [["Lamp 1", "light", "Lamp 1"]]
+    assert facts["added at another"] == [["Lamp 1", "light", "Lamp 1"], ["Lamp 2", "light", "Lamp 2"]]
 
 
 def test_a_scene_without_a_light_in_view_gets_one(facts: Any) -> None:
     """Block of first_minute.py: "add flare"."""
     assert facts["none in view"] == ["Flare", "Anamorphic Blue", True]
-    assert facts["beside a selected mesh"] == [["light", "light", "Lamp 1"]]
+    assert facts["beside a selected mesh"] == [["Lamp 1", "light", "Lamp 1"]]
     assert facts["a new one"] == ["Lamp 1", "Flare"]
     assert facts["without a camera"] == [True, ["Flare"], True]
 
@@ -150,3 +150,13 @@ def test_area_lights_flare_as_areas(facts: Any) -> None:
     assert facts["as a sphere"] == ["sphere", pytest.approx(0.5)]
     assert facts["as a mesh"] == ["points", [4, 0, 1]]
     assert "choose Point as its extent" in facts["an area of nothing"]
+
+
+def test_an_area_light_behind_a_fence_is_baked_as_it_is_shown(facts: Any) -> None:
+    """Block of first_minute.py: "lights that are areas"."""
+    shares = 0.5, 0.48, 0.5  # of the lamp, exactly
+    for (difference, ratio, brightest, share), exact in zip(facts["behind a fence"], shares, strict=True):
+        assert brightest > 100, "in codes"
+        assert difference < max(2, facts["a point"]), "in codes, as for points"
+        assert ratio == pytest.approx(1, abs=0.01)
+        assert share == pytest.approx(exact, abs=0.015)

@@ -12,6 +12,7 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
+from quads import drawn_levels
 from start import empty, install, leave, part, refusal
 
 package, flare, two, out = sys.argv[1:5]
@@ -352,6 +353,50 @@ hidden = brightness(scene)
 wall.hide_render = True
 whole = brightness(scene)
 facts["half hidden"] = round(hidden / whole, 2)
+
+def codes(light):
+    """Display codes of scene-linear light over a dark grey."""
+    light = np.clip(light + 0.05, 0, 1)
+    return 255 * np.where(light > 0.0031308, 1.055 * light ** (1 / 2.4) - 0.055, 12.92 * light)
+
+
+small(scene)
+fence = object_in(scene, "Fence", bpy.data.meshes.new("Fence"), (0, 5, 0))
+fence.data.from_pydata([(0.4 * plank + x, 0, z) for plank in range(-6, 7) for x, z in ((0, -2), (0.2, -2), (0.2, 2),
+                                                                                       (0, 2))],
+                       [], [tuple(range(4 * plank, 4 * plank + 4)) for plank in range(13)])
+for number, x in ((1, 0.0), (3, 0.2)):
+    fence.location.x = x
+    fence.keyframe_insert("location", frame=number)
+scene.frame_start, scene.frame_end = 1, 3
+ops.bake()
+overlay, cameras = part("flare_addon.overlay"), part("flare_addon.cameras")
+
+
+def shown(scene):
+    """The flare as the overlay draws it."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    camera = scene.camera.evaluated_get(depsgraph)
+    window = overlay.drawn_region(overlay.CameraFrame(0, 0, 64, 36), (64, 36), cameras.core_camera(
+        camera.data, camera.matrix_world, scene.render))
+    gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
+    return drawn_levels(overlay, gaussians, window, looks.look_of(scene))
+
+
+fenced = []
+for number in (1, 2, 3):
+    scene.frame_set(number)
+    with_flare, item.intensity = rendered(scene), 0.0
+    baked, item.intensity = with_flare - rendered(scene), 1.0
+    fenced.append([float(np.abs(codes(shown(scene)) - codes(baked)).max()), float(baked.sum() / shown(scene).sum()),
+                   float(codes(baked).max()), brightness(scene) / whole])
+item.extent = "point"
+bpy.context.view_layer.update()
+facts["a point"] = float(np.abs(codes(shown(scene)) - codes(drawn(scene))).max())
+item.extent = "auto"
+facts["behind a fence"] = fenced
+ops.remove_compositor()
+bpy.data.objects.remove(fence)
 lamp.rotation_euler = (np.pi / 2, 0, 0)
 bpy.context.view_layer.update()
 facts["from behind"] = brightness(scene)

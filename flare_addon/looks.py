@@ -96,7 +96,7 @@ def _place_at(scene: Any, look: Look, targets: Sequence[Any], add: bool) -> None
     remaining = [target for target in targets if target not in _targets(state)]
     for item in [item for item in state.lights if item.target is None][:len(remaining)]:
         item.target = remaining.pop(0)
-        if len(look.lights) == 1 and item.name == item.source:  # the name of a look's only light tells an artist nothing
+        if len(look.lights) == 1 and item.name == item.source:  # it tells an artist nothing
             item.name = free_name(item.target.name, {entry.name for entry in state.lights if entry != item})
         lamp_drive.measure(scene, item)
     for target in remaining if add else ():

@@ -3,7 +3,11 @@
 PYTHON ?= python3.11
 PIP = -m pip --disable-pip-version-check --quiet
 # Blender's modules are hundreds of megabytes: an installation whose download broke off is begun again after a pause.
-AGAIN = sh -c 'for pause in 10 30 60 120; do "$$@" && exit; sleep $$pause; done; "$$@"' --
+PAUSES = 10 30 60 120
+AGAIN = sh -c 'for pause in $(PAUSES); do "$$@" && exit; sleep $$pause; done; "$$@"' --
+# The first Python 3.13 that starts: the one on the PATH may be pyenv's stand-in for a version that is not selected.
+PYTHON313 ?= $(shell for python in python3.13 "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/3.13.*/bin/python3.13; do \
+	"$$python" -c "import ensurepip, venv" 2> /dev/null && echo "$$python" && break; done)
 
 .PHONY: demo pictures test check setup package clean
 
@@ -23,7 +27,7 @@ check: .venv/.ready
 	.venv/bin/ruff check .
 	.venv/bin/mypy
 
-setup: .venv/.ready .venv-bpy45/.ready
+setup: .venv/.ready .venv-bpy45/.ready .venv-bpy53/.ready
 
 # The engine, with Blender as a module beside it.
 .venv/.ready: constraints.txt pyproject.toml
@@ -38,9 +42,21 @@ setup: .venv/.ready .venv-bpy45/.ready
 	$(AGAIN) .venv-bpy45/bin/python $(PIP) install bpy==4.5.15 numpy==1.26.4 OpenEXR==3.5.3
 	touch $@
 
+# The newest Blender, whose module needs Python 3.13. Without it, or where the installation fails, the other environments
+# are complete, and the tests skip this Blender with the reason in .venv-bpy53.missing.
+.venv-bpy53/.ready: PAUSES = 10 30
+.venv-bpy53/.ready: constraints.txt pyproject.toml
+	@rm -f $@
+	@if [ -z "$(PYTHON313)" ]; then echo "no Python 3.13 was found" > .venv-bpy53.missing; \
+	elif $(PYTHON313) -m venv .venv-bpy53 \
+		&& $(AGAIN) .venv-bpy53/bin/python $(PIP) install bpy==5.3.0 numpy==2.5.5 OpenEXR==3.5.3; \
+	then rm -f .venv-bpy53.missing && touch $@; \
+	else echo "its installation failed (see the output of make setup)" > .venv-bpy53.missing; fi
+	@[ ! -e .venv-bpy53.missing ] || echo "make setup: the tests leave out Blender 5.3: $$(cat .venv-bpy53.missing)"
+
 # The extension as Blender installs it.
 package: .venv/.ready
 	.venv/bin/python headless/package.py
 
 clean:
-	rm -rf build .venv .venv-bpy45
+	rm -rf build .venv .venv-bpy45 .venv-bpy53 .venv-bpy53.missing

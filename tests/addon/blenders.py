@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-OLDER = Path(os.environ.get("FIT_FLARE_OLDER", "")
-             or ROOT / ".venv-bpy45" / ("Scripts/python.exe" if os.name == "nt" else "bin/python"))
+_PYTHON = "Scripts/python.exe" if os.name == "nt" else "bin/python"
+OLDER = Path(os.environ.get("FIT_FLARE_OLDER", "") or ROOT / ".venv-bpy45" / _PYTHON)
+NEWEST = Path(os.environ.get("FIT_FLARE_NEWEST", "") or ROOT / ".venv-bpy53" / _PYTHON)
+NEWEST_MISSING = ROOT / ".venv-bpy53.missing"  # `make setup` writes there why it installed none
 
 
 @dataclass(frozen=True)
@@ -65,3 +67,19 @@ def newer() -> Blender | None:
 def older() -> Blender | None:
     """Blender 4.5 in a Python without an engine, or what FIT_FLARE_OLDER names."""
     return Blender(OLDER) if OLDER.is_file() else None
+
+
+def newest() -> Blender | None:
+    """Blender 5.3 in a Python 3.13 without an engine, or what FIT_FLARE_NEWEST names."""
+    is_complete = os.environ.get("FIT_FLARE_NEWEST") or (ROOT / ".venv-bpy53" / ".ready").is_file()
+    return Blender(NEWEST) if is_complete and NEWEST.is_file() else None
+
+
+def missing_reason(name: str) -> str:
+    """Return why a test of the Blender of this name is skipped."""
+    if name == "named":
+        return "no Blender is named by FIT_FLARE_BLENDER"
+    if name == "newest":
+        why = NEWEST_MISSING.read_text(encoding="utf-8").strip() if NEWEST_MISSING.is_file() else "run `make setup`"
+        return f"Blender 5.3 is not set up here: {why}"
+    return f"the {name} Blender is not set up here (`make setup`)"

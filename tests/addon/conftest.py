@@ -12,13 +12,12 @@ import pytest
 from blenders import ROOT, Blender, newer
 
 
-@pytest.fixture(scope="session", params=["newer", "older", "named"])
+@pytest.fixture(scope="session", params=["newer", "older", "newest", "named"])
 def blender(request: pytest.FixtureRequest) -> Blender:
     """Each of the Blenders that are set up here."""
     found = getattr(blenders, request.param)()
     if found is None:
-        pytest.skip("no Blender is named by FIT_FLARE_BLENDER" if request.param == "named" else
-                    f"the {request.param} Blender is not set up here (`make setup`)")
+        pytest.skip(blenders.missing_reason(request.param))
     return found
 
 

@@ -8,12 +8,25 @@ import io
 import json
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import bpy
 
 NAME = "bl_ext.user_default.fit_flare"
+deprecations: list[str] = []
+"""What the extension uses although this Blender or its Python announces its end; `leave` fails with it."""
+
+
+def _record(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object) -> None:
+    is_ours = "fit_flare" in filename or "flare_addon" in filename
+    if issubclass(category, DeprecationWarning | PendingDeprecationWarning) and is_ours:
+        deprecations.append(f"{filename}:{lineno}: {message}")
+
+
+warnings.showwarning = _record
+warnings.simplefilter("always")
 
 
 def install(package: str) -> None:
@@ -61,7 +74,8 @@ def refusal(call: Callable[[], Any]) -> str:
 
 
 def leave(facts: dict[str, Any]) -> None:
-    """Hand the facts to the test, and go."""
+    """Hand the facts to the test, and go. A use of what is deprecated fails the script."""
+    assert not deprecations, "\n".join(sorted(set(deprecations)))
     print(json.dumps(facts))
     sys.stdout.flush()
     os._exit(0)

@@ -2,12 +2,14 @@
 """The operator that makes a look of the library from a lens prescription, in the engine."""
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ...core.errors import SettingsError
-from ...core.optics.lenses import lens_names
+from ...core.optics.lenses import find_lens, lens_names
+from ...core.optics.prescription import read_prescription
 from .. import engine, jobs, library
 from ..reports import GuardedOperator
 
@@ -24,9 +26,23 @@ def _lens_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
     """Return the lenses as menu items, kept here since Blender holds no reference to the texts."""
     global _items
     if not _items:
-        _items = [*((name, name, f"The lens of the patent {name}") for name in lens_names()),
+        lenses = sorted(((find_lens(name), name) for name in lens_names()), key=lambda pair: pair[0].focal_length())
+        _items = [*((name, f"{lens.focal_length():.0f} mm f/{lens.widest_f_number():.1f} ({name})",
+                     f"The lens of the patent {name}") for lens, name in lenses),
                   (FILE, "Lens File", "A prescription of your own in the .lens format")]
     return _items
+
+
+def _on_made(job: jobs.Job) -> None:
+    """Choose the new look in the panel Library."""
+    target = job.args[job.args.index("--out") + 1] if "--out" in job.args else ""
+    number = next((item[-1] for item in library.items() if item[0] == target), None)
+    if job.state == "done" and number is not None:
+        library.choose(None, number)
+    jobs.redraw_bars()
+
+
+jobs.ON_FINISHED["make flare"] = _on_made
 
 
 class FITFLARE_OT_make_flare(GuardedOperator, bpy.types.Operator):
@@ -74,6 +90,8 @@ class FITFLARE_OT_make_flare(GuardedOperator, bpy.types.Operator):
         lens = bpy.path.abspath(self.filepath) if self.lens == FILE else self.lens
         if not lens:
             raise SettingsError("Choose a .lens file first.")
+        if self.lens == FILE:
+            read_prescription(Path(lens))  # a bad file is reported at once
         target = library.free_path(self.name)
         options = {"--f-number": self.f_number, "--squeeze": self.squeeze if self.squeeze != 1 else 0.0,
                    "--streak": self.streak, "--ring": self.ring}

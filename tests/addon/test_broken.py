@@ -213,3 +213,17 @@ def test_logs_show_their_end_or_why_they_cannot_be_read(said: Any) -> None:
     assert "cannot be read" in text
     assert "last" in text
     assert "first" not in text
+
+
+def test_a_flare_is_made_from_a_lens(said: Any) -> None:
+    """Block of broken.py: "engines that are none, or die"."""
+    refused, panel = said["a flare from a lens, refused"]
+    assert "not there" in refused or any("not there" in text for text in panel)
+    said_nothing, chosen, args = said["a flare from a lens"]
+    assert (said_nothing, chosen) == ("", "From a Lens")
+    assert args[0].endswith(tuple("0123456789"))
+    assert [args[args.index(name) + 1] for name in ("--f-number", "--squeeze", "--blades")] == ["4", "1.8", "8"]
+    assert all(is_sentence(text) for text in said["a lens that is none"])
+    assert is_sentence(said["a name that is taken"])
+    assert "35 mm f/1.4 (US3576360)" in said["lenses"]
+    assert said["lenses"][-1] == "Lens File"

@@ -145,6 +145,22 @@ except part("core.errors").EngineError as problem:
     said["cannot be executed"] = str(problem)
 behave("finishes")
 said["a fit that ends well"] = [refusal(lambda: ops.fit()), fits.fit_state(scene), scene.fit_flare.flare != ""]
+make = {"name": "From a Lens", "f_number": 4.0, "squeeze": 1.8}
+behave("refuses")
+said["a flare from a lens, refused"] = [refusal(lambda: ops.make_flare(**make)), shown("library")]
+behave("makes")
+made = refusal(lambda: ops.make_flare(**make))
+said["a flare from a lens"] = [made, Path(bpy.context.window_manager.fit_flare_library).stem,
+                               Path(sham).with_name("arguments").read_text().split("make-flare")[1].split()]
+bad = folder / "bad.lens"
+bad.write_text("1 2 three")
+said["a lens that is none"] = [refusal(lambda: ops.make_flare(name=name, lens="FILE", filepath=path))
+                               for name, path in (("From a File", str(bad)), ("From a File", str(folder / "gone.lens")),
+                                                  ("From a File", ""), ("///", str(bad)))]
+said["a name that is taken"] = refusal(lambda: ops.make_flare(**make))
+said["lenses"] = [item[1] for item in part("flare_addon.operators.make_flare")._lens_items(None, None)]
+for path in part("flare_addon.library").folder().iterdir():
+    path.unlink()
 behave("answers")
 said["test"] = [refusal(lambda: ops.test_engine()), engine.last_test().result]
 

@@ -23,6 +23,7 @@ case $(cat "$here/behaviour") in
   bakes) [ -f "$out/layers.0001.exr" ] && echo layer > "$out/layers.0002.exr"
          echo '{"type": "result", "data": {"layers": "x", "frames": 2}}' ;;
   finishes) mkdir -p "$out"; cp "$here/lamp.flare" "$out/flare.flare"; echo '{"type": "result", "data": {"run": "x"}}' ;;
+  makes) cp "$here/lamp.flare" "$out"; echo "$@" > "$here/arguments"; echo '{"type": "result", "data": {"flare": "x"}}' ;;
   answers) echo '{"type": "result", "data": {"version": "1", "torch": "2", "device": "a sham"}}' ;;
   sleeps) trap 'echo "{\"type\": \"error\", \"text\": \"Stopped during fit as asked; what is done is kept.\"}"; exit 130' INT
           n=0; while [ $n -lt 300 ]; do sleep 0.1; n=$((n + 1)); done ;;

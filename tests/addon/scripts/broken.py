@@ -154,7 +154,7 @@ said["a flare from a lens"] = [made, Path(bpy.context.window_manager.fit_flare_l
                                Path(sham).with_name("arguments").read_text().split("make-flare")[1].split()]
 bad = folder / "bad.lens"
 bad.write_text("1 2 three")
-said["a lens that is none"] = [refusal(lambda: ops.make_flare(name=name, lens="FILE", filepath=path))
+said["a lens that is none"] = [refusal(partial(ops.make_flare, name=name, lens="FILE", filepath=path))
                                for name, path in (("From a File", str(bad)), ("From a File", str(folder / "gone.lens")),
                                                   ("From a File", ""), ("///", str(bad)))]
 said["a name that is taken"] = refusal(lambda: ops.make_flare(**make))

@@ -13,6 +13,7 @@
     overlay.py          the flare in the viewport                points.py          the point cloud in the viewport
     shots.py            scenes as shots                          baking.py          bakes
     lamp_drive.py       power of lamps as a factor               light_extents.py   areas of lights
+    asset_browser.py    looks in the Asset Browser
     views.py            3D views                                 compositor/        the layers in the compositor
     library.py          the library of flares                    paths.py           paths of a .blend that moves
     fcurves.py          animation of list items                  render_settings.py   rendering and saving
@@ -22,10 +23,23 @@ from __future__ import annotations
 
 import bpy
 
-from . import baking, fits, jobs, looks, operators, overlay, panels, paths, points, preferences, properties
+from . import (
+    asset_browser,
+    baking,
+    fits,
+    jobs,
+    looks,
+    operators,
+    overlay,
+    panels,
+    paths,
+    points,
+    preferences,
+    properties,
+)
 from .compositor import drivers
 
-_MODULES = (properties, preferences, operators, panels, points, overlay, paths)
+_MODULES = (properties, preferences, operators, panels, points, overlay, paths, asset_browser)
 
 
 @bpy.app.handlers.persistent

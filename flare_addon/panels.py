@@ -432,6 +432,7 @@ class FITFLARE_PT_transfer(_SidebarPanel, bpy.types.Panel):
         layout, state = self.layout, context.scene.fit_flare
         column = layout.column(align=True)
         column.operator("fit_flare.save_flare", icon="FILE_TICK")
+        column.operator("fit_flare.list_assets", icon="ASSET_MANAGER")
         column.operator("fit_flare.shot_from_picture", icon="IMAGE_DATA")
         column.operator("fit_flare.pick_light", icon="EYEDROPPER")
         if state.flare and not state.native and any(item.target for item in state.lights):

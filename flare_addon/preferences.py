@@ -41,6 +41,9 @@ class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
         column.use_property_split = True
         column.prop(self, "engine")
         column.prop(self, "library")
+        row = layout.row()
+        row.operator("fit_flare.list_assets", icon="ASSET_MANAGER")
+        row.operator("fit_flare.unlist_assets", icon="X")
         _draw_engine(layout)
 
 

@@ -257,6 +257,7 @@ class FITFLARE_PG_object(bpy.types.PropertyGroup):
         override=OVERRIDABLE)
     light: StringProperty(  # type: ignore[valid-type]
         name="Light Name", description="Name of the light in lights.json and in the .flare", override=OVERRIDABLE)
+    asset_look: StringProperty()  # type: ignore[valid-type]  # the look of an asset that was not dropped yet
     is_points: BoolProperty()  # type: ignore[valid-type]
     is_root: BoolProperty()  # type: ignore[valid-type]
     is_made: BoolProperty()  # type: ignore[valid-type]

@@ -9,7 +9,7 @@ import bpy
 from mathutils import Vector
 
 from ...core.errors import FlareFileError
-from .. import cameras, library, lights, looks, overlay, render_settings
+from .. import asset_browser, cameras, library, lights, looks, overlay, render_settings
 from ..compositor import setup
 from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator
 from ..views import look_through_camera
@@ -44,8 +44,41 @@ class FITFLARE_OT_save_flare(GuardedOperator, bpy.types.Operator):
         look = looks.look_of(context.scene)
         edits = looks.edits_to_store(context.scene.fit_flare, look)
         path = library.save(look, edits, self.name, self.notes or look.notes, self.licence or look.licence)
+        asset_browser.update()
         sliders = "" if edits.is_neutral else ", with the sliders of the panel Look as they are now"
         self.report({"INFO"}, f"{path.stem} is in the library{sliders}")
+
+
+class FITFLARE_OT_list_assets(GuardedOperator, bpy.types.Operator):
+    """Offer the looks of the library in Blender's Asset Browser, from where they can be dragged into a scene"""
+
+    bl_idname = "fit_flare.list_assets"
+    bl_label = "Show in Asset Browser"
+    changes_scene = False
+
+    @classmethod
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        return asset_browser.why_not()
+
+    def act(self, _context: bpy.types.Context) -> None:
+        count = asset_browser.list_looks()
+        self.report({"INFO"}, f"{count} looks are in the asset library {asset_browser.NAME}: open an Asset Browser and "
+                    "drag one into the view")
+
+
+class FITFLARE_OT_unlist_assets(GuardedOperator, bpy.types.Operator):
+    """Take the looks out of Blender's Asset Browser; the library of the panel keeps them"""
+
+    bl_idname = "fit_flare.unlist_assets"
+    bl_label = "Remove from Asset Browser"
+    changes_scene = False
+
+    @classmethod
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        return "" if asset_browser.listed() is not None else "The looks are not in the Asset Browser"
+
+    def act(self, _context: bpy.types.Context) -> None:
+        asset_browser.unlist()
 
 
 class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
@@ -229,7 +262,8 @@ def _add_camera(scene: Any, name: str, image: Any, lens: float | None) -> Any:
     return camera
 
 
-_CLASSES = (FITFLARE_OT_save_flare, FITFLARE_OT_apply_flare, FITFLARE_OT_pick_light, FITFLARE_OT_shot_from_picture)
+_CLASSES = (FITFLARE_OT_save_flare, FITFLARE_OT_list_assets, FITFLARE_OT_unlist_assets, FITFLARE_OT_apply_flare,
+            FITFLARE_OT_pick_light, FITFLARE_OT_shot_from_picture)
 
 
 def register() -> None:

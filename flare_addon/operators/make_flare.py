@@ -10,7 +10,7 @@ import bpy
 from ...core.errors import SettingsError
 from ...core.optics.lenses import find_lens, lens_names
 from ...core.optics.prescription import read_prescription
-from .. import engine, jobs, library
+from .. import asset_browser, engine, jobs, library
 from ..reports import GuardedOperator
 
 FILE = "FILE"
@@ -39,6 +39,7 @@ def _on_made(job: jobs.Job) -> None:
     number = next((item[-1] for item in library.items() if item[0] == target), None)
     if job.state == "done" and number is not None:
         library.choose(None, number)
+        asset_browser.update()
     jobs.redraw_bars()
 
 

@@ -225,5 +225,5 @@ def test_a_flare_is_made_from_a_lens(said: Any) -> None:
     assert [args[args.index(name) + 1] for name in ("--f-number", "--squeeze", "--blades")] == ["4", "1.8", "8"]
     assert all(is_sentence(text) for text in said["a lens that is none"])
     assert is_sentence(said["a name that is taken"])
-    assert "35 mm f/1.4 (US3576360)" in said["lenses"]
+    assert "35 mm f/1.3 (US3576360)" in said["lenses"]
     assert said["lenses"][-1] == "Lens File"

@@ -79,6 +79,16 @@ def test_flares_of_deleted_lamps_are_removed_together(facts: Any) -> None:
     assert "has its light object" in facts["none is lost"]
 
 
+def test_looks_are_assets_and_a_dropped_one_flares(facts: Any) -> None:
+    """Block of first_minute.py: "the asset browser"."""
+    if not facts["reports drops"]:
+        pytest.skip("this Blender does not report dropped assets; 4.3 does")
+    assert facts["not listed by itself"]
+    assert facts["offered as assets"] == [True, 1, 0, True]
+    assert facts["dropped"] == ["Torch", [["Torch", "light", "Torch"], ["Torch.001", "light", "Torch.001"]], True]
+    assert facts["taken out"]
+
+
 def test_layers_are_baked_without_an_engine(facts: Any) -> None:
     """Block of first_minute.py: "bake without an engine"."""
     assert facts["no engine"]

@@ -38,6 +38,7 @@ def steps():
     yield from change()
     yield from bake()
     yield from render()
+    shot("last")
     done("all")
 
 

@@ -144,6 +144,30 @@ facts["as fitted"] = [state.master.intensity, state.lights[0].spread, state.ligh
 neutral = library.thumbnail(core_look.read(two))
 facts["thumbnail differs"] = float(np.abs(library.thumbnail(core_look.read(saved)) - neutral).max()) > 0.01
 
+# ---- the asset browser ----------------------------------------------------------------------------------
+browser = part("flare_addon.asset_browser")
+facts["reports drops"] = hasattr(bpy.app.handlers, "blend_import_post")
+if facts["reports drops"]:
+    before = len(bpy.data.objects)
+    facts["not listed by itself"] = browser.listed() is None
+    ops.list_assets()
+    ops.list_assets()
+    entries = bpy.context.preferences.filepaths.asset_libraries
+    assets = browser.folder() / browser.ASSETS
+    with bpy.data.libraries.load(str(assets), assets_only=True) as (inside, _):
+        offered = list(inside.objects)
+    facts["offered as assets"] = [sorted(offered) == sorted(item[1] for item in library.items()),
+                                  sum(entry.name == "Fit Flare" for entry in entries),
+                                  len(bpy.data.objects) - before, (browser.folder() / browser.CATALOGS).is_file()]
+    scene, _ = scene_with()
+    for name in ("Torch", "Torch"):
+        bpy.ops.wm.append(directory=f"{assets}/Object/", filename=name)
+        browser.add_dropped()
+    dropped = scene.objects["Torch"]
+    facts["dropped"] = [Path(scene.fit_flare.flare).stem, rows(scene), dropped.asset_data is None]
+    ops.unlist_assets()
+    facts["taken out"] = browser.listed() is None
+
 # ---- bake without an engine -----------------------------------------------------------------------------
 def rendered(scene):
     """The picture that a render gives, scene-linear, row 0 on top."""

@@ -6,6 +6,7 @@
     operators/          the buttons                              reports.py         refusals and errors of buttons
     layouts.py          labels and progress bars                 engine.py          finding and installing the engine
     jobs.py             processes of the engine                  fits.py            fits, light search, clean frames
+    weights.py          the weights of the removal network
     capture/            captures into and out of Blender         cameras.py         Blender's cameras and the core's
     lights.py           light objects                            objects.py         matrices of objects
     light_paths.py      lights that move, and tracks of clips

@@ -15,27 +15,15 @@ import bpy
 from ..core.errors import EngineError, FitFlareError
 from ..core.system.files import remove_folder, write_text
 from ..core.system.processes import child_environment, find_python
-from . import jobs
+from . import jobs, weights
 from .jobs import Job
-from .user_settings import engine_path
+from .user_settings import engine_path, user_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN_SCRIPT = ROOT / "headless" / "run.py"
-PACKAGE = (__package__ or "").rpartition(".")[0]  # such as "bl_ext.user_default.fit_flare"
 ENGINE_FOLDER = "engine"
 ENGINE_VARIABLE = "FIT_FLARE_ENGINE"
 TESTED_FILE = "python.txt"  # holds the path of the Python that was tested last
-
-
-def user_folder(name: str, create: bool = False) -> Path:
-    """Return a folder of the extension in Blender's user folder."""
-    try:
-        return Path(bpy.utils.extension_path_user(PACKAGE, path=name, create=create))
-    except (ValueError, AttributeError):  # loaded from source, not installed as an extension
-        folder = Path(bpy.utils.user_resource("CONFIG", path="fit_flare", create=create)) / name
-        if create:
-            folder.mkdir(parents=True, exist_ok=True)
-        return folder
 
 
 def set_up_folder() -> Path:
@@ -99,7 +87,7 @@ def command(*args: object) -> list[str]:
 
 def run(kind: str, folder: Path, args: Sequence[object]) -> Job:
     """Start a command of run.py whose events go to `folder`; see `jobs.start`."""
-    return jobs.start(kind, folder, command(*args), child_environment(), args=args)
+    return jobs.start(kind, folder, command(*args), {**child_environment(), **weights.environment()}, args=args)
 
 
 def run_without(kind: str, folder: Path, args: Sequence[object]) -> Job:
@@ -129,7 +117,7 @@ def last_test() -> Job | None:
 
 
 def set_up() -> Job:
-    """Install the engine into a virtual environment in `set_up_folder`.
+    """Install the engine into a virtual environment in `set_up_folder`, and the weights where they are offered.
 
     Raises EngineError where Blender's online access is off, or where a damaged earlier engine cannot be removed.
     """
@@ -137,8 +125,7 @@ def set_up() -> Job:
         raise EngineError("Blender's online access is off; allow it in Preferences > System > Network, then set up.")
     if is_set_up() and not (virtual_environment() / "pyvenv.cfg").is_file():  # damaged
         _remove_environment(virtual_environment())
-    script = ROOT / "headless" / "set_up.py"
-    command_line = [sys.executable, *bpy.app.python_args, "-I", str(script), str(virtual_environment())]
+    command_line = [*weights.SET_UP, str(virtual_environment()), *weights.download_args()]
     return jobs.start("set up", set_up_folder(), command_line, child_environment())
 
 

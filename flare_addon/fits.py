@@ -14,12 +14,15 @@ from ..core.conventions.run_files import CONFIG, FLARE, SMALL_PREVIEW
 from ..core.errors import CaptureError, FitFlareError, RunError
 from ..core.look import Look, read
 from ..core.system.reading import MAX_PATH_BYTES, read_text
-from . import engine, jobs, lights, looks, plate_space
+from . import engine, jobs, lights, looks, plate_space, weights
 from .capture.importer import set_exposures
 from .images import reload_images
 from .jobs import Job
 from .paths import absolute, blend_relative, is_file, is_folder
 from .reports import NO_CAPTURE
+
+TRUE_SCENE = Path("truth", "scene")
+"""Folder of a sample capture with its exact clean frames."""
 
 FitState = Literal["none", "running", "resumable", "finished", "lost"]
 """resumable: stopped or failed before its end. lost: the folder of the run does not exist any more."""
@@ -81,7 +84,10 @@ def why_not(scene: Any) -> str:
         return missing
     if fit_state(scene) == "running":
         return "A fit is running"
-    return ""
+    if scene.fit_flare.mode == "split" or any(is_folder(capture / name) for name in (REMOVED, TRUE_SCENE)):
+        return ""
+    missing = weights.missing_reason()
+    return f"The fit starts by making clean frames. {missing}, or choose No Clean Frames" if missing else ""
 
 
 def new_run_folder(scene: Any) -> Path:
@@ -248,6 +254,16 @@ def clean_frames(scene: Any) -> Job:
     if earlier is not None and (earlier.state == "done" or earlier.args != list(map(str, args))):
         args = [*args, "--overwrite"]
     return engine.run("clean", _cleaning_folder(capture), args)
+
+
+def why_not_clean(scene: Any) -> str:
+    """Return why clean frames cannot be made and what to do, without a full stop; "" where they can."""
+    capture = capture_folder(scene)
+    if capture is None or not is_folder(capture / "images"):
+        return NO_CAPTURE
+    if missing := engine.missing_reason():
+        return missing
+    return "" if "--run" in cleaning_args(scene, capture) else weights.missing_reason()
 
 
 def cleaning_job(capture: Path) -> Job | None:

@@ -19,6 +19,7 @@ from .compositor import drivers, flare_node, setup
 from .layouts import draw_progress, label_lines
 from .operators import make_flare
 from .paths import is_folder
+from .user_settings import PACKAGE
 
 
 class _SidebarPanel:
@@ -233,7 +234,7 @@ def draw_missing_engine(layout: Any) -> None:
     """Draw why there is no engine, and a button that opens the preferences."""
     box = layout.box()
     label_lines(box, f"{engine.missing_reason()}.", "ERROR")
-    box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = engine.PACKAGE
+    box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = PACKAGE
 
 
 class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The preferences: the engine and the library of flares, with the buttons that install, test and remove the engine.
+"""The preferences: the engine, the weights of the removal network and the library of flares, with the buttons that
+install, test and remove them.
 
 `user_settings` reads the values.
 """
@@ -10,21 +11,28 @@ from typing import Any
 
 import bpy
 
-from . import engine, jobs
+from . import engine, jobs, weights
 from .layouts import draw_progress, label_lines
 from .reports import GuardedOperator
+from .user_settings import PACKAGE
 
 DOWNLOAD_SIZE = f"about {'3 GB, most of it CUDA,' if sys.platform == 'linux' else '1 GB'} to download once"
 
 
 class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
-    bl_idname = engine.PACKAGE
+    bl_idname = PACKAGE
 
     engine: bpy.props.StringProperty(  # type: ignore[valid-type]
         name="Engine",
         description="The Python with torch, or the folder of its virtual environment. Empty: the engine that Set Up "
                     "Engine "
         "installed",
+        subtype="FILE_PATH",
+    )
+    weights: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="Removal Weights",
+        description="File with the weights of the removal network, which makes clean frames. Empty: those that Set Up "
+                    "Engine or Download Weights downloaded",
         subtype="FILE_PATH",
     )
     library: bpy.props.StringProperty(  # type: ignore[valid-type]
@@ -40,11 +48,13 @@ class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
         column = layout.column()
         column.use_property_split = True
         column.prop(self, "engine")
+        column.prop(self, "weights")
         column.prop(self, "library")
         row = layout.row()
         row.operator("fit_flare.list_assets", icon="ASSET_MANAGER")
         row.operator("fit_flare.unlist_assets", icon="X")
         _draw_engine(layout)
+        _draw_weights(layout)
 
 
 def _draw_engine(layout: Any) -> None:
@@ -79,6 +89,33 @@ def _draw_engine(layout: Any) -> None:
     row.operator("fit_flare.test_engine", icon="PLAY")
     row.operator("fit_flare.set_up_engine", icon="IMPORT")
     row.operator("fit_flare.remove_engine", icon="TRASH")
+
+
+def _draw_weights(layout: Any) -> None:
+    """Draw whether the weights of the removal network are there, their download, and its button."""
+    box, job, found = layout.box().column(), weights.job(), weights.find()
+    if job is not None and job.running:
+        draw_progress(box, job, "Downloading the weights")
+        return
+    if found is not None:
+        box.label(text=f"Removal weights: {found}", icon="CHECKMARK")
+        return
+    box.label(text="No weights of the removal network", icon="INFO")
+    _, configured = weights.configured()
+    if configured:
+        label_lines(box, f"{weights.missing_reason()}.")
+        return
+    label_lines(box, "Clean frames by the network, and fits with Estimated Clean Frames, need them (20 MB). "
+                + ("Set Up Engine downloads them too." if weights.source_url() else
+                   "The place that this extension was installed from does not offer them: name their file above."))
+    set_up = engine.set_up_job()
+    error = job.error if job is not None else ""
+    if not error and set_up is not None:
+        error = str(set_up.result.get("weights_error", ""))
+    if error:
+        label_lines(box, error, "ERROR")
+    if weights.source_url():
+        box.row().operator("fit_flare.download_weights", icon="IMPORT")
 
 
 def _draw_log_button(layout: Any, job: jobs.Job) -> None:
@@ -132,6 +169,25 @@ class FITFLARE_OT_set_up_engine(GuardedOperator, bpy.types.Operator):
         engine.set_up()
 
 
+class FITFLARE_OT_download_weights(GuardedOperator, bpy.types.Operator):
+    """Download the weights of the removal network (20 MB) from the repository of this extension"""
+
+    bl_idname = "fit_flare.download_weights"
+    bl_label = "Download Weights"
+    changes_scene = False
+
+    @classmethod
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        if not bpy.app.online_access:
+            return "Allow Online Access in Preferences > System > Network first"
+        if weights.find() is not None:
+            return "The weights are there"
+        return "" if weights.source_url() else "The place that this extension was installed from does not offer them"
+
+    def act(self, _context: bpy.types.Context) -> None:
+        weights.download()
+
+
 class FITFLARE_OT_remove_engine(GuardedOperator, bpy.types.Operator):
     """Delete the engine that Set Up Engine installed, and free its disk space"""
 
@@ -153,7 +209,8 @@ class FITFLARE_OT_remove_engine(GuardedOperator, bpy.types.Operator):
         engine.remove()
 
 
-_CLASSES = (FITFLARE_AP_preferences, FITFLARE_OT_test_engine, FITFLARE_OT_set_up_engine, FITFLARE_OT_remove_engine)
+_CLASSES = (FITFLARE_AP_preferences, FITFLARE_OT_test_engine, FITFLARE_OT_set_up_engine, FITFLARE_OT_remove_engine,
+            FITFLARE_OT_download_weights)
 
 
 register, unregister = bpy.utils.register_classes_factory(_CLASSES)

@@ -1,15 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Installs the engine: `python headless/set_up.py FOLDER` makes a virtual environment there and fills it.
+"""Installs the engine and the weights of the removal network.
+
+    set_up.py FOLDER [PACKAGE ...] [--weights URL FILE SHA256]    make a virtual environment in FOLDER and fill it
+    set_up.py --weights URL FILE SHA256                           download the weights alone
 
 The add-on runs it with Blender's own Python, so it uses the standard library alone. The packages are the group
 "engine" of pyproject.toml, at the versions in constraints.txt. Events go to standard output, one JSON object per line
 (core/system/progress.py). Every Python is started isolated (-I), so that none imports a module from the folder in
 which it happens to start. An environment in FOLDER, also one that a stopped set-up left, is replaced.
+
+The weights are downloaded from URL to FILE, and refused if their SHA-256 is another. An engine without them is
+complete but for the removal network, so a failure leaves the engine, and the result says why in "weights_error".
 """
 from __future__ import annotations
 
+import argparse
 import contextlib
 import glob
+import hashlib
 import json
 import os
 import platform
@@ -20,6 +28,7 @@ import sys
 import threading
 import time
 import tomllib
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -28,6 +37,8 @@ ROOT = Path(__file__).resolve().parents[1]
 WINDOWS = os.name == "nt"
 MIN_MACOS = 14  # required by the wheels of torch and pycolmap in constraints.txt
 RENAME_ATTEMPTS = 20  # 0.1 s apart
+MAX_WEIGHTS_BYTES = 1 << 30
+DOWNLOAD_TIMEOUT_S = 60
 IMPORT_TEST = "import cv2, numpy, torch, numba, OpenEXR, pycolmap"  # OpenCV before COLMAP, as in core/capture/solve
 
 
@@ -188,13 +199,86 @@ def test_step(folder: Path) -> Step:
                 f"The engine was installed but cannot be loaded ({{why}}); {cure}, and set up again.")
 
 
+def weights_step(url: str, file: Path, digest: str) -> Step:
+    """Return the step that downloads the weights from `url` to `file`, of this SHA-256 in hexadecimal digits."""
+    return Step("Downloading the weights of the removal network",
+                [sys.executable, "-I", str(Path(__file__).resolve()), "--fetch", url, str(file), digest],
+                f"The weights of the removal network could not be downloaded from {url} ({{why}}); name their file in "
+                "the field Removal Weights, or try again.")
+
+
+def fetch(url: str, file: Path, digest: str) -> None:
+    """Download `url` to `file`, whole or not at all. Raises OSError, ValueError for another SHA-256 than `digest`."""
+    print(f"Downloading {url}", flush=True)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_name(f".{file.name}.{os.getpid()}")
+    checksum, size = hashlib.sha256(), 0
+    try:
+        with urllib.request.urlopen(url, timeout=DOWNLOAD_TIMEOUT_S) as source, open(partial, "wb") as target:
+            while chunk := source.read(1 << 20):
+                size += len(chunk)
+                if size > MAX_WEIGHTS_BYTES:
+                    raise ValueError("the file is too large")
+                checksum.update(chunk)
+                target.write(chunk)
+        if checksum.hexdigest() != digest.lower():
+            raise ValueError("the file is not the one of this version: its SHA-256 differs")
+        partial.replace(file)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def download_weights(url: str, file: Path, digest: str) -> str:
+    """Run the step of the weights; return "" on success, else the sentence about its failure."""
+    step = weights_step(url, file, digest)
+    emit(type="say", text=step.message)
+    try:
+        why = run_logged(step.command)
+    finally:
+        for partial in file.parent.glob(f".{glob.escape(file.name)}.*"):  # of a download that was killed
+            partial.unlink(missing_ok=True)
+    return step.failure.replace("{why}", why) if why else ""
+
+
+def only_weights(url: str, file: Path, digest: str) -> int:
+    """Download the weights alone; return the exit status."""
+    emit(type="stage", name="weights", total=1, done=0)
+    if problem := download_weights(url, file, digest):
+        emit(type="error", text=problem)
+        return 1
+    emit(type="progress", stage="weights", done=1, total=1, eta_s=None, figures={})
+    emit(type="result", data={"weights": str(file)})
+    return 0
+
+
 def main(argv: list[str]) -> int:
-    """Set the engine up in the folder argv[0], with the packages of the rest or all; return the exit status."""
-    if not argv:
-        print(__doc__, file=sys.stderr)
-        return 2
-    folder, names = Path(argv[0]), argv[1:] or engine_packages()
-    if not argv[1:] and unsupported_reason():
+    """Set the engine up, download the weights, or both; return the exit status."""
+    parser = argparse.ArgumentParser(description="Installs the engine and the weights of the removal network.")
+    parser.add_argument("folder", nargs="?", type=Path, help="folder of the virtual environment")
+    parser.add_argument("packages", nargs="*", help="packages instead of those of the engine")
+    parser.add_argument("--weights", nargs=3, metavar=("URL", "FILE", "SHA256"), help="weights to download")
+    parser.add_argument("--fetch", nargs=3, help=argparse.SUPPRESS)
+    args = parser.parse_args(argv)
+    if args.fetch:
+        try:
+            fetch(args.fetch[0], Path(args.fetch[1]), args.fetch[2])
+        except (OSError, ValueError) as problem:
+            print(f"ERROR: {getattr(problem, 'reason', None) or problem}", flush=True)
+            return 1
+        return 0
+    if args.folder is None:
+        if args.weights is None:
+            parser.print_usage(sys.stderr)
+            return 2
+        return only_weights(args.weights[0], Path(args.weights[1]), args.weights[2])
+    return set_up_engine(args.folder, args.packages, args.weights)
+
+
+def set_up_engine(folder: Path, packages: list[str], weights: list[str] | None = None) -> int:
+    """Set the engine up in a folder, with these packages or all, and with weights (URL, FILE, SHA256); return the exit
+    status."""
+    names = packages or engine_packages()
+    if not packages and unsupported_reason():
         emit(type="error", text=unsupported_reason())
         return 1
     base = find_base_python()
@@ -207,9 +291,10 @@ def main(argv: list[str]) -> int:
              text=f"{folder} exists and is not a virtual environment; choose another folder, or remove it.")
         return 1
     steps = [venv_step(base, folder), *(install_step(folder, name) for name in names)]
-    if not argv[1:]:
+    if not packages:
         steps.append(test_step(folder))
-    emit(type="stage", name="set up", total=len(steps), done=0)
+    total = len(steps) + (weights is not None)
+    emit(type="stage", name="set up", total=total, done=0)
     if not remove_environment(folder):
         emit(type="error", text=f"The engine in {folder} is in use; close other Blenders and programs that use it, "
                                "and set up again.")
@@ -225,8 +310,14 @@ def main(argv: list[str]) -> int:
             discard_environment(folder)
             emit(type="error", text=step.failure.replace("{why}", why))
             return 1
-        emit(type="progress", stage="set up", done=number + 1, total=len(steps), eta_s=None, figures={})
-    emit(type="result", data={"engine": str(environment_python(folder))})
+        emit(type="progress", stage="set up", done=number + 1, total=total, eta_s=None, figures={})
+    result = {"engine": str(environment_python(folder))}
+    if weights is not None:
+        if problem := download_weights(weights[0], Path(weights[1]), weights[2]):
+            emit(type="say", text=problem)
+            result["weights_error"] = problem
+        emit(type="progress", stage="set up", done=total, total=total, eta_s=None, figures={})
+    emit(type="result", data=result)
     return 0
 
 

@@ -11,8 +11,8 @@ import bpy
 from ...core.conventions.run_files import LOG, PREVIEW
 from ...core.system.reading import open_regular
 from .. import engine, fits, jobs, shots
-from ..paths import is_file, is_folder
-from ..reports import NO_CAPTURE, GuardedOperator
+from ..paths import is_file
+from ..reports import GuardedOperator
 
 MAX_LOG_BYTES = 200_000
 
@@ -60,10 +60,7 @@ class FITFLARE_OT_clean_frames(GuardedOperator, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        capture = fits.capture_folder(context.scene)
-        if capture is None or not is_folder(capture / "images"):
-            return NO_CAPTURE
-        return engine.missing_reason()
+        return fits.why_not_clean(context.scene)
 
     def act(self, context: bpy.types.Context) -> None:
         fits.clean_frames(context.scene)

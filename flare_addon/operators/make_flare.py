@@ -12,6 +12,7 @@ from ...core.optics.lenses import find_lens, lens_names
 from ...core.optics.prescription import read_prescription
 from .. import asset_browser, engine, jobs, library
 from ..reports import GuardedOperator
+from ..user_settings import user_folder
 
 FILE = "FILE"
 _items: list[tuple[str, str, str]] = []
@@ -19,7 +20,7 @@ _items: list[tuple[str, str, str]] = []
 
 def making_job() -> jobs.Job | None:
     """Return the job of the flare that is being made, or that was made last; None without one."""
-    return jobs.find(engine.user_folder("make_flare"))
+    return jobs.find(user_folder("make_flare"))
 
 
 def _lens_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
@@ -97,7 +98,7 @@ class FITFLARE_OT_make_flare(GuardedOperator, bpy.types.Operator):
         options = {"--f-number": self.f_number, "--squeeze": self.squeeze if self.squeeze != 1 else 0.0,
                    "--streak": self.streak, "--ring": self.ring}
         args = [word for name, value in options.items() if value for word in (name, f"{value:.6g}")]
-        engine.run("make flare", engine.user_folder("make_flare", create=True), [
+        engine.run("make flare", user_folder("make_flare", create=True), [
             "make-flare", lens, "--out", target, "--blades", self.blades, "--dust", self.dust, "--scratches",
             self.scratches, *args])
 

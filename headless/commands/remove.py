@@ -54,7 +54,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="long side of the largest picture that the network gets (default 480, slightly more than "
                              "in its training)")
     parser.add_argument("--weights", type=Path, metavar="FILE",
-                        help="weights from `train-removal` (default: those that come with the program)")
+                        help="weights from `train-removal` (default: the file that FIT_FLARE_WEIGHTS names, else "
+                             "those that come with the program)")
     parser.add_argument("--model", choices=("network", "diffusion"), default="network",
                         help="network: the one that comes with the program. diffusion: a base model with a LoRA from "
                              "`train-removal`; needs diffusers, transformers and peft (default network)")

@@ -64,7 +64,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.optics.prescription import built_in_lenses, read_lenses
     from ...core.removal.evaluation import held_out_lenses
     from ...core.removal.model import recipe as recipes
-    from ...core.removal.model import weights
+    from ...core.removal.model.weights_file import default_weights
     from ...core.removal.training.backgrounds import (
         describe_unusable,
         is_held_out,
@@ -115,7 +115,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                          "of the flare.")
         if args.model == "diffusion":
             return _train_diffusion(args, recipe, backgrounds, train_on, user_flares, progress)
-        start = weights.IN_THE_BOX if str(args.start) == "box" else args.start
+        start = default_weights() if str(args.start) == "box" else args.start
         progress.say(f"{len(backgrounds.photos)} photographs, {len(backgrounds.maps)} environment maps, "
                      f"{len(train_on)} lenses, {len(user_flares) if user_flares else 'no'} flares of your own.")
         path = train(recipe, args.out, backgrounds, train_on, validation=validation, user_flares=user_flares,

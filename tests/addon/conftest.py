@@ -22,14 +22,22 @@ def blender(request: pytest.FixtureRequest) -> Blender:
 
 
 @pytest.fixture(scope="session")
-def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A static repository of the extension, with its weights."""
     if newer() is None:
         pytest.skip("Blender's packer comes with the bpy package (`make setup`)")
-    out = tmp_path_factory.mktemp("package")
-    done = subprocess.run([sys.executable, str(ROOT / "headless" / "package.py"), str(out)], capture_output=True,
-                          text=True, check=False)
+    out = tmp_path_factory.mktemp("repository")
+    done = subprocess.run([sys.executable, str(ROOT / "headless" / "package.py"), "--repository", str(out)],
+                          capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    return next(out.glob("*.zip"))
+    assert "warning" not in (done.stdout + done.stderr).lower(), done.stdout + done.stderr
+    return out
+
+
+@pytest.fixture(scope="session")
+def package(repository: Path) -> Path:
+    """The zip of the extension."""
+    return next(repository.glob("*.zip"))
 
 
 @pytest.fixture(scope="session")

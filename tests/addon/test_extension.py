@@ -2,6 +2,11 @@
 """The built extension: packed by Blender's packer, installed, used, disabled."""
 from __future__ import annotations
 
+import hashlib
+import importlib.util
+import json
+import subprocess
+import sys
 import tomllib
 import zipfile
 from pathlib import Path
@@ -13,7 +18,9 @@ from blenders import ROOT, Blender
 
 from core.bake.exr import write_layers
 from core.bake.layers import FrameLayers
+from core.removal.model.weights_file import published_digest, published_name
 
+MAX_PACKAGE_BYTES = 8_000_000
 SCRIPTS = Path(__file__).parent / "scripts"
 
 
@@ -37,8 +44,36 @@ def test_the_package_holds_the_program_and_nothing_else(package: Path) -> None:
             "headless/set_up.py", "constraints.txt", "pyproject.toml"} <= set(names)
     strangers = [name for name in names if name.split("/")[0].startswith(".") or "__pycache__" in name
                  or name.split("/")[0] in ("tests", "benchmarks", "sample_scenes", "build", "tmp", "docs", "Makefile",
-                                           "ARCHITECTURE.md", "CONTRIBUTING.md")]
+                                           "ARCHITECTURE.md", "CONTRIBUTING.md", "README.md")
+                 or name.endswith((".safetensors", ".csv", "headless/package.py"))]
     assert strangers == []
+    assert package.stat().st_size < MAX_PACKAGE_BYTES
+
+
+def test_the_manifest_passes_the_platforms_rules(package: Path) -> None:
+    """The tags of the platform, a website, a reason for each permission."""
+    manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
+    assert manifest["website"].startswith("https://")
+    for text in (manifest["tagline"], *manifest["permissions"].values()):
+        assert 0 < len(text) <= 64 and text[-1].isalnum()
+    assert set(manifest["permissions"]) == {"files", "network"}
+    packer = importlib.util.find_spec("bpy")
+    assert packer is not None and packer.submodule_search_locations
+    scripts, = Path(packer.submodule_search_locations[0]).glob("*/scripts")
+    tags = scripts / "modules" / "_bpy_internal" / "extensions" / "tags.py"
+    done = subprocess.run([sys.executable, str(scripts / "addons_core" / "bl_pkg" / "cli" / "blender_ext.py"),
+                           "validate", str(package), "--valid-tags", str(tags)],
+                          capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_weights_of_a_repository_are_those_of_the_program(repository: Path) -> None:
+    weights = next(repository.glob("*.safetensors"))
+    assert weights.name == published_name()
+    assert hashlib.sha256(weights.read_bytes()).hexdigest() == published_digest()
+    index = json.loads((repository / "index.json").read_text(encoding="utf-8"))
+    assert [(entry["id"], entry["archive_url"]) for entry in index["data"]] == [
+        ("fit_flare", f"./{next(repository.glob('*.zip')).name}")]
 
 
 def test_the_extension_installs_and_registers(facts: Any) -> None:

@@ -2,6 +2,7 @@
 """Setting up the engine, with a package made for the test in place of torch."""
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import os
@@ -71,6 +72,35 @@ def module() -> Any:
     found = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(found)
     return found
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_weights_are_downloaded_with_the_engine_or_alone(alone: bool, tmp_path: Path) -> None:
+    source, target = tmp_path / "weights of a server", tmp_path / "user" / "weights.safetensors"
+    source.write_bytes(b"weights")
+    arguments = ["--weights", source.as_uri(), str(target), hashlib.sha256(b"weights").hexdigest()]
+    first = [] if alone else [str(tmp_path / "engine"), str(wheel(tmp_path, "sham_torch"))]
+    done = subprocess.run([sys.executable, "-I", str(SCRIPT), *first, *arguments], capture_output=True, text=True,
+                          check=False)
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.returncode == 0 and events[-1]["type"] == "result"
+    assert target.read_bytes() == b"weights"
+    assert [event["done"] for event in events if event["type"] == "progress"][-1] == events[0]["total"]
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_other_weights_are_refused_and_the_engine_stays(alone: bool, tmp_path: Path) -> None:
+    source, target = tmp_path / "source", tmp_path / "user" / "weights.safetensors"
+    source.write_bytes(b"weights of another version")
+    arguments = ["--weights", source.as_uri(), str(target), hashlib.sha256(b"weights").hexdigest()]
+    first = [] if alone else [str(tmp_path / "engine"), str(wheel(tmp_path, "sham_torch"))]
+    done = subprocess.run([sys.executable, "-I", str(SCRIPT), *first, *arguments], capture_output=True, text=True,
+                          check=False)
+    last = json.loads(done.stdout.splitlines()[-1])
+    assert done.returncode == (1 if alone else 0)
+    assert "its SHA-256 differs" in (last["text"] if alone else last["data"]["weights_error"])
+    assert list((tmp_path / "user").iterdir()) == []
+    assert alone or (tmp_path / "engine" / "pyvenv.cfg").is_file()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="the Python without ensurepip is a shell script")

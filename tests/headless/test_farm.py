@@ -26,7 +26,7 @@ from core.fit.settings import override_settings
 from core.look import PlacedLight, read
 from core.look.shot import Shot, ShotFrame
 from core.removal.jobs.manifest import MANIFEST
-from core.removal.model.weights import IN_THE_BOX
+from core.removal.model.weights_file import IN_THE_BOX
 from tests.core.removal_cases import picture, write_codes
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -121,6 +121,15 @@ def test_bad_plates_do_not_stop_other_processes(backgrounds: Path, tmp_path: Pat
         "f2.png", "f3.png", "f5.png", "f6.png", "remove.json"]
 
 
+def test_missing_weights_are_reported_with_their_variable(backgrounds: Path, tmp_path: Path,
+                                                          capsys: pytest.CaptureFixture[str],
+                                                          monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FIT_FLARE_WEIGHTS", str(tmp_path / "nowhere.safetensors"))
+    assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path / "clean")]) == 1
+    said = capsys.readouterr().err
+    assert "nowhere.safetensors; name their file with FIT_FLARE_WEIGHTS" in said and "Traceback" not in said
+
+
 def test_diffusion_needs_a_base_and_its_packages(backgrounds: Path, tmp_path: Path,
                                                  capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path), "--model", "diffusion"]) == 1
@@ -186,7 +195,7 @@ def test_a_fit_in_mode_split_makes_no_clean_frames(capture: Path, tmp_path: Path
 def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
                                           monkeypatch: pytest.MonkeyPatch) -> None:
     net = network_file(tmp_path / "net.safetensors", bias=0.1)
-    monkeypatch.setattr("fit_flare.core.removal.inference.remover.IN_THE_BOX", net)
+    monkeypatch.setenv("FIT_FLARE_WEIGHTS", str(net))
     bare = tmp_path / "bare"
     shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
     args = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2"]

@@ -22,7 +22,8 @@ from ...images.plates import Plate
 from ...system.reading import read_bytes
 from ..model.image_formation import flare_to_linear
 from ..model.network import RemovalNetwork
-from ..model.weights import IN_THE_BOX, load
+from ..model.weights import load
+from ..model.weights_file import default_weights
 from .confidence import SENSITIVITIES, Sensitivity, gate_by_mean
 from .device import select_device
 from .framing import (
@@ -75,12 +76,13 @@ class Remover:
 
     def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
                  glow: Glow = "keep at lights") -> None:
-        """weights: None for those that come with the program. Raises RunError, SettingsError."""
+        """weights: None for `default_weights`. Raises RunError, SettingsError."""
         if not 64 <= working_size <= 8192:
             raise SettingsError(f"A working size of {working_size} pixels is outside 64 to 8192.")
-        self.network: RemovalNetwork = load(weights or IN_THE_BOX)
+        weights = weights or default_weights()
+        self.network: RemovalNetwork = load(weights)
         self.working_size, self.glow = working_size, glow
-        self.cache_key = compute_cache_key("network", weights or IN_THE_BOX, working_size,
+        self.cache_key = compute_cache_key("network", weights, working_size,
                                            _GLOW_IN_CACHE_KEY[glow])
 
     plate_space: ColourSpace | None = None

@@ -17,9 +17,7 @@ from ...errors import RunError
 from ...system import tensor_files
 from ...system.reading import parse_json
 from .network import RemovalNetwork
-
-IN_THE_BOX = Path(__file__).parents[1] / "box" / "removal.safetensors"
-"""The weights that come with the program."""
+from .weights_file import WEIGHTS_VARIABLE
 
 _MAX_LEVELS, _MAX_SIZE = 16, 4096
 """Bounds of the resolutions of a network, and of the channels or blocks at each."""
@@ -39,7 +37,9 @@ def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Return the tensors under their present names, and the text of the header. Raises RunError where the file is
     missing or damaged."""
     if not Path(path).is_file():
-        raise RunError(f"{path} is missing; train it with train-removal, or install the program again.")
+        raise RunError(f"The weights of the removal network are missing: {path}; name their file with "
+                       f"{WEIGHTS_VARIABLE}, download them in the preferences of the extension, or train them with "
+                       "train-removal.")
     try:
         tensors, metadata = tensor_files.read(path)
     except (OSError, ValueError) as problem:
@@ -83,7 +83,7 @@ def _not_weights(path: Path | str) -> RunError:
 
 
 @lru_cache(maxsize=2)
-def load(path: Path = IN_THE_BOX) -> RemovalNetwork:
+def load(path: Path) -> RemovalNetwork:
     """Load the network of a weights file on the CPU, in evaluation mode. Raises RunError."""
     tensors, metadata = read(path)
     if not all(bool(value.isfinite().all()) for value in tensors.values()):

@@ -5,8 +5,8 @@
 """
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
 from typing import overload
 
 import numpy as np
@@ -74,10 +74,36 @@ def read_solve(folder: Path, *, required: bool = True) -> CameraSolve | None:
                                    f"a model lies in {deeper}: name the folder that holds it and its images, such as "
                                    f"{deeper.parent}, or move it to {folder / 'sparse' / '0'}."))
         frames, points = read_model(model)
-        solve = CameraSolve(frames, points, frames_folder(folder, model))
+        root = frames_folder(folder, model)
+        solve = CameraSolve(_names_below(root, frames), points, root)
         solve.sentences += [sentence] if sentence else []
     solve.frames.sort(key=lambda frame: natural_key(frame.name))
     return solve
+
+
+def _names_below(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
+    """Return a model's frames with names that start from `root`, the folder of the frames.
+
+    COLMAP's names start from the folder that it was started on: "images/1.png", "/data/shot/images/1.png" of another
+    machine. The first folders that all names share are left out, as few as lead to a picture; none where nothing does.
+    """
+    parts = [PurePosixPath(frame.name.replace("\\", "/")).parts for frame in frames]
+    shared = 0
+    while all(len(each) > shared + 1 and each[shared] == parts[0][shared] for each in parts):
+        shared += 1
+    if not shared or not root.is_dir():
+        return frames
+    is_below = parts[0][0] not in ("/", "..")
+    if is_below and any(root.joinpath(*each).exists() for each in parts):
+        return frames
+    index = PictureIndex(root)
+    if is_below and any(index.find(frame.name) for frame in frames):
+        return frames
+    for start in range(1, shared + 1):
+        names = ["/".join(each[start:]) for each in parts]
+        if any(index.find(name) for name in names):
+            return [replace(frame, name=name) for frame, name in zip(frames, names, strict=True)]
+    return frames
 
 
 @dataclass

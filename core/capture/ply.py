@@ -15,10 +15,14 @@ from ..system.reading import MAX_MODEL_BYTES, read_bytes
 from .colmap import PointCloud
 
 HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
-COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"), HARMONICS)
-"""Names of the colours' properties, in the order in which they are looked for."""
+COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"),
+           ("scalar_red", "scalar_green", "scalar_blue"), HARMONICS)
+"""Names of the colours' properties in lower case, in the order in which they are looked for; CloudCompare writes the
+fourth."""
 HARMONIC_0 = 0.28209479177387814
 """The spherical harmonic of degree 0."""
+GREY = 128
+"""Colour of the points of a cloud without colours."""
 MAX_UNIT_COLOUR = 1.001
 """Largest float colour of a cloud whose colours are 0..1."""
 
@@ -39,7 +43,9 @@ def read_points(path: Path) -> PointCloud:
         layout, number = vertices.layout(), vertices.rows
     except ValueError as problem:
         raise CaptureError(f"{path} has the vertex property {problem}, not a plain number.") from problem
-    names = [name for name, _ in layout]
+    names = [name.lower() for name, _ in layout]
+    if len(set(names)) == len(names):
+        layout = [(name.lower(), kind) for name, kind in layout]
     if header.format not in ply.BYTE_ORDERS or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
         raise CaptureError(f"{path} is not a PLY file of points with x, y and z.")
     try:
@@ -49,7 +55,9 @@ def read_points(path: Path) -> PointCloud:
             if len(table) < number:
                 raise ValueError
         else:
-            table = ply.read_table(data, vertices.row(ply.BYTE_ORDERS[header.format]), number, header.start)
+            order = ply.BYTE_ORDERS[header.format]
+            row = np.dtype([(name, order + kind) for name, kind in layout])
+            table = ply.read_table(data, row, number, header.start)
     except ValueError as problem:
         raise CaptureError(f"{path} is truncated or damaged; export it again.") from problem
     with np.errstate(over="ignore"):  # infinite values are refused below
@@ -67,7 +75,7 @@ def _read_colours(table: NDArray[Any], kinds: dict[str, str], number: int) -> ND
     """
     names = next((names for names in COLOURS if set(names) <= set(kinds)), None)
     if names is None or not number:
-        return np.full((number, 3), 128, np.uint8)
+        return np.full((number, 3), GREY, np.uint8)
     colours = np.nan_to_num(np.stack([table[name].astype(np.float64) for name in names], axis=1))
     largest = float(colours.max(initial=0))
     if names == HARMONICS:

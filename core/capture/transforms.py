@@ -26,7 +26,7 @@ from .camera import Floats, is_rotation
 from .colmap import MAX_MAGNITUDE, PointCloud, PosedFrame, check_lens, read_model
 from .layout import LATER_MODEL_PLACES, choose_model, find_models
 from .lens import Lens
-from .ply import read_points
+from .ply import GREY, read_points
 
 FILE = "transforms.json"
 PARTS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
@@ -254,7 +254,10 @@ def _read_points(path: Path, meta: dict[str, Any], result: Transforms) -> PointC
         cloud_file = find_entry(folder, file.relative_to(folder).as_posix())
         if cloud_file is None or not cloud_file.is_file():
             raise CaptureError(f"{file} is missing, which {path} names as its points.")
-        return read_points(cloud_file)
+        cloud = read_points(cloud_file)
+        if len(cloud) and (cloud.rgb == GREY).all():
+            result.sentences.append(f"The points of {cloud_file} have no colours, so they start grey.")
+        return cloud
     model, sentence = choose_model(find_models(folder, LATER_MODEL_PLACES), folder)
     if model is None:
         return PointCloud.empty()

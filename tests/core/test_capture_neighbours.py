@@ -6,6 +6,7 @@ Nothing of a capture is passed over without a sentence.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import unicodedata
 from pathlib import Path
@@ -102,6 +103,27 @@ def test_absolute_names_of_another_machine_resolve_by_their_suffix(elsewhere: st
     (folder / "transforms.json").write_text(json.dumps(data))
     with pytest.raises(CaptureError, match="not inside the folder"):
         Capture.open(folder)
+
+
+@pytest.mark.parametrize("start", ["images/", "shot/images/", "/data/shot/images/", "C:\\shot\\images\\", "../images/"])
+@pytest.mark.parametrize("subfolder", ["", "left/"])
+def test_names_of_a_model_that_start_above_its_frames_are_found(start: str, subfolder: str, tmp_path: Path) -> None:
+    folder = make_capture(tmp_path / "c")
+    (folder / "images" / subfolder).mkdir(exist_ok=True)
+    for name in [f"000{number}.png" for number in range(4)] if subfolder else []:
+        (folder / "images" / name).rename(folder / "images" / subfolder / name)
+    text = re.sub(r" (\d{4}\.png)\n", lambda match: f" {start}{subfolder}{match[1]}\n",
+                  (folder / MODEL / "images.txt").read_text())
+    (folder / MODEL / "images.txt").write_text(text)
+    capture = Capture.open(folder)
+    assert [view.name for view in capture.views] == [f"{subfolder}000{number}.png" for number in range(4)]
+    assert not capture.sentences and not capture.left_out
+
+
+def test_points_without_colours_are_reported(tmp_path: Path) -> None:
+    folder = make_transforms(tmp_path / "c", ply_file_path="p.ply")
+    ply(folder / "p.ply", ("intensity",), "float", [0.5])
+    assert any("p.ply have no colours, so they start grey" in sentence for sentence in Capture.open(folder).sentences)
 
 
 def test_a_model_in_another_place_is_named(tmp_path: Path) -> None:
@@ -443,7 +465,8 @@ RGB, DIFFUSE = ("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffu
     (RGB, "uchar", 1), (RGB, "ushort", 257), (RGB, "ushort", 1), (RGB, "uint", 257 * 65537), (RGB, "int", 1),
     (RGB, "float", 1 / 255), (RGB, "double", 1 / 255), (RGB, "float", 1), (DIFFUSE, "uchar", 1),
     (DIFFUSE, "ushort", 257), (DIFFUSE, "float", 1 / 255), (("r", "g", "b"), "uchar", 1),
-    (("r", "g", "b"), "double", 1 / 255),
+    (("r", "g", "b"), "double", 1 / 255), (("Red", "Green", "Blue"), "uchar", 1),
+    (("scalar_Red", "scalar_Green", "scalar_Blue"), "float", 1),
 ])
 def test_colours_of_every_type_are_read(tmp_path: Path, names: tuple[str, ...], kind: str, factor: float) -> None:
     path = ply(tmp_path / "p.ply", names, kind, [200 * factor, 100 * factor, 7 * factor])

@@ -6,7 +6,6 @@ converted by swscale to planes of the same depth. `video.py` reads planes, `vide
 """
 from __future__ import annotations
 
-import math
 import re
 import threading
 from dataclasses import dataclass
@@ -160,26 +159,27 @@ class Orientation:
 
 
 def side_data(frame: Any) -> dict[str, bytes]:
-    """Return the side data of a PyAV frame by its name; none where a frame has a kind that PyAV does not know, such as
-    an Exif block, for which it lists none of them."""
+    """Return the side data of a PyAV frame by its name; "KIND_28", say, for a kind that PyAV has no name for."""
     try:
         return {item.type.name: bytes(item) for item in frame.side_data}
-    except ValueError:
-        return {}
+    except ValueError:  # a kind of a later FFmpeg, such as an Exif block: PyAV then lists none at all
+        from av.sidedata.sidedata import Type
+
+        Type._missing_ = classmethod(_unnamed_kind)  # type: ignore[method-assign, assignment]
+        return {item.type.name: bytes(item) for item in frame.side_data}
+
+
+def _unnamed_kind(kinds: Any, value: object) -> Any:
+    """Return a member of PyAV's enumeration for a kind of side data without a name."""
+    member = object.__new__(kinds)
+    member._name_, member._value_ = f"KIND_{value}", value
+    return member
 
 
 def display_matrix(frame: Any) -> list[int] | None:
-    """Return the nine numbers of a PyAV frame's display matrix (ISO/IEC 14496-12, 8.3.2), or None.
-
-    Where its side data is not listed it is that of the frame's rotation, without a mirroring.
-    """
+    """Return the nine numbers of a PyAV frame's display matrix (ISO/IEC 14496-12, 8.3.2), or None."""
     data = side_data(frame).get("DISPLAYMATRIX", b"")
-    if len(data) >= 36:
-        return [int(number) for number in np.frombuffer(data[:36], "=i4")]
-    if not (turn := frame.rotation):
-        return None
-    cosine, sine = (round(65536 * function(math.radians(turn))) for function in (math.cos, math.sin))
-    return [cosine, -sine, 0, sine, cosine, 0, 0, 0, 1 << 30]
+    return [int(number) for number in np.frombuffer(data[:36], "=i4")] if len(data) >= 36 else None
 
 
 def orientation_from_matrix(matrix: list[int] | None) -> Orientation:

@@ -2,6 +2,7 @@
 """Videos: colours are those that players show or light, frames stand upright, and what cannot be read is said."""
 from __future__ import annotations
 
+import io
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,14 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from core.colour.spaces import P3_D65, REC_709, REC_2020, matrix_between
 from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.errors import FrameError
+from core.images.formats.exif import apply_orientation
 from core.images.video import Video, write_frame
+from core.images.video_planes import side_data
 from core.removal.training import flare_bank
 from core.removal.training.flare_bank import UserFlares
 from tests.core.videos import PATCHES, STRIPE, X265, middles, stripes, write_video
@@ -177,6 +181,29 @@ def test_alpha_is_kept(name: str, codec: str, pixels: str, options: dict[str, st
     assert stored.shape == (96, 192, 4) and stored.dtype == frame.pixels().dtype
     assert np.array_equal(stored[..., 2::-1], frame.pixels())
     assert np.array_equal(stored[..., 3], frame.alpha())
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(("kind", "codec", "pixels", "name"), [("JPEG", "mjpeg", "yuvj444p", "a.avi"),
+                                                               ("PNG", "png", "rgb24", "a.mov")])
+def test_footage_with_exif_data_is_read_upright(orientation: int, kind: str, codec: str, pixels: str, name: str,
+                                               tmp_path: Path) -> None:
+    """Mirrored too: PyAV has no name for the side data of Exif, and by itself lists none beside it."""
+    shown = np.full((48, 64, 3), 40, np.uint8)
+    shown[:16, :24] = 200
+    exif, encoded = Image.Exif(), io.BytesIO()
+    exif[0x112] = orientation
+    Image.fromarray(shown).save(encoded, kind, exif=exif, **({"subsampling": 0} if kind == "JPEG" else {}))
+    with av.open(str(tmp_path / name), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, pixels
+        packet = av.Packet(encoded.getvalue())
+        packet.stream, packet.pts, packet.dts, packet.time_base = stream, 0, 0, Fraction(1, 25)
+        container.mux(packet)
+    with Video(tmp_path / name) as video:
+        [frame] = video
+        assert np.abs(frame.pixels().astype(int) - apply_orientation(shown, orientation)).max() < 12
+        assert "DISPLAYMATRIX" in side_data(frame.raw)
 
 
 @pytest.mark.parametrize("rotation", [90, 180, 270, -90])

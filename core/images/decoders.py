@@ -127,7 +127,7 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
         try:
             pixels = np.asarray(picture.convert(mode))
         except Exception as problem:  # the plug-ins raise what their libraries do
-            raise _damaged(path, problem) from problem
+            raise _damaged(path, "" if kind == "jxl" else problem) from problem
     return _bgr(apply_orientation(pixels, orientation))
 
 
@@ -329,10 +329,12 @@ def _open_by_pillow(path: Path, kind: Kind) -> Any:
     if kind == "heif":
         _library("pillow_heif", path).register_heif_opener()
     check_regular(path)
+    image.MAX_IMAGE_PIXELS = MAX_PIXELS  # type: ignore[attr-defined]  # Pillow refuses photographs of 200 megapixels
     try:
         return image.open(path)
-    except Exception as problem:  # the plug-ins raise what their libraries do
-        raise _damaged(path, problem) from problem
+    except Exception as problem:  # the plug-ins raise what their libraries do; that of JPEG XL gives no reason
+        is_vague = kind == "jxl" or isinstance(problem, image.UnidentifiedImageError)
+        raise _damaged(path, "" if is_vague else problem) from problem
 
 
 def _decode_heif(path: Path) -> NDArray[Any]:

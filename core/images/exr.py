@@ -21,10 +21,15 @@ from ..colour.spaces import built_in_names as space_names
 from ..colour.srgb import Pixels
 from ..errors import FrameError, SettingsError
 from ..system.reading import check_regular, open_regular
-from .decoders import open_oiio
+from .decoders import file_kind, open_oiio
 from .formats import exr_header
 from .size import checked_size, picture_size
 from .window import DataWindow
+
+
+def is_exr(path: Path) -> bool:
+    """True if a file is an EXR by its contents, whatever its name. Raises OSError."""
+    return file_kind(path) == "exr"
 
 
 def channel_names(path: Path | str) -> list[str]:
@@ -74,7 +79,7 @@ def read_exr_header(path: Path | str) -> dict[str, Any]:
 
     Raises FrameError where the file is damaged.
     """
-    return _exr_headers(path)[0]
+    return read_exr_headers(path)[0]
 
 
 def foreign_strings(path: Path | str) -> dict[str, bytes]:
@@ -83,10 +88,36 @@ def foreign_strings(path: Path | str) -> dict[str, bytes]:
         if stream.read(4) != exr_header.MAGIC:
             return {}
         places = exr_header.string_places(stream)
-    return {name: text for name, (_, text) in places.items() if not _is_utf8(text)}
+    return {name: text for name, (_, text) in places.items() if not is_utf8(text)}
 
 
-def _is_utf8(text: bytes) -> bool:
+def foreign_names(path: Path | str) -> dict[bytes, bytes]:
+    """Return the names of attributes and channels of an EXR that are not UTF-8, by the names under which this program
+    has them: with the character DEL for each byte above 127, which keeps the order of channels. Raises OSError, and
+    FrameError where two names would be one, or channels would be in another order.
+    """
+    with open_regular(path) as stream:
+        if stream.read(4) != exr_header.MAGIC:
+            return {}
+        places = exr_header.name_places(stream)
+    names = {_in_ascii(name): name for _, _, name in places if not is_utf8(name)}
+    if names:
+        for part in {part for part, _, _ in places}:
+            stored = [name for number, _, name in places if number == part]
+            readable = [name if is_utf8(name) else _in_ascii(name) for name in stored]
+            if len(set(readable)) < len(set(stored)) or [sorted(stored).index(name) for name in stored] != [
+                    sorted(readable).index(name) for name in readable]:
+                example = min(names.values()).decode("latin-1")
+                raise FrameError(f"{path} has attributes or channels, such as {example}, whose names are not UTF-8 and "
+                                 "differ in nothing else; rename them.")
+    return names
+
+
+def _in_ascii(name: bytes) -> bytes:
+    return bytes(byte if byte < 128 else 0x7F for byte in name)
+
+
+def is_utf8(text: bytes) -> bool:
     try:
         text.decode("utf-8")
     except UnicodeDecodeError:
@@ -96,26 +127,32 @@ def _is_utf8(text: bytes) -> bool:
 
 @contextlib.contextmanager
 def _readable_copy(path: Path | str) -> Iterator[str]:
-    """Yield the path of an EXR that the library can read: the file itself, or a copy with "?" for what is not UTF-8 in
-    its text attributes, for which the library refuses the whole file."""
+    """Yield the path of an EXR that the library can read: the file itself, or a copy without what is not UTF-8, for
+    which the library refuses the whole file: "?" in its text attributes, and the names of `foreign_names`."""
     check_regular(path)
-    if not foreign_strings(path):
+    names = foreign_names(path)
+    if not names and not foreign_strings(path):
         yield str(path)
         return
     with open_regular(path) as stream:
         places = exr_header.string_places(stream)
+        name_places = exr_header.name_places(stream)
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy.exr"
         shutil.copyfile(path, copy)
         with open(copy, "r+b") as stream:
             for at, text in places.values():
-                if not _is_utf8(text):
+                if not is_utf8(text):
                     stream.seek(at)
                     stream.write(bytes(byte if byte < 128 else ord("?") for byte in text))
+            for _, at, name in name_places:
+                if not is_utf8(name):
+                    stream.seek(at)
+                    stream.write(_in_ascii(name))
         yield str(copy)
 
 
-def _exr_headers(path: Path | str) -> list[dict[str, Any]]:
+def read_exr_headers(path: Path | str) -> list[dict[str, Any]]:
     """Read the header of each part, at least one. Raises FrameError."""
     import OpenEXR
 
@@ -197,9 +234,9 @@ def read_data_window(path: Path | str) -> DataWindow:
     """Read where a picture's stored pixels lie on its frame; only EXRs can differ from the frame. Raises FrameError."""
     path = Path(path)
     size = picture_size(path)
-    if path.suffix.lower() != ".exr":
+    if not is_exr(path):
         return DataWindow(size, (0, 0), size)
-    headers = _exr_headers(path)
+    headers = read_exr_headers(path)
     return window_from_header(path, main_part([(header, [channel.name for channel in header["channels"]])
                                                for header in headers]))
 

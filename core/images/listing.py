@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ..system.file_names import natural_key
 from .formats.kinds import SUFFIXES as KIND_BY_SUFFIX
+from .formats.kinds import is_video
 
 _SYSTEM_FILES = frozenset({"thumbs.db", "desktop.ini"})
 """Files that file managers leave, in lower case."""
@@ -47,6 +48,8 @@ def unlisted_entries(folder: Path, *, subfolders: bool = True) -> list[tuple[str
             reason = f"a subfolder with {count} picture{'' if count == 1 else 's'}" if count else ""
         elif suffix in SUFFIXES:
             reason = "" if path.is_file() else "a link to a missing file" if path.is_symlink() else "not a file"
+        elif is_video(path):
+            reason = "a video, which is read by its own name"
         else:
             reason = f"{suffix[1:].upper()} is not read here" if suffix else "not a picture"
         if reason:

@@ -17,6 +17,7 @@ import numpy as np
 from ..system.reading import open_regular, read_bytes
 from .formats import jpeg, png, tiff
 from .formats.exif import without_thumbnail
+from .formats.image_resources import without_thumbnails
 
 KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"cICP", b"mDCV", b"cLLI", b"mDCv", b"cLLi", b"pHYs", png.EXIF,
                b"tEXt", b"zTXt", b"iTXt", b"tIME", b"sCAL", b"oFFs", b"pCAL", b"sTER")
@@ -28,17 +29,18 @@ _STRUCTURE_TAGS = frozenset({
     531, 532})
 """TIFF tags that say how the pixels are stored, which the encoder writes anew; and offsets of other directories."""
 EXIF_DIRECTORY, GPS_DIRECTORY = 34665, 34853
+_RESOURCES_TAG = 34377
+"""TIFF tag of Photoshop's image resources."""
+_MAX_RESOURCE_BYTES = 65_000
+"""Bytes of image resources in a segment."""
 _COLOUR_TYPE_OFFSET, _HEADER_END = 25, 33
 """Offsets in a PNG of the colour type, whose bit 2 means colour, and of the end of the first chunk, IHDR."""
 _SRGB_POINTS, _UNSPECIFIED = (1, 13), 2
 """Code points (ITU-T H.273): primaries and transfer of sRGB, and that for an unspecified one."""
-_MARKERS = frozenset({jpeg.APP1, jpeg.APP2, 0xED, jpeg.COMMENT, *range(0xE3, 0xED), 0xEF})
+_MARKERS = frozenset({jpeg.APP1, jpeg.APP2, jpeg.APP13, jpeg.COMMENT, *range(0xE3, 0xED), 0xEF})
 """JPEG segments that are kept; APP14 says how the encoder stores its colours, and APP0 is replaced as a whole."""
 _INDEX, _ISO_GAIN_MAP = b"MPF\0", b"urn:iso:std:iso:ts:21496:-1"
 """Segments that describe the pictures behind a JPEG's first one."""
-_XMP = b"http://ns.adobe.com/xap/1.0/\0"
-_EXTENDED_XMP = b"http://ns.adobe.com/xmp/extension/\0"
-_EXIF = b"Exif\0\0"
 _HEIF_GAIN_MAPS = (b"aux:hdrgainmap", b"urn:iso:std:iso:ts:21496:-1", b"tmap")
 """Names of gain maps in the header of HEIC and AVIF: Apple's, and that of ISO 21496-1."""
 _TAIL_BYTES = 1 << 12
@@ -47,10 +49,15 @@ _HEAD_BYTES = 1 << 16
 """Bytes of a file in which its header is looked for."""
 _ORIGINAL = "http://ns.google.com/photos/1.0/image/"
 """Name space of XMP of the picture before refocusing, which lies in the segments of extended XMP with its depth."""
+_CAMERA = "http://ns.google.com/photos/1.0/camera/"
+"""Name space of XMP of Google's camera, which most of its photographs have."""
 _CLAIMS = ("http://ns.adobe.com/hdr-gain-map/1.0/", "http://ns.google.com/photos/1.0/container/",
-           "http://ns.google.com/photos/dd/1.0/", "http://ns.google.com/photos/1.0/camera/",
-           "http://ns.apple.com/HDRGainMap/1.0/", _ORIGINAL)
+           "http://ns.google.com/photos/dd/1.0/", "http://ns.apple.com/HDRGainMap/1.0/", _ORIGINAL)
 """First letters of the name spaces of XMP by which a file claims that it holds more than its first picture."""
+_CAMERA_CLAIMS = ("MotionPhoto", "MicroVideo")
+"""First letters of the properties of Google's camera that claim a clip."""
+_THUMBNAILS = "http://ns.adobe.com/xap/1.0/g/img/"
+"""Name space of XMP of thumbnails, which would show the flare."""
 _EXTENDED_CLAIMS = ("http://ns.google.com/photos/1.0/depthmap/", "http://ns.adobe.com/xmp/note/")
 """Those that go with the segments of extended XMP."""
 
@@ -91,7 +98,7 @@ def with_description(encoded: bytes, exif: bytes, xmp: bytes) -> bytes:
     """Return an encoded PNG with the Exif block and the XMP of the picture of another format that it was made from;
     without the claims of what the PNG does not hold."""
     chunks = png.make_chunk(png.EXIF, without_thumbnail(exif)) if exif else b""
-    if packet := _without_claims(_XMP + xmp).removeprefix(_XMP) if xmp else b"":
+    if packet := _without_claims(jpeg.XMP + xmp).removeprefix(jpeg.XMP) if xmp else b"":
         chunks += png.make_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + packet)
     return encoded[:_HEADER_END] + chunks + encoded[_HEADER_END:]
 
@@ -106,7 +113,7 @@ def dropped_parts(path: Path) -> str:
         if head[:2] != b"\xff\xd8":
             return ""
         for _, content in jpeg.segments(stream):
-            if content.startswith((_INDEX, _ISO_GAIN_MAP)) or (content.startswith(_XMP) and _has_claims(content)):
+            if content.startswith((_INDEX, _ISO_GAIN_MAP)) or (content.startswith(jpeg.XMP) and _has_claims(content)):
                 return (f"{path} holds more than one picture (a gain map, a clip or a preview), which would still show "
                         "the flare; the clean picture goes without it, and without the tags that claim it.")
         stream.seek(-min(_TAIL_BYTES, stream.seek(0, 2)), 2)
@@ -123,33 +130,47 @@ def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
         at = 4 + int.from_bytes(encoded[4:6], "big")
         header = encoded[2:at]
     segments = list(jpeg.segments(io.BytesIO(data)))
-    has_original = any(content.startswith(_XMP) and _ORIGINAL.encode() in content for _, content in segments)
+    has_original = any(content.startswith(jpeg.XMP) and _ORIGINAL.encode() in content for _, content in segments)
     copied = []
-    for marker, content in segments:
+    for marker, content in _without_resource_thumbnails(segments):
         if marker == 0xE0 and content.startswith(b"JFIF\0") and len(content) >= 14:
             header = jpeg.make_segment(marker, content[:12] + b"\0\0")  # density, without its thumbnail
-        elif has_original and content.startswith(_EXTENDED_XMP):
+        elif has_original and content.startswith(jpeg.EXTENDED_XMP):
             continue
         elif marker in _MARKERS and not content.startswith((_INDEX, _ISO_GAIN_MAP)):
-            if content.startswith(_XMP):
+            if content.startswith(jpeg.XMP):
                 content = _without_claims(content)
-            elif content.startswith(_EXIF):
-                content = _EXIF + without_thumbnail(content.removeprefix(_EXIF))
+            elif content.startswith(jpeg.EXIF):
+                content = jpeg.EXIF + without_thumbnail(content.removeprefix(jpeg.EXIF))
             if content:
                 copied.append(jpeg.make_segment(marker, content))
     return encoded[:2] + header + b"".join(copied) + encoded[at:]
 
 
+def _without_resource_thumbnails(segments: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    """Return a JPEG's segments without the thumbnails in Photoshop's image resources, which may span several."""
+    numbers = [number for number, (marker, content) in enumerate(segments)
+               if marker == jpeg.APP13 and content.startswith(jpeg.PHOTOSHOP)]
+    resources = b"".join(segments[number][1][len(jpeg.PHOTOSHOP):] for number in numbers)
+    if (kept := without_thumbnails(resources)) == resources:
+        return segments
+    parts = [(jpeg.APP13, jpeg.PHOTOSHOP + kept[at:at + _MAX_RESOURCE_BYTES])
+             for at in range(0, len(kept), _MAX_RESOURCE_BYTES)]
+    return [*segments[:numbers[0]], *parts, *(segments[number] for number in range(numbers[0], len(segments))
+                                              if number not in numbers)]
+
+
 def _has_claims(segment: bytes) -> bool:
-    return any(name.encode() in segment for name in _CLAIMS)
+    return any(name.encode() in segment for name in _CLAIMS) or (
+        _CAMERA.encode() in segment and any(name.encode() in segment for name in _CAMERA_CLAIMS))
 
 
 def _without_claims(segment: bytes) -> bytes:
-    """Return an XMP segment without the properties by which it claims parts that are not kept; empty where it cannot be
-    parsed."""
-    if not _has_claims(segment):
+    """Return an XMP segment without thumbnails, and without the properties by which it claims parts that are not kept;
+    empty where it cannot be parsed."""
+    if not _has_claims(segment) and _THUMBNAILS.encode() not in segment:
         return segment
-    text = segment[len(_XMP):].rstrip(b"\0 \n")
+    text = segment[len(jpeg.XMP):].rstrip(b"\0 \n")
     try:
         for _, (prefix, address) in ElementTree.iterparse(io.BytesIO(text), ("start-ns",)):
             if not prefix.startswith("ns"):
@@ -158,13 +179,14 @@ def _without_claims(segment: bytes) -> bytes:
     except (ElementTree.ParseError, ValueError):
         return b""
     names = (*_CLAIMS, *_EXTENDED_CLAIMS) if _ORIGINAL.encode() in segment else _CLAIMS
-    claims = tuple(f"{{{name}" for name in names)
+    claims = (*(f"{{{name}" for name in names), *(f"{{{_CAMERA}}}{name}" for name in _CAMERA_CLAIMS),
+              "{http://ns.adobe.com/xap/1.0/}Thumbnails")
     for element in root.iter():
         for name in [name for name in element.attrib if name.startswith(claims)]:
             del element.attrib[name]
         for child in [child for child in element if child.tag.startswith(claims)]:
             element.remove(child)
-    return _XMP + ElementTree.tostring(root, encoding="utf-8")
+    return jpeg.XMP + ElementTree.tostring(root, encoding="utf-8")
 
 
 def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
@@ -174,6 +196,10 @@ def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
     directories = {number: tags.pop(number) for number in (EXIF_DIRECTORY, GPS_DIRECTORY) if number in tags}
     if not has_alpha:
         tags.pop(tiff.EXTRA_SAMPLES, None)
+    if (resources := tags.get(_RESOURCES_TAG)) is not None and resources.values.dtype.itemsize == 1:
+        tags.pop(_RESOURCES_TAG)
+        if kept := without_thumbnails(resources.values.tobytes()):
+            tags[_RESOURCES_TAG] = resources._replace(values=np.frombuffer(kept, np.uint8))
     encoded = tiff.with_tags(encoded, tags)
     for number, place in directories.items():
         if len(place.values) == 1:

@@ -31,16 +31,16 @@ def needs_oiio_writer(path: Path) -> bool:
     return kind in ("dpx", "cineon", "webp", "bmp", "tga") or (kind == "tiff" and needs_openimageio(path))
 
 
-def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[Any] | None) -> None:
-    """Write codes (height, width, 1 or 3), with alpha (height, width), with the header of `source`. Raises FrameError.
-    """
-    if path.suffix.lower() == ".webp":
+def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[Any] | None, suffix: str) -> None:
+    """Write codes (height, width, 1 or 3), with alpha (height, width), with the header of `source`. suffix: that of the
+    format. Raises FrameError."""
+    if suffix == ".webp":
         _write_webp(path, source, codes, alpha)
         return
     import OpenImageIO as oiio  # noqa: N813 - as its own documents do
 
     pixels = codes if alpha is None else np.concatenate([codes, alpha[..., None]], -1)
-    name = OIIO_FORMATS[path.suffix.lower()]
+    name = OIIO_FORMATS[suffix]
     opened = open_oiio(source)
     try:
         spec = opened.spec().copy()
@@ -66,7 +66,7 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
         done = (output is not None and output.open(str(temporary), spec)
                 and output.write_image(np.ascontiguousarray(pixels)) and output.close())
         if not done:
-            raise FrameError(f"{path} could not be encoded as {path.suffix[1:].upper()} "
+            raise FrameError(f"{path} could not be encoded as {suffix[1:].upper()} "
                              f"({output.geterror() if output is not None else oiio.geterror()}).")
         if name == "tiff":
             temporary.write_bytes(copy_metadata(temporary.read_bytes(), source, has_alpha=alpha is not None))

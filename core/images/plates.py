@@ -8,7 +8,7 @@ last bit; an unchanged plate is copied.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,12 +23,13 @@ from ..errors import FrameError, SettingsError, is_out_of_memory
 from ..system.files import atomic_path
 from ..system.reading import open_regular
 from .borders import PictureArea, find_picture_area
-from .declared import declared_space
-from .decoders import Description, describe, file_kind
-from .exr import foreign_strings, has_chroma, missing_rgb, read_exr_parts, read_luminance_chroma
-from .formats import png, tiff
+from .declared import declared_space, jpeg_profile
+from .decoders import Description, describe, file_kind, profile_space
+from .exr import has_chroma, is_exr, main_part, missing_rgb, read_exr_parts, read_luminance_chroma
+from .exr_views import check_parts
+from .formats import jpeg, png, tiff
 from .formats.exif import upright_block
-from .formats.kinds import JPEG_SUFFIXES
+from .formats.kinds import JPEG_SUFFIXES, SUFFIX_OF_KIND
 from .formats.kinds import SUFFIXES as SUFFIX_KINDS
 from .listing import SUFFIXES
 from .metadata import copy_metadata, dropped_parts, with_colour_chunks, with_description
@@ -37,12 +38,11 @@ from .picture import Encoding
 from .read import read_stored_pixels, rgb_codes
 from .size import picture_size
 from .unsupported import unsupported_file
-from .write import save_exr, write_exr
+from .write import save_exr_parts, write_exr
 
 _PLACEMENT = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
 _UNWRITTEN = ("heif", "avif", "jxl", "jp2", "gif", "psd")
 """Formats whose clean plates are PNG."""
-_DESCRIBED_ELSEWHERE = ("png", "jpeg", "tiff", "exr", "")
 _JPEG_QUALITY = 97
 _JPEGS, _TIFFS = JPEG_SUFFIXES, (".tif", ".tiff")
 _DEPTHS: dict[str, tuple[type, ...]] = {".png": (np.uint8, np.uint16), **dict.fromkeys(_JPEGS, (np.uint8,))}
@@ -54,8 +54,9 @@ class Plate:
     """A picture file with its code values.
 
     codes: (height, width, 3), the file's type, R G B; a grey file has three equal channels. encoding: "srgb" for
-    integer codes, "linear" for floats. extras: an EXR's header and other channels, written back unchanged. declared:
-    the space that the file declares, or that the user names; None for the usual one of its encoding.
+    integer codes, "linear" for floats. extras: an EXR's header and other channels, written back unchanged; of several
+    parts, those of all, and the number of the main one. declared: the space that the file declares, or that the user
+    names; None for the usual one of its encoding.
     """
 
     path: Path
@@ -159,21 +160,36 @@ class Plate:
 
     @cached_property
     def description(self) -> Description | None:
-        """Header of a file whose format is not written; None for others."""
+        """Header of the file, for a clean plate that is a PNG; None where the file is one, or an EXR."""
         kind = file_kind(self.path)
-        is_foreign = clean_name(self.path) != self.path and kind not in _DESCRIBED_ELSEWHERE
-        return describe(self.path, kind) if is_foreign else None
+        if kind == "jpeg":
+            return _describe_jpeg(self.path)
+        return None if kind in ("png", "exr", "") else describe(self.path, kind)
 
     @property
     def warning(self) -> str:
-        """Sentence on what the clean plate cannot keep; "" where it keeps all."""
-        return dropped_parts(self.path)
+        """Sentences on what the clean plate cannot keep, and on a name that is not of the file's format; "" for none.
+        """
+        written, kind = _format_suffix(self.path, self), file_kind(self.path)
+        sentence = "" if written == self.path.suffix.lower() or clean_name(self.path) != self.path else (
+            f"{self.path} holds {kind.upper()} data, whatever its name; the clean plate of that name holds "
+            f"{written[1:].upper()} data.")
+        return " ".join(filter(None, (sentence, dropped_parts(self.path))))
 
     @property
     def placement(self) -> dict[str, Any]:
         """Header attributes that give another EXR this one's windows and colours."""
         header = self.extras.get("header", {})
         return {name: header[name] for name in _PLACEMENT if name in header}
+
+
+def _describe_jpeg(path: Path) -> Description:
+    """Read the profile, the Exif block and the XMP of a JPEG. Raises FrameError."""
+    with open_regular(path) as stream:
+        profile, segments = jpeg_profile(stream), list(jpeg.segments(stream))
+    exif, xmp = (next((content[len(start):] for marker, content in segments
+                       if marker == jpeg.APP1 and content.startswith(start)), b"") for start in (jpeg.EXIF, jpeg.XMP))
+    return Description(*picture_size(path), profile_space(path, profile), profile=profile, exif=exif, xmp=xmp)
 
 
 def clean_name(path: Path) -> Path:
@@ -214,7 +230,7 @@ def read_plate(path: Path | str, space: ColourSpace | None = None) -> Plate:
     if path.suffix.lower() not in SUFFIXES:
         raise unsupported_file(path)
     picture_size(path)
-    return _read_exr(path, space) if path.suffix.lower() == ".exr" else _read_codes(path, space)
+    return _read_exr(path, space) if is_exr(path) else _read_codes(path, space)
 
 
 def _read_codes(path: Path, space: ColourSpace | None) -> Plate:
@@ -268,12 +284,15 @@ def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
 
 
 def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
-    """Read an EXR plate of one part, with its header and all channels. Raises FrameError."""
+    """Read an EXR plate, with the headers and channels of all its parts. Raises FrameError."""
     parts = read_exr_parts(path)
-    header, channels = parts[0]
-    if len(parts) > 1:
-        raise FrameError(f"{path} has {len(parts)} parts; export the plate as a file of its own.")
+    check_parts(path, parts)
+    main = main_part([(number, channels) for number, (_, channels) in enumerate(parts)])
+    header, channels = parts[main]
     if has_chroma(channels):  # written back as R, G, B, since chroma of half resolution cannot hold a clean edge
+        if len(parts) > 1:
+            raise FrameError(f"{path} has {len(parts)} parts, one of luminance and chroma; export the plate as a file "
+                             "of its own.")
         colour = read_luminance_chroma(path).astype(np.asarray(channels["Y"]).dtype)
         channels = {**{name: pixels for name, pixels in channels.items() if name not in ("Y", "RY", "BY")},
                     **{name: colour[..., k] for k, name in enumerate("RGB")}}
@@ -285,7 +304,10 @@ def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
     if len({channel.shape for channel in channels.values()}) > 1:
         raise FrameError(f"{path} has channels of several sizes (luminance and chroma, say); export it as R, G, B.")
     codes = np.stack([np.asarray(channels[name]) for name in (names if len(names) == 3 else names * 3)], -1)
-    return Plate(path, codes, "linear", len(names) == 1, None, {"header": header, "channels": channels}, space)
+    extras: dict[str, Any] = {"header": header, "channels": channels}
+    if len(parts) > 1:
+        extras.update(parts=parts, main=main)
+    return Plate(path, codes, "linear", len(names) == 1, None, extras, space)
 
 
 def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDArray[Any] | None = None) -> None:
@@ -305,6 +327,7 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
         return
     if alpha is not None:
         plate = replace(plate, alpha=alpha)
+    suffix = _format_suffix(path, plate)
     if suffix == ".exr":
         light = plate.space.to_linear(codes.astype(np.float32) / np.float32(plate.max_code))
         write_exr(path, {name: light[..., k] for k, name in enumerate("RGB")})
@@ -312,7 +335,7 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
     if suffix not in (".png", *_JPEGS, *_TIFFS) and suffix not in OIIO_FORMATS:
         raise FrameError(f"{path} is of a format that this program does not write; choose PNG, TIFF or EXR.")
     if (needs_oiio_writer(plate.path) and suffix in OIIO_FORMATS) or suffix not in (".png", *_JPEGS, *_TIFFS):
-        write_by_oiio(path, plate.path, codes[..., :1] if plate.grey else codes, plate.alpha)
+        write_by_oiio(path, plate.path, codes[..., :1] if plate.grey else codes, plate.alpha, suffix)
         return
     if codes.dtype not in _DEPTHS.get(suffix, (codes.dtype,)) or (suffix in _JPEGS and plate.alpha is not None):
         raise FrameError(f"{plate.path} holds what no {suffix[1:].upper()} can hold ({codes.dtype} pixels"
@@ -330,9 +353,20 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
     encoded = copy_metadata(data.tobytes(), plate.path, has_alpha=plate.alpha is not None)
     if suffix == ".png" and (described := plate.description) is not None:
         encoded = with_colour_chunks(encoded, described.profile, described.code_points)
-        encoded = with_description(encoded, upright_block(described.exif), described.xmp)
+        is_upright = file_kind(plate.path) != "jpeg"  # others are decoded so
+        exif = upright_block(described.exif) if is_upright else described.exif
+        encoded = with_description(encoded, exif, described.xmp)
     with atomic_path(path) as temporary:
         temporary.write_bytes(encoded)
+
+
+def _format_suffix(path: Path, plate: Plate) -> str:
+    """Return the usual suffix of the format in which a clean plate is written: that of its file's contents where both
+    have one name, else that of its name."""
+    suffix, kind = path.suffix.lower(), file_kind(plate.path)
+    if suffix != plate.path.suffix.lower() or kind in ("", SUFFIX_KINDS.get(suffix)):
+        return suffix
+    return clean_name(Path(f"plate{SUFFIX_OF_KIND[kind]}")).suffix
 
 
 def _encoder_options(suffix: str, kind: np.dtype[Any]) -> list[int]:
@@ -360,19 +394,24 @@ def write_results(results: Sequence[Path], plate: Plate, codes: NDArray[Any], fl
 
 
 def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
-    """Write codes with the header and the other channels of an EXR plate, as scanlines without loss."""
-    import OpenEXR
-
+    """Write codes with the headers and the other channels of an EXR plate, as scanlines without loss."""
     channels = dict(plate.extras["channels"])
     for index, name in enumerate(["Y"] if plate.grey else ["R", "G", "B"]):
         channels[name] = np.ascontiguousarray(codes[..., index], channels[name].dtype)  # channels may differ in depth
-    header = {name: value for name, value in plate.extras["header"].items() if name not in ("channels", "chunkCount")}
+    parts = list(plate.extras.get("parts", [None]))
+    parts[plate.extras.get("main", 0)] = plate.extras["header"], channels
+    save_exr_parts(path, [(_scanline_header(header), others) for header, others in parts], source=plate.path)
+
+
+def _scanline_header(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a part's header for scanlines, with a lossless compression in place of a lossy one."""
+    import OpenEXR
+
+    header = {name: value for name, value in stored.items() if name not in ("channels", "chunkCount", "tiles")}
     header["type"] = OpenEXR.scanlineimage
-    header.pop("tiles", None)
     if header.get("lineOrder") == OpenEXR.RANDOM_Y:  # tiles in the order of rendering
         header["lineOrder"] = OpenEXR.INCREASING_Y
     if header.get("compression") in (OpenEXR.B44_COMPRESSION, OpenEXR.B44A_COMPRESSION, OpenEXR.DWAA_COMPRESSION,
                                      OpenEXR.DWAB_COMPRESSION):  # lossy
         header["compression"] = OpenEXR.ZIP_COMPRESSION
-    save_exr(path, header, channels, strings=foreign_strings(plate.path))
-
+    return header

@@ -17,7 +17,7 @@ from ..errors import FrameError
 from ..system.reading import open_regular, read_bytes
 from .declared import declared_space
 from .decoders import decode_foreign, file_kind
-from .exr import main_part, read_exr_parts, rec709_pixels, rgb_channels, window_from_header
+from .exr import is_exr, main_part, read_exr_parts, rec709_pixels, rgb_channels, window_from_header
 from .formats import exr_header, png, tiff
 from .listing import SUFFIXES
 from .picture import Picture
@@ -43,7 +43,7 @@ def read_picture(path: Path | str, *, space: ColourSpace | None = None, over_bla
         raise unsupported_file(path)
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
-    if path.suffix.lower() == ".exr":
+    if is_exr(path):
         return _read_exr_picture(path, space)
     stored = read_stored_pixels(path)
     picture = _to_picture(path, stored, space)
@@ -120,7 +120,7 @@ def has_float_pixels(path: Path, space: ColourSpace | None = None) -> bool:
 
 def has_half_pixels(path: Path) -> bool:
     """True if a picture is stored in 16 bit floats, as some EXRs are. Raises FrameError."""
-    if path.suffix.lower() != ".exr":
+    if not is_exr(path):
         return False
     with open_regular(path) as stream:
         kinds = exr_header.channel_kinds(stream)
@@ -143,6 +143,8 @@ def read_stored_pixels(path: Path) -> NDArray[Any]:
     kind = file_kind(path)
     if kind == "jpeg":
         stored: NDArray[Any] | None = _decode_jpeg(path)
+    elif kind == "tiff" and _is_corrupt_tiff(path):
+        stored = None
     elif kind == "png" or (kind == "tiff" and not needs_openimageio(path)):
         stored = decode(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     else:
@@ -150,6 +152,11 @@ def read_stored_pixels(path: Path) -> NDArray[Any]:
     if stored is None or stored.shape[:2] != (height, width):
         raise FrameError(f"{path} is damaged or truncated; export it again.")
     return stored
+
+
+def _is_corrupt_tiff(path: Path) -> bool:
+    with open_regular(path) as stream:
+        return tiff.has_corrupt_data(stream)
 
 
 def _decode_jpeg(path: Path) -> NDArray[Any]:

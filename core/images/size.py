@@ -11,6 +11,7 @@ from ..system.reading import open_regular
 from .decoders import MAX_PIXELS as MAX_PIXELS
 from .decoders import describe, file_kind
 from .formats import exr_header, jpeg, png, tiff
+from .formats.kinds import HEAD_BYTES, holds_video
 
 
 def picture_size(path: Path | str) -> tuple[int, int]:
@@ -24,9 +25,12 @@ def picture_size(path: Path | str) -> tuple[int, int]:
     try:
         kind = file_kind(path)
         with open_regular(path) as stream:
-            is_big = stream.read(4) in tiff.BIG_TIFF
+            head = stream.read(HEAD_BYTES)
+            is_big = head[:4] in tiff.BIG_TIFF
             stream.seek(0)
             size = _size_from_header(stream)
+        if not kind and holds_video(head):
+            raise FrameError(f"{path} holds a video, not a picture; give it the suffix of its format, such as .mp4.")
         if is_big or kind not in ("png", "jpeg", "tiff", "exr", ""):
             size = describe(path, kind)[:2]
     except OSError as problem:

@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import FrameError
 from ..system.reading import open_regular
 from .formats import jpeg, tiff, webp
-from .video import is_video
+from .formats.kinds import HEAD_BYTES, SUFFIX_OF_KIND, holds_video, is_video, kind_of
 
 
 def unsupported_file(path: Path) -> FrameError:
@@ -21,7 +21,21 @@ def unsupported_file(path: Path) -> FrameError:
     if is_video(path):
         return FrameError(f"{path} is a video; take its frames out first, as by `ffmpeg -i {path.name} "
                           "frames/%06d.png`, and give their folder.")
+    if path.is_file() and (reason := misnamed_reason(path)):
+        return FrameError(f"{path} {reason}.")
     return FrameError(f"{path} is not a picture this program reads; use PNG, JPEG, TIFF, EXR or DPX.")
+
+
+def misnamed_reason(path: Path) -> str:
+    """Say what a file holds whose suffix is neither that of its format nor of another picture; "" for unknown contents.
+
+    Raises OSError.
+    """
+    with open_regular(path) as stream:
+        head = stream.read(HEAD_BYTES)
+    if kind := kind_of(head, ""):
+        return f"holds {kind.upper()} data; give it the suffix {SUFFIX_OF_KIND[kind]}"
+    return "holds a video; give it the suffix of its format, such as .mp4" if holds_video(head) else ""
 
 
 _CMYK = "is CMYK, for print; convert it to RGB"

@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from ..errors import EngineError, FrameError
 from ..system.files import atomic_path
 from ..system.reading import check_regular
+from .formats.kinds import VIDEOS as VIDEOS
+from .formats.kinds import is_video as is_video
 from .picture import Encoding, Picture
 from .video_colour import (
     LUMA_WEIGHTS,
@@ -52,19 +54,11 @@ from .video_planes import (
 )
 from .write import write_exr
 
-VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv", ".mxf",
-                    ".ts", ".m2t", ".vob", ".3gp", ".flv", ".ogv", ".dv"})
-"""Suffixes of video files."""
 MAX_VIDEO_PIXELS = 100_000_000
 """Largest frame that is decoded; a header that claims more is damaged or hostile."""
 MAX_NAMED_FRAMES = 8
 """Number of damaged frames that a sentence names."""
 _LIMITED, _FULL = 1, 2
-
-
-def is_video(path: Path) -> bool:
-    """True if a file's name is a video's."""
-    return path.suffix.lower() in VIDEOS
 
 
 def import_av() -> ModuleType:

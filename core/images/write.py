@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import importlib.util
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError
 from ..system.files import atomic_path
 from ..typed import is_utf8
-from .exr import is_exr_truncated
+from .exr import foreign_names, foreign_strings, is_exr_truncated
 from .formats import exr_header, exr_writer
 
 
@@ -44,10 +44,15 @@ def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: b
 
 
 def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]],
-             commit_lock: AbstractContextManager[None] | None = None,
-             strings: Mapping[str, bytes] | None = None) -> None:
-    """Write one part with this header and these channels. commit_lock: see `atomic_path`. strings: text attributes that
-    are not UTF-8, which the library cannot write; the header holds others of their lengths.
+             commit_lock: AbstractContextManager[None] | None = None) -> None:
+    """Write one part with this header and these channels; see `save_exr_parts`."""
+    save_exr_parts(path, [(header, channels)], commit_lock)
+
+
+def save_exr_parts(path: Path | str, parts: Sequence[tuple[Mapping[str, Any], Mapping[str, NDArray[Any]]]],
+                   commit_lock: AbstractContextManager[None] | None = None, source: Path | None = None) -> None:
+    """Write parts, each with its header and channels. commit_lock: see `atomic_path`. source: the EXR whose texts and
+    names that are not UTF-8 are written byte for byte; headers and channels hold others of their lengths.
 
     Raises OSError where the system refuses, for instance for a full disk, and FrameError for a path that is not UTF-8.
     """
@@ -55,26 +60,32 @@ def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str,
 
     if not is_utf8(str(path)):
         raise FrameError(f"The path {str(path)!r} is not UTF-8, and no EXR can be written there; rename its folder.")
-    with atomic_path(path, commit_lock) as temporary, OpenEXR.File(dict(header), dict(channels)) as file:
+    strings, names = (foreign_strings(source), foreign_names(source)) if source is not None else ({}, {})
+    first_header, first_channels = (dict(each) for each in parts[0])
+    opened = (OpenEXR.File(first_header, first_channels) if len(parts) == 1 else
+              OpenEXR.File([OpenEXR.Part(dict(header), dict(channels)) for header, channels in parts]))
+    with atomic_path(path, commit_lock) as temporary, opened as file:
         try:
             file.write(str(temporary))
         except RuntimeError as problem:  # the library reports a refusal of the system as text
             full = os.strerror(errno.ENOSPC) in str(problem)
             raise OSError(errno.ENOSPC if full else errno.EIO, str(problem), str(path)) from problem
-        if strings:
-            _restore_strings(temporary, strings)
+        if strings or names:
+            _restore_bytes(temporary, strings, names)
         # Errors on closing the file are not reported.
         if not temporary.stat().st_size or is_exr_truncated(temporary):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
-def _restore_strings(path: Path, strings: Mapping[str, bytes]) -> None:
-    """Write text attributes byte for byte over those that have their lengths."""
+def _restore_bytes(path: Path, strings: Mapping[str, bytes], names: Mapping[bytes, bytes]) -> None:
+    """Write text attributes, and names of attributes and channels, byte for byte over those that have their lengths."""
     with open(path, "r+b") as stream:
-        for name, (at, text) in exr_header.string_places(stream).items():
-            if len(strings.get(name, b"")) == len(text):
-                stream.seek(at)
-                stream.write(strings[name])
+        places = [(at, strings[name]) for name, (at, text) in exr_header.string_places(stream).items()
+                  if len(strings.get(name, b"")) == len(text)]
+        places += [(at, names[name]) for _, at, name in exr_header.name_places(stream) if name in names]
+        for at, content in places:
+            stream.seek(at)
+            stream.write(content)
 
 
 def write_png(path: Path | str, display: NDArray[Any], bits: Literal[8, 16] = 8) -> None:

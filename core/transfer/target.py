@@ -20,13 +20,13 @@ from ..conventions.frame_numbers import NumberedFrame, layers_file, number_views
 from ..errors import CaptureError, FrameError, SettingsError
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
-from ..images.exr import read_data_window
+from ..images.exr import is_exr, read_data_window
+from ..images.exr_views import views_of_file
 from ..images.formats.exif import read_exif
 from ..images.formats.tiff import UPRIGHT
 from ..images.listing import pictures_in
 from ..images.picture import Picture, same_aspect
 from ..images.plates import clean_name
-from ..images.views import read_header_and_names, stereo_views
 from ..images.window import DataWindow, union_window
 from ..lights.detection import Detector
 from ..look import Look, PlacedLight
@@ -301,7 +301,7 @@ def plate_window(plate: Path, orientation: int = UPRIGHT) -> DataWindow:
     Raises FrameError for a stereo picture: one flare fits one eye.
     """
     window = read_data_window(plate)
-    if plate.suffix.lower() == ".exr" and (views := stereo_views(*read_header_and_names(plate))):
+    if is_exr(plate) and (views := views_of_file(plate)):
         raise FrameError(f"{plate} holds the views {' and '.join(view.name for view in views)}, and a flare lies "
                          "elsewhere in each; export each view as a file of its own, and transfer to one at a time.")
     return window.oriented(orientation)

@@ -17,10 +17,11 @@ from PIL import Image, TiffImagePlugin, features
 from core.capture.plate_space import read_plate_space, record_plate_space
 from core.colour import colour_space
 from core.errors import FrameError, SettingsError
-from core.images.exr import foreign_strings, read_exr_header
+from core.images.exr import foreign_names, foreign_strings, read_exr_header
 from core.images.formats import jpeg, png, tiff
 from core.images.plates import Plate, clean_name, read_plate, write_plate
 from core.images.read import has_float_pixels, read_picture
+from core.images.size import picture_size
 from core.images.write import write_exr
 from core.removal.inference.plate_light import to_network_plate
 from tests.core.picture_files import WRITERS, by_oiio, png_16, scene, tiff_16
@@ -167,6 +168,27 @@ def test_text_of_an_exr_that_is_not_utf8_stays_byte_for_byte(tmp_path: Path) -> 
     np.testing.assert_array_equal(read_plate(tmp_path / "b.exr").codes, 0.25)
 
 
+def test_names_in_an_exr_that_are_not_utf8_stay_byte_for_byte(tmp_path: Path) -> None:
+    """Of a channel between others, and of an attribute."""
+    depth = np.arange(64, dtype=np.float32).reshape(8, 8)
+    write_exr(tmp_path / "a.exr", {**dict.fromkeys("RGB", np.full((8, 8), 0.5)), "H\x7fhe": depth,
+                                   "Hzzz": depth + 1, "H\x7fhf": depth + 2}, header={"gr?sse": "x"})
+    data = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "a.exr").write_bytes(data.replace(b"H\x7fh", b"H\xf6h").replace(b"gr?sse", b"gr\xf6sse"))
+    plate = read_plate(tmp_path / "a.exr")
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.exr").pixels, 0.5)
+    write_plate(tmp_path / "b.exr", plate, plate.codes / np.float16(2))
+    assert foreign_names(tmp_path / "b.exr") == {b"H\x7fhe": b"H\xf6he", b"H\x7fhf": b"H\xf6hf",
+                                                b"gr\x7fsse": b"gr\xf6sse"}
+    again = read_plate(tmp_path / "b.exr")
+    np.testing.assert_array_equal(again.codes, 0.25)
+    for name, added in (("H\x7fhe", 0), ("Hzzz", 1), ("H\x7fhf", 2)):
+        np.testing.assert_array_equal(again.extras["channels"][name], depth + added)
+    (tmp_path / "c.exr").write_bytes((tmp_path / "a.exr").read_bytes().replace(b"H\xf6hf", b"H\xe4he"))
+    with pytest.raises(FrameError, match="whose names are not UTF-8 and differ in nothing else; rename them"):
+        read_plate(tmp_path / "c.exr")
+
+
 def test_a_tiff_keeps_text_place_and_exif(tmp_path: Path) -> None:
     text = {315: b"Ada\0", 33432: b"Studio\0", 306: b"2026:01:02 03:04:05\0"}
     tags = {number: tiff.Tag(2, np.frombuffer(value, np.uint8)) for number, value in text.items()}
@@ -226,6 +248,91 @@ def test_a_gif_keeps_its_transparency(mode: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_plate(tmp_path / "b.png").alpha, alpha)
     picture.save(tmp_path / "a.gif")
     assert read_plate(tmp_path / "a.gif").alpha is None
+
+
+def xmp_segment(attributes: str, inner: str = "") -> tuple[int, bytes]:
+    return jpeg.APP1, (f'http://ns.adobe.com/xap/1.0/\0<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf='
+                       f'"http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description xmlns:dc='
+                       f'"http://purl.org/dc/elements/1.1/" dc:format="f" {attributes}>{inner}</rdf:Description>'
+                       "</rdf:RDF></x:xmpmeta>").encode()
+
+
+def cleaned_jpeg(folder: Path, *segments: tuple[int, bytes]) -> tuple[str, bytes]:
+    """Return the warning for a JPEG with these segments, and the bytes of its clean plate."""
+    raw = cv2.imencode(".jpg", np.full((24, 32, 3), 90, np.uint8))[1].tobytes()
+    (folder / "a.jpg").write_bytes(raw[:2] + b"".join(jpeg.make_segment(*part) for part in segments) + raw[2:])
+    plate = read_plate(folder / "a.jpg")
+    write_plate(folder / "b.jpg", plate, plate.codes // 2)
+    return plate.warning, (folder / "b.jpg").read_bytes()
+
+
+CAMERA = 'xmlns:GCamera="http://ns.google.com/photos/1.0/camera/"'
+
+
+@pytest.mark.parametrize("claim", ['GCamera:MotionPhoto="1"', 'GCamera:MicroVideoOffset="4000"'])
+def test_names_of_googles_camera_claim_a_clip_only_where_there_is_one(claim: str, tmp_path: Path) -> None:
+    notes = 'GCamera:hdrp_makernote="SERSUA" GCamera:PortraitVersion="1"'
+    warning, written = cleaned_jpeg(tmp_path, xmp_segment(f"{CAMERA} {notes}"))
+    assert not warning and b"hdrp_makernote" in written and b"PortraitVersion" in written
+    warning, written = cleaned_jpeg(tmp_path, xmp_segment(f"{CAMERA} {notes} {claim}"))
+    assert "more than one picture" in warning
+    assert b"hdrp_makernote" in written and claim.partition("=")[0].encode() not in written
+
+
+def image_resource(number: int, content: bytes, name: bytes = b"") -> bytes:
+    label = bytes([len(name)]) + name
+    return (b"8BIM" + number.to_bytes(2, "big") + label.ljust(len(label) + len(label) % 2, b"\0")
+            + len(content).to_bytes(4, "big") + content.ljust(len(content) + len(content) % 2, b"\0"))
+
+
+@pytest.mark.parametrize("number", [1033, 1036])
+def test_thumbnails_that_show_the_flare_go(number: int, tmp_path: Path) -> None:
+    thumbnail = image_resource(number, b"THUMB" * 20_001, b"odd")
+    iptc, resolution = image_resource(1028, b"\x1c\2\x78\0\7Caption"), image_resource(1005, bytes(16))
+    resources = iptc + thumbnail + resolution
+    parts = [(jpeg.APP13, jpeg.PHOTOSHOP + resources[at:at + 60_000]) for at in range(0, len(resources), 60_000)]
+    _, written = cleaned_jpeg(tmp_path, *parts)
+    assert b"THUMB" not in written and jpeg.PHOTOSHOP + iptc + resolution in written
+    thumbnails = '<xmp:Thumbnails xmlns:xmp="http://ns.adobe.com/xap/1.0/"><rdf:Alt><rdf:li xmlns:xmpGImg="http://ns.' \
+                 'adobe.com/xap/1.0/g/img/" rdf:parseType="Resource"><xmpGImg:image>QUJD</xmpGImg:image></rdf:li>' \
+                 "</rdf:Alt></xmp:Thumbnails>"
+    warning, written = cleaned_jpeg(tmp_path, xmp_segment("", thumbnails))
+    assert not warning and b"dc:format" in written and b"QUJD" not in written
+    tiff_16(tmp_path / "a.tif", scene(32, 24), {34377: tiff.Tag(1, np.frombuffer(resources, np.uint8))})
+    plate = read_plate(tmp_path / "a.tif")
+    write_plate(tmp_path / "b.tif", plate, plate.codes // 2)
+    written = (tmp_path / "b.tif").read_bytes()
+    assert b"THUMB" not in written and iptc + resolution in written
+
+
+@pytest.mark.parametrize("compression", ["tiff_adobe_deflate", "tiff_deflate"])
+def test_a_tiff_whose_zip_data_are_corrupt_is_refused(compression: str, tmp_path: Path) -> None:
+    """The TIFF library does not compare the checksum, and OpenCV shows what comes out."""
+    noise = np.random.default_rng(0).integers(0, 255, (96, 128, 3)).astype(np.uint8)
+    Image.fromarray(noise).save(tmp_path / "a.tif", compression=compression)
+    np.testing.assert_array_equal(read_plate(tmp_path / "a.tif").codes, noise)
+    data = bytearray((tmp_path / "a.tif").read_bytes())
+    data[len(data) // 2:len(data) // 2 + 9] = bytes(9)
+    (tmp_path / "a.tif").write_bytes(data)
+    for read in (read_picture, read_plate):
+        with pytest.raises(FrameError, match=r"a\.tif is damaged or truncated"):
+            read(tmp_path / "a.tif")
+
+
+def test_a_jpeg_xl_that_cannot_be_read_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    pytest.importorskip("pillow_jxl")
+    (tmp_path / "a.jxl").write_bytes(b"\xff\x0a" + bytes(99))
+    with pytest.raises(FrameError, match=r"a\.jxl is damaged or truncated; export it again\.$"):
+        read_picture(tmp_path / "a.jxl")
+
+
+def test_a_photograph_of_200_megapixels_is_opened(tmp_path: Path) -> None:
+    """Pillow refuses pictures above 179 megapixels unless its limit is raised."""
+    Image.new("P", (8, 8)).save(tmp_path / "a.gif")
+    data = bytearray((tmp_path / "a.gif").read_bytes())
+    data[6:10] = (16320).to_bytes(2, "little") + (12240).to_bytes(2, "little")
+    (tmp_path / "a.gif").write_bytes(data)
+    assert picture_size(tmp_path / "a.gif") == (16320, 12240)
 
 
 def test_the_picture_before_refocusing_goes_with_its_claim(tmp_path: Path) -> None:

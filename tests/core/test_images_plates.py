@@ -153,15 +153,6 @@ def test_unsupported_pictures_are_refused_by_name(tmp_path: Path) -> None:
         read_plate(tmp_path / "pages.tif")
 
 
-def test_a_multipart_exr_is_refused(tmp_path: Path) -> None:
-    pixels = np.zeros((4, 4), np.float32)
-    parts = [OpenEXR.Part({"name": name, "type": OpenEXR.scanlineimage}, dict.fromkeys("RGB", pixels)) for name in "ab"]
-    with OpenEXR.File(parts) as file:
-        file.write(str(tmp_path / "two.exr"))
-    with pytest.raises(FrameError, match="2 parts"):
-        read_plate(tmp_path / "two.exr")
-
-
 def test_a_written_png_is_read_as_a_plate(tmp_path: Path) -> None:
     write_png(tmp_path / "a.png", np.full((3, 4, 3), 0.5), bits=16)
     plate = read_plate(tmp_path / "a.png")

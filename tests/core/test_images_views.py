@@ -10,8 +10,9 @@ import OpenEXR
 import pytest
 
 from core.errors import FrameError
+from core.images.exr_views import stereo_views
 from core.images.plates import read_plate
-from core.images.views import split_views, stereo_views, write_view_results
+from core.images.views import split_views, write_view_results
 from core.removal.inference.remover import Remover
 from core.removal.jobs.batch import remove_all
 from core.system.progress import Progress
@@ -87,11 +88,72 @@ def test_a_transfer_to_a_stereo_picture_is_refused_by_name(tmp_path: Path) -> No
         plate_window(path)
 
 
-def test_two_parts_are_refused_by_name(tmp_path: Path) -> None:
-    parts = [OpenEXR.Part({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "view": view,
-                           "name": view}, {name: np.zeros((8, 8), np.float16) for name in "RGB"}, view)
-             for view in ("left", "right")]
-    with OpenEXR.File(parts) as file:
-        file.write(str(tmp_path / "a.exr"))
-    with pytest.raises(FrameError, match=r"a\.exr"):
-        read_plate(tmp_path / "a.exr")
+def write_parts(path: Path, parts: list[tuple[dict[str, Any], list[str]]], size: tuple[int, int] = (64, 48)) -> Path:
+    """Write parts, each of a header and the names of its channels."""
+    random = np.random.default_rng(0)
+    whole = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File([OpenEXR.Part({**whole, **header}, {
+            name: random.random(size[::-1]).astype(np.float32 if name == "Z" else np.float16) for name in names})
+            for header, names in parts]) as file:
+        file.write(str(path))
+    return path
+
+
+def read_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]]:
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return [(dict(part.header), {name: channel.pixels.copy() for name, channel in part.channels.items()})
+                for part in file.parts]
+
+
+NUKE = [({"name": "rgba.left", "view": "left", "compression": OpenEXR.DWAA_COMPRESSION}, [*RGB, "A"]),
+        ({"name": "depth.left", "view": "left"}, ["Z"]), ({"name": "rgba.right", "view": "right"}, [*RGB, "A"]),
+        ({"name": "depth.right", "view": "right", "owner": "Ada"}, ["Z"])]
+
+
+@pytest.mark.parametrize("layout", ["Nuke", "right first", "without attribute"])
+def test_both_eyes_in_parts_of_their_own_are_cleaned(layout: str, flare_everywhere: Path, tmp_path: Path) -> None:
+    parts = {"Nuke": NUKE, "right first": [*NUKE[2:], *NUKE[:2]], "without attribute": [
+        ({name: value for name, value in header.items() if name != "view"}, names) for header, names in NUKE]}[layout]
+    path = write_parts(tmp_path / "a.exr", parts)
+    remove_all([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
+               flare_folder=tmp_path / "flare")
+    before, after, flare = read_parts(path), read_parts(tmp_path / "out" / "a.exr"), read(tmp_path / "flare" / "a.exr")
+    assert len(before) == len(after) == 4
+    first = before[0][0]["name"].rpartition(".")[2]
+    for (header, channels), (new_header, new_channels) in zip(before, after, strict=True):
+        assert [new_header.get(name) for name in ("name", "view", "owner")] == [
+            header.get(name) for name in ("name", "view", "owner")]
+        for name in ("A", "Z"):
+            if name in channels:
+                np.testing.assert_array_equal(new_channels[name], channels[name])
+        if "R" in channels:
+            eye = header["name"].rpartition(".")[2]
+            removed = channels["R"].astype(float) - new_channels["R"]
+            assert (removed > 0).mean() > 0.3
+            np.testing.assert_allclose(removed, flare["R" if eye == first else f"{eye}.R"], atol=2e-3)
+    with pytest.raises(FrameError, match=r"a\.exr holds the views"):
+        plate_window(path)
+
+
+def test_a_plate_with_other_parts_is_cleaned_and_keeps_them(tmp_path: Path) -> None:
+    path = write_parts(tmp_path / "a.exr", [({"name": "depth"}, ["Z"]), ({"name": "rgba"}, RGB),
+                                            ({"name": "diffuse"}, ["diffuse.R", "diffuse.G", "diffuse.B"])])
+    plate = read_plate(path)
+    assert len(split_views(plate)) == 1
+    write_view_results([tmp_path / "b.exr"], plate, [(plate.codes * np.float16(0.5), plate.codes)])
+    before, after = read_parts(path), read_parts(tmp_path / "b.exr")
+    for number, factor in ((0, 1), (1, 0.5), (2, 1)):
+        for name, pixels in before[number][1].items():
+            np.testing.assert_array_equal(after[number][1][name], pixels * pixels.dtype.type(factor))
+
+
+@pytest.mark.parametrize(("parts", "problem"), [
+    ([({"name": "a"}, RGB), ({"name": "b"}, RGB)], "2 of them with a picture, and does not say that these are views"),
+    ([({"name": "a", "view": "left"}, RGB), ({"name": "b", "view": "left"}, RGB)], "2 of them with a picture"),
+    ([({"name": "a", "view": "left"}, RGB), ({"name": "b", "view": "right", "dataWindow": (
+        np.array([2, 2], np.int32), np.array([65, 49], np.int32))}, RGB)], "views of different data windows"),
+])
+def test_parts_that_cannot_be_cleaned_together_are_refused_by_name(parts: list[Any], problem: str,
+                                                                 tmp_path: Path) -> None:
+    with pytest.raises(FrameError, match=rf"a\.exr has .*{problem}"):
+        read_plate(write_parts(tmp_path / "a.exr", parts))

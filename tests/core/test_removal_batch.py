@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from core.errors import FrameError, SettingsError
-from core.images.plates import Plate
+from core.images.plates import Plate, read_plate
 from core.images.write import write_exr
 from core.removal.inference.remover import Remover
 from core.removal.jobs import batch
@@ -22,6 +22,7 @@ from core.removal.jobs.batch import collect_plates, remove_all
 from core.removal.jobs.manifest import MANIFEST
 from core.removal.jobs.mattes import Mattes
 from core.system.progress import Progress
+from tests.core.recording_progress import RecordingProgress
 from tests.core.removal_cases import picture, write_codes
 
 
@@ -50,16 +51,20 @@ def test_unreadable_plates_do_not_stop_the_others(tmp_path: Path, flare_everywhe
 
 @pytest.mark.parametrize(("kind", "named", "depth", "channels"), [
     (".png", "a.jpg", np.uint16, 3), (".png", "a.jpeg", np.uint8, 4), (".tiff", "a.png", np.float32, 3)])
-def test_a_plate_under_the_suffix_of_another_format_is_left_out(
+def test_a_plate_under_the_suffix_of_another_format_keeps_depth_and_alpha(
         tmp_path: Path, flare_everywhere: Path, kind: str, named: str, depth: type, channels: int) -> None:
-    """OpenCV would bring its numbers to 8 bit, or leave its alpha out, without a word."""
+    """The format of the suffix would bring its numbers to 8 bit, or leave its alpha out."""
     codes = np.full((48, 64, channels), 0.7, np.float32) if depth is np.float32 else np.full(
         (48, 64, channels), np.iinfo(depth).max * 2 // 3, depth)
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / named).write_bytes(cv2.imencode(kind, codes)[1].tobytes())
-    with pytest.raises(FrameError, match=r"suffix of another kind of file; rename it"):
-        remove_all([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
-    assert not (tmp_path / "out" / named).exists()
+    said = RecordingProgress()
+    remove_all([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), said)
+    before, after = (read_plate(tmp_path / folder / named) for folder in ("in", "out"))
+    assert after.codes.dtype == before.codes.dtype == depth and (after.codes < before.codes).any()
+    assert (after.alpha is None) == (channels == 3)
+    assert any(f"{named} holds {'PNG' if kind == '.png' else 'TIFF'} data, whatever its name" in sentence
+               for sentence in said.texts)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links want rights on Windows")

@@ -27,10 +27,10 @@ from core.errors import FitFlareError, FrameError
 from core.fit import checkpoint
 from core.flare.file import load as load_flare
 from core.images.exr import read_data_window, read_exr_header
+from core.images.exr_views import stereo_views
 from core.images.plates import read_plate
 from core.images.read import read_picture
 from core.images.size import picture_size
-from core.images.views import stereo_views
 from core.images.write import write_exr
 from core.look import read
 from core.metrics import lpips

@@ -37,7 +37,7 @@ def test_what_is_passed_over_in_a_folder_has_a_reason(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "gone.png").symlink_to("nowhere.png")
     assert sorted(unlisted_entries(tmp_path)) == sorted([
-        ("a subfolder with 1 picture", ["a"]), ("MOV is not read here", ["cut.mov"]),
+        ("a subfolder with 1 picture", ["a"]), ("a video, which is read by its own name", ["cut.mov"]),
         ("a link to a missing file", ["gone.png"]), ("TXT is not read here", ["notes.txt"]),
         ("not a picture", ["README"]), ("XMP is not read here", ["sidecar.xmp"])])
 
@@ -52,7 +52,8 @@ def test_a_solve_counts_frames_and_other_files(tmp_path: Path) -> None:
                            "header); export it again."]}
     tally = tally_solve(report, tmp_path / "in a")
     assert tally.sentence() == ("8 frames placed; 4 left out: f9.png (no place in the model), f 2.png (is damaged or "
-                                "truncated), cut.mov (MOV is not read here), second (a subfolder with 1 picture).")
+                                "truncated), cut.mov (a video, which is read by its own name), second (a subfolder "
+                                "with 1 picture).")
 
 
 def test_the_commands_of_a_capture_count_its_frames_last(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from ...images.listing import pictures_in
 from ...images.picture import Picture
 from ...images.read import read_picture
 from ...images.size import picture_size
+from ...images.unsupported import misnamed_reason
 from ...images.video import Video, is_video, write_frame
 from ...images.write import write_png
 from ...system.files import read_json, write_json
@@ -112,7 +113,8 @@ def prepare_frames(source: Path, work: Path, number: int, size: int,
     elif source.is_file() and is_video(source):
         frames, left_out = _from_video(source, work, number or 150, size, progress, space)
     else:
-        raise CaptureError(f"{source} is neither a folder of frames nor a video.")
+        reason = misnamed_reason(source) if source.is_file() else ""
+        raise CaptureError(f"{source} is neither a folder of frames nor a video{f': it {reason}' if reason else ''}.")
     if len(frames) < 3:
         why = f"; {left_out[0]}" if left_out else ""
         raise CaptureError(f"{source} gives {len(frames)} usable frames, and a solve needs at least 3 that see "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads the first header of an EXR without a library: Blender's own Python has none that reads EXRs.
+"""Reads the headers of an EXR without a library: Blender's own Python has none that reads EXRs.
 
 The layout is that of "OpenEXR File Layout" (Academy Software Foundation): after a magic number and a version, each
 attribute is a name, a type, a length and that many bytes; an empty name ends the header.
@@ -7,6 +7,7 @@ attribute is a name, a type, a length and that many bytes; an empty name ends th
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from typing import BinaryIO
 
 import numpy as np
@@ -92,25 +93,62 @@ def is_truncated(stream: BinaryIO) -> bool:
 
 
 def string_places(stream: BinaryIO) -> dict[str, tuple[int, bytes]]:
-    """Return the offset and the bytes of each text attribute of the first header, by name; of each text of a list by
-    its name and number, such as "tags[1]"."""
-    stream.seek(len(MAGIC) + 4)
+    """Return the offset and the bytes of each text attribute, by name; of each text of a list by its name and number,
+    such as "tags[1]"; of parts behind the first by the part's number too, such as "owner, part 1"."""
     places = {}
-    while name := _read_name(stream):
-        kind, length = _read_name(stream), int.from_bytes(stream.read(4), "little", signed=True)
+    for part, _, name, kind, length in _iterate_attributes(stream):
         at = stream.tell()
-        if length < 0:
-            break
+        key, behind = name.decode("latin-1"), f", part {part}" if part else ""
         if kind == b"string" and length <= _MAX_ATTRIBUTE_BYTES:
-            places[name.decode("latin-1")] = at, stream.read(length)
+            places[key + behind] = at, stream.read(length)
         elif kind == b"stringvector" and length <= _MAX_ATTRIBUTE_BYTES:
             value, start, number = stream.read(length), 0, 0
             while start + 4 <= len(value):
                 end = start + 4 + int.from_bytes(value[start:start + 4], "little")
-                places[f"{name.decode('latin-1')}[{number}]"] = at + start + 4, value[start + 4:end]
+                places[f"{key}[{number}]{behind}"] = at + start + 4, value[start + 4:end]
                 start, number = end, number + 1
-        stream.seek(at + length)
     return places
+
+
+def name_places(stream: BinaryIO) -> list[tuple[int, int, bytes]]:
+    """Return the part, the offset and the bytes of the name of each attribute and of each channel, in the file's order.
+    """
+    places = []
+    for part, at, name, kind, length in _iterate_attributes(stream):
+        places.append((part, at, name))
+        if kind == b"chlist" and length <= _MAX_ATTRIBUTE_BYTES:
+            start, value = stream.tell(), stream.read(length)
+            places += [(part, start + offset, channel) for offset, channel in _channels(value)]
+    return places
+
+
+def _channels(value: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield the offset and the name of each channel in the value of a "chlist"."""
+    at = 0
+    while (end := value.find(b"\0", at)) > at:
+        yield at, value[at:end]
+        at = end + 17  # past the zero, the kind, whether it is linear, and the sampling
+
+
+def _iterate_attributes(stream: BinaryIO) -> Iterator[tuple[int, int, bytes, bytes, int]]:
+    """Yield part, offset, name, type and length of each attribute of all headers, with the stream at its value; up to
+    the first damaged one."""
+    stream.seek(len(MAGIC))
+    has_parts = int.from_bytes(stream.read(4), "little") & _PARTS
+    part, is_empty, at = 0, True, stream.tell()
+    while True:
+        if not (name := _read_name(stream)):
+            if is_empty or not has_parts:
+                return
+            part, is_empty, at = part + 1, True, stream.tell()
+            continue
+        kind, length = _read_name(stream), int.from_bytes(stream.read(4), "little", signed=True)
+        if length < 0:
+            return
+        start = stream.tell()
+        yield part, at, name, kind, length
+        stream.seek(start + length)
+        is_empty, at = False, stream.tell()
 
 
 def _read_attributes(stream: BinaryIO, kinds: dict[bytes, bytes], *, to_the_end: bool = False) -> dict[bytes, bytes]:

@@ -2,6 +2,7 @@
 """Recognises formats by their first bytes, whatever a file is named, and by suffix where bytes do not say."""
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 Kind = Literal["png", "jpeg", "tiff", "exr", "webp", "dpx", "cineon", "psd", "bmp", "hdr", "tga", "gif", "jp2", "jxl",
@@ -17,14 +18,21 @@ SUFFIXES: dict[str, Kind] = {
     ".heif": "heif", ".hif": "heif", ".avif": "avif",
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"), "raw")}
 """The formats that are read, by suffix in lower case."""
+SUFFIX_OF_KIND: dict[str, str] = {kind: suffix for suffix, kind in reversed(SUFFIXES.items())}
+"""The usual suffix of each format."""
 JPEG_SUFFIXES = tuple(suffix for suffix, kind in SUFFIXES.items() if kind == "jpeg")
 """Suffixes of JPEGs; browsers on Windows save them as .jfif."""
+VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv", ".mxf",
+                    ".ts", ".m2t", ".vob", ".3gp", ".flv", ".ogv", ".dv"})
+"""Suffixes of video files."""
 _MAGIC: tuple[tuple[bytes, Kind], ...] = (
     (b"\x89PNG\r\n\x1a\n", "png"), (b"\xff\xd8", "jpeg"), (b"\x76\x2f\x31\x01", "exr"), (b"SDPX", "dpx"),
     (b"XPDS", "dpx"), (b"\x80\x2a\x5f\xd7", "cineon"), (b"\xd7\x5f\x2a\x80", "cineon"), (b"8BPS", "psd"),
     (b"BM", "bmp"), (b"#?RADIANCE", "hdr"), (b"#?RGBE", "hdr"), (b"GIF8", "gif"), (b"\0\0\0\x0cjP  \r\n", "jp2"),
     (b"\xff\x4f\xff\x51", "jp2"), (b"\xff\x0a", "jxl"), (b"\0\0\0\x0cJXL ", "jxl"))
 _TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_VIDEO_MAGIC = (b"\x1a\x45\xdf\xa3", b"\x00\x00\x01\xba", b"\x06\x0e\x2b\x34", b"FLV\x01", b"OggS", b"\x30\x26\xb2\x75")
+"""First bytes of Matroska, MPEG, MXF, Flash, Ogg and Windows Media."""
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"miaf")
 
 
@@ -44,3 +52,14 @@ def kind_of(head: bytes, suffix: str) -> Kind:
         if head.startswith(magic):
             return kind
     return "tga" if named == "tga" else ""
+
+
+def is_video(path: Path) -> bool:
+    """True if a file's name is a video's."""
+    return path.suffix.lower() in VIDEOS
+
+
+def holds_video(head: bytes) -> bool:
+    """True if the first HEAD_BYTES of a file that is no picture are a video's."""
+    is_box = head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide") and head[8:12] != b"crx "  # Canon's raw files
+    return is_box or head.startswith(_VIDEO_MAGIC) or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")

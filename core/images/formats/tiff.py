@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, Literal, NamedTuple
@@ -40,6 +41,12 @@ _BIG_TYPES = {16: "u8", 17: "i8", 18: "u8"}
 _MAX_ENTRIES = 1 << 16
 """Largest directory that is read of a BigTIFF, whose field has 64 bits."""
 _RATIONALS = (5, 10)
+_ZIP = (8, 32946)
+"""ZIP compression: Adobe's number and the older one."""
+_STRIPS, _TILES = (273, 279), (324, 325)
+"""Tags of the places and of the bytes of the parts of a picture."""
+_PIECE_BYTES, _BYTES_BEYOND = 1 << 20, 1 << 24
+"""Bytes that are uncompressed at once, and bytes beyond the pixels, such as the ends of tiles, that are checked."""
 _MAX_PAGES = 1000
 
 
@@ -124,6 +131,36 @@ def page_count(stream: BinaryIO) -> int:
         kinds = [layout.number(entry[layout.place:], "I") for entry in entries if layout.number(entry, "H") == SUBFILE]
         count += not any(kind & 1 for kind in kinds)
     return count
+
+
+def has_corrupt_data(stream: BinaryIO) -> bool:
+    """True if strips or tiles of ZIP compression do not match their checksums, which the library of the format does not
+    compare."""
+    tags = read_tags(stream, (WIDTH, HEIGHT, BITS, SAMPLES, COMPRESSION, *_STRIPS, *_TILES))
+    numbers = integer_values(tags)
+    if numbers.get(COMPRESSION) not in _ZIP:
+        return False
+    limit = _BYTES_BEYOND + numbers.get(WIDTH, 0) * numbers.get(HEIGHT, 0) * numbers.get(SAMPLES, 1) * 8
+    for places, lengths in (_STRIPS, _TILES):
+        if places in tags and lengths in tags:
+            for at, length in zip(tags[places].values.tolist(), tags[lengths].values.tolist(), strict=False):
+                stream.seek(at)
+                limit -= (inflated := _inflated_size(stream.read(length), limit))
+                if inflated < 0:
+                    return True
+    return False
+
+
+def _inflated_size(data: bytes, limit: int) -> int:
+    """Return the bytes of uncompressed data, counted up to a limit; -1 where they do not match their checksum."""
+    inflater, size = zlib.decompressobj(), 0
+    try:
+        while data and not inflater.eof and size < limit:
+            size += len(inflater.decompress(data, _PIECE_BYTES))
+            data = inflater.unconsumed_tail
+    except zlib.error:
+        return -1
+    return size
 
 
 def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:

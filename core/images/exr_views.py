@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Identifies the views of a stereo EXR, left and right eye, in one part ("Storing Multi-View Images in OpenEXR Files",
+ILM), or in a part each, as Nuke writes them.
+
+The attribute multiView lists the views of a part; the first one's channels are at the root, the others' behind their
+name ("right.R"). Some programs write every view behind its name, and no attribute. A part of one view has the attribute
+view. `plates.py` refuses what it cannot keep apart, `views.py` cleans all views, transfer refuses them by name.
+"""
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import FrameError
+from .exr import main_part, read_exr_headers
+
+_EYES = ("left", "right")
+_WINDOWS = ("dataWindow", "displayWindow")
+
+
+class View(NamedTuple):
+    """A view, the names of its three colour channels, and the number of the part that holds them; a grey view has one
+    name three times."""
+
+    name: str
+    channels: tuple[str, str, str]
+    part: int = 0
+
+
+_Parts = Sequence[tuple[Mapping[str, Any], Collection[str]]]
+"""Header and channel names of each part of an EXR."""
+
+
+def views_of_file(path: Path) -> list[View]:
+    """Return the views of an EXR file, that of its main part first; empty for a picture of one view. Raises FrameError.
+    """
+    return views_of_parts([(header, [channel.name for channel in header["channels"]])
+                           for header in read_exr_headers(path)])
+
+
+def views_of_parts(parts: _Parts) -> list[View]:
+    """Return the views of an EXR's parts, that of the main part first; empty for a picture of one view."""
+    main = main_part([(number, names) for number, (_, names) in enumerate(parts)])
+    if inside := stereo_views(*parts[main]):
+        return [view._replace(part=main) for view in inside]
+    views: dict[str, View] = {}
+    for number in (main, *(number for number in range(len(parts)) if number != main)):
+        header, names = parts[number]
+        if (view := _view_of_part(header)) and (colours := _colours(names, "")):
+            views.setdefault(view, View(view, colours, number))
+    return list(views.values()) if len(views) > 1 else []
+
+
+def _view_of_part(header: Mapping[str, Any]) -> str:
+    """Return the view that a part is of: by its attribute, else by its name, such as "rgba.left"; "" for none."""
+    if isinstance(view := header.get("view"), str) and view:
+        return view
+    last = str(header.get("name", "")).rpartition(".")[2]
+    return last if last.lower() in _EYES else ""
+
+
+def stereo_views(header: Mapping[str, Any], names: Collection[str]) -> list[View]:
+    """Return the views in one part of an EXR, the one at the root first; empty for a picture of one view."""
+    listed = [str(name) for name in header.get("multiView", ())]
+    prefixed = dict.fromkeys(name.rpartition(".")[0] for name in names if name.count(".") == 1)
+    eyes = listed[1:] or [name for name in prefixed if name.lower() in _EYES]
+    root = listed[0] if listed else next(name for name in (*_EYES, "root") if name not in [eye.lower() for eye in eyes])
+    views = [View(root, colours)] if (colours := _colours(names, "")) else []
+    if not views and listed:
+        eyes = listed
+    views += [View(eye, colours) for eye in eyes if (colours := _colours(names, f"{eye}."))]
+    return views if len(views) > 1 else []
+
+
+def _colours(names: Collection[str], prefix: str) -> tuple[str, str, str] | None:
+    for each in ("RGB", "YYY"):
+        channels = tuple(f"{prefix}{name}" for name in each)
+        if all(name in names for name in channels):
+            return channels[0], channels[1], channels[2]
+    return None
+
+
+def check_parts(path: Path, parts: _Parts) -> None:
+    """Raise FrameError for an EXR with several pictures of which only one would be changed: parts that are not of its
+    views, or views of other windows."""
+    pictures = [number for number, (_, names) in enumerate(parts) if _colours(names, "")]
+    views = views_of_parts(parts)
+    if len(pictures) > 1 and sorted(view.part for view in views) != pictures:
+        raise FrameError(f"{path} has {len(parts)} parts, {len(pictures)} of them with a picture, and does not say "
+                         "that these are views; export the plate as a file of its own.")
+    windows = {tuple(np.ravel([parts[view.part][0].get(name, ()) for name in _WINDOWS]).tolist()) for view in views}
+    if len(windows) > 1:
+        raise FrameError(f"{path} has views of different data windows; export each as a file of its own.")

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Reads the camera solve of a capture, of whatever program, and matches its poses with the pictures on disk.
 
-`Capture.open` calls `read_solve`, then `match_frames`; it makes its views of the result and passes the sentences on.
+`Capture.open` calls `read_solve_in_steps`, then `match_frames_in_steps`; it makes its views of the result and passes
+the sentences on.
 """
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import overload
 
 import numpy as np
 
 from ..errors import CaptureError
 from ..system.file_names import canonical_name, natural_key
 from ..system.files import safe_join
-from .colmap import PointCloud, PosedFrame, read_model
+from ..system.steps import FRAMES_PER_STEP, Steps
+from .colmap import PointCloud, PosedFrame, read_model_in_steps
 from .frame_files import PictureIndex
 from .layout import LATER_MODEL_PLACES, choose_model, find_deeper_model, find_models, frames_folder
 from .transforms import FILE as TRANSFORMS
@@ -47,13 +48,7 @@ class CameraSolve:
     sentences: list[str] = field(default_factory=list)
 
 
-@overload
-def read_solve(folder: Path) -> CameraSolve: ...
-@overload
-def read_solve(folder: Path, *, required: bool) -> CameraSolve | None: ...
-
-
-def read_solve(folder: Path, *, required: bool = True) -> CameraSolve | None:
+def read_solve_in_steps(folder: Path, *, required: bool = True) -> Steps[CameraSolve | None]:
     """Read a COLMAP model or a transforms.json, in natural order of the frames.
 
     Raises CaptureError where there is none; returns None instead if it is not `required`.
@@ -73,7 +68,7 @@ def read_solve(folder: Path, *, required: bool = True) -> CameraSolve | None:
                                    "run solve first." if deeper is None else
                                    f"a model lies in {deeper}: name the folder that holds it and its images, such as "
                                    f"{deeper.parent}, or move it to {folder / 'sparse' / '0'}."))
-        frames, points = read_model(model)
+        frames, points = yield from read_model_in_steps(model)
         root = frames_folder(folder, model)
         solve = CameraSolve(_names_below(root, frames), points, root)
         solve.sentences += [sentence] if sentence else []
@@ -120,12 +115,19 @@ class MatchedFrames:
     sentences: list[str]
 
 
-def match_frames(solve: CameraSolve) -> MatchedFrames:
+def match_frames_in_steps(solve: CameraSolve) -> Steps[MatchedFrames]:
     """Find the pictures of the posed frames, by other forms of their names too. Raises CaptureError for a name that
     leads out of the capture."""
-    paths = {frame.name: safe_join(solve.root, frame.name, CaptureError) for frame in solve.frames}
-    files = {name: path for name, path in paths.items() if path.exists() or path.is_symlink()}
+    paths, files = {}, {}
+    for number, frame in enumerate(solve.frames):
+        if number % FRAMES_PER_STEP == 0:
+            yield
+        path = paths[frame.name] = safe_join(solve.root, frame.name, CaptureError)
+        if path.exists() or path.is_symlink():
+            files[frame.name] = path
+    yield
     index = _index(solve.root, [path.parent for path in paths.values()])
+    yield
     used = {path.relative_to(solve.root).as_posix() for path in files.values()}
     missing: list[str] = []
     renamed: list[str] = []

@@ -27,18 +27,18 @@ from numpy.typing import NDArray
 from ..colour import ColourSpace
 from ..errors import CaptureError, FrameError
 from ..images.formats.exif import SWAPS_SIDES, read_exif
-from ..images.listing import SUFFIXES
 from ..images.picture import Picture, same_aspect
 from ..images.read import has_float_pixels, read_picture
 from ..images.size import picture_size
-from ..images.unsupported import unsupported_file
 from ..images.video import is_video
 from ..system.file_names import canonical_name, find_entry
 from ..system.files import read_json, safe_join
+from ..system.steps import FRAMES_PER_STEP, Steps, finish
 from .camera import Camera, Floats
-from .camera_solve import check_geometry, match_frames, read_solve
+from .camera_solve import check_geometry, match_frames_in_steps, read_solve_in_steps
 from .colmap import PointCloud, PosedFrame
 from .frame_files import mask_pictures, matching_pictures, view_name
+from .frame_sizes import checked_size, size_or_model_size
 from .lens import PINHOLES, Lens
 from .lights import Light, LightState, check_places, paths_of, read_lights
 from .orientation import TurnedFrame, find_upright
@@ -113,13 +113,20 @@ class Capture:
 
         Raises CaptureError (model, lights, split) or FrameError (pictures), naming the file.
         """
+        return finish(cls.open_in_steps(folder, need_frames=need_frames, cache_bytes=cache_bytes,
+                                        need_cameras=need_cameras, focal=focal))
+
+    @classmethod
+    def open_in_steps(cls, folder: Path | str, *, need_frames: bool = True, cache_bytes: int = 1 << 30,
+                      need_cameras: bool = True, focal: float | None = None) -> Steps[Capture]:
+        """Read a capture as `open` does, in steps."""
         folder = Path(folder)
         if folder.is_file() and is_video(folder):
             raise CaptureError(f"{folder} is a video; make a capture of it by `solve {folder.name} --out my_capture`, "
                                "and name that.")
         if not folder.is_dir():
             raise CaptureError(f"{folder} is {'no folder' if folder.exists() else 'missing'}; name a capture's folder.")
-        solve, focal_source = read_solve(folder, required=need_cameras), "solved"
+        solve, focal_source = (yield from read_solve_in_steps(folder, required=need_cameras)), "solved"
         has_cameras = solve is not None
         if solve is None:
             solve, focal_source = cameras_without_solve(folder, focal)
@@ -128,34 +135,42 @@ class Capture:
         if len(set(names)) < len(names):
             duplicate = next(name for name in names if names.count(name) > 1)
             raise CaptureError(f"{folder}: the frame {duplicate} has two poses; remove one of them.")
-        matched = match_frames(solve)
+        yield
+        matched = yield from match_frames_in_steps(solve)
+        yield
         turned = [turned_frame for frame in posed if (turned_frame := _to_turned(frame, matched.files.get(frame.name)))]
         upright, sentences = (find_upright(turned, solve.points) if has_cameras
                               else ({frame.posed.name for frame in turned}, []))
         turned_by_name = {frame.posed.name: frame for frame in turned if frame.posed.name in upright}
         views, frames, order, names_of = [], {}, {}, {}
+        yield
         for number, frame in enumerate(posed):
+            if number % FRAMES_PER_STEP == 0:
+                yield
             path = matched.files.get(frame.name)
             if path is None and need_frames and matched.files:
                 continue
             path = path or safe_join(root, frame.name, CaptureError)
-            size_of = _checked_size if need_frames else _size_or_model_size
+            size_of = checked_size if need_frames else size_or_model_size
             size = size_of(path, frame.lens, turned_by_name.get(frame.name))
             name = view_name(frame.name, root == folder)
             if name in frames:
                 raise CaptureError(f"{folder}: the frame {name} has two poses; remove one of them.")
             views.append(_to_view(name, frame, size, frame.name in upright))
             frames[name], order[name], names_of[frame.name] = path, number, name
-        capture = cls(folder, views, solve.points, read_lights(find_entry(folder, LIGHTS) or folder / LIGHTS),
-                      frames=frames, cache_bytes=cache_bytes)
+        lights = read_lights(find_entry(folder, LIGHTS) or folder / LIGHTS)
+        yield
+        capture = cls(folder, views, solve.points, lights, frames=frames, cache_bytes=cache_bytes)
+        yield
         capture._order, capture.has_cameras, capture.focal_source = order, has_cameras, focal_source
         capture._focal = focal
         check_places(capture.lights, capture.folder / LIGHTS, list(frames), has_cameras)
         capture._lists = tuple(None if each is None else {names_of[name] for name in each if name in names_of}
                                for each in (solve.training, solve.held_out))
         capture._masks.update({names_of[name]: path for name, path in solve.masks.items() if name in names_of})
+        yield
         if need_frames:
-            capture._check_layer_sizes()
+            yield from capture._check_layer_sizes()
             capture.sentences = (*solve.sentences, *matched.sentences, *sentences, *check_geometry(solve),
                                  *capture.light_sentences)
             capture.left_out = {reason: tuple(each) for reason, each in (
@@ -433,7 +448,7 @@ class Capture:
             raise CaptureError(f"{path} names a frame twice; name each once.")
         return {view.name for view in views.values() if view is not None}
 
-    def _check_layer_sizes(self) -> None:
+    def _check_layer_sizes(self) -> Steps[None]:
         """Check the sizes of removed/ and truth/, and that removed/ is complete: an incomplete one is an interrupted
         run."""
         if self._removed and len(self._removed) < len(self.views):
@@ -441,7 +456,9 @@ class Capture:
             raise CaptureError(f"{self.folder / 'removed'} lacks {len(lacking)} of {len(self.views)} frames, "
                                f"first {lacking[0]}; finish or remove it.")
         for paths in (self._removed, self._truth_scene, self._truth_flare, self._masks):
-            for view in self.views:
+            for number, view in enumerate(self.views):
+                if number % FRAMES_PER_STEP == 0:
+                    yield
                 if view.name in paths:
                     size = picture_size(paths[view.name])
                     if view.upright and _orientation(paths[view.name]) in SWAPS_SIDES:
@@ -449,24 +466,6 @@ class Capture:
                     if not same_aspect(size, view.camera.size):
                         raise FrameError(f"{paths[view.name]} is {size[0]} x {size[1]} pixels and the frame "
                                          f"{view.camera.width} x {view.camera.height}; make them one shape.")
-
-
-def _checked_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:
-    size = turned.upright_size if turned else picture_size(path)
-    if not same_aspect(size, (lens.width, lens.height)):
-        raise FrameError(f"{path} is {size[0]} x {size[1]} pixels and its camera {lens.width} x {lens.height}, "
-                         "which is another shape; use the frames that were solved.")
-    if path.suffix.lower() not in SUFFIXES:
-        raise unsupported_file(path)
-    return size
-
-
-def _size_or_model_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:
-    """Return the picture's size, or the model's where the picture is missing or unusable."""
-    try:
-        return _checked_size(path, lens, turned)
-    except FrameError:
-        return lens.width, lens.height
 
 
 def _orientation(path: Path) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from ..images.size import MAX_PIXELS
 from ..system.file_names import find_entry
 from ..system.files import atomic_path
 from ..system.reading import MAX_MODEL_BYTES, UTF8_SIG, read_bytes, read_text
+from ..system.steps import FRAMES_PER_STEP, Steps, finish
 from .camera import Floats, quaternion_from_rotation, rotation_from_quaternion
 from .lens import MODEL_NAMES, MODELS, Lens
 
@@ -69,15 +70,22 @@ def read_model(folder: Path) -> tuple[list[PosedFrame], PointCloud]:
 
     Raises CaptureError, naming the file, where one is missing, damaged, empty or invalid.
     """
-    lenses = _read_file(folder, "cameras", _read_cameras_bin, _read_cameras_txt)
-    images = _read_file(folder, "images", _read_images_bin, _read_images_txt)
-    points, known = (_read_file(folder, "points3D", _read_points_bin, _read_points_txt)
+    return finish(read_model_in_steps(folder))
+
+
+def read_model_in_steps(folder: Path) -> Steps[tuple[list[PosedFrame], PointCloud]]:
+    """Read a model as `read_model` does, in steps."""
+    lenses = yield from _read_file(folder, "cameras", _read_cameras_bin, _read_cameras_txt)
+    images = yield from _read_file(folder, "images", _read_images_bin, _read_images_txt)
+    points, known = ((yield from _read_file(folder, "points3D", _read_points_bin, _read_points_txt))
                      or (PointCloud.empty(), np.zeros(0, np.int64)))
     order = np.argsort(known, kind="stable")
     if not images:
         raise CaptureError(f"{_file_path(folder, 'images')} holds no images; the solve registered no frame.")
-    posed = []
+    posed: list[PosedFrame] = []
     for name, camera, quaternion, translation, point_ids in images:
+        if len(posed) % FRAMES_PER_STEP == 0:
+            yield
         if camera not in lenses:
             raise CaptureError(f"{_file_path(folder, 'images')} gives {name} the camera {camera}, which "
                                f"{_file_path(folder, 'cameras')} does not have; export the whole model again.")
@@ -157,8 +165,9 @@ def _file_path(folder: Path, name: str) -> Path:
     return next((path for path in candidates if path is not None and path.is_file()), folder / f"{name}.txt")
 
 
-def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Any:
-    """Read a part of a model by its binary or text reader; None without points3D. Raises CaptureError."""
+def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Steps[Any]:
+    """Read a part of a model by its binary or text reader, in steps; None without points3D. Raises CaptureError."""
+    yield
     path = _file_path(folder, name)
     if not path.is_file():
         if name == "points3D":
@@ -166,7 +175,8 @@ def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Any:
         raise CaptureError(f"{folder} has no {name}.bin or {name}.txt; export the whole COLMAP model.")
     try:
         if path.suffix.lower() == ".bin":
-            return binary(_ByteReader(path))
+            result = binary(_ByteReader(path))
+            return (yield from result) if isinstance(result, Generator) else result
         return text(path, read_text(path, MAX_MODEL_BYTES, UTF8_SIG).splitlines())
     except OSError as problem:
         raise CaptureError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
@@ -345,25 +355,35 @@ Points = tuple[PointCloud, NDArray[np.int64]]
 """The cloud, and the id of each point."""
 
 
-def _read_points_bin(file: _ByteReader) -> Points:
-    """Read a points3D.bin. Raises CaptureError."""
-    number = file.count(51)
-    record = struct.Struct("<Q3d3BdQ")
-    values = np.empty((number, 4), np.float64)
-    rgb, numbers = np.empty((number, 3), np.uint8), np.empty(number, np.uint64)
-    data, at = file.data, file.at
+_POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
+"""A point of points3D.bin, before its track of 8 bytes an entry."""
+_POINTS_PER_STEP = 1 << 15
+_TRACK_AT = 43
+"""Offset of the length of the track in a point, bytes."""
+_TRACK_LENGTH = struct.Struct("<Q")
+
+
+def _read_points_bin(file: _ByteReader) -> Steps[Points]:
+    """Read a points3D.bin, in steps. Raises CaptureError."""
+    number = file.count(_POINT.itemsize)
+    data, at, last = file.data, file.at, len(file.data) - _POINT.itemsize
+    starts = np.empty(number, np.int64)
     for i in range(number):
-        if at + record.size > len(data):
-            break
-        numbers[i], x, y, z, r, g, b, error, track = record.unpack_from(data, at)
-        values[i] = x, y, z, error
-        rgb[i] = r, g, b
-        at += record.size + 8 * track
-    else:
-        if at <= len(data):
-            return _to_cloud(file.path, values, rgb), numbers.view(np.int64)
-    file.need(len(data) + 1)
-    raise AssertionError  # need() has raised
+        if i % _POINTS_PER_STEP == 0:
+            yield
+        if at > last:
+            file.need(len(data) + 1)  # raises
+        starts[i] = at
+        at += _POINT.itemsize + 8 * _TRACK_LENGTH.unpack_from(data, at + _TRACK_AT)[0]
+    file.at = min(at, len(data))
+    file.need(at - file.at)
+    points, raw = np.empty(number, _POINT), np.frombuffer(data, np.uint8)
+    for first in range(0, number, _POINTS_PER_STEP):
+        yield
+        chosen = starts[first:first + _POINTS_PER_STEP, None] + np.arange(_POINT.itemsize)
+        points[first:first + len(chosen)] = raw[chosen].view(_POINT)[:, 0]
+    values = np.concatenate([points["xyz"], points["error"][:, None]], 1)
+    return _to_cloud(file.path, values, points["rgb"].copy()), points["id"].copy()
 
 
 def _read_points_txt(path: Path, lines: list[str]) -> Points:

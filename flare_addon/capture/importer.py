@@ -22,6 +22,7 @@ from ...core.capture.camera import Camera, quaternion_from_rotation
 from ...core.conventions.frame_numbers import number_views
 from ...core.errors import CaptureError
 from ...core.removal.jobs.provenance import has_exact_clean_frames
+from ...core.system.steps import Steps, finish
 from .. import cameras, fcurves, light_paths
 from ..cameras import FLIP_YZ
 from ..compositor.setup import footage_nodes
@@ -39,6 +40,9 @@ EXPOSURE_PATH = "fit_flare.exposure"
 
 PIXEL_ASPECT_TOLERANCE = 2e-3
 """Largest relative difference of fx / fy between cameras with the same pixel aspect: one pixel in 1000."""
+
+CAMERAS_PER_STEP = 10
+"""Cameras with a picture each that one step adds."""
 
 CameraLayout = Literal["animated", "each"]
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")
@@ -67,6 +71,30 @@ class Imported:
     notes: tuple[str, ...]
 
 
+class _SceneState:
+    """The state of a scene before an import, which an import that is cancelled restores."""
+
+    def __init__(self, scene: Any) -> None:
+        self._scene, render = scene, scene.render
+        self._range = scene.frame_start, scene.frame_end, scene.frame_current
+        self._render = {name: getattr(render, name) for name in (
+            "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y")}
+
+    def restore(self, collection: Any) -> None:
+        """Restore size and frames of the scene, and remove the collection with its objects and their data."""
+        scene = self._scene
+        scene.frame_start, scene.frame_end = self._range[:2]
+        for name, value in self._render.items():
+            setattr(scene.render, name, value)
+        scene.frame_set(self._range[2])
+        for item in list(collection.objects):
+            data = item.data
+            bpy.data.objects.remove(item)
+            if data is not None and not data.users:
+                bpy.data.batch_remove([data])
+        bpy.data.collections.remove(collection)
+
+
 def find_capture(path: Path | str) -> Path:
     """Return the folder of a capture from a path to it or to anything in it, such as images/ or lights.json.
 
@@ -83,19 +111,40 @@ def find_capture(path: Path | str) -> Path:
 
 def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | None = None) -> Imported:
     """Import the capture in `folder` into `scene`. Raises CaptureError and FrameError."""
-    settings = settings or ImportSettings()
+    return finish(import_in_steps(scene, folder, settings or ImportSettings()))
+
+
+def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) -> Steps[Imported]:
+    """Import a capture as `import_capture` does, in steps.
+
+    What a generator that is closed or fails has added is removed.
+    """
     folder = find_capture(folder)
-    capture = Capture.open(folder, need_frames=settings.frames)
+    capture = yield from Capture.open_in_steps(folder, need_frames=settings.frames)
+    collection = bpy.data.collections.new(folder.resolve().name)
+    before = _SceneState(scene)
+    try:
+        imported = yield from _add_capture(scene, folder, settings, capture, collection)
+    except BaseException:  # GeneratorExit too
+        before.restore(collection)
+        raise
+    return imported
+
+
+def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Capture, collection: Any
+                 ) -> Steps[Imported]:
+    """Add the objects of a capture to a new collection, in steps."""
     notes: list[str] = []
     extent = capture.extent
-    collection = bpy.data.collections.new(folder.resolve().name)
     scene.collection.children.link(collection)
     root = _add_object(collection, f"{collection.name} Root", None, None)
     root.empty_display_type, root.empty_display_size = "ARROWS", 0.2 * extent
     root.rotation_euler, root.scale = UP_ROTATIONS[settings.up], (settings.scale,) * 3
-    camera_objects = _add_cameras(collection, root, capture, extent, settings, scene, notes)
+    yield
+    camera_objects = yield from _add_cameras(collection, root, capture, extent, settings, scene, notes)
     if settings.points and len(capture.points):
         _add_points(collection, root, capture.points)
+    yield
     lights = tuple(add_light(collection, root, light.name, np.nan_to_num(light.xyz), 0.02 * extent)
                    for light in capture.lights)
     scene_frames = {frame.view: frame.number for frame in number_views(view.name for view in capture.views)}
@@ -106,7 +155,10 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     if state.root is not None:
         state.root.fit_flare.is_root = True  # earlier versions did not store it
     root.fit_flare.is_root = True
-    state.capture, state.root, state.footage = blend_relative(folder), root, "images"
+    state.root = None  # so that the frames of an earlier capture are not changed
+    state.footage = "images"
+    state.capture, state.root = blend_relative(folder), root
+    yield
     show_recorded(scene, folder)
     state.known_lights = "\n".join(light.name for light in capture.lights)
     if settings.frames:
@@ -136,8 +188,8 @@ def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> A
 
 
 def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, settings: ImportSettings, scene: Any,
-                 notes: list[str]) -> tuple[Any, ...]:
-    """Add the cameras, with animation and frames as the settings say; append warnings to `notes`."""
+                 notes: list[str]) -> Steps[tuple[Any, ...]]:
+    """Add the cameras, with animation and frames as the settings say, in steps; append warnings to `notes`."""
     frames = number_views(view.name for view in capture.views)
     number = {frame.view: frame.number for frame in frames}
     folders: dict[str, list[View]] = {}
@@ -159,13 +211,17 @@ def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, se
         if settings.cameras == "animated":
             camera = _add_camera(collection, root, label, views[0], aspect, 0.15 * extent)
             camera.fit_flare.view = folder
+            yield
             _animate(camera, views, [number[view.name] for view in views], aspect)
             if settings.frames and not _show_sequence(camera, capture, views, [number[view.name] for view in views]):
                 notes.append(f"The frames of {label} have no common numbering, so only the first is shown behind it; "
                              "import with one camera for each frame to see all.")
             camera_objects.append(camera)
+            yield
         else:
             for view in views:
+                if len(camera_objects) % CAMERAS_PER_STEP == 0:
+                    yield
                 camera = _add_camera(collection, root, Path(view.name).stem, view, aspect, 0.08 * extent)
                 camera.fit_flare.view = view.name
                 if settings.frames:

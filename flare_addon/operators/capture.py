@@ -2,14 +2,21 @@
 """Operators that import a capture, and that make one from a solved or animated camera of Blender."""
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import bpy
 
+from ...core.system.steps import finish
 from .. import fits
 from ..capture import exporter
-from ..capture.importer import ImportSettings, import_capture
-from ..reports import NO_CAMERA, GuardedOperator
+from ..capture.importer import Imported, ImportSettings, import_in_steps
+from ..reports import NO_CAMERA, GuardedOperator, report_errors
+
+STEP_S = 0.02
+"""Time for which an import holds the window in one go; a step that takes longer is not interrupted."""
+INTERVAL_S = 0.005
+"""Pause of the import between two such times."""
 
 
 class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
@@ -43,7 +50,11 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         name="Match Scene", description="Set size, frame range and view transform of the scene to those of the frames",
         default=True)
 
+    _in_steps = False
+    """Whether a person called the operator, who sees the window; a script waits for the end."""
+
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        self._in_steps = True
         if self.filepath or self.directory:  # dropped into the window
             return self.execute(context)
         self.filepath = ""
@@ -56,17 +67,55 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         for name in ("cameras", "up", "scale", "frames", "points", "match_scene"):
             layout.prop(self, name)
 
-    def act(self, context: bpy.types.Context) -> None:
-        chosen = Path(bpy.path.abspath(self.filepath or self.directory))
-        if not chosen.exists() and self.directory:
-            chosen = Path(bpy.path.abspath(self.directory))
-        settings = ImportSettings(self.cameras, self.up, self.scale, self.frames, self.points, self.match_scene)
-        imported = import_capture(context.scene, chosen, settings)
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        with report_errors(self) as outcome:
+            chosen = Path(bpy.path.abspath(self.filepath or self.directory))
+            if not chosen.exists() and self.directory:
+                chosen = Path(bpy.path.abspath(self.directory))
+            settings = ImportSettings(self.cameras, self.up, self.scale, self.frames, self.points, self.match_scene)
+            self._name, self._steps = chosen.name, import_in_steps(context.scene, chosen, settings)
+            if not self._in_steps:
+                self._show(context, finish(self._steps))
+                return outcome.status
+            manager = context.window_manager
+            self._timer = manager.event_timer_add(INTERVAL_S, window=context.window)
+            manager.modal_handler_add(self)
+            context.workspace.status_text_set(f"Importing {self._name}; ESC to cancel")
+            outcome.status = {"RUNNING_MODAL"}
+        return outcome.status
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Go on with the import; other events wait, so that nothing else changes the scene meanwhile."""
+        if event.type == "ESC":
+            self.cancel(context)
+            self.report({"INFO"}, "The import was cancelled")
+            return {"CANCELLED"}
+        if event.type != "TIMER":
+            return {"RUNNING_MODAL"}
+        began = time.perf_counter()
+        with report_errors(self) as outcome:
+            try:
+                while time.perf_counter() - began < STEP_S:
+                    next(self._steps)
+                return {"RUNNING_MODAL"}
+            except StopIteration as end:
+                self._show(context, end.value)
+        self.cancel(context)
+        return outcome.status
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """End the import and the timer; an import that is not finished leaves nothing."""
+        self._steps.close()
+        context.window_manager.event_timer_remove(self._timer)
+        context.workspace.status_text_set(None)
+
+    def _show(self, context: bpy.types.Context, imported: Imported) -> None:
+        """Report what was imported, and turn the view to its camera. Raises RunError."""
         fits.clear_other_run(context.scene)
         fits.expose_cameras(context.scene, fits.run_folder(context.scene))
         for note in imported.notes:
             self.report({"WARNING"}, note)
-        self.report({"INFO"}, f"{chosen.name}: cameras {len(imported.cameras)}, lights {len(imported.lights)}")
+        self.report({"INFO"}, f"{self._name}: cameras {len(imported.cameras)}, lights {len(imported.lights)}")
         _look_through_camera(context)
 
 

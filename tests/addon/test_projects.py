@@ -77,6 +77,11 @@ def test_footage_moves_with_its_project(facts: Any) -> None:
     assert facts["stills and sequences"] == [["FILE", 1], ["SEQUENCE", 1]]
 
 
+def test_a_cancelled_import_leaves_nothing(facts: Any) -> None:
+    """Block of projects.py: "an import that is cancelled"."""
+    assert facts["cancelled import"] == [True, True, True]
+
+
 def test_lights_follow_a_fit_in_a_scene_that_no_window_shows(facts: Any) -> None:
     """Block of projects.py: "a fit that ends while its scene is not the one in the window"."""
     assert facts["moved unseen"] < 1e-4

@@ -23,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 import driver as ui
-from measure import NAME, Gaps, Ours, Times, milliseconds, module, timed
+from measure import NAME, Gaps, Ours, milliseconds, module
 
 ZIP, CAPTURE, ENGINE, OUT = (os.environ[f"FIT_FLARE_{name}"] for name in ("ZIP", "CAPTURE", "ENGINE", "OUT"))
 WIDTH = os.environ.get("FIT_FLARE_WIDTH", "240")  # of the fit; its quality is not the matter here
@@ -128,13 +128,11 @@ def import_capture():
     yield from ui.open_tab("Fit Flare")
     yield 0.5
     shot("02_empty")
-    importing: Times = []
-    timed(module("operators.capture"), "import_capture", importing)
     yield from ui.press_button("fit_flare.import_capture", panel())
     shot("02_file_browser")
     yield from ui.choose_file(CAPTURE + os.sep)
-    yield from wait(lambda: bpy.context.scene.fit_flare.capture, 30)
-    done("import", import_s=round(importing[0][0], 3))
+    import_s = yield from wait(lambda: bpy.context.scene.fit_flare.capture, 30)
+    done("import", import_s=round(import_s, 3))
     yield 0.5
     shot("03_imported")
 

@@ -153,6 +153,25 @@ facts["stills and sequences"] = sorted({(image.source, len(camera.background_ima
                                         for camera in bpy.data.cameras for back in camera.background_images
                                         for image in [back.image]})
 
+# ---- an import that is cancelled ------------------------------------------------------------------------
+importer, scene = part("flare_addon.capture.importer"), empty()
+
+
+def all_of_it():
+    return [scene.frame_end, scene.render.resolution_x, scene.fit_flare.capture,
+            *(len(getattr(bpy.data, kind)) for kind in ("objects", "collections", "cameras", "meshes"))]
+
+
+before, steps_before_cameras = all_of_it(), 0
+steps = importer.import_in_steps(scene, capture, importer.ImportSettings("each"))
+for _ in steps:
+    if bpy.data.cameras:
+        break
+    steps_before_cameras += 1
+grown = all_of_it()
+steps.close()
+facts["cancelled import"] = [before == all_of_it(), grown != before, steps_before_cameras > 5]
+
 # ---- a fit that ends while its scene is not the one in the window ---------------------------------------
 looks, lights = part("flare_addon.looks"), part("flare_addon.lights")
 scene = empty()

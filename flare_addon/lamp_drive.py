@@ -1,14 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The power and colour of a lamp as a factor on its flare, relative to a reference.
+"""What a light object does to the brightness of its flare, each by a switch of the flare.
 
-`looks.place_lights` multiplies flares with it, so the overlay, bakes and transfers follow the lamp alike. The reference
-is the lamp's light in the first frame of the scene:
+    follow_power         power and colour of a lamp, relative to a reference
+    follow_visibility    no flare where the object is disabled in renders, or a lamp or mesh in viewports
+    follow_direction     the cone of a spot, and the side and angle of an area light that flares as a point
+    follow_distance      inverse square fall-off, relative to a reference distance (core.look.placed_light computes it)
+
+`looks.place_light` applies them, so the overlay, bakes and transfers follow the lamp alike. A flare at an object that
+the artist has placed has all of them, one at a light of the capture none: its flare was fitted as it was filmed.
+
+The reference of the power is the lamp's light in the first frame of the scene:
 
     keyed lamp     computed from its curves, so it follows them
     driven lamp    measured at the first frame, when the flare gets the lamp or when a bake reads the scene
     other lamp     measured when the flare gets the lamp, so that a change by hand dims the flare
 
-An empty or a mesh has no power; its factor is 1.
+An empty or a mesh has no power; its factor is 1. The reference distance is the one from the camera to the object when
+the flare gets it; the artist can change it.
 """
 from __future__ import annotations
 
@@ -20,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import fcurves
-from .objects import view_layer_of
+from .objects import depsgraph_of, enabled_collections, view_layer_of
 
 Gain = tuple[float, float, float]
 
@@ -29,6 +37,11 @@ MIN_CHANNEL = 1e-3
 """Smallest reference of a colour channel relative to the largest: a red lamp that turns blue has a finite factor."""
 MAX_FACTOR = 1e6
 _PATHS = ("energy", "exposure", "color")
+SWITCHES = ("follow_power", "follow_visibility", "follow_direction", "follow_distance")
+"""The switches of a flare."""
+DARK: Gain = (0.0, 0.0, 0.0)
+_MIN_BLEND = 1e-4
+"""Smallest soft edge of a spot's cone, cosines."""
 
 
 def is_lamp(target: Any) -> bool:
@@ -50,6 +63,82 @@ def factor(scene: Any, depsgraph: Any, item: Any) -> Gain:
     present = light_of(target.evaluated_get(depsgraph).data)
     red, green, blue = np.clip(present / np.maximum(reference, MIN_CHANNEL * strongest), 0, MAX_FACTOR).tolist()
     return red, green, blue
+
+
+def is_sun(target: Any) -> bool:
+    """Return whether a light object is a sun, which has no distance."""
+    return is_lamp(target) and target.data.type == "SUN"
+
+
+def has_direction(item: Any) -> bool:
+    """Return whether a flare's lamp shines in some directions only, which `direction_factor` is for."""
+    return is_lamp(item.target) and item.target.data.type in ("SPOT", "AREA")
+
+
+def rendered_collections(scene: Any) -> set[Any]:
+    """Return the collections that renders of the scene show, in any view layer."""
+    return {collection for layer in scene.view_layers
+            for collection in enabled_collections(layer.layer_collection, "hide_render")}
+
+
+def is_shown(target: Any, depsgraph: Any, rendered: set[Any]) -> bool:
+    """Return whether a light object shines at the current frame.
+
+    It does not if it is disabled in renders or in viewports, nor if no collection of it is rendered. Of an empty,
+    which no render shows, only Disable in Renders counts. rendered: the `rendered_collections`.
+    """
+    evaluated = target.evaluated_get(depsgraph)
+    if evaluated.hide_render or target.type == "EMPTY":
+        return not evaluated.hide_render
+    return not evaluated.hide_viewport and any(collection in rendered for collection in target.users_collection)
+
+
+def direction_factor(item: Any, depsgraph: Any, matrix: Any, eye: Any) -> float:
+    """Return the part of a lamp's light that goes to `eye`, 0..1: in the cone of a spot, in front of an area light.
+
+    matrix: matrix_world of the lamp. An area light with an extent is left to the extent.
+    """
+    if not has_direction(item):
+        return 1.0
+    data = item.target.evaluated_get(depsgraph).data
+    if data.type == "AREA":
+        return 1.0 if item.extent != "point" else _cosine(matrix.to_3x3(), eye - matrix.translation)
+    local = matrix.inverted_safe() @ eye
+    if local.length < 1e-9:
+        return 1.0
+    edge = float(np.cos(data.spot_size / 2))
+    inside = (-local.z / local.length - edge) / max((1 - edge) * data.spot_blend, _MIN_BLEND)
+    share = min(max(inside, 0.0), 1.0)
+    return share * share * (3 - 2 * share)  # as Blender's renderers soften the edge
+
+
+def _cosine(rotation: Any, offset: Any) -> float:
+    """Return the cosine of the angle between a lamp's -Z and an offset in the world; 0 behind the lamp."""
+    normal = -rotation.col[2]
+    length = normal.length * offset.length
+    return max(float(normal.dot(offset)) / length, 0.0) if length > 0 else 1.0
+
+
+def dark_reason(scene: Any, depsgraph: Any, item: Any) -> str:
+    """Return why a flare is dark at the current frame by its switches, and what to do; "" where it is not."""
+    target = item.target
+    if item.follow_visibility and not is_shown(target, depsgraph, rendered_collections(scene)):
+        return f"{target.name} is disabled, and its flare with it: enable it, or switch Follow Visibility off."
+    if item.follow_direction and scene.camera is not None and has_direction(item):
+        matrix, eye = target.evaluated_get(depsgraph).matrix_world, scene.camera.matrix_world.translation
+        if direction_factor(item, depsgraph, matrix, eye) <= 0:
+            return f"{target.name} does not shine at the camera: turn it, or switch Follow Direction off."
+    return ""
+
+
+def report_dark(operator: Any, scene: Any) -> None:
+    """Report the first flare that is dark by its switches; operators that add flares call it."""
+    depsgraph = depsgraph_of(scene)
+    for item in scene.fit_flare.lights:
+        placed = item.target is not None and scene.objects.get(item.target.name) == item.target
+        if placed and (reason := dark_reason(scene, depsgraph, item)):
+            operator.report({"WARNING"}, reason)
+            return
 
 
 def light_of(data: Any) -> NDArray[np.float64]:
@@ -101,11 +190,13 @@ def is_driven(target: Any) -> bool:
 
 
 def measure(scene: Any, item: Any) -> None:
-    """Store the reference of a flare's lamp: its light in the first frame of the scene for a driven lamp, else now.
+    """Store the references of a flare: the distance of its light now, and the power of its lamp, in the first frame of
+    the scene for a driven lamp, else now.
 
     For a driven lamp this moves the timeline to the first frame and back.
     """
     target = item.target
+    item.reference_distance = _distance(scene, target)
     if not is_lamp(target):
         return
     layer = view_layer_of(scene)
@@ -120,6 +211,15 @@ def measure(scene: Any, item: Any) -> None:
     item.reference_is_driven = is_driven(target)
 
 
+def _distance(scene: Any, target: Any) -> float:
+    """Return the distance from the scene's camera to a light object; 0 without a camera, and for a sun."""
+    if scene.camera is None or is_sun(target):
+        return 0.0
+    depsgraph = depsgraph_of(scene)
+    camera, light = (item.evaluated_get(depsgraph).matrix_world.translation for item in (scene.camera, target))
+    return float((light - camera).length)
+
+
 def measure_driven(scene: Any) -> None:
     """Measure the references of driven lamps that were not driven when they were measured; a bake begins with it."""
     for item in scene.fit_flare.lights:
@@ -128,8 +228,19 @@ def measure_driven(scene: Any) -> None:
 
 
 def on_target(item: Any, _context: Any) -> None:
-    """Measure the reference when a flare gets another light object."""
-    scene = item.id_data
-    if isinstance(scene, bpy.types.Scene) and is_lamp(item.target):
-        item.reference_light = light_of(item.target.data).tolist()
+    """Measure the references when a flare gets another light object, and set its switches when it is the first one.
+
+    The switches are on, or off for a light of the capture.
+    """
+    scene, target = item.id_data, item.target
+    if not isinstance(scene, bpy.types.Scene) or target is None:
+        return
+    of_capture = target.fit_flare.is_light
+    if of_capture or not item.is_at_artists_light:
+        for name in SWITCHES:
+            setattr(item, name, not of_capture)
+    item.is_at_artists_light = not of_capture
+    item.reference_distance = _distance(scene, target)
+    if is_lamp(target):
+        item.reference_light = light_of(target.data).tolist()
         item.reference_is_driven = False

@@ -78,7 +78,7 @@ def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add:
             item.name = free_name(light.name, {entry.name for entry in state.lights})
         lamp = objects.get(light.name)
         if item is not None and item.target is None and lamp is not None and lamp not in _targets(state):
-            item.target, item.follow_power = lamp, False  # the power of a light of the footage is in its flare
+            item.target = lamp
     _place_at(scene, look, targets, add)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
     state.native = _was_learned_here(look, state, objects, depsgraph_of(scene))
@@ -263,34 +263,42 @@ def place_lights(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.fl
     state = scene.fit_flare
     matrix = camera.evaluated_get(depsgraph).matrix_world
     to_capture = cameras.world_to_capture(state.root, depsgraph)
-    lights = []
-    for item in state.lights:
-        if not is_placed(item, scene):
-            continue
-        lights.append(place_light(scene, depsgraph, matrix, to_capture, item, hides=state.occlusion))
+    rendered = lamp_drive.rendered_collections(scene)
+    lights = [place_light(scene, depsgraph, matrix, to_capture, item, hides=state.occlusion, rendered=rendered)
+              for item in state.lights if is_placed(item, scene)]
     return cameras.pose_in_capture(matrix, state.root, depsgraph), lights
 
 
 def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.float64], item: Any, *,
-                hides: bool) -> PlacedLight:
+                hides: bool, rendered: set[Any]) -> PlacedLight:
     """Return the light of a flare as a camera of this matrix_world sees it. Raises CaptureError.
 
     to_capture: matrix (4, 4) from Blender's world to the coordinates of the result. hides: whether objects hide it.
+    rendered: `lamp_drive.rendered_collections` of the scene.
     """
-    eye = camera.translation
-    placed = world_matrix(item.target, depsgraph)
-    position = light_position(item.target, placed, eye)
+    eye, target = camera.translation, item.target
+    if item.follow_visibility and not lamp_drive.is_shown(target, depsgraph, rendered):
+        xyz = (to_capture @ np.array([*target.matrix_world.translation, 1.0]))[:3]
+        return PlacedLight(item.name, item.source, xyz, factor=lamp_drive.DARK)
+    placed = world_matrix(target, depsgraph)
+    position = light_position(target, placed, eye)
     xyz = (to_capture @ np.array([*position, 1.0]))[:3]
     gain = lamp_drive.factor(scene, depsgraph, item)
+    if item.follow_direction:
+        share = lamp_drive.direction_factor(item, depsgraph, placed, eye)
+        gain = (gain[0] * share, gain[1] * share, gain[2] * share)
+    reference = item.reference_distance if item.follow_distance and not lamp_drive.is_sun(target) else 0.0
+    reference *= float(np.cbrt(abs(np.linalg.det(to_capture[:3, :3]))))
     extent = light_extents.extent_of(item, depsgraph, placed)
     if extent is None:
         visibility = occlusion.visibility(scene, depsgraph, eye, item) if hides else 1.0
-        return PlacedLight(item.name, item.source, xyz, visibility, factor=gain)
+        return PlacedLight(item.name, item.source, xyz, visibility, factor=gain, reference_distance=reference)
     shares = None
     if hides:
         sampled = extent.sampled(np.array(position), np.linalg.inv(cameras.camera_to_world(camera)))
         shares = tuple(sampled.shares(occlusion.visible_points(scene, depsgraph, eye, item, sampled.points)).tolist())
-    return PlacedLight(item.name, item.source, xyz, 1.0, extent.transformed(to_capture[:3, :3]), shares, gain)
+    return PlacedLight(item.name, item.source, xyz, 1.0, extent.transformed(to_capture[:3, :3]), shares, gain,
+                       reference)
 
 
 def evaluate_flares(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:

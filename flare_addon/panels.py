@@ -326,8 +326,10 @@ def _draw_flare(layout: Any, scene: Any, item: Any, look: Look) -> None:
     _draw_sliders(box, item)
     column = box.column()
     column.use_property_split = True
-    if lamp_drive.is_lamp(item.target):
-        column.prop(item, "follow_power")
+    _draw_switches(column, item)
+    if item.target is not None and looks.is_placed(item, scene) and (
+            dark := lamp_drive.dark_reason(scene, bpy.context.view_layer.depsgraph, item)):
+        label_lines(column, dark, "INFO")
     column.prop(item, "extent")
     if item.extent == "point" or item.target is None or light_extents.is_point(item):
         column.prop(item, "radius")
@@ -341,6 +343,21 @@ def _draw_flare(layout: Any, scene: Any, item: Any, look: Look) -> None:
         if 0 <= item.element < len(item.elements):
             box.label(text=item.elements[item.element].name.capitalize(), icon="DOT")
             _draw_sliders(box, item.elements[item.element], item.elements[item.element].kind == "streak")
+
+
+def _draw_switches(column: Any, item: Any) -> None:
+    """Draw what of its light object a flare follows."""
+    if item.target is None:
+        return
+    if lamp_drive.is_lamp(item.target):
+        column.prop(item, "follow_power")
+    column.prop(item, "follow_visibility")
+    if lamp_drive.has_direction(item):
+        column.prop(item, "follow_direction")
+    if not lamp_drive.is_sun(item.target):
+        column.prop(item, "follow_distance")
+        if item.follow_distance:
+            column.prop(item, "reference_distance")
 
 
 class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):

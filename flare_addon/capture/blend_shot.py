@@ -19,7 +19,7 @@ from ...core.errors import CaptureError
 from ...core.look import PlacedLight
 from ...core.look.shot import Shot, ShotFrame
 from ...core.system.files import write_json
-from .. import cameras, lamp_drive, lights, looks
+from .. import cameras, fcurves, lamp_drive, lights, looks
 from ..objects import enabled_collections, world_matrix
 from . import exporter
 
@@ -57,7 +57,8 @@ def read_shot(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[in
         depsgraph = bpy.context.evaluated_depsgraph_get()
         camera = _active_camera(scene).evaluated_get(depsgraph)
         core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
-        placed = tuple(_place_light(scene, depsgraph, item, camera.matrix_world) for item in items)
+        rendered = lamp_drive.rendered_collections(scene)
+        placed = tuple(_place_light(scene, depsgraph, item, camera.matrix_world, rendered) for item in items)
         shot_frames.append(ShotFrame(frame, scene.name, core, placed))
         done()
     return Shot(flare, tuple(shot_frames))
@@ -84,7 +85,14 @@ def _find_lights(scene: Any, names: Sequence[str]) -> list[Any]:
                 for collection in enabled_collections(layer.layer_collection, "hide_render")
                 for obj in collection.objects}
     return [obj for obj in scene.objects if obj.type == "LIGHT" and obj.data.type in LAMP_TYPES
-            and not obj.hide_render and obj.name in rendered]
+            and (not obj.hide_render or _is_keyed(obj, "hide_render")) and obj.name in rendered]
+
+
+def _is_keyed(obj: Any, path: str) -> bool:
+    """Return whether keys or drivers change a property of an object."""
+    data = obj.animation_data
+    return data is not None and any(
+        curve.data_path == path for group in (*fcurves.fcurves_of(obj), data.drivers) for curve in group)
 
 
 def _flare_of(obj: Any, radius: float) -> Any:
@@ -93,13 +101,17 @@ def _flare_of(obj: Any, radius: float) -> Any:
     light = lamp_drive.light_of(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data).tolist() \
         if lamp_drive.is_lamp(obj) else (0.0, 0.0, 0.0)
     return SimpleNamespace(name=obj.name, source=obj.name, target=obj, radius=radius or _lamp_radius(obj),
-                           follow_power=True, reference_light=light, extent="auto")
+                           follow_power=True, follow_visibility=True, follow_direction=True, follow_distance=False,
+                           reference_light=light, reference_distance=0.0, extent="auto")
 
 
-def _place_light(scene: Any, depsgraph: Any, item: Any, camera: Any) -> PlacedLight:
-    """Return a light with its position, visibility, extent and power, seen by a camera of this matrix_world."""
+def _place_light(scene: Any, depsgraph: Any, item: Any, camera: Any, rendered: set[Any]) -> PlacedLight:
+    """Return a light with its position, visibility, extent and power, seen by a camera of this matrix_world.
+
+    rendered: the collections that renders show.
+    """
     _light_position(depsgraph, item.target, camera.translation)  # refuses one that is not finite
-    return looks.place_light(scene, depsgraph, camera, np.eye(4), item, hides=True)
+    return looks.place_light(scene, depsgraph, camera, np.eye(4), item, hides=True, rendered=rendered)
 
 
 def _light_position(depsgraph: Any, obj: Any, eye: Any) -> cameras.Floats:

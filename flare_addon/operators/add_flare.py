@@ -9,7 +9,7 @@ import bpy
 from mathutils import Vector
 
 from ...core.errors import FlareFileError
-from .. import cameras, library, lights, looks
+from .. import cameras, lamp_drive, library, lights, looks
 from ..objects import depsgraph_of, world_matrix
 from ..reports import GuardedOperator
 from ..views import look_through_camera
@@ -71,6 +71,7 @@ class FITFLARE_OT_add_library_flare(GuardedOperator, bpy.types.Operator):
         if is_first:
             _remove_unplaced(scene)
         scene.fit_flare.show = True
+        lamp_drive.report_dark(self, scene)
         look_through_camera(context)
 
 

@@ -9,7 +9,7 @@ import bpy
 from mathutils import Vector
 
 from ...core.errors import FlareFileError
-from .. import asset_browser, cameras, library, lights, looks, overlay, render_settings
+from .. import asset_browser, cameras, lamp_drive, library, lights, looks, overlay, render_settings
 from ..compositor import setup
 from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator
 from ..views import look_through_camera
@@ -108,6 +108,7 @@ class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
         missing = [item.name for item in context.scene.fit_flare.lights if item.target is None]
         if missing:
             self.report({"WARNING"}, f"{', '.join(missing)}: choose the light object in the panel Look")
+        lamp_drive.report_dark(self, context.scene)
 
 
 class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):

@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ...core.errors import FitFlareError
-from .. import looks
+from .. import lamp_drive, looks
 from ..compositor import drivers
 from ..properties import EDIT_NAMES
 from ..reports import NO_FLARE, GuardedOperator
@@ -49,6 +49,7 @@ class FITFLARE_OT_open_flare(GuardedOperator, bpy.types.Operator):
         chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
         look = looks.show_look(context.scene, Path(bpy.path.abspath(self.filepath)), chosen)
         self.report({"INFO"}, f"{Path(self.filepath).name}: {len(look.lights)} lights, {look.count} Gaussians")
+        lamp_drive.report_dark(self, context.scene)
 
 
 class FITFLARE_OT_add_flare(GuardedOperator, bpy.types.Operator):
@@ -74,6 +75,7 @@ class FITFLARE_OT_add_flare(GuardedOperator, bpy.types.Operator):
         for item in context.selected_objects:
             if item.type != "CAMERA":
                 looks.add_flare(context.scene, item, self.source or look.names[0])
+        lamp_drive.report_dark(self, context.scene)
 
 
 class FITFLARE_OT_remove_flare(GuardedOperator, bpy.types.Operator):

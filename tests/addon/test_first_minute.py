@@ -138,16 +138,6 @@ def test_a_single_picture_is_rendered_with_its_flare(facts: Any) -> None:
     assert facts["picture alone removed"] and facts["picture removed"]
 
 
-def test_power_and_colour_of_a_lamp_drive_its_flare(facts: Any) -> None:
-    """Block of first_minute.py: "lamps drive their flares"."""
-    assert facts["dimmed by hand"] == [0.5, 0.25, 0.5]
-    assert facts["half as bright"] == pytest.approx(0.5, abs=1e-3)
-    assert facts["not following"] == [1, 1, 1]
-    assert facts["keyed"] == [[1, 1, 1], [3, 3, 3]], "relative to the first frame"
-    assert facts["keyed, in a bake"] == facts["keyed, in a transfer"] == [1, 3]
-    assert facts["driven"] == [4, [1, 1, 1], [4, 4, 4]], "and the timeline stays where it was"
-
-
 def test_area_lights_flare_as_areas(facts: Any) -> None:
     """Block of first_minute.py: "lights that are areas"."""
     shape, size, emission, share = facts["area"]

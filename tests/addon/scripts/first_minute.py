@@ -13,7 +13,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 from quads import drawn_levels
-from start import empty, install, leave, part, refusal
+from start import empty, install, leave, object_in, part, refusal, scene_with, select
 
 package, flare, two, out = sys.argv[1:5]
 install(package)
@@ -26,31 +26,8 @@ names = [item[1] for item in library.items()]
 path_of = {item[1]: item[0] for item in library.items()}
 
 
-def object_in(scene, name, data, place):
-    item = bpy.data.objects.new(name, data)
-    scene.collection.objects.link(item)
-    item.location = place
-    return item
-
-
-def scene_with(*lamps):
-    """An empty file with a camera that looks along +y, and lamps at these places."""
-    scene = empty()
-    scene.camera = object_in(scene, "Camera", bpy.data.cameras.new("Camera"), (0, 0, 0))
-    scene.camera.rotation_euler = (np.pi / 2, 0, 0)
-    made = [object_in(scene, f"Lamp {number}", bpy.data.lights.new("Lamp", "POINT"), place)
-            for number, place in enumerate(lamps, 1)]
-    bpy.context.view_layer.update()
-    return scene, made
-
-
 def rows(scene):
     return [[item.name, item.source, item.target.name if item.target else ""] for item in scene.fit_flare.lights]
-
-
-def select(scene, *objects):
-    for item in scene.objects:
-        item.select_set(item in objects)
 
 
 def brightness(scene):
@@ -304,50 +281,6 @@ baking._preparation = baking.Preparation(reading, False, folder)
 during = refusal(ops.bake)
 bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 facts["another file is opened"] = [during, baking.preparation() is None]
-
-# ---- lamps drive their flares ---------------------------------------------------------------------------
-def factor(scene, frame=None):
-    """The factor of the first flare, as a shot has it."""
-    if frame is not None:
-        scene.frame_set(frame)
-    bpy.context.view_layer.update()
-    _, (light,) = looks.place_lights(scene, bpy.context.evaluated_depsgraph_get(), scene.camera)
-    return [round(value, 4) for value in light.factor]
-
-
-scene, (lamp,) = scene_with((0.5, 8, 0.4))
-lamp.data.energy, scene.frame_end = 100, 9
-select(scene, lamp)
-ops.apply_flare(filepath=flare)
-item = scene.fit_flare.lights[0]
-bright = brightness(scene)
-lamp.data.energy, lamp.data.color = 50, (1, 0.5, 1)
-facts["dimmed by hand"] = factor(scene)
-lamp.data.color = (1, 1, 1)
-bpy.context.view_layer.update()
-facts["half as bright"] = brightness(scene) / bright
-item.follow_power = False
-facts["not following"] = factor(scene)
-item.follow_power = True
-for frame, energy in ((1, 20), (9, 60)):
-    lamp.data.energy = energy
-    lamp.data.keyframe_insert("energy", frame=frame)
-facts["keyed"] = [factor(scene, 1), factor(scene, 9)]
-shot = shots.scene_shot(scene, [], [1, 9], Path(flare), None)
-facts["keyed, in a bake"] = [round(frame.lights[0].factor[0], 4) for frame in shot.frames]
-lamp.data.animation_data_clear()
-driver = lamp.data.driver_add("energy").driver
-driver.type, driver.expression = "SCRIPTED", "10 * frame"
-scene.frame_set(4)
-part("flare_addon.lamp_drive").measure_driven(scene)
-facts["driven"] = [scene.frame_current, factor(scene, 1), factor(scene, 4)]
-lamp.data.driver_remove("energy")
-blend_shot = part("flare_addon.capture.blend_shot")
-for frame, energy in ((1, 20), (9, 60)):
-    lamp.data.energy = energy
-    lamp.data.keyframe_insert("energy", frame=frame)
-read = blend_shot.read_shot(scene, Path(flare), [], [1, 9])
-facts["keyed, in a transfer"] = [round(frame.lights[0].factor[1], 4) for frame in read.frames]
 
 # ---- lights that are areas ------------------------------------------------------------------------------
 scene, (lamp,) = scene_with((0, 8, 0))

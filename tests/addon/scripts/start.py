@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import io
 import json
+import math
 import os
 import sys
 import warnings
@@ -46,6 +47,30 @@ def empty() -> Any:
     """A new file; its scene."""
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     return bpy.context.scene
+
+
+def object_in(scene: Any, name: str, data: Any, place: Any) -> Any:
+    """A new object of the scene."""
+    item = bpy.data.objects.new(name, data)
+    scene.collection.objects.link(item)
+    item.location = place
+    return item
+
+
+def scene_with(*lamps: Any) -> tuple[Any, list[Any]]:
+    """An empty file with a camera that looks along +y, and lamps at these places."""
+    scene = empty()
+    scene.camera = object_in(scene, "Camera", bpy.data.cameras.new("Camera"), (0, 0, 0))
+    scene.camera.rotation_euler = (math.pi / 2, 0, 0)
+    made = [object_in(scene, f"Lamp {number}", bpy.data.lights.new("Lamp", "POINT"), place)
+            for number, place in enumerate(lamps, 1)]
+    bpy.context.view_layer.update()
+    return scene, made
+
+
+def select(scene: Any, *objects: Any) -> None:
+    for item in scene.objects:
+        item.select_set(item in objects)
 
 
 def artists_tree(scene: Any) -> Any:

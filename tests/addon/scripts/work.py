@@ -383,6 +383,7 @@ other = empty()
 camera = bpy.data.objects.new("Second", bpy.data.cameras.new("Second"))
 camera.rotation_euler = (math.pi / 2, 0, 0)
 lamp = bpy.data.objects.new("Spot", bpy.data.lights.new("Spot", "SPOT"))
+lamp.rotation_euler = (-math.pi / 2, 0, 0)  # shines at the camera
 lamp.location = (-1.0, 6.0, 0.8)
 for thing in (camera, lamp):
     other.collection.objects.link(thing)

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside Blender: lamps drive their flares, in the camera view, in bakes and in transfers. Arguments: the zip, a .flare
+with one light, a folder to write."""
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import bpy
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+from start import install, leave, object_in, part, scene_with, select
+
+package, flare = sys.argv[1:3]
+install(package)
+sys.path.remove(str(Path(__file__).parent))
+ops = bpy.ops.fit_flare
+looks, panels, shots, core_look = (
+    part(name) for name in ("flare_addon.looks", "flare_addon.panels", "flare_addon.shots", "core.look"))
+facts: dict[str, object] = {}
+
+
+def brightness(scene):
+    """The sum of the flare over a small picture, as numpy draws it."""
+    gaussians = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera)
+    k = np.array([[48.0, 0, 24], [0, 48.0, 13.5], [0, 0, 1]])
+    return float(core_look.draw(gaussians.values(), k, 48, 27).sum())
+
+
+# ---- lamps drive their flares ---------------------------------------------------------------------------
+def placed_light(scene):
+    """The first light, as a shot has it."""
+    bpy.context.view_layer.update()
+    return looks.place_lights(scene, bpy.context.evaluated_depsgraph_get(), scene.camera)[1][0]
+
+
+def factor(scene, frame=None):
+    """The factor of the first flare, as a shot has it."""
+    if frame is not None:
+        scene.frame_set(frame)
+    return [round(value, 4) for value in placed_light(scene).factor]
+
+
+scene, (lamp,) = scene_with((0.5, 8, 0.4))
+lamp.data.energy, scene.frame_end = 100, 9
+select(scene, lamp)
+ops.apply_flare(filepath=flare)
+item = scene.fit_flare.lights[0]
+bright = brightness(scene)
+lamp.data.energy, lamp.data.color = 50, (1, 0.5, 1)
+facts["dimmed by hand"] = factor(scene)
+lamp.data.color = (1, 1, 1)
+bpy.context.view_layer.update()
+facts["half as bright"] = brightness(scene) / bright
+item.follow_power = False
+facts["not following"] = factor(scene)
+item.follow_power = True
+for frame, energy in ((1, 20), (9, 60)):
+    lamp.data.energy = energy
+    lamp.data.keyframe_insert("energy", frame=frame)
+facts["keyed"] = [factor(scene, 1), factor(scene, 9)]
+shot = shots.scene_shot(scene, [], [1, 9], Path(flare), None)
+facts["keyed, in a bake"] = [round(frame.lights[0].factor[0], 4) for frame in shot.frames]
+lamp.data.animation_data_clear()
+driver = lamp.data.driver_add("energy").driver
+driver.type, driver.expression = "SCRIPTED", "10 * frame"
+scene.frame_set(4)
+part("flare_addon.lamp_drive").measure_driven(scene)
+facts["driven"] = [scene.frame_current, factor(scene, 1), factor(scene, 4)]
+lamp.data.driver_remove("energy")
+blend_shot = part("flare_addon.capture.blend_shot")
+for frame, energy in ((1, 20), (9, 60)):
+    lamp.data.energy = energy
+    lamp.data.keyframe_insert("energy", frame=frame)
+read = blend_shot.read_shot(scene, Path(flare), [], [1, 9])
+facts["keyed, in a transfer"] = [round(frame.lights[0].factor[1], 4) for frame in read.frames]
+
+# ---- lamps switch their flares --------------------------------------------------------------------------
+SWITCHES = ("follow_power", "follow_visibility", "follow_direction", "follow_distance")
+
+
+def baked(scene, numbers):
+    """The sum of the flare in each frame, as a bake of the scene has it."""
+    look, sums = looks.look_of(scene), []
+    k = np.array([[48.0, 0, 24], [0, 48.0, 13.5], [0, 0, 1]])
+    for frame in shots.scene_shot(scene, [], numbers, look.path, None).frames:
+        gaussians = look.evaluate_lights(frame.camera.world_to_camera, frame.lights, looks.edits_of(scene.fit_flare),
+                                         looks.query_of(scene.fit_flare))
+        sums.append(float(core_look.draw(gaussians.values(), k, 48, 27).sum()) if gaussians else 0.0)
+    return sums
+
+
+def keyed(item, path, *keys):
+    """Key a property: (frame, value), ..."""
+    for frame, value in keys:
+        setattr(item, path, value)
+        item.keyframe_insert(path, frame=frame)
+
+
+def over(scene, numbers):
+    """The sum of the flare in each frame relative to the first, in the camera view and in a bake."""
+    seen = []
+    for number in numbers:
+        scene.frame_set(number)
+        seen.append(brightness(scene))
+    scene.frame_set(numbers[0])
+    both = [seen, baked(scene, numbers)]
+    return [[round(value / max(values[0], 1e-9), 3) for value in values] for values in both]
+
+
+def lit_scene(place=(0.4, 8, 0.3), kind="POINT"):
+    scene, (lamp,) = scene_with(place)
+    lamp.data.type, scene.frame_end = kind, 9
+    select(scene, lamp)
+    ops.apply_flare(filepath=flare)
+    return scene, lamp, scene.fit_flare.lights[0]
+
+
+scene, lamp, item = lit_scene()
+facts["switches"] = [[getattr(item, name) for name in SWITCHES], round(item.reference_distance, 3)]
+marked = object_in(scene, "Marked", bpy.data.lights.new("Marked", "POINT"), (0, 8, 0))
+marked.fit_flare.is_light = True
+item.target = marked
+facts["switches of a capture"] = [getattr(item, name) for name in SWITCHES]
+item.target = lamp
+facts["switches again"] = [getattr(item, name) for name in SWITCHES]
+for path in ("hide_render", "hide_viewport"):
+    scene, lamp, item = lit_scene()
+    keyed(lamp, path, (1, False), (5, True), (9, False))
+    facts[f"keyed {path}"] = over(scene, [1, 5, 9])
+    if path == "hide_render":
+        read = blend_shot.read_shot(scene, Path(flare), [], [1, 5, 9])
+        facts["hidden, in a transfer"] = [frame.lights[0].factor[0] for frame in read.frames]
+        scene.frame_set(5)
+        facts["hidden, not followed"] = [brightness(scene) > 0, setattr(item, "follow_visibility", False),
+                                         brightness(scene) > 0]
+        item.follow_visibility = True
+        layout = MagicMock()
+        panels.FITFLARE_PT_look.draw(SimpleNamespace(layout=layout), bpy.context)
+        facts["hidden, in the panel"] = " ".join(
+            str(call.kwargs.get("text", "")) for call in layout.mock_calls if call[0].rpartition(".")[2] == "label")
+scene, lamp, item = lit_scene()
+lamp.driver_add("hide_render").driver.expression = "frame == 5"
+facts["driven hide_render"] = over(scene, [1, 5, 9])
+scene, lamp, item = lit_scene()
+group = bpy.data.collections.new("Lamps")
+scene.collection.children.link(group)
+group.objects.link(lamp)
+scene.collection.objects.unlink(lamp)
+bpy.context.view_layer.update()
+in_group = brightness(scene) > 0
+group.hide_render = True
+facts["in a hidden collection"] = [in_group, brightness(scene) > 0]
+
+scene, lamp, item = lit_scene((0, 8, 0), "SPOT")
+lamp.data.spot_size, lamp.data.spot_blend = np.radians(60), 0.0
+keyed(lamp, "rotation_euler", (1, (-np.pi / 2, 0, 0)), (2, (-np.pi / 2, 0, np.radians(29))),
+      (3, (-np.pi / 2, 0, np.radians(31))))
+facts["hard spot"] = over(scene, [1, 2, 3])
+read = blend_shot.read_shot(scene, Path(flare), [], [1, 3])
+facts["spot, in a transfer"] = [frame.lights[0].factor[0] for frame in read.frames]
+scene.frame_set(3)
+facts["spot, in the panel"] = part("flare_addon.lamp_drive").dark_reason(scene, bpy.context.view_layer.depsgraph, item)
+operator = MagicMock()
+part("flare_addon.lamp_drive").report_dark(operator, scene)
+facts["spot, reported"] = operator.report.call_args.args[1] == facts["spot, in the panel"]
+item.follow_direction = False
+facts["spot, not followed"] = brightness(scene) > 0
+item.follow_direction = True
+lamp.animation_data_clear()
+lamp.rotation_euler = (-np.pi / 2, 0, np.radians(20))
+lamp.data.spot_blend = 1.0
+bpy.context.view_layer.update()
+share = (np.cos(np.radians(20)) - np.cos(np.radians(30))) / (1 - np.cos(np.radians(30)))
+facts["soft spot"] = [factor(scene)[0], round(float(share * share * (3 - 2 * share)), 4)]
+keyed(lamp.data, "spot_size", (1, np.radians(60)), (5, np.radians(10)))
+facts["keyed cone"] = [factor(scene, 1)[0] > 0.1, factor(scene, 5)[0]]
+scene, lamp, item = lit_scene((0, 8, 0), "AREA")
+item.extent = "point"
+lamp.rotation_euler = (-np.pi / 2, 0, np.pi / 3)
+bpy.context.view_layer.update()
+facts["area as a point"] = factor(scene)[0]
+
+scene, lamp, item = lit_scene()
+keyed(lamp, "location", (1, (0.4, 8, 0.3)), (9, (0.8, 16, 0.6)))
+facts["twice as far"] = over(scene, [1, 9])
+item.follow_distance = False
+facts["twice as far, not followed"] = over(scene, [1, 9])
+scene, sun, item = lit_scene((0, 0, 9), "SUN")
+facts["a sun has no distance"] = [item.reference_distance, placed_light(scene).reference_distance]
+
+leave(facts)

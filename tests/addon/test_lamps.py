@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lamps drive their flares, in the camera view, in bakes and in transfers alike."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blenders import Blender
+from test_work import a_flare
+
+SCRIPT = Path(__file__).parent / "scripts" / "lamps.py"
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("lamps")
+    return blender.run(SCRIPT, package, a_flare(base / "lamp.flare"), user=base / "user")
+
+
+def test_power_and_colour_of_a_lamp_drive_its_flare(facts: Any) -> None:
+    """Block of lamps.py: "lamps drive their flares"."""
+    assert facts["dimmed by hand"] == [0.5, 0.25, 0.5]
+    assert facts["half as bright"] == pytest.approx(0.5, abs=1e-3)
+    assert facts["not following"] == [1, 1, 1]
+    assert facts["keyed"] == [[1, 1, 1], [3, 3, 3]], "relative to the first frame"
+    assert facts["keyed, in a bake"] == facts["keyed, in a transfer"] == [1, 3]
+    assert facts["driven"] == [4, [1, 1, 1], [4, 4, 4]], "and the timeline stays where it was"
+
+
+def test_a_flare_follows_all_of_its_lamp_but_nothing_of_a_light_of_the_capture(facts: Any) -> None:
+    """Block of lamps.py: "lamps switch their flares"."""
+    assert facts["switches"] == [[True] * 4, pytest.approx(8.016, abs=1e-3)]
+    assert facts["switches of a capture"] == [False] * 4
+    assert facts["switches again"] == [True] * 4
+
+
+@pytest.mark.parametrize("how", ["keyed hide_render", "keyed hide_viewport", "driven hide_render"])
+def test_a_lamp_that_is_switched_off_has_no_flare(facts: Any, how: str) -> None:
+    """Block of lamps.py: "lamps switch their flares"."""
+    assert facts[how] == [[1, 0, 1]] * 2, "in the camera view, in a bake"
+
+
+def test_hidden_lamps_are_followed_in_transfers_collections_and_the_panel(facts: Any) -> None:
+    """Block of lamps.py: "lamps switch their flares"."""
+    assert facts["hidden, in a transfer"] == [1, 0, 1]
+    assert facts["hidden, not followed"] == [False, None, True]
+    assert "switch Follow Visibility off" in facts["hidden, in the panel"]
+    assert facts["in a hidden collection"] == [True, False]
+
+
+def test_the_cone_of_a_spot_limits_its_flare(facts: Any) -> None:
+    """Block of lamps.py: "lamps switch their flares"."""
+    assert facts["hard spot"] == [[1, 1, 0]] * 2, "in the camera view, in a bake"
+    assert facts["spot, in a transfer"] == [1, 0]
+    assert "does not shine at the camera" in facts["spot, in the panel"] and facts["spot, reported"]
+    assert facts["spot, not followed"]
+    measured, exact = facts["soft spot"]
+    assert 0.1 < exact < 0.9 and measured == pytest.approx(exact, abs=1e-3)
+    assert facts["keyed cone"] == [True, 0]
+    assert facts["area as a point"] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_a_flare_dims_with_the_square_of_the_distance(facts: Any) -> None:
+    """Block of lamps.py: "lamps switch their flares"."""
+    assert facts["twice as far"] == [[1, pytest.approx(0.25, abs=2e-3)]] * 2, "in the camera view, in a bake"
+    assert facts["twice as far, not followed"] == [[1, pytest.approx(1, abs=2e-3)]] * 2
+    assert facts["a sun has no distance"] == [0, 0]

@@ -170,10 +170,12 @@ class Plate:
     def warning(self) -> str:
         """Sentences on what the clean plate cannot keep, and on a name that is not of the file's format; "" for none.
         """
-        written, kind = _format_suffix(self.path, self), file_kind(self.path)
-        sentence = "" if written == self.path.suffix.lower() or clean_name(self.path) != self.path else (
-            f"{self.path} holds {kind.upper()} data, whatever its name; the clean plate of that name holds "
-            f"{written[1:].upper()} data.")
+        suffix, kind = self.path.suffix.lower(), file_kind(self.path)
+        written, sentence = SUFFIX_KINDS.get(_format_suffix(self.path, self)), ""
+        if clean_name(self.path) == self.path and kind not in ("", SUFFIX_KINDS.get(suffix)):
+            sentence = f"{self.path} holds {kind.upper()} data, whatever its name; " + (
+                "so does the clean plate of that name." if written == kind else
+                f"the clean plate of that name holds {str(written).upper()} data.")
         return " ".join(filter(None, (sentence, dropped_parts(self.path))))
 
     @property

@@ -112,3 +112,17 @@ def test_a_picture_without_a_suffix_is_named(tmp_path: Path) -> None:
 def test_a_video_in_a_folder_of_pictures_has_a_reason(clip: Path, tmp_path: Path) -> None:
     shutil.copy(clip, tmp_path / "a.mp4")
     assert unlisted_entries(tmp_path) == [("a video, which is read by its own name", ["a.mp4"])]
+
+
+def test_a_solve_of_a_folder_without_frames_names_what_it_could_read(clip: Path, tmp_path: Path) -> None:
+    for name in ("left", "right", "notes"):
+        (tmp_path / "shot" / name).mkdir(parents=True)
+        (tmp_path / "shot" / name / "a.txt").write_text("")
+    with pytest.raises(CaptureError, match="shot holds no frames; give a folder with PNG"):
+        prepare_frames(tmp_path / "shot", tmp_path / "work", 0, 100, Progress())
+    write_files(tmp_path / "shot" / "left")
+    with pytest.raises(CaptureError, match="shot holds no frames; left in it does: name that"):
+        prepare_frames(tmp_path / "shot", tmp_path / "work", 0, 100, Progress())
+    shutil.copy(clip, tmp_path / "shot" / "a.mp4")
+    with pytest.raises(CaptureError, match=r"shot holds no frames; .*left.* in it do: name one of them"):
+        prepare_frames(tmp_path / "shot", tmp_path / "work", 0, 100, Progress())

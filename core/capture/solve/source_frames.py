@@ -19,7 +19,7 @@ from ...colour.srgb import Pixels
 from ...errors import CaptureError, FrameError
 from ...images.exr import read_data_window
 from ...images.formats.exif import apply_orientation, read_exif
-from ...images.listing import pictures_in
+from ...images.listing import pictures_in, unlisted_entries
 from ...images.picture import Picture
 from ...images.read import read_picture
 from ...images.size import picture_size
@@ -29,6 +29,7 @@ from ...images.write import write_png
 from ...system.files import read_json, write_json
 from ...system.progress import Progress
 from ...typed import parse_table, parse_value
+from ..camera_solve import list_names
 
 RECORD_FILE = "stills.json"
 """File of the chosen frames, below the work folder."""
@@ -150,7 +151,12 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
     named = colour_space(*space) if space[0] else None
     files = pictures_in(source)
     if not files:
-        raise CaptureError(f"{source} holds no frames (PNG, JPEG, TIFF or EXR).")
+        names = [name for reason, names in unlisted_entries(source) if reason.startswith(("a subfolder", "a video"))
+                 for name in names]
+        raise CaptureError(f"{source} holds no frames; " + (
+            f"{list_names(names)} in it does: name that." if len(names) == 1 else
+            f"{list_names(names)} in it do: name one of them." if names else
+            "give a folder with PNG, JPEG, TIFF or EXR files, or a video."))
     left_out: list[str] = []
     if 0 < number < len(files):
         progress.stage("choose frames", len(files))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from core.images.panorama import wraps_around
 from core.images.plates import Plate, read_plate
+from core.images.write import write_exr
 from core.removal.inference.framing import (
     MAX_ASPECT,
     fill_hidden,
@@ -21,6 +22,7 @@ from core.removal.inference.framing import (
     merge_columns,
     predict_in_parts,
     wrap_columns,
+    wrap_margin,
 )
 from core.removal.inference.remover import Remover
 from tests.core.removal_cases import picture
@@ -127,6 +129,33 @@ def test_jpeg_tiff_and_exr_say_that_they_are_panoramas(tmp_path: Path) -> None:
         plate = read_plate(tmp_path / "a.exr")
         assert wraps_around(plate.path, plate.extras["header"]) is expected
     assert not wraps_around(tmp_path / "missing.jpg")
+
+
+def circle(height: int, start: int = 0) -> np.ndarray[Any, Any]:
+    """Codes (height, 2 height, 3) of a panorama without tags, from its column `start` on."""
+    coarse = np.random.default_rng(0).uniform(0, 255, (6, 12, 3)).astype(np.float32)
+    wide = cv2.resize(np.concatenate([coarse, coarse], 1), (4 * height, height), interpolation=cv2.INTER_CUBIC)
+    return wide[:, height + start:3 * height + start].clip(0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("change", ["", "part", "3:2", "flat", "mirrored"])
+@pytest.mark.parametrize("suffix", [".png", ".exr"])
+def test_a_picture_whose_sides_meet_is_a_panorama(tmp_path: Path, change: str, suffix: str) -> None:
+    codes = circle(96, 40)
+    if change == "part":
+        codes = cv2.resize(codes[:48, :96], (192, 96))
+    elif change == "3:2":
+        codes = np.ascontiguousarray(codes[:, :144])
+    elif change == "flat":
+        codes[:] = 120
+    elif change == "mirrored":
+        codes[:, 96:] = codes[:, 96:][:, ::-1]
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".png":
+        cv2.imwrite(str(path), codes)
+    else:
+        write_exr(path, {name: (codes[..., k] / np.float32(255)) ** 2.2 for k, name in enumerate("RGB")})
+    assert (wrap_margin(read_plate(path)) > 0) == (change == "")
 
 
 def test_a_panorama_has_no_seam(flare_everywhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...colour.srgb import Pixels
-from ...images.panorama import wraps_around
-from ...images.plates import Plate
+from ...colour.srgb import Pixels, srgb_from_linear
+from ...images.panorama import do_sides_meet, wraps_around
+from ...images.plates import Plate, finite_light
 from ..model.network import SIZE_MULTIPLE
 
 MAX_ASPECT = 3.0
@@ -71,8 +71,17 @@ def _diffuse(light: Pixels, alpha: Pixels) -> Pixels:
 
 def wrap_margin(plate: Plate) -> int:
     """Return the columns that a panorama gets from its other side at each edge; 0 for other pictures."""
-    is_panorama = wraps_around(plate.path, plate.extras.get("header"))
-    return plate.codes.shape[1] // WRAP_SHARE if is_panorama else 0
+    width = plate.codes.shape[1]
+    is_panorama = wraps_around(plate.path, plate.extras.get("header")) or (
+        width == 2 * plate.codes.shape[0] >= 4 and do_sides_meet(_side_columns(plate)))
+    return width // WRAP_SHARE if is_panorama else 0
+
+
+def _side_columns(plate: Plate) -> Pixels:
+    """Return display values (height, 4, 3) of the first two and the last two columns."""
+    sides = replace(plate, codes=plate.codes[:, [0, 1, -2, -1]], alpha=None).in_rec709
+    return sides.values if sides.encoding == "srgb" else np.asarray(
+        srgb_from_linear(np.clip(finite_light(sides.codes), 0, 1)))
 
 
 def wrap_plate(plate: Plate, margin: int) -> Plate:

@@ -55,7 +55,7 @@ MIN_FLARE = 0.002
 """What a flare adds to display values, up to which there is none: half a code of 8 bits."""
 MIN_MEAN_FLARE = 0.0005
 """Gate (`gate_by_mean`) of the network's predictions, display values: it predicts small flares where there are none."""
-REVISION = 4
+REVISION = 5
 """Raised whenever the same plate, weights and settings give another result, so that existing results are made again."""
 Glow = Literal["keep", "keep at lights", "remove"]
 """What to do with the glow about lights: keep all of it; keep the part that lights at night have with a clean lens too

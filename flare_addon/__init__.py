@@ -14,7 +14,8 @@
     overlay.py          the flare in the viewport                points.py          the point cloud in the viewport
     shots.py            scenes as shots                          baking.py          bakes
     lamp_drive.py       power of lamps as a factor               light_extents.py   areas of lights
-    asset_browser.py    looks in the Asset Browser
+    asset_browser.py    looks in the Asset Browser      highlight.py        the chosen element in the view
+    viewport_render.py  viewport renders with the flare
     views.py            3D views                                 compositor/        the layers in the compositor
     library.py          the library of flares                    paths.py           paths of a .blend that moves
     fcurves.py          animation of list items                  render_settings.py   rendering and saving
@@ -28,6 +29,7 @@ from . import (
     asset_browser,
     baking,
     fits,
+    highlight,
     jobs,
     looks,
     operators,
@@ -40,7 +42,7 @@ from . import (
 )
 from .compositor import drivers
 
-_MODULES = (properties, preferences, operators, panels, points, overlay, paths, asset_browser)
+_MODULES = (properties, preferences, operators, panels, points, overlay, highlight, paths, asset_browser)
 
 
 @bpy.app.handlers.persistent

@@ -301,11 +301,15 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
                        reference)
 
 
-def evaluate_flares(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:
-    """Evaluate every flare of the scene for a camera at the current frame. Raises FlareFileError and CaptureError."""
+def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | None = None
+                    ) -> dict[str, PlaneGaussians]:
+    """Evaluate every flare of the scene for a camera at the current frame.
+
+    edits: in place of those of the scene's sliders. Raises FlareFileError and CaptureError.
+    """
     look = look_of(scene)
     pose, lights = place_lights(scene, depsgraph, camera)
-    gaussians = look.evaluate_lights(pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
+    gaussians = look.evaluate_lights(pose, lights, edits or edits_of(scene.fit_flare), query_of(scene.fit_flare))
     exposure = camera.evaluated_get(depsgraph).fit_flare.exposure
     return {name: light_gaussians.with_exposure(exposure, look.blend) for name, light_gaussians in gaussians.items()}
 

@@ -12,6 +12,7 @@ Only the visible part of the frame is drawn, at the pixels of the region, so zoo
 """
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,8 +24,9 @@ from ..core.errors import FitFlareError
 from ..core.look import Look, PlaneGaussians, to_pixels
 from ..core.look.drawing import OPACITY_MAX, extent
 from ..core.look.plane import arc_log_peak, arcs_to_pixels, concatenate
-from . import baking, cameras, looks
+from . import baking, cameras, highlight, looks
 from .compositor.flare_node import find_node
+from .overlay_shaders import gaussian_shader, sum_shader
 
 LEVELS = (1, 2, 4, 8, 16)
 MIN_TEXELS = 4.0  # standard deviation of the narrow side of a Gaussian, in the level that it is drawn in
@@ -190,92 +192,8 @@ def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -
 def _shader(name: str) -> Any:
     """Return a compiled shader, "gaussian" or "sum"."""
     if name not in _shaders:
-        _shaders[name] = _gaussian_shader() if name == "gaussian" else _sum_shader()
+        _shaders[name] = gaussian_shader() if name == "gaussian" else sum_shader(LEVELS)
     return _shaders[name]
-
-
-def _gaussian_shader() -> Any:
-    """Compile the shader that draws the quads of Gaussians."""
-    import gpu
-
-    flow = gpu.types.GPUStageInterfaceInfo("fit_flare_gaussian")
-    flow.smooth("VEC2", "position")
-    flow.flat("VEC3", "colour")
-    flow.flat("VEC3", "ring_shape")
-    flow.flat("VEC3", "arc_shape")
-    info = gpu.types.GPUShaderCreateInfo()
-    info.push_constant("VEC2", "size")
-    info.push_constant("FLOAT", "is_over")
-    info.vertex_in(0, "VEC2", "place")
-    info.vertex_in(1, "VEC2", "local")
-    info.vertex_in(2, "VEC3", "light")
-    info.vertex_in(3, "VEC3", "ring")
-    info.vertex_in(4, "VEC3", "arc")
-    info.vertex_out(flow)
-    info.fragment_out(0, "VEC4", "result")
-    info.vertex_source("void main() {\n"
-                       "  position = local; colour = light; ring_shape = ring; arc_shape = arc;\n"
-                       "  vec2 ndc = place / size * 2.0 - 1.0;\n"
-                       "  gl_Position = vec4(ndc.x, -ndc.y, 0.0, 1.0);\n"
-                       "}\n")
-    info.fragment_source("void main() {\n"
-                         "  float radius = sqrt(max(dot(position, position), 1e-12));\n"
-                         "  float deviations = (radius - ring_shape.x) / ring_shape.y;\n"
-                         "  float log_arc = dot(arc_shape.xy, position) - arc_shape.z;\n"
-                         "  float profile = exp(log_arc - 0.5 * deviations * deviations);\n"
-                         "  float alpha = is_over > 0.5 ? profile * ring_shape.z : 1.0;\n"
-                         "  if (is_over > 0.5 ? alpha < 1.0 / 255.0 : profile < 1.0 / 4096.0) { discard; }\n"
-                         "  result = vec4(colour * profile, alpha);\n"
-                         "}\n")
-    return gpu.shader.create_from_info(info)
-
-
-def _sum_shader() -> Any:
-    """Compile the shader that adds the levels up."""
-    import gpu
-
-    flow = gpu.types.GPUStageInterfaceInfo("fit_flare_sum")
-    flow.smooth("VEC2", "position")
-    info = gpu.types.GPUShaderCreateInfo()
-    info.push_constant("VEC4", "box")
-    info.push_constant("VEC2", "extent")
-    info.push_constant("FLOAT", "is_display")
-    for number in range(len(LEVELS)):
-        info.sampler(number, "FLOAT_2D", f"level{number}")
-    info.vertex_in(0, "VEC2", "corner")
-    info.vertex_out(flow)
-    info.fragment_out(0, "VEC4", "result")
-    info.vertex_source("void main() {\n"
-                       "  position = corner;\n"
-                       "  gl_Position = vec4(mix(box.xy, box.zw, corner) * 2.0 - 1.0, 0.0, 1.0);\n"
-                       "}\n")
-    # Texels are filtered here, so that the result does not depend on the settings of a texture. The size of a level is
-    # rounded up, so its rows are counted from the top, where the picture begins.
-    samples = "".join(f"  sum += bilinear(level{number}, extent / {divisor}.0);\n"
-                      for number, divisor in enumerate(LEVELS))
-    info.fragment_source("vec3 bilinear(sampler2D picture, vec2 covered) {\n"
-                         "  ivec2 size = textureSize(picture, 0);\n"
-                         "  float y = float(size.y) - (1.0 - position.y) * covered.y;\n"
-                         "  vec2 texel = vec2(position.x * covered.x, y) - 0.5;\n"
-                         "  ivec2 low = ivec2(floor(texel));\n"
-                         "  vec2 weight = texel - vec2(low);\n"
-                         "  ivec2 last = size - 1;\n"
-                         "  vec3 a = texelFetch(picture, clamp(low, ivec2(0), last), 0).rgb;\n"
-                         "  vec3 b = texelFetch(picture, clamp(low + ivec2(1, 0), ivec2(0), last), 0).rgb;\n"
-                         "  vec3 c = texelFetch(picture, clamp(low + ivec2(0, 1), ivec2(0), last), 0).rgb;\n"
-                         "  vec3 d = texelFetch(picture, clamp(low + ivec2(1, 1), ivec2(0), last), 0).rgb;\n"
-                         "  return mix(mix(a, b, weight.x), mix(c, d, weight.x), weight.y);\n"
-                         "}\n"
-                         "void main() {\n"
-                         "  vec3 sum = vec3(0.0);\n" + samples +
-                         "  sum = max(sum, vec3(0.0));\n"
-                         "  if (is_display > 0.5) {\n"  # display values to linear light
-                         "    sum = mix(sum / 12.92, pow((sum + 0.055) / 1.055, vec3(2.4)), "
-                         "step(vec3(0.04045), sum));\n"
-                         "  }\n"
-                         "  result = vec4(sum, 1.0);\n"
-                         "}\n")
-    return gpu.shader.create_from_info(info)
 
 
 def _offscreen(divisor: int, width: int, height: int) -> Any:
@@ -361,6 +279,17 @@ def _remember_buffer() -> None:
 
 def _draw() -> None:
     """Draw the overlay in the current 3D view; an error is stored in `last_error`."""
+    _draw_with(draw_region)
+
+
+def _draw_outlines() -> None:
+    """Draw the outline of the highlighted element in the current 3D view."""
+    if highlight.touched(bpy.context.scene) is not None:
+        _draw_with(draw_outline)
+
+
+def _draw_with(draw: Callable[[Any, Any, Any], None]) -> None:
+    """Call a function with context, scene and camera where the current 3D view shows the flare."""
     global last_error
     context = bpy.context
     scene, space = context.scene, context.space_data
@@ -373,7 +302,7 @@ def _draw() -> None:
     if not is_shown or camera is None or camera.type != "CAMERA":
         return
     try:
-        draw_region(context, scene, camera)
+        draw(context, scene, camera)
         last_error = ""
     except FitFlareError as error:
         last_error = str(error)
@@ -393,15 +322,16 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
     import gpu
 
     depsgraph = context.view_layer.depsgraph
-    evaluated = camera.evaluated_get(depsgraph)
-    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
-    frame = camera_frame(context, scene, evaluated)
-    region = context.region.width, context.region.height
-    window = drawn_region(frame, region, core) if frame is not None else None
+    window = _window_of(context, scene, camera)
     if window is None:
         return
+    region = context.region.width, context.region.height
     look = looks.look_of(scene)
-    gaussians = concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values()))
+    chosen, edits = highlight.touched(scene), looks.edits_of(scene.fit_flare)
+    if chosen is not None:
+        names = {item.name: [part.name for part in item.elements] for item in scene.fit_flare.lights}
+        edits = highlight.highlighted(edits, chosen, names)
+    gaussians = concatenate(list(looks.evaluate_flares(scene, depsgraph, camera, edits).values()))
     if gaussians is None:
         return
     drawn = render(gaussians, window, look)
@@ -417,6 +347,38 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
     gpu.state.viewport_set(*viewport)
 
 
+def _window_of(context: Any, scene: Any, camera: Any) -> DrawnRegion | None:
+    """Return the part of the camera's frame that the region of a context shows; None where it shows nothing."""
+    evaluated = camera.evaluated_get(context.view_layer.depsgraph)
+    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    frame = camera_frame(context, scene, evaluated)
+    return None if frame is None else drawn_region(frame, (context.region.width, context.region.height), core)
+
+
+def draw_outline(context: Any, scene: Any, camera: Any) -> None:
+    """Draw a box around the highlighted element. Raises FitFlareError."""
+    import gpu
+    from gpu_extras.batch import batch_for_shader
+
+    window, chosen = _window_of(context, scene, camera), highlight.touched(scene)
+    if window is None or chosen is None:
+        return
+    edits = highlight.alone(chosen, looks.edits_of(scene.fit_flare))
+    gaussians = concatenate(list(looks.evaluate_flares(scene, context.view_layer.depsgraph, camera, edits).values()))
+    if gaussians is None:
+        return
+    box = highlight.outline(gaussians, *to_pixels(gaussians, window.intrinsics, looks.look_of(scene).pixel_grid))
+    if box is None:
+        return
+    (left, right), (top, bottom) = (np.clip(box[axis::2], 1, size - 1) for axis, size in (
+        (0, window.width), (1, window.height)))
+    x, y = (window.x + left, window.x + right), (window.y + window.height - bottom, window.y + window.height - top)
+    corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    shader.uniform_float("color", (*context.preferences.themes[0].view_3d.object_active[:3], 1.0))
+    batch_for_shader(shader, "LINES", {"pos": corners}, indices=((0, 1), (1, 2), (2, 3), (3, 0))).draw(shader)
+
+
 def has_display_footage(camera: Any) -> bool:
     """Return whether a camera shows footage, behind or in front of the scene, that bypasses the view transform."""
     if not camera.data.show_background_images:
@@ -427,23 +389,29 @@ def has_display_footage(camera: Any) -> bool:
                if (back.image if back.source == "IMAGE" else back.clip) is not None)
 
 
-def render_picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> Floats:
-    """Render the overlay to pixels (height, width, 3), scene-linear, row 0 on top. Needs a GPU context."""
-    import gpu
-
+def add_to_picture(target: Any, scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> None:
+    """Add the flares of the scene to a picture of the whole frame, in a buffer off screen. Needs a GPU context."""
     evaluated = camera.evaluated_get(depsgraph)
     core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
     window = drawn_region(CameraFrame(0, 0, width, height), (width, height), core)
     assert window is not None
     look = looks.look_of(scene)
-    gaussians = concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values()))
-    drawn = render(gaussians, window, look)
+    drawn = render(concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values())), window, look)
+    with target.bind():
+        composite(drawn, (0, 0, 1, 1), look.blend, window)
+
+
+def render_picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> Floats:
+    """Render the overlay to pixels (height, width, 3), scene-linear, row 0 on top. Needs a GPU context."""
+    import gpu
+
     target = gpu.types.GPUOffScreen(width, height, format="RGBA32F")
     try:
         with target.bind():
+            gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
+        add_to_picture(target, scene, depsgraph, camera, width, height)
+        with target.bind():
             buffer = gpu.state.active_framebuffer_get()
-            buffer.clear(color=(0.0, 0.0, 0.0, 0.0))
-            composite(drawn, (0, 0, 1, 1), look.blend, window)
             rgba = buffer.read_color(0, 0, width, height, 4, 0, "FLOAT")
     finally:
         target.free()
@@ -453,7 +421,7 @@ def render_picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: 
 
 def register() -> None:
     if not bpy.app.background:
-        for function, when in ((_remember_buffer, "PRE_VIEW"), (_draw, "POST_VIEW")):
+        for function, when in ((_remember_buffer, "PRE_VIEW"), (_draw, "POST_VIEW"), (_draw_outlines, "POST_PIXEL")):
             _handles.append(bpy.types.SpaceView3D.draw_handler_add(function, (), "WINDOW", when))
 
 

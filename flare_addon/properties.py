@@ -66,6 +66,13 @@ def _update_target(self: Any, context: Any) -> None:
     redraw_viewports()
 
 
+def _touch_element(self: Any, _context: Any) -> None:
+    """Highlight the chosen element in the camera view."""
+    from .highlight import touch
+
+    touch(self)
+
+
 def _update_footage(self: Any, _context: Any) -> None:
     """Show the frames as filmed, or the clean frames, behind the cameras."""
     from .capture.importer import show_footage
@@ -170,7 +177,8 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
         default="auto", update=redraw_viewports)
     identity: StringProperty()  # type: ignore[valid-type]  # stays when the flare is renamed; the baked layers store it
     elements: CollectionProperty(type=FITFLARE_PG_element)  # type: ignore[valid-type]
-    element: IntProperty(name="Element", description="The element whose sliders are shown", default=0)  # type: ignore[valid-type]
+    element: IntProperty(  # type: ignore[valid-type]
+        name="Element", description="The element whose sliders are shown", default=0, update=_touch_element)
     show_elements: BoolProperty(  # type: ignore[valid-type]
         name="Elements", description="Show the sliders of single ghosts, streaks and rings", default=False)
     radius: FloatProperty(  # type: ignore[valid-type]

@@ -10,10 +10,19 @@ def look_through_camera(context: Any) -> bool:
 
     A view that looks through a camera of its own is turned to the scene's.
     """
-    areas = [area for area in context.screen.areas if area.type == "VIEW_3D"] if context.screen else []
-    if not areas or context.scene.camera is None:
+    view = largest_view(context)
+    if view is None or context.scene.camera is None:
         return False
-    space = max(areas, key=lambda area: area.width * area.height).spaces.active
+    space = view[2]
     space.use_local_camera = False
     space.region_3d.view_perspective = "CAMERA"
     return True
+
+
+def largest_view(context: Any) -> tuple[Any, Any, Any] | None:
+    """Return area, region and space of the largest 3D view of the screen; None without one."""
+    areas = [area for area in context.screen.areas if area.type == "VIEW_3D"] if context.screen else []
+    if not areas:
+        return None
+    area = max(areas, key=lambda area: area.width * area.height)
+    return area, next(region for region in area.regions if region.type == "WINDOW"), area.spaces.active

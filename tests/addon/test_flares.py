@@ -120,3 +120,24 @@ def test_animated_live_sliders_give_a_warning_for_farms(facts: Any) -> None:
     assert facts["scale keyed"] == []
     (warning,) = facts["intensity keyed"]
     assert "without this extension, as on a farm, they do not move" in warning
+
+
+def test_a_touched_row_shows_its_element_in_the_view(facts: Any) -> None:
+    """Block of flares.py: "a row is touched"."""
+    assert facts["nothing touched"] is None
+    is_flare, other, own, alone = facts["touched"]
+    assert is_flare and len(alone) == 1
+    assert other == pytest.approx(0.15, rel=1e-3)
+    assert own == pytest.approx(1, rel=1e-3), "the element as it is without mute, and the dimmed rest"
+    assert facts["sliders stay"]
+    assert facts["outlined"] == [True, True]
+
+
+def test_a_viewport_render_is_saved_as_the_view_transform_shows_it(facts: Any) -> None:
+    """What is drawn into it needs a window: tests/window/agreement.py compares it with a render.
+
+    Block of flares.py: "a viewport render".
+    """
+    assert facts["viewport render"] == ["view_0007.png", [8, 4], [8, 4], [255, 128, 128]]
+    video, camera, window = facts["viewport render refused"]
+    assert "choose an image format" in video and "no camera" in camera and "need Blender's window" in window

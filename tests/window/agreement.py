@@ -8,6 +8,7 @@ largest and the mean difference in codes, where neither clips, and the share of 
 from __future__ import annotations
 
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -35,18 +36,20 @@ def steps():
                                              overwrite=True)
     yield 1
     results = {}
-    for over in ("present", "plate"):
+    for over in ("present", "fence", "plate"):
         scene = yield from prepare(over)
         for engine in ("CYCLES", "BLENDER_WORKBENCH"):
-            if over == "plate" and engine != "CYCLES":
+            if (over, engine) in (("plate", "BLENDER_WORKBENCH"), ("fence", "CYCLES")):
                 continue
             yield from compare(scene, engine, over, results)
     (flow.out / "agreement.json").write_text(json.dumps(results, indent=1))
+    ui.screenshot(str(flow.out / "last.png"))
     done("agreement", **{key: value["within_2"] for key, value in results.items()})
 
 
 def prepare(over: str):
-    """A scene of flat greys, or a photograph, with a flare and its layers in the compositor."""
+    """A scene of flat greys, one with an area light behind a fence, or a photograph, with a flare and its layers in the
+    compositor."""
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     yield 1
     scene = bpy.context.scene
@@ -67,7 +70,12 @@ def prepare(over: str):
     scene.render.dither_intensity = 0
     scene.frame_end = 1
     library = {item[1]: item[0] for item in module("library").items()}
-    bpy.ops.fit_flare.add_library_flare(look=library["Vintage Ring"], light="new")
+    if over == "fence":
+        add_fenced_lamp(scene)
+        bpy.ops.fit_flare.add_library_flare(look=library["Vintage Ring"])
+        assert scene.fit_flare.lights[0].target.type == "LIGHT"
+    else:
+        bpy.ops.fit_flare.add_library_flare(look=library["Vintage Ring"], light="new")
     with ui.override():
         bpy.ops.fit_flare.bake("EXEC_DEFAULT")
     jobs, shots, flare_node = module("jobs"), module("shots"), module("compositor.flare_node")
@@ -93,6 +101,23 @@ def add_grey(scene, x: float, value: float) -> None:
     emission.inputs["Color"].default_value = (value, value, value, 1)
     tree.links.new(emission.outputs[0], out.inputs[0])
     mesh.materials.append(material)
+
+
+def add_fenced_lamp(scene) -> None:
+    """An area light of two by one units before the camera, behind planks that hide half of it."""
+    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "AREA"))
+    lamp.data.shape, lamp.data.size, lamp.data.size_y = "RECTANGLE", 2.0, 1.0
+    mesh = bpy.data.meshes.new("Fence")
+    mesh.from_pydata([(0.3 * plank + x, y, 0) for plank in range(-8, 9) for x, y in (
+        (0, -2), (0.15, -2), (0.15, 2), (0, 2))], [], [tuple(range(4 * plank, 4 * plank + 4)) for plank in range(17)])
+    fence = bpy.data.objects.new("Fence", mesh)
+    for item, place in ((lamp, (-1.0, 0.8, -11)), (fence, (0.07, 0, -8))):
+        scene.collection.objects.link(item)
+        item.parent, item.location = scene.camera, place
+    lamp.rotation_euler = (math.pi, 0, 0)  # its -Z looks at the camera
+    fence.color = (0.05, 0.05, 0.05, 1)
+    lamp.select_set(True)
+    bpy.context.view_layer.update()
 
 
 def compare(scene, engine: str, over: str, results) -> None:
@@ -153,7 +178,21 @@ def compare(scene, engine: str, over: str, results) -> None:
         results[f"{over} {engine} {transform}"] = {
             "largest": float(best.max()), "mean": round(float(best.mean()), 3),
             "within_2": round(float((best <= 2).mean()), 5), "brightest": float(rendered.max())}
+        if engine == "BLENDER_WORKBENCH":
+            results[f"{over} {engine} {transform}"]["viewport_render"] = viewport_render(scene, rendered)
         print(over, engine, transform, results[f"{over} {engine} {transform}"], flush=True)
+
+
+def viewport_render(scene, rendered) -> dict[str, float]:
+    """The viewport render with the flare against the render."""
+    scene.render.filepath = str(flow.out / "viewport_####")
+    bpy.ops.fit_flare.viewport_render("EXEC_DEFAULT")
+    drawn = pixels(module("viewport_render").output_path(scene, scene.frame_current))
+    steep = np.maximum(*(np.abs(rendered - np.roll(rendered, 1, axis)).max(-1) for axis in (0, 1))) > EDGE
+    edge = np.logical_or.reduce([np.roll(steep, shift, (0, 1)) for shift in NEIGHBOURS])
+    away = np.abs(rendered - drawn)[(rendered < 254) & (drawn < 254) & ~edge[..., None]]
+    return {"largest": float(away.max()), "mean": round(float(away.mean()), 3),
+            "within_2": round(float((away <= 2).mean()), 5)}
 
 
 def align(scene) -> None:

@@ -3,15 +3,17 @@
 .flare, a folder of layers and live.json, one of a layer more, a folder to write."""
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import bpy
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from start import empty, install, leave, part
+from start import empty, install, leave, part, refusal
 
 package, flare, layers, more, out = sys.argv[1:6]
 install(package)
@@ -228,5 +230,64 @@ first.write_bytes((Path(out) / "again.exr").read_bytes())
 part("flare_addon.jobs").ON_FINISHED["bake"](SimpleNamespace(folder=Path(layers), state="done"))
 facts["baked again"].append(shown(scene))
 first.write_bytes(kept)
+
+# ---- a row is touched -----------------------------------------------------------------------------------
+scene = shot(["lamp", "second"])
+scene.camera.rotation_euler = (math.pi / 2, 0, 0)
+for x, name in enumerate(("lamp", "second")):
+    scene.objects[name].location = (x, 8, 0.5)
+bpy.context.view_layer.update()
+highlight, state = part("flare_addon.highlight"), scene.fit_flare
+facts["nothing touched"] = highlight.touched(scene)
+state.lights[1].elements[0].mute = True
+state.lights[1].element = 0
+chosen, edits = highlight.touched(scene), looks.edits_of(state)
+elements = {item.name: [entry.name for entry in item.elements] for item in state.lights}
+
+
+def light_of(edits):
+    """The drawn light of each flare, and of the touched element within its own."""
+    gaussians = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera, edits)
+    return {name: float((each.opacities[:, None] * each.colours).sum()) for name, each in gaussians.items()}
+
+
+plain, dimmed, by_itself = (light_of(each) for each in (
+    edits, highlight.highlighted(edits, chosen, elements), highlight.alone(chosen, edits)))
+names = list(elements)
+facts["touched"] = [chosen.flare == names[1], dimmed[names[0]] / plain[names[0]],
+                    dimmed[names[1]] / (by_itself[names[1]] + highlight.DIMMED * plain[names[1]]), list(by_itself)]
+facts["sliders stay"] = looks.edits_of(state) == edits
+parts = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera,
+                              highlight.alone(chosen, edits))[names[1]]
+left, top, right, bottom = highlight.outline(parts, parts.means, parts.covariances)
+facts["outlined"] = [left < float(parts.means[:, 0].mean()) < right, top < float(parts.means[:, 1].mean()) < bottom]
+# ---- a viewport render ------------------------------------------------------------------------------
+viewport_render, errors = part("flare_addon.viewport_render"), part("core.errors")
+render = scene.render
+render.filepath, render.resolution_percentage = str(Path(out) / "view_####"), 50
+pixels = np.zeros((4, 8, 4), np.float32)
+pixels[..., :3], pixels[0, 0, :3] = 0.2140411, 2.0
+scene.render.image_settings.file_format = "PNG"
+path = viewport_render.output_path(scene, 7)
+viewport_render.save(scene, pixels, path)
+image = bpy.data.images.load(str(path))
+facts["viewport render"] = [path.name, list(viewport_render.size_of(scene)), list(image.size),
+                            [round(255 * image.pixels[index]) for index in (0, 4, 4 * 31)]]
+if hasattr(render.image_settings, "media_type"):
+    render.image_settings.media_type = "VIDEO"
+else:
+    render.image_settings.file_format = "FFMPEG"
+refusals = []
+for gone in (False, True):
+    if gone:
+        scene.camera = None
+        if hasattr(render.image_settings, "media_type"):
+            render.image_settings.media_type = "IMAGE"
+        render.image_settings.file_format = "PNG"
+    try:
+        viewport_render.check(scene)
+    except errors.SettingsError as problem:
+        refusals.append(str(problem))
+facts["viewport render refused"] = [*refusals, refusal(ops.viewport_render)]
 
 leave(facts)

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The operator that renders the camera view with its flare, as a picture or as the frames of the scene."""
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import bpy
+
+from .. import viewport_render
+from ..reports import GuardedOperator, report_errors
+from ..views import largest_view
+
+INTERVAL_S = 0.005
+"""Pause between two frames of an animation."""
+
+
+class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
+    """Render the camera view with its flare to the folder of Output, with the shading of the 3D viewport"""
+
+    bl_idname = "fit_flare.viewport_render"
+    bl_label = "Viewport Render with Flare"
+    changes_scene = False
+
+    animation: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Animation", description="All frames of the scene, in place of the current one", default=False,
+        options={"SKIP_SAVE"})
+
+    @classmethod
+    def why_not(cls, context: bpy.types.Context) -> str:
+        if bpy.app.background:
+            return "Viewport renders need Blender's window"
+        return "" if largest_view(context) is not None else "There is no 3D viewport in this window"
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        with report_errors(self) as outcome:
+            self._begin(context)
+            if not self.animation:
+                for _ in self._frames:
+                    pass
+                self._end(context)
+                return outcome.status
+            manager = context.window_manager
+            self._timer = manager.event_timer_add(INTERVAL_S, window=context.window)
+            manager.modal_handler_add(self)
+            context.workspace.status_text_set("Viewport render with flare; ESC to cancel")
+            outcome.status = {"RUNNING_MODAL"}
+        return outcome.status
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        with report_errors(self) as outcome:
+            self._begin(context)
+            for _ in self._frames:
+                pass
+            self._end(context)
+        return outcome.status
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Render the next frame; other events wait, so that nothing changes the scene meanwhile."""
+        if event.type == "ESC":
+            self.cancel(context)
+            self.report({"INFO"}, f"The viewport render was cancelled after {self._done} frames")
+            return {"CANCELLED"}
+        if event.type != "TIMER":
+            return {"RUNNING_MODAL"}
+        with report_errors(self) as outcome:
+            if next(self._frames, None) is not None:
+                return {"RUNNING_MODAL"}
+            self._end(context)
+        self.cancel(context)
+        return outcome.status
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """End the timer, and move the timeline back."""
+        context.scene.frame_set(self._before)
+        if getattr(self, "_timer", None) is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            context.workspace.status_text_set(None)
+
+    def _begin(self, context: bpy.types.Context) -> None:
+        """Prepare the frames. Raises SettingsError."""
+        scene = context.scene
+        viewport_render.check(scene)
+        self._before, self._done, self._timer = scene.frame_current, 0, None
+        numbers = (list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)) if self.animation
+                   else [scene.frame_current])
+        self._frames = self._render(context, numbers)
+
+    def _render(self, context: Any, numbers: list[int]) -> Iterator[int]:
+        """Render and save each frame; yield its number."""
+        scene = context.scene
+        for number in numbers:
+            if number != scene.frame_current:
+                scene.frame_set(number)
+            area, region, space = largest_view(context)
+            with context.temp_override(area=area, region=region, space_data=space, region_data=space.region_3d):
+                pixels = viewport_render.draw(bpy.context, space, region)
+            viewport_render.save(scene, pixels, viewport_render.output_path(scene, number))
+            self._done += 1
+            yield number
+
+    def _end(self, context: bpy.types.Context) -> None:
+        """Report what was rendered."""
+        path = viewport_render.output_path(context.scene, context.scene.frame_current)
+        context.scene.frame_set(self._before)
+        what = f"{self._done} frames are" if self.animation else f"{path.name} is"
+        self.report({"INFO"}, f"{what} in {path.parent}")
+
+
+def _draw_menu(self: Any, _context: Any) -> None:
+    """Draw the entries of the menu View."""
+    layout = self.layout
+    layout.separator()
+    name = FITFLARE_OT_viewport_render.bl_idname
+    layout.operator(name, text="Viewport Render Image with Flare", icon="RENDER_STILL").animation = False
+    layout.operator(name, text="Viewport Render Animation with Flare", icon="RENDER_ANIMATION").animation = True
+
+
+def register() -> None:
+    bpy.utils.register_class(FITFLARE_OT_viewport_render)
+    bpy.types.VIEW3D_MT_view.append(_draw_menu)
+
+
+def unregister() -> None:
+    bpy.types.VIEW3D_MT_view.remove(_draw_menu)
+    bpy.utils.unregister_class(FITFLARE_OT_viewport_render)

@@ -4,7 +4,8 @@
     properties.py       the properties that a .blend stores      user_settings.py   values of the preferences
     preferences.py      panel of the preferences                 panels.py          the sidebar
     operators/          the buttons                              reports.py         refusals and errors of buttons
-    layouts.py          labels and progress bars                 engine.py          finding and installing the engine
+    panel_parts.py      parts of the sidebar's panels            engine.py          finding and installing the engine
+    layouts.py          labels and progress bars
     jobs.py             processes of the engine                  fits.py            fits, light search, clean frames
     weights.py          the weights of the removal network
     capture/            captures into and out of Blender         cameras.py         Blender's cameras and the core's

@@ -14,7 +14,7 @@ from ..core.capture import REMOVED
 from ..core.conventions.run_files import FLARE
 from ..core.errors import FitFlareError
 from ..core.look import Look
-from . import baking, engine, fits, jobs, lamp_drive, library, light_extents, lights, looks, overlay, shots
+from . import baking, engine, fits, jobs, library, light_extents, lights, looks, overlay, panel_parts, shots
 from .compositor import drivers, flare_node, setup
 from .layouts import draw_progress, label_lines
 from .operators import make_flare
@@ -87,8 +87,9 @@ class FITFLARE_PT_lights(_FitPanel, bpy.types.Panel):
         column = layout.column(align=True)
         for light in objects:
             row = column.row(align=True)
-            row.prop(light.fit_flare, "light", text="", icon="LIGHT_POINT")
+            row.prop(light.fit_flare, "light", text="", icon=panel_parts.light_icon(scene, light))
             row.operator("fit_flare.remove_light", text="", icon="X").object = light.name
+        panel_parts.draw_motion(layout, scene, objects)
         folder = fits.capture_folder(scene)
         job = jobs.find(folder / "lights") if folder is not None else None
         if job is not None and job.running:
@@ -326,10 +327,7 @@ def _draw_flare(layout: Any, scene: Any, item: Any, look: Look) -> None:
     _draw_sliders(box, item)
     column = box.column()
     column.use_property_split = True
-    _draw_switches(column, item)
-    if item.target is not None and looks.is_placed(item, scene) and (
-            dark := lamp_drive.dark_reason(scene, bpy.context.view_layer.depsgraph, item)):
-        label_lines(column, dark, "INFO")
+    panel_parts.draw_switches(column, scene, item)
     column.prop(item, "extent")
     if item.extent == "point" or item.target is None or light_extents.is_point(item):
         column.prop(item, "radius")
@@ -343,21 +341,6 @@ def _draw_flare(layout: Any, scene: Any, item: Any, look: Look) -> None:
         if 0 <= item.element < len(item.elements):
             box.label(text=item.elements[item.element].name.capitalize(), icon="DOT")
             _draw_sliders(box, item.elements[item.element], item.elements[item.element].kind == "streak")
-
-
-def _draw_switches(column: Any, item: Any) -> None:
-    """Draw what of its light object a flare follows."""
-    if item.target is None:
-        return
-    if lamp_drive.is_lamp(item.target):
-        column.prop(item, "follow_power")
-    column.prop(item, "follow_visibility")
-    if lamp_drive.has_direction(item):
-        column.prop(item, "follow_direction")
-    if not lamp_drive.is_sun(item.target):
-        column.prop(item, "follow_distance")
-        if item.follow_distance:
-            column.prop(item, "reference_distance")
 
 
 class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
@@ -388,6 +371,7 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
             column.prop(state, "bake_live")
             column.prop(state, "bake_scene")
             column.prop(state, "bake_composite")
+            panel_parts.draw_stereo(layout, scene)
             if state.flare and engine.find_engine() is None:
                 label_lines(layout, "Without an engine, Blender's own Python draws the layers: some seconds per frame.",
                             "INFO")

@@ -10,6 +10,9 @@ from ...core.conventions.frame_numbers import NumberedFrame, missing_numbers
 from ...core.images.picture import same_aspect
 from . import drivers, flare_node, setup, trees
 
+STEREO = ("This scene renders stereo, and both eyes get the flare of one camera; bake each eye's camera by itself, and "
+          "composite each eye in a scene of its own.")
+
 
 def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
     """Yield a warning for each problem of a scene whose compositor shows `layers`.
@@ -23,6 +26,8 @@ def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
     if trees.is_off_in_renders(scene):
         yield ("The compositor effect with the flare is switched off for renders, so they have no flare; switch it on "
                "in the list of effects.")
+    if render.use_multiview:
+        yield STEREO
     if strips := _active_strips(scene):
         yield (f"Renders show the video sequencer, which has {strips[0].name!r}, in place of the compositor, without "
                "the flare; switch Sequencer off in the output properties, under Post Processing.")

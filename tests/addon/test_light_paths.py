@@ -19,6 +19,12 @@ def test_a_lamp_on_a_moving_car_is_written_as_a_path(facts: Any) -> None:
     assert facts["current frame"] and facts["others stand"] == ["lamp"]
 
 
+def test_the_panel_names_the_lights_that_are_fitted_along_their_animation(facts: Any) -> None:
+    """Block of light_paths.py: "parented to something that moves, and dimmed"."""
+    assert "Fitted along the animation, frame by frame: headlight." in facts["panel"]
+    assert facts["icons"] == ["ANIM", "LIGHT_POINT"]
+
+
 def test_the_brightness_of_a_dimmed_lamp_is_written(facts: Any) -> None:
     """Block of light_paths.py: "parented to something that moves, and dimmed"."""
     assert facts["dimmed"] == [1.0, 0.5]

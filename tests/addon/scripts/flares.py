@@ -212,6 +212,9 @@ scene.render.image_settings.color_mode = "RGBA"
 facts["transparent"] = set_up_warnings(scene)
 scene.render.image_settings.color_mode = "RGB"
 facts["no alpha"] = set_up_warnings(scene)
+scene.render.use_multiview = True
+facts["stereo"] = set_up_warnings(scene)
+scene.render.use_multiview = False
 
 # ---- a layer that an artist looks at as a still -----------------------------------------------------
 scene = shot(["lamp"])

@@ -6,6 +6,8 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -15,7 +17,8 @@ from start import empty, install, leave, part, refusal
 
 package, capture = sys.argv[1], Path(sys.argv[2])
 install(package)
-lights, importer, light_paths = (part(f"flare_addon.{name}") for name in ("lights", "capture.importer", "light_paths"))
+lights, importer, light_paths, panels = (
+    part(f"flare_addon.{name}") for name in ("lights", "capture.importer", "light_paths", "panels"))
 Capture, read_lights = part("core.capture").Capture, part("core.capture").read_lights
 facts: dict[str, object] = {}
 path = capture / "lights.json"
@@ -58,6 +61,10 @@ facts["between"] = bool(0 < written[1].xyz[0] < 2)
 facts["dimmed"] = [round(state.on, 3) for state in (written[0], written[-1])]
 facts["current frame"] = scene.frame_current == first
 facts["others stand"] = [light.name for light in read_lights(path) if not light.moves]
+layout = MagicMock()
+panels.FITFLARE_PT_lights.draw(SimpleNamespace(layout=layout), bpy.context)
+facts["panel"] = " ".join(str(call.kwargs.get("text", "")) for call in layout.mock_calls)
+facts["icons"] = [call.kwargs["icon"] for call in layout.mock_calls if call.args[1:] == ("light",)]
 facts["reads back"] = [json.loads(path.read_text())["lights"][-1]["name"]]
 
 # ---- read back, and corrected -----------------------------------------------------------------------

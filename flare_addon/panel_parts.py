@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Parts of the panels in the sidebar: the switches of a flare, and notes about lights that move and stereo renders."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import bpy
+
+from . import fits, lamp_drive, light_paths, lights, looks
+from .compositor.warnings import STEREO
+from .layouts import label_lines
+from .paths import is_folder
+
+
+def draw_switches(column: Any, scene: Any, item: Any) -> None:
+    """Draw what a flare follows of its light object, and why it is dark where its switches make it so."""
+    if item.target is None:
+        return
+    if lamp_drive.is_lamp(item.target):
+        column.prop(item, "follow_power")
+    column.prop(item, "follow_visibility")
+    if lamp_drive.has_direction(item):
+        column.prop(item, "follow_direction")
+    if not lamp_drive.is_sun(item.target):
+        column.prop(item, "follow_distance")
+        if item.follow_distance:
+            column.prop(item, "reference_distance")
+    if looks.is_placed(item, scene) and (
+            dark := lamp_drive.dark_reason(scene, bpy.context.view_layer.depsgraph, item)):
+        label_lines(column, dark, "INFO")
+
+
+def _changes(scene: Any, light: Any) -> bool:
+    """Return whether a light of the capture moves or changes."""
+    return light_paths.moves(light, scene.fit_flare.root) or light_paths.has_animated_light(light)
+
+
+def light_icon(scene: Any, light: Any) -> str:
+    """Return the icon of a light of the capture, another one where it moves or changes."""
+    return "ANIM" if _changes(scene, light) else "LIGHT_POINT"
+
+
+def draw_motion(layout: Any, scene: Any, objects: Sequence[Any]) -> None:
+    """Draw what a fit does with the lights of the capture that move or change."""
+    names = [lights.light_name(light) for light in objects if _changes(scene, light)]
+    if not names:
+        return
+    folder = fits.capture_folder(scene)
+    if folder is not None and is_folder(folder / "images"):
+        label_lines(layout, f"Fitted along the animation, frame by frame: {', '.join(names)}.", "INFO")
+    else:
+        label_lines(layout, "Animated, but fitted where they are at the current frame, since the capture has no folder "
+                            f"images: {', '.join(names)}.", "INFO")
+
+
+def draw_stereo(layout: Any, scene: Any) -> None:
+    """Draw what a stereo render shows of the flare."""
+    if scene.render.use_multiview:
+        label_lines(layout, STEREO, "ERROR")

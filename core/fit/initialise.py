@@ -11,7 +11,7 @@ import torch
 from ..capture import LIGHTS, Capture, View
 from ..errors import CaptureError
 from ..flare.deformation import QueryRange
-from ..flare.model import FlareModel, LightFlare, ViewOfLight
+from ..flare.model import FlareModel, LightFlare, ViewOfLight, plane_scale
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..images.picture import Picture
@@ -110,6 +110,7 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
         positions = frame_lights.positions[len(frame_lights.positions) // 2].clone()
     cameras = [view.camera for view in views]
     corner_radius = max(camera.corner_radius for camera in cameras)
+    scale = plane_scale(max(camera.width / 2 / camera.fx for camera in cameras))
     flares = []
     for number, light in enumerate(capture.lights):
         light_views = [
@@ -124,7 +125,8 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
                               torch.stack([view.light for view in in_front]), corner_radius)
         if settings.uses_plates:
             query = replace(query, camera_low=(-CAMERA_RANGE,) * 3, camera_high=(CAMERA_RANGE,) * 3)
-        flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator, settings.flare.opacity))
+        flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator, settings.flare.opacity,
+                                 scale))
     return FlareModel(names, positions, flares, frame_lights)
 
 

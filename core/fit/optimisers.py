@@ -17,6 +17,9 @@ COLOUR_RATE_FACTOR = 3.0
 """Factor on the learning rate of the scene's colours where frames go above white, which is farther to go. Lamps of 32
 times white end a sixth off instead of three fifths (`desk`, preset draft)."""
 
+PLANE_ROWS = ("offsets",)
+"""Rows of a flare's Gaussians whose values are lengths in the normalised plane."""
+
 
 class Optimisers:
     """The optimisers of the scene, of the flare (networks and Gaussians) and of its grids; the last two are None
@@ -118,7 +121,8 @@ class FlareOptimisers:
                 continue
             dense[name] = parameter
             last = name.rsplit(".", 1)[1]
-            rate_by_name[name] = gaussian_rates[last] if ".gaussians." in name else rates.network
+            rate = gaussian_rates[last] if ".gaussians." in name else rates.network
+            rate_by_name[name] = rate * (flare.lights[int(name.split(".")[0])].scale if last in PLANE_ROWS else 1)
         self.dense = Adam(dense, rate_by_name)
         self.grids = torch.optim.SparseAdam(tables, lr=rates.grids)
         lights = flare.frame_lights

@@ -28,7 +28,7 @@ from ..flare.compositing import splat_flare
 from ..flare.deformation import QueryRange
 from ..flare.density import clone_and_prune
 from ..flare.file import FlareFile
-from ..flare.model import FlareModel, LightFlare, ViewOfLight
+from ..flare.model import FlareModel, LightFlare, ViewOfLight, plane_scale
 from ..look import TrainedCamera, store_elements
 from ..optics.flare import LensSetup, build_optics, render_flare
 from ..optics.ghosts import draw_ghosts
@@ -236,7 +236,8 @@ def _new_model(settings: TracedFlareSettings, setup: LensSetup, fit: FitSettings
     cameras = torch.tensor([[-CAMERA_RANGE] * 3, [CAMERA_RANGE] * 3])
     corner = math.hypot(settings.reach, settings.reach * settings.height / settings.tracing.width)
     query_range = QueryRange.of(cameras, torch.tensor(traced.places, dtype=torch.float32), corner)
-    flare = LightFlare(fit.flare.form, query_range, fit.flare.count, generator, fit.flare.opacity)
+    flare = LightFlare(fit.flare.form, query_range, fit.flare.count, generator, fit.flare.opacity,
+                       plane_scale(settings.reach))
     order = torch.randperm(flare.count, generator=generator)
     at_light, at_ghosts = (round(flare.count * share) for share in (SHARE_AT_LIGHT, SHARE_AT_GHOSTS))
     _start_at_light(flare, order[:at_light], settings.reach, 2 * settings.reach / settings.tracing.width, generator)
@@ -255,7 +256,7 @@ def _start_at_light(flare: LightFlare, chosen: Tensor, reach: float, pixel: floa
     """
     rows = flare.gaussians
     with torch.no_grad():
-        rows["log_scales"] += math.log(reach / REFERENCE_REACH)
+        rows["log_scales"] += math.log(reach / REFERENCE_REACH / flare.scale)
         low, high = (math.log(bound) for bound in RAY_LENGTHS)
         distance = torch.exp(low + (high - low) * torch.rand(len(chosen), generator=generator)) * reach
         angle = 2 * math.pi * torch.rand(len(chosen), generator=generator)

@@ -86,8 +86,10 @@ def _to_triple(values: Any) -> tuple[float, float, float]:
 def _pack(model: FlareModel) -> dict[str, Tensor]:
     """Return the state, with every hash table as its rows that are not zero."""
     packed: dict[str, Tensor] = {}
-    for name, tensor in model.flares.state_dict().items():
-        tensor = tensor.detach().contiguous().cpu()
+    states = {f"{number}.{name}": tensor for number, light in enumerate(model.lights)
+              for name, tensor in light.state_without_scale().items()}
+    for name, tensor in states.items():
+        tensor = tensor.contiguous().cpu()
         if name.endswith(TABLE):
             rows = tensor.abs().amax(1).nonzero()[:, 0]
             packed[f"{name}.rows"], packed[f"{name}.values"] = rows.to(torch.int32), tensor[rows]

@@ -29,7 +29,10 @@ MIN_TRAINING_VISIBILITY = 0.2
 RING_INTERVAL = 4
 """One Gaussian in this many is a ring at first, where the form has rings."""
 INITIAL_SIZES = 0.01, 0.06
-"""Range of the Gaussians' standard deviations at first, in the normalised plane (a 50 mm frame is about 0.7 wide)."""
+"""Range of the Gaussians' standard deviations at first, in the normalised plane of a frame of FULL_SCALE_REACH."""
+FULL_SCALE_REACH = 0.36
+"""Half the width of a frame, normalised, of a lens of 50 mm on a sensor of 36 mm. The sizes and steps of a fit are in
+these units; those of a longer lens are smaller by `plane_scale`."""
 INITIAL_RING_RADII = 3.0, 8.5
 """r0 of rings at first, in standard deviations, from the smallest to the largest: up to half of the plane. A ring with
 no Gaussian near it is not learned; and thin rings, unlike larger Gaussians, leave the frame free."""
@@ -63,6 +66,12 @@ class ViewOfLight(NamedTuple):
         return cls(camera.float(), pose[:3, :3].float(), light.float(), z)
 
 
+def plane_scale(reach: float) -> float:
+    """Return the scale of a flare's sizes and steps in the normalised plane, for frames of this half width: 1 for
+    lenses up to 50 mm, less for longer ones, whose frame is a small part of the plane."""
+    return min(reach / FULL_SCALE_REACH, 1.0)
+
+
 class LightFlare(nn.Module):
     """Canonical Gaussians of one light and their deformation.
 
@@ -72,11 +81,13 @@ class LightFlare(nn.Module):
     """
 
     def __init__(self, form: FlareForm, query_range: QueryRange, count: int, generator: torch.Generator,
-                 opacity: float = 0.05) -> None:
+                 opacity: float = 0.05, scale: float = 1.0) -> None:
+        """scale: the `plane_scale` of the frames that the flare is fitted to."""
         super().__init__()
-        self.form, self.query_range = form, query_range
+        self.form, self.query_range, self.scale = form, query_range, scale
         self.gaussians = nn.ParameterDict(
-            {name: nn.Parameter(rows) for name, rows in _initial_gaussians(form, count, opacity, generator).items()})
+            {name: nn.Parameter(rows)
+             for name, rows in _initial_gaussians(form, count, opacity, scale, generator).items()})
         deformed = [name for name in self.gaussians if name not in ("offsets", "latent")]
         heads = {name: self.gaussians[name].shape[1] for name in deformed}
         if form.line and form.plane_offset:
@@ -106,10 +117,10 @@ class LightFlare(nn.Module):
 
         light = view.light
         if form.light_correction:
-            light = light + self.network.light_correction(features)
+            light = light + self.scale * self.network.light_correction(features)
         means = placement.on_line(deformed("positions"), light) if form.line else deformed("positions")
         if "plane_offset" in change:
-            means = means + change["plane_offset"]
+            means = means + self.scale * change["plane_offset"]
         if form.static_offset:
             means = means + rows["offsets"]
         scales, rotations = deformed("log_scales"), deformed("rotations")
@@ -126,6 +137,21 @@ class LightFlare(nn.Module):
         return PlaneGaussians(means, covariances, opacities, self._colours(deformed("sh"), means, view.rotation),
                               rings, arcs)
 
+    def state_without_scale(self) -> dict[str, Tensor]:
+        """Return the state of the same flare with a `scale` of 1: the scale goes into the network's last layers."""
+        state = {name: tensor.detach() for name, tensor in self.state_dict().items()}
+        if self.scale == 1:
+            return state
+        names, widths = self.network.names, self.network.widths
+        head = torch.ones(sum(widths))
+        if "plane_offset" in names:
+            first = sum(widths[:names.index("plane_offset")])
+            head[first:first + 2] = self.scale
+        for layer, factor in (("head", head), ("correction.2", torch.full((2,), self.scale))):
+            for part, values in (("weight", factor[:, None]), ("bias", factor)):
+                state[f"network.{layer}.{part}"] = state[f"network.{layer}.{part}"] * values
+        return state
+
     def _colours(self, sh: Tensor, means: Tensor, rotation: Tensor) -> Tensor:
         rays = torch.cat([means, torch.ones_like(means[:, :1])], -1)
         return colours(rays @ rotation, sh.unflatten(-1, (-1, 3)), self.form.sh_degree)
@@ -136,15 +162,16 @@ def _rings(raw: Tensor) -> Tensor:
     return torch.stack([raw[:, 0], raw[:, 1].clamp(-3, 3).exp()], -1)
 
 
-def _initial_gaussians(form: FlareForm, count: int, opacity: float, generator: torch.Generator) -> dict[str, Tensor]:
+def _initial_gaussians(form: FlareForm, count: int, opacity: float, scale: float, generator: torch.Generator
+                       ) -> dict[str, Tensor]:
     """Return `count` Gaussians spread along the line, of log-uniform INITIAL_SIZES that leave most of the frame free.
     """
     if form.line:
         positions = torch.linspace(-1.2, 1.4, count)[:, None]
     else:
-        positions = torch.rand(count, 2, generator=generator) - 0.5
+        positions = scale * (torch.rand(count, 2, generator=generator) - 0.5)
     fraction = torch.rand(count, 1, generator=generator)
-    size = _log_interpolate(*INITIAL_SIZES, fraction)
+    size = _log_interpolate(*INITIAL_SIZES, fraction) + math.log(scale)
     if form.solid:
         log_scales = (size + math.log(PLANE_DEPTH)).repeat(1, 3)
         rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)

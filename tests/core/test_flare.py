@@ -24,7 +24,7 @@ from core.flare.deformation import QueryRange
 from core.flare.density import DensitySettings, clone_and_prune
 from core.flare.encoding import HashGrid, frequency_encoding
 from core.flare.file import FlareFile
-from core.flare.model import OURS, PAPER, FlareModel, LightFlare, ViewOfLight
+from core.flare.model import OURS, PAPER, FlareModel, LightFlare, ViewOfLight, plane_scale
 from core.gaussians import Splats, rasterization
 from core.gaussians.optimiser import Adam
 from core.gaussians.rendering import arc_strengths
@@ -68,6 +68,24 @@ def test_initial_rings_have_all_sizes_and_are_thin() -> None:
     assert radii[0] < 0.04 and radii[-1] > 0.45
     assert (radii[1:] / radii[:-1]).max() < 1.3
     assert scales.max() <= 0.061
+
+
+def test_a_flare_of_a_long_lens_starts_within_its_frame() -> None:
+    flare = LightFlare(OURS, RANGE, 400, random_(2), scale=plane_scale(0.03))
+    assert flare.gaussians["log_scales"].detach().exp().max() <= 0.06 * 0.03 / 0.36 + 1e-6
+    assert plane_scale(0.36) == plane_scale(2.0) == 1.0
+
+
+def test_a_saved_flare_of_a_long_lens_is_the_fitted_one(tmp_path: Path) -> None:
+    model = some_flare(replace(OURS, light_correction=True))
+    model.lights[0].scale = 0.1
+    expected = model(pose())["lamp 0"].means
+    flare_file.save(tmp_path / "a.flare", FlareFile(model, "add", CAMERA))
+    read = flare_file.load(tmp_path / "a.flare").model
+    assert read.lights[0].scale == 1
+    torch.testing.assert_close(read(pose())["lamp 0"].means, expected)
+    model.lights[0].scale = 1.0
+    assert (model(pose())["lamp 0"].means - expected).abs().max() > 1e-3
 
 
 def test_a_light_that_passes_the_cameras_plane_leaves_the_grid_to_the_frame() -> None:

@@ -37,6 +37,13 @@ def test_the_error_falls_with_the_length_of_the_fit(made: tuple[Path, traced_fla
     assert made[1].worst >= made[1].error
 
 
+def test_a_long_lens_is_fitted_as_well_as_a_short_one(made: tuple[Path, traced_flare.TracedResult],
+                                                      tmp_path: Path) -> None:
+    settings = TracedFlareSettings().override({**SMALL, "focal_length": 600.0})
+    long = make_flare(settings, tmp_path / "b.flare", Progress())
+    assert long.error < 1.2 * made[1].error
+
+
 def test_a_made_flare_is_a_look_as_any_other(made: tuple[Path, traced_flare.TracedResult]) -> None:
     look = read(made[0])
     assert (look.blend, look.notes, look.licence, look.names) == ("add", "n", "CC0-1.0", ("light",))

@@ -3,10 +3,11 @@
 
 Each Gaussian is a quad. With the blend "add" it is drawn into the coarsest of five buffers (full size to 1/16) in which
 its narrow side still has four texels, so the cost does not grow with the size of a glow. With "over" all are drawn back
-to front at full size over black, as they are baked. The buffers are half float and linear. A last pass adds them to the
-viewport's picture in scene-linear light, before Blender applies the view transform, as the compositor does in a render.
-Blender draws footage behind the camera after the view transform, unless the image is viewed as a render. Over such
-footage the pass adds to the viewport's overlay, which Blender blends in display-linear light.
+to front at full size over black, as they are baked. The buffers are linear, and half float for few Gaussians. A last
+pass adds them to the viewport's picture in scene-linear light, before Blender applies the view transform, as the
+compositor does in a render. Blender draws footage behind the camera after the view transform, unless the image is
+viewed as a render. Over such footage the pass adds to the viewport's overlay, which Blender blends in display-linear
+light.
 
 Only the visible part of the frame is drawn, at the pixels of the region, so zooming in costs nothing.
 """
@@ -31,6 +32,10 @@ from .overlay_shaders import gaussian_shader, sum_shader
 LEVELS = (1, 2, 4, 8, 16)
 MIN_TEXELS = 4.0  # standard deviation of the narrow side of a Gaussian, in the level that it is drawn in
 
+MAX_IN_HALF_FLOAT = 6_000
+"""Gaussians up to which the buffers are half float. A sum of more, as for an area light, loses the light of faint ones
+to rounding."""
+
 Floats = NDArray[np.float32]
 
 last_error = ""
@@ -39,7 +44,7 @@ last_error = ""
 _handles: list[Any] = []
 _scene_buffer: Any = None  # the framebuffer with the scene-linear picture of the region that is being drawn
 _shaders: dict[str, Any] = {}
-_offscreens: dict[tuple[int, int, int], Any] = {}
+_offscreens: dict[tuple[int, int, int, str], Any] = {}
 
 
 @dataclass(frozen=True)
@@ -196,16 +201,16 @@ def _shader(name: str) -> Any:
     return _shaders[name]
 
 
-def _offscreen(divisor: int, width: int, height: int) -> Any:
-    """Return the buffer of a level for a region of this size; one of another size is freed."""
+def _offscreen(divisor: int, width: int, height: int, form: str) -> Any:
+    """Return the buffer of a level for a region of this size; one of another size or format is freed."""
     import gpu
 
     size = max(-(-width // divisor), 1), max(-(-height // divisor), 1)
-    key = (divisor, *size)
+    key = (divisor, *size, form)
     if key not in _offscreens:
         for old in [other for other in _offscreens if other[0] == divisor]:
             _offscreens.pop(old).free()
-        _offscreens[key] = gpu.types.GPUOffScreen(*size, format="RGBA16F")
+        _offscreens[key] = gpu.types.GPUOffScreen(*size, format=form)
     return _offscreens[key]
 
 
@@ -231,9 +236,10 @@ def render(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look) ->
     import gpu
 
     by_level = {} if gaussians is None else quads_by_level(gaussians, window, look)
+    form = "RGBA16F" if gaussians is None or len(gaussians) <= MAX_IN_HALF_FLOAT else "RGBA32F"
     drawn = []
     for divisor in LEVELS:
-        offscreen = _offscreen(divisor, window.width, window.height)
+        offscreen = _offscreen(divisor, window.width, window.height, form)
         with offscreen.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
             if divisor in by_level:

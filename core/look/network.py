@@ -5,8 +5,11 @@ Hash tables are stored sparsely, as the sorted rows that training touched: one v
 """
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -24,6 +27,42 @@ PRIMES = np.array([1, 2654435761, 805459861], np.int64)
 """Primes of the spatial hash (Müller et al. 2022, eq. 4)."""
 CORNERS = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)], np.int64)
 """Corners of a cell, (8, 3)."""
+
+
+MAX_CACHE_BYTES = 64 << 20
+"""Most bytes of offsets that are kept: those of some hundred lights of a look."""
+
+_numbers = itertools.count()
+
+
+class _OffsetsCache:
+    """The offsets that were computed last, by network and features.
+
+    A light that keeps its place in the picture, or several lights at one place, need the network once.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes, self._bytes, self._lock = max_bytes, 0, threading.Lock()
+        self._entries: OrderedDict[tuple[int, bytes], Floats] = OrderedDict()
+
+    def get(self, key: tuple[int, bytes], compute: Callable[[], Floats]) -> Floats:
+        """Return the entry of a key, computed where it is missing."""
+        with self._lock:
+            entry = self._entries.get(key)
+            if entry is not None:
+                self._entries.move_to_end(key)
+                return entry
+        entry = compute()
+        with self._lock:
+            if key not in self._entries:
+                self._entries[key] = entry
+                self._bytes += entry.nbytes
+            while self._bytes > self._max_bytes:
+                self._bytes -= self._entries.popitem(last=False)[1].nbytes
+        return entry
+
+
+_cache = _OffsetsCache(MAX_CACHE_BYTES)
 
 
 class HashGrid:
@@ -121,7 +160,7 @@ class Network:
         self._camera_grid = grid("camera_grid", CAMERA_BITS, CAMERA_GROWTH)
         self._hidden = sorted(name[:-len(".weight")] for name in self._t
                               if name.startswith("network.layers.") and name.endswith(".weight"))
-        self._encoded = encoded
+        self._encoded, self._number = encoded, next(_numbers)
         if self._t["network.head.weight"].shape[0] != sum(self._heads.values()):
             raise ValueError("the network's heads do not fit the form")
 
@@ -147,8 +186,9 @@ class Network:
             raise ValueError("the correction of the light is no place")
 
     def offsets(self, features: Floats) -> dict[str, Floats]:
-        """Return the offsets by name, (n, width) each."""
-        every = self._concatenated_offsets(self._gaussian_features, features)
+        """Return the offsets by name, (n, width) each; they are shared and must not be changed."""
+        every = _cache.get((self._number, features.tobytes()), lambda: self._concatenated_offsets(
+            self._gaussian_features, features))
         edges = np.cumsum([0, *self._heads.values()])
         return {name: every[:, a:b] for name, a, b in zip(self._heads, edges[:-1], edges[1:], strict=True)}
 
@@ -157,9 +197,11 @@ class Network:
 
     def _concatenated_offsets(self, gaussian_features: Floats, features: Floats) -> Floats:
         """Return the offsets of all heads, (n, sum of their widths)."""
-        x = np.maximum(gaussian_features + self._linear("network.view_layer", features[None]), 0)
+        x = gaussian_features + self._linear("network.view_layer", features[None])
+        np.maximum(x, 0, out=x)
         for name in self._hidden:
-            x = np.maximum(self._linear(name, x), 0)
+            x = self._linear(name, x)
+            np.maximum(x, 0, out=x)
         return self._linear("network.head", x)
 
     def light_correction(self, features: Floats) -> Floats:
@@ -168,4 +210,6 @@ class Network:
         return self._linear("network.correction.2", hidden)[0]
 
     def _linear(self, name: str, x: Floats) -> Floats:
-        return np.asarray(x @ self._t[f"{name}.weight"].T + self._t[f"{name}.bias"], np.float32)
+        result = x @ self._t[f"{name}.weight"].T
+        result += self._t[f"{name}.bias"]
+        return np.asarray(result, np.float32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import io
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,10 +12,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, PngImagePlugin, TiffImagePlugin
 
+from core.colour.spaces import P3_D65
+from core.images.formats import jpeg
+from core.images.plates import read_plate
 from core.images.read import read_picture
 from core.images.video import Video
-from tests.core.picture_files import scene
+from core.images.views import split_views, write_view_results
+from core.images.write import write_exr
+from tests.core.picture_files import profile, scene
 from tests.core.videos import stripes, write_video
 
 WIDTH, HEIGHT = 48, 32
@@ -30,7 +37,8 @@ class Medium(NamedTuple):
 
 
 def media() -> Iterator[Medium]:
-    """Yield the formats for which no library here writes files, and videos of further codecs."""
+    """Yield the formats for which no library here writes files, videos of further codecs, and plates whose clean plates
+    are written."""
     for file, write, library in (("a.psd", _write_psd, "OpenImageIO"), ("a.cin", _write_cineon, "OpenImageIO"),
                                  ("a.dng", _write_dng, "rawpy"), ("a.jxl", _write_jxl, "pillow_jxl")):
         if importlib.util.find_spec(library):  # the last two are optional
@@ -41,6 +49,76 @@ def media() -> Iterator[Medium]:
             write_video(path, codec, pixels, frames)
 
         yield Medium(f"video {codec} {Path(file).suffix}", file, write_clip, _read_video)
+
+
+    for file, name, write in (("a.jpg", "JPEG with tags", _write_tagged_jpeg),
+                              ("a.tif", "TIFF with tags", _write_zip_tiff),
+                              ("a.png", "PNG with tags", _write_tagged_png),
+                              ("a.exr", "EXR of two eyes", _write_eyes),
+                              ("b.exr", "EXR with foreign names", _write_foreign_names)):
+        yield Medium(f"clean plate of {name}", file, write, _clean_plate)
+
+
+def _clean_plate(path: Path) -> None:
+    """Write a clean plate, with all that it keeps, and what the user is told of it."""
+    plate = read_plate(path)
+    plate.warning  # noqa: B018 - parses the file
+    changed = [view.codes // 2 if view.codes.dtype.kind == "u" else view.codes * view.codes.dtype.type(0.5)
+               for _, view in split_views(plate)]
+    write_view_results([path.with_name(f"clean{path.suffix}")], plate, [(codes, codes) for codes in changed])
+
+
+def _write_tagged_jpeg(path: Path) -> None:
+    """Write a JPEG with Exif data, a profile, image resources and XMP that claims a gain map."""
+    encoded = io.BytesIO()
+    exif = Image.Exif()
+    exif[0x112], exif[0x13b] = 6, "Ada"
+    Image.fromarray(_codes()).save(encoded, "JPEG", exif=exif, icc_profile=profile(P3_D65), comment=b"stage 4")
+    data = encoded.getvalue()
+    resource = b"8BIM" + struct.pack(">HHI", 1036, 0, 30) + bytes(30)
+    xmp = (b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+           b'<rdf:Description xmlns:hdrgm="http://ns.adobe.com/hdr-gain-map/1.0/" hdrgm:Version="1.0"/></rdf:RDF>'
+           b"</x:xmpmeta>")
+    path.write_bytes(data[:2] + jpeg.make_segment(jpeg.APP1, jpeg.XMP + xmp)
+                     + jpeg.make_segment(jpeg.APP13, jpeg.PHOTOSHOP + resource + resource) + data[2:])
+
+
+def _write_zip_tiff(path: Path) -> None:
+    """Write a TIFF of ZIP compression with text, a profile and image resources."""
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[315], tags[34377] = "Ada", b"8BIM" + struct.pack(">HHI", 1036, 0, 30) + bytes(30)
+    Image.fromarray(_codes()).save(path, compression="tiff_adobe_deflate", tiffinfo=tags, icc_profile=profile(P3_D65))
+
+
+def _write_tagged_png(path: Path) -> None:
+    exif, text = Image.Exif(), PngImagePlugin.PngInfo()
+    exif[0x13b] = "Ada"
+    text.add_itxt("XML:com.adobe.xmp", '<x:xmpmeta xmlns:x="adobe:ns:meta/"/>', zip=True)
+    Image.fromarray(_codes()).save(path, exif=exif, pnginfo=text, icc_profile=profile(P3_D65), dpi=(72, 72))
+
+
+def _write_eyes(path: Path) -> None:
+    """Write an EXR with a part for each eye, and one of depth."""
+    import OpenEXR
+
+    light = scene(WIDTH, HEIGHT).astype(np.float16)
+    colours = {name: np.ascontiguousarray(light[..., k]) for k, name in enumerate("RGB")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    contents = (("rgba.left", "left", colours), ("rgba.right", "right", colours),
+                ("depth", "left", {"Z": colours["R"]}))
+    parts = [OpenEXR.Part({**header, "name": name, "view": view, "owner": "Ada"}, channels)
+             for name, view, channels in contents]
+    with OpenEXR.File(parts) as file:
+        file.write(str(path))
+
+
+def _write_foreign_names(path: Path) -> None:
+    """Write an EXR with names and a text that are not UTF-8."""
+    light = scene(WIDTH, HEIGHT)
+    write_exr(path, {"H\x7fhe": light[..., 0], **{name: light[..., k] for k, name in enumerate("RGB")}},
+              header={"gr\x7fsse": "x", "owner": "Bross?"})
+    path.write_bytes(path.read_bytes().replace(b"\x7fhe", b"\xf6he").replace(b"\x7fsse", b"\xf6sse")
+                     .replace(b"Bross?", b"Bross\xe9"))
 
 
 def _read_video(path: Path) -> None:
@@ -55,8 +133,6 @@ def _codes() -> NDArray[np.uint8]:
 
 
 def _write_jxl(path: Path) -> None:
-    from PIL import Image
-
     importlib.import_module("pillow_jxl")  # adds the format
     Image.fromarray(_codes()).save(path)
 

@@ -144,7 +144,10 @@ def _apply_umask(temporary: Path, mode: int) -> None:
 
 
 def _partial_prefix(target: Path) -> str:
-    """Start of the names of temporary files for `target`."""
+    """Start of the names of temporary files for `target`; for one that is temporary itself, of those for its final
+    name, so that they are found there after a kill."""
+    if target.name.startswith(_PARTIAL) and (writer := _WRITER_TAG.search(target.name)):
+        return target.name[:writer.start() + 1]
     return f"{_PARTIAL}{os.fsencode(target.name)[:80].decode(errors='ignore')}-"
 
 

@@ -323,6 +323,17 @@ def test_a_partial_file_of_another_machine_is_kept_for_an_hour(tmp_path: Path) -
     assert not theirs.exists()
 
 
+def test_a_temporary_file_of_a_temporary_file_has_its_final_name(tmp_path: Path) -> None:
+    """So that the next process that writes the file removes it after a kill."""
+    with atomic_path(tmp_path / "a.flare") as outer:
+        with atomic_path(outer) as inner:
+            assert inner != outer
+            assert inner.name[:17] == outer.name[:17] == ".partial-a.flare-"
+            assert outer.exists()
+            inner.write_text("1")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.flare", "1")]
+
+
 def test_a_long_name_leaves_room_for_its_partial_one(tmp_path: Path) -> None:
     target = tmp_path / ("\u6f22" * 80 + ".png")  # three bytes each, of 255 that a name may have
     with atomic_path(target) as partial:

@@ -80,7 +80,8 @@ CASES = (
          "widths=[8,8,8,8,8] --set size_stages=[[1.0,64,64]] --set pixels_per_iteration=1 --set bank_size=2 --set "
          "canvas_size=64 --iterations 2 --processes 1 --threads 1 --resume"),
     Case("solve", ("shot",), "solve {shot} --out {out}/capture --work-size 320 --no-mask",
-         varies=frozenset(f"capture/images/{number:03d}.png" for number in range(8))),
+         varies=frozenset({"capture/solve.png", *(f"capture/images/{number:03d}.png" for number in range(8)),
+                           *(f"capture/sparse/0/{name}.bin" for name in ("cameras", "images", "points3D"))})),
     Case("compose", (*FITTED, "layers"), "compose {layers} --out {out}/frames --frames 1-2",
          varies=frozenset({"frames/compositor.blend1"})))
 """The commands, the quick ones first."""

@@ -325,12 +325,11 @@ def test_a_partial_file_of_another_machine_is_kept_for_an_hour(tmp_path: Path) -
 
 def test_a_temporary_file_of_a_temporary_file_has_its_final_name(tmp_path: Path) -> None:
     """So that the next process that writes the file removes it after a kill."""
-    with atomic_path(tmp_path / "a.flare") as outer:
-        with atomic_path(outer) as inner:
-            assert inner != outer
-            assert inner.name[:17] == outer.name[:17] == ".partial-a.flare-"
-            assert outer.exists()
-            inner.write_text("1")
+    with atomic_path(tmp_path / "a.flare") as outer, atomic_path(outer) as inner:
+        assert inner != outer
+        assert inner.name[:17] == outer.name[:17] == ".partial-a.flare-"
+        assert outer.exists()
+        inner.write_text("1")
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.flare", "1")]
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-CAMERAS, POINTS, GAUSSIANS, LEVELS = 400, 100_000, 2_000, 16
+CAMERAS, POINTS, GAUSSIANS, LEVELS, LAMPS = 400, 100_000, 2_000, 16, 100
 
 
 def load_module(name: str) -> Any:
@@ -116,6 +116,35 @@ def time_range(call: Any, times: int = 10) -> tuple[float, float]:
     return min(times_ms), max(times_ms)
 
 
+def time_lamps(looks: Any, overlay: Any, look: Path, window: Any) -> list[str]:
+    """Return lines on the overlay of a hundred lamps with one look, with a camera that moves and one that stands."""
+    import bpy
+
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    scene, random = bpy.context.scene, np.random.default_rng(0)
+    scene.camera = camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    camera.rotation_euler = (np.pi / 2, 0, 0)
+    lamps = [bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "POINT")) for _ in range(LAMPS)]
+    for lamp in lamps:
+        scene.collection.objects.link(lamp)
+        lamp.location = random.uniform(-4, 4), 10, random.uniform(-2, 2)
+    looks.show_look(scene, look, lamps, add=True)
+    lines = []
+    for moves in (True, False):
+        def frame(moves: bool = moves) -> None:
+            camera.location.x += 0.01 * moves
+            bpy.context.view_layer.update()
+            flares = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), camera)
+            overlay.quads_by_level(overlay.concatenate(list(flares.values())), window, looks.look_of(scene))
+
+        frame()
+        fast, slow = time_range(frame, 5)
+        lines.append(f"overlay of {LAMPS} lamps with one look, all but the GPU, camera "
+                     f"{'moves' if moves else 'stands'}: {fast:.0f} to {slow:.0f} ms")
+    return lines
+
+
 def main() -> None:
     """Time the import of a capture, the reading of events, and the overlay, inside Blender."""
     import bpy
@@ -152,7 +181,10 @@ def main() -> None:
 
         look = looks.look_of(scene)
 
-        def frame() -> None:
+        def frame(*, moves: bool = True) -> None:
+            if moves:  # the network is needed again
+                scene.camera.delta_location.x += 1e-4
+                bpy.context.view_layer.update()
             gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
             overlay.quads_by_level(gaussians, window, look)
 
@@ -160,6 +192,7 @@ def main() -> None:
         fast, slow = time_range(frame, 20)
         count = sum(map(len, looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
         lines.append(f"overlay of {count} Gaussians, all but the GPU: {fast:.1f} to {slow:.1f} ms")
+        lines += time_lamps(looks, overlay, load_module("flare_addon.library").BOX / "Anamorphic Blue.flare", window)
     print("\n".join(lines))
     sys.stdout.flush()
     os._exit(0)

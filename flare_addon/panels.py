@@ -124,7 +124,10 @@ class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
         settings = _settings_column(layout)
         settings.prop(state, "preset")
         settings.prop(state, "mode")
-        settings.prop(state, "width")
+        row = settings.row(heading="Limit Width")
+        row.prop(state, "limits_width", text="")
+        if state.limits_width:
+            row.prop(state, "width", text="")
         capture = fits.capture_folder(scene)
         if capture is not None and (state.mode != "default" or fits.cleaning_job(capture) is not None):
             _draw_clean_frames(layout, state, capture, stage)
@@ -174,7 +177,7 @@ def _draw_clean_frames(layout: Any, state: Any, capture: Any, stage: str) -> Non
         if not exists and state.mode != "split" and (state.matte or state.keep_glow):
             label_lines(layout, "Press Make Clean Frames first: a fit makes them without these options.", "INFO")
     if exists and state.mode == "split":  # they were made while the .blend was closed
-        label_lines(layout, "There are clean frames: choose them under Supervision to use them.", "INFO")
+        label_lines(layout, "There are clean frames: choose them under Learn From to use them.", "INFO")
     by_fit = stage == "finished" and (job is None or "--run" not in job.args)
     if not exists or by_network or by_fit:
         layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if exists else "Make Clean Frames",
@@ -187,7 +190,7 @@ def _draw_running_fit(layout: Any, job: jobs.Job) -> None:
     if job.figures:
         loss, count = job.figures.get("loss", job.figures.get("scene_loss")), job.figures.get("flare_gaussians")
         parts = [f"step {job.done} of {job.total}"]
-        parts += [f"loss {loss:.4f}"] if loss is not None else []
+        parts += [f"difference from the frames {loss:.4f}"] if loss is not None else []
         parts += [f"{count:,.0f} flare Gaussians"] if count else []
         label_lines(layout, ", ".join(parts))
     icon = fits.preview_icon(job.folder)

@@ -73,6 +73,20 @@ def _touch_element(self: Any, _context: Any) -> None:
     touch(self)
 
 
+USUAL_WIDTH = 960
+"""Width of a fit, pixels, when Limit Width is switched on."""
+
+
+def _limits_width(self: Any) -> bool:
+    """Return whether the fit is smaller than the frames."""
+    return bool(self.width > 0)
+
+
+def _limit_width(self: Any, value: bool) -> None:
+    """Limit the width of the fit, or use the width of the frames."""
+    self.width = (self.width or USUAL_WIDTH) if value else 0
+
+
 def _update_footage(self: Any, _context: Any) -> None:
     """Show the frames as filmed, or the clean frames, behind the cameras."""
     from .capture.importer import show_footage
@@ -223,11 +237,14 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     preset: EnumProperty(  # type: ignore[valid-type]
         name="Preset", description="Length and size of the fit", items=PRESETS, default="draft")
     mode: EnumProperty(  # type: ignore[valid-type]
-        name="Supervision", description="Which clean frames supervise the scene in the fit",
+        name="Learn From", description="The frames that the fit learns the scene without flare from",
         items=MODES)
     width: IntProperty(  # type: ignore[valid-type]
         name="Width", description="Largest width in pixels of the frames in the fit; 0 uses the width of the frames",
         default=0, min=0, max=16384)
+    limits_width: BoolProperty(  # type: ignore[valid-type]
+        name="Limit Width", description="Fit smaller frames, which is faster; otherwise the fit uses the width of the "
+        "frames", get=_limits_width, set=_limit_width)
 
     flare: StringProperty(  # type: ignore[valid-type]
         name="Flare", description="The .flare file that the scene shows", subtype="FILE_PATH",
@@ -266,7 +283,7 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         "show the flare over the picture chosen under Over", default=True)
     over: EnumProperty(  # type: ignore[valid-type]
         name="Over", description="The picture that the compositor adds the flare to",
-        items=(("present", "Present Image", "The present output of the compositor, or the render"),
+        items=(("present", "Render", "The render, or the output of your own nodes in the compositor"),
                ("plate", "Footage", "The frames behind the camera"),
                ("scene", "Baked Scene", "The fitted scene in the layers")))
 

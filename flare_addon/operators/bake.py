@@ -106,8 +106,8 @@ class FITFLARE_OT_set_up_compositor(GuardedOperator, bpy.types.Operator):
         options={"SKIP_SAVE"},  # else the last value would count as a dropped file
     )
     keep_image: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Over the Present Image",
-        description="Put the flare over the present output of the compositor, instead of the baked scene",
+        name="Over the Render",
+        description="Put the flare over the render, or the output of your own nodes, instead of the baked scene",
         default=False,
     )
     plate: bpy.props.BoolProperty(  # type: ignore[valid-type]

@@ -138,10 +138,14 @@ def import_capture():
 
 
 def fit():
-    """Width into its field, a click on Fit, and the view turned while the engine works."""
+    """Limit Width and its field, a click on Fit, and the view turned while the engine works."""
     scene = bpy.context.scene
     state, fits = scene.fit_flare, module("fits")
-    x, y = yield from ui.find("fit_flare.width", panel(), path=True, across=0.65)
+    x, y = yield from ui.find("fit_flare.limits_width", panel(), path=True, across=0.47)
+    ui.click(x, y)
+    yield 0.5
+    assert state.limits_width
+    x, y = yield from ui.find("fit_flare.width", panel(), path=True, across=0.75, below=y + 20)
     yield from ui.fill(x, y, WIDTH)
     assert state.width == int(WIDTH)
     view = ui.region("WINDOW")

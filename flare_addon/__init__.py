@@ -16,7 +16,7 @@
     shots.py            scenes as shots                          baking.py          bakes
     lamp_drive.py       power of lamps as a factor               light_extents.py   areas of lights
     asset_browser.py    looks in the Asset Browser      highlight.py        the chosen element in the view
-    viewport_render.py  viewport renders with the flare
+    viewport_render.py  viewport renders with the flare      editor_panels.py    panels of other editors
     views.py            3D views                                 compositor/        the layers in the compositor
     library.py          the library of flares                    paths.py           paths of a .blend that moves
     fcurves.py          animation of list items                  render_settings.py   rendering and saving
@@ -29,6 +29,7 @@ import bpy
 from . import (
     asset_browser,
     baking,
+    editor_panels,
     fits,
     highlight,
     jobs,
@@ -43,7 +44,7 @@ from . import (
 )
 from .compositor import drivers
 
-_MODULES = (properties, preferences, operators, panels, points, overlay, highlight, paths, asset_browser)
+_MODULES = (properties, preferences, operators, panels, editor_panels, points, overlay, highlight, paths, asset_browser)
 
 
 @bpy.app.handlers.persistent

@@ -384,7 +384,7 @@ def redraw_bars() -> None:
     for area in (area for window in bpy.context.window_manager.windows for area in window.screen.areas):
         if area.type == "PREFERENCES":
             area.tag_redraw()
-        elif area.type == "VIEW_3D":
+        elif area.type in ("VIEW_3D", "NODE_EDITOR", "IMAGE_EDITOR"):
             for region in area.regions:
                 if region.type == "UI" and region.active_panel_category == SIDEBAR_TAB:
                     region.tag_redraw()

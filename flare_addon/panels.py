@@ -263,13 +263,14 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
             return
         if overlay.last_error:
             label_lines(layout, overlay.last_error, "ERROR")
+        view = context.space_data if getattr(context.space_data, "type", "") == "VIEW_3D" else None
         if scene.camera is None:
             label_lines(layout, "The scene has no camera; add one to see the flare.", "ERROR")
-        elif not _looks_through_camera(context):
+        elif view is not None and view.region_3d.view_perspective != "CAMERA":
             layout.operator("view3d.view_camera", text="Look through the Camera", icon="VIEW_CAMERA")
-        elif context.space_data is not None and not context.space_data.overlay.show_overlays:
+        elif view is not None and not view.overlay.show_overlays:
             label_lines(layout, "Overlays are switched off in this view, and the flare with them.", "INFO")
-        elif context.space_data is not None and overlay.is_composited(context.space_data, scene):
+        elif view is not None and overlay.is_composited(view, scene):
             label_lines(layout, "This view is composited: it shows the flare as it was baked.", "INFO")
         elif state.show and state.native and state.footage == "images" and fits.has_clean_frames(scene):
             label_lines(layout, "The frames behind the camera contain their own flare, and this one is drawn over it: "
@@ -298,12 +299,6 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("fit_flare.reset_look", icon="LOOP_BACK")
         row.operator("fit_flare.open_flare", text="Open", icon="FILE_FOLDER")
-
-
-def _looks_through_camera(context: bpy.types.Context) -> bool:
-    """Return whether the 3D view of the panel shows the camera's view."""
-    space = context.space_data
-    return space is None or space.type != "VIEW_3D" or space.region_3d.view_perspective == "CAMERA"
 
 
 def _draw_sliders(layout: Any, sliders: Any, streak: bool = True) -> None:

@@ -215,10 +215,12 @@ class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(name="Picture", description="The picture to put the flare over",  # type: ignore[valid-type]
-                                       subtype="FILE_PATH")
+                                       subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        if self.filepath:  # of the Image Editor
+            return self.execute(context)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 

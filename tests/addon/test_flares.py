@@ -142,3 +142,9 @@ def test_a_viewport_render_is_saved_as_the_view_transform_shows_it(facts: Any) -
     assert facts["viewport render"] == ["view_0007.png", [8, 4], [8, 4], [255, 128, 128]]
     video, camera, window = facts["viewport render refused"]
     assert "choose an image format" in video and "no camera" in camera and "need Blender's window" in window
+
+
+def test_look_and_bake_are_beside_the_compositor_and_the_picture(facts: Any) -> None:
+    """Block of flares.py: "panels of other editors"."""
+    assert facts["other editors"] == [True, True, [], True, True, ["fit_flare.shot_from_picture"], []]
+    assert facts["other editors without a flare"] == [[], []]

@@ -264,6 +264,32 @@ parts = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scen
                               highlight.alone(chosen, edits))[names[1]]
 left, top, right, bottom = highlight.outline(parts, parts.means, parts.covariances)
 facts["outlined"] = [left < float(parts.means[:, 0].mean()) < right, top < float(parts.means[:, 1].mean()) < bottom]
+# ---- panels of other editors ------------------------------------------------------------------------
+editors = part("flare_addon.editor_panels")
+scene = shot(["lamp"])
+
+
+def drawn(name, space):
+    """Whether a panel is shown beside a scene with a flare, and the operators that it draws."""
+    cls, layout = getattr(editors, f"FITFLARE_PT_{name}"), MagicMock()
+    context = SimpleNamespace(scene=scene, space_data=space)
+    if not cls.poll(context):
+        return []
+    panel = SimpleNamespace(layout=layout)
+    panel._draw_compositor = lambda *words: cls._draw_compositor(panel, *words)
+    cls.draw(panel, context)
+    return [call.args[0] for call in layout.mock_calls if call[0].endswith("operator")]
+
+
+nodes = SimpleNamespace(type="NODE_EDITOR", tree_type="CompositorNodeTree")
+pictures = SimpleNamespace(type="IMAGE_EDITOR", image=SimpleNamespace(source="FILE", filepath="//photo.png"))
+facts["other editors"] = ["fit_flare.reset_look" in drawn("node_look", nodes), "fit_flare.bake" in drawn(
+    "node_bake", nodes), drawn("node_look", SimpleNamespace(tree_type="ShaderNodeTree")),
+    "fit_flare.reset_look" in drawn("image_look", pictures), "fit_flare.bake" in drawn("image_bake", pictures),
+    drawn("image_picture", pictures), drawn("image_picture", SimpleNamespace(image=None))]
+scene.fit_flare.flare = ""
+facts["other editors without a flare"] = [drawn("image_look", pictures), drawn("image_bake", pictures)]
+
 # ---- a viewport render ------------------------------------------------------------------------------
 viewport_render, errors = part("flare_addon.viewport_render"), part("core.errors")
 render = scene.render

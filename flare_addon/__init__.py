@@ -5,7 +5,7 @@
     preferences.py      panel of the preferences                 panels.py          the sidebar
     operators/          the buttons                              reports.py         refusals and errors of buttons
     panel_parts.py      parts of the sidebar's panels            engine.py          finding and installing the engine
-    layouts.py          labels and progress bars
+    layouts.py          labels and progress bars                 handbook.py         links to the handbook
     jobs.py             processes of the engine                  fits.py            fits, light search, clean frames
     weights.py          the weights of the removal network
     capture/            captures into and out of Blender         cameras.py         Blender's cameras and the core's
@@ -31,6 +31,7 @@ from . import (
     baking,
     editor_panels,
     fits,
+    handbook,
     highlight,
     jobs,
     looks,
@@ -44,7 +45,8 @@ from . import (
 )
 from .compositor import drivers
 
-_MODULES = (properties, preferences, operators, panels, editor_panels, points, overlay, highlight, paths, asset_browser)
+_MODULES = (properties, preferences, handbook, operators, panels, editor_panels, points, overlay, highlight, paths,
+            asset_browser)
 
 
 @bpy.app.handlers.persistent

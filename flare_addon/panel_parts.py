@@ -54,6 +54,15 @@ def draw_motion(layout: Any, scene: Any, objects: Sequence[Any]) -> None:
                             f"images: {', '.join(names)}.", "INFO")
 
 
+def draw_bake(row: Any, state: Any) -> None:
+    """Draw the buttons that bake, and composite where this is chosen: for the scene's camera, for the selected ones."""
+    label = "Bake and Composite" if state.bake_composite else "Bake Layers"
+    for selected in (False, True):
+        icon = "OUTLINER_OB_CAMERA" if selected else "RENDER_ANIMATION"
+        button = row.operator("fit_flare.bake", text="" if selected else label, icon=icon)
+        button.selected, button.composite = selected, state.bake_composite
+
+
 def draw_stereo(layout: Any, scene: Any) -> None:
     """Draw what a stereo render shows of the flare."""
     if scene.render.use_multiview:

@@ -14,7 +14,7 @@ from ..core.capture import REMOVED
 from ..core.conventions.run_files import FLARE
 from ..core.errors import FitFlareError
 from ..core.look import Look
-from . import baking, engine, fits, jobs, library, light_extents, lights, looks, overlay, panel_parts, shots
+from . import baking, engine, fits, handbook, jobs, library, light_extents, lights, looks, overlay, panel_parts, shots
 from .compositor import drivers, flare_node, setup
 from .layouts import draw_progress, label_lines
 from .operators import make_flare
@@ -28,6 +28,11 @@ class _SidebarPanel:
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = jobs.SIDEBAR_TAB
+    page = ""
+    """The page of the handbook about the panel."""
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        handbook.draw_button(self.layout, self.page)  # type: ignore[attr-defined]
 
 
 def _settings_column(layout: Any) -> Any:
@@ -50,6 +55,7 @@ class _FitPanel(_SidebarPanel):
 class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
     bl_label = "Capture"
     bl_idname = "FITFLARE_PT_capture"
+    page = "first_fit"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, state = self.layout, context.scene.fit_flare
@@ -74,6 +80,7 @@ class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
 class FITFLARE_PT_lights(_FitPanel, bpy.types.Panel):
     bl_label = "Lights"
     bl_idname = "FITFLARE_PT_lights"
+    page = "first_fit"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -109,6 +116,7 @@ class FITFLARE_PT_lights(_FitPanel, bpy.types.Panel):
 class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
     bl_label = "Fit"
     bl_idname = "FITFLARE_PT_fit"
+    page = "first_fit"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, scene = self.layout, context.scene
@@ -244,6 +252,7 @@ def draw_missing_engine(layout: Any) -> None:
 class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
     bl_label = "Look"
     bl_idname = "FITFLARE_PT_look"
+    page = "editing"
 
     def draw_header(self, context: bpy.types.Context) -> None:
         self.layout.prop(context.scene.fit_flare, "show", text="")
@@ -344,6 +353,7 @@ def _draw_flare(layout: Any, scene: Any, item: Any, look: Look) -> None:
 class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
     bl_label = "Bake"
     bl_idname = "FITFLARE_PT_bake"
+    page = "editing"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, scene = self.layout, context.scene
@@ -384,8 +394,7 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
                     label_lines(layout, warning, "ERROR")
             row = layout.row(align=True)
             row.scale_y = 1.3
-            row.operator("fit_flare.bake", icon="RENDER_ANIMATION").selected = False
-            row.operator("fit_flare.bake", text="", icon="OUTLINER_OB_CAMERA").selected = True
+            panel_parts.draw_bake(row, state)
             if job is not None:
                 _draw_bake_log(layout, job)
         self._draw_compositor(layout, scene)
@@ -427,6 +436,7 @@ def _draw_bake_log(layout: Any, job: jobs.Job) -> None:
 class FITFLARE_PT_transfer(_SidebarPanel, bpy.types.Panel):
     bl_label = "Transfer"
     bl_idname = "FITFLARE_PT_transfer"
+    page = "transfer"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, state = self.layout, context.scene.fit_flare
@@ -443,6 +453,7 @@ class FITFLARE_PT_transfer(_SidebarPanel, bpy.types.Panel):
 class FITFLARE_PT_library(_SidebarPanel, bpy.types.Panel):
     bl_label = "Library"
     bl_idname = "FITFLARE_PT_library"
+    page = "first_flare"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, state, manager = self.layout, context.scene.fit_flare, context.window_manager

@@ -11,7 +11,7 @@ from typing import Any
 
 import bpy
 
-from . import engine, jobs, weights
+from . import engine, handbook, jobs, weights
 from .layouts import draw_progress, label_lines
 from .reports import GuardedOperator
 from .user_settings import PACKAGE
@@ -55,6 +55,7 @@ class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
         row.operator("fit_flare.unlist_assets", icon="X")
         _draw_engine(layout)
         _draw_weights(layout)
+        handbook.draw_button(layout, text="Handbook")
 
 
 def _draw_engine(layout: Any) -> None:

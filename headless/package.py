@@ -16,6 +16,7 @@ import importlib.util
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -38,9 +39,20 @@ def build(packer: list[str], out: Path) -> int:
     status = subprocess.run([*packer, "build", "--source-dir", str(ROOT), "--output-dir", str(out)],
                             check=False).returncode
     for package in out.glob("fit_flare-*.zip") if status == 0 else ():
+        add_handbook(package)
         status = status or subprocess.run([*packer, "validate", str(package)], check=False).returncode
         print(f"{package}: {package.stat().st_size / 1e6:.1f} MB")
     return status
+
+
+def add_handbook(package: Path) -> None:
+    """Add the handbook to the extension, as HTML pages."""
+    sys.path.insert(0, str(ROOT))
+    from headless.handbook import write_pages
+
+    with zipfile.ZipFile(package, "a", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in write_pages(ROOT / "docs" / "handbook").items():
+            archive.writestr(f"handbook/{name}", content)
 
 
 def copy_weights(folder: Path) -> str:

@@ -15,6 +15,9 @@ from ..compositor import drivers, flare_node, setup, warnings
 from ..paths import absolute, is_folder
 from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator, report_errors
 
+_composite_anew: set[str] = set()
+"""The scenes whose bake sets the compositor up, also if it is set up already."""
+
 
 class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
     """Render the flares to EXR layers, for the frames and the camera of the scene: in the engine, or slower without"""
@@ -26,6 +29,9 @@ class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
     selected: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Selected Cameras", description="Bake from every selected camera, each to its own folder",
         default=False)
+    composite: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Composite", description="Set the compositor up for the layers when they are baked, anew if it is set up "
+        "already", default=False, options={"SKIP_SAVE"})
     replace: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Replace Others", description="Delete other frames in the folder that were baked with other settings",
         default=False, options={"HIDDEN", "SKIP_SAVE"})
@@ -53,7 +59,12 @@ class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
             message=shots.replacement_warning(shots.layers_folder(context.scene), replaced))
 
     def act(self, context: bpy.types.Context) -> None:
-        baking.start(context.scene, self._chosen(context), replace_others=self.replace)
+        scene = context.scene
+        _composite_anew.discard(scene.name)
+        if self.composite:
+            scene.fit_flare.bake_composite = True
+            _composite_anew.add(scene.name)
+        baking.start(scene, self._chosen(context), replace_others=self.replace)
 
     def _chosen(self, context: bpy.types.Context) -> list[Any]:
         """Return the selected cameras; [] for the scene's camera. Raises CaptureError where none is selected."""
@@ -191,9 +202,14 @@ class _Notes:
 
 
 def _set_up_after_bake(job: jobs.Job, scene: Any) -> None:
-    """Set the compositor of a scene up for new layers, if the panel says so and it is not set up already."""
-    state = scene.fit_flare
-    if not state.bake_composite or scene.library is not None or flare_node.find_node(scene) is not None:
+    """Set the compositor of a scene up for new layers, if the panel says so.
+
+    One that is set up already stays as it is, unless the bake was to set it up anew.
+    """
+    state, is_anew = scene.fit_flare, scene.name in _composite_anew
+    _composite_anew.discard(scene.name)
+    if not state.bake_composite or scene.library is not None or (
+            flare_node.find_node(scene) is not None and not is_anew):
         return
     notes = _Notes(job)
     try:

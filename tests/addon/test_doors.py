@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""People come in through Blender's menus, its search, dropped files and the handbook."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blenders import ROOT
+
+from headless.handbook import write_pages
+
+
+@pytest.fixture(scope="session")
+def facts(run_script: Callable[[str, int], Any]) -> Any:
+    return run_script("doors", 3)
+
+
+def test_the_menus_of_blender_have_entries(facts: Any) -> None:
+    """Block of doors.py: "menus"."""
+    assert all(len(functions) == 1 for functions in facts["menus"].values())
+    assert facts["import"] == [["fit_flare.import_capture", "Fit Flare Capture (.json, COLMAP)"],
+                               ["fit_flare.open_flare", "Flare (.flare)"]]
+    assert facts["render"] == [["fit_flare.bake", "Bake and Composite Flares"]]
+
+
+def test_the_context_menu_of_a_lamp_adds_and_chooses_its_flare(facts: Any) -> None:
+    """Block of doors.py: "menus"."""
+    assert facts["of a mesh"] == []
+    assert facts["of a lamp"] == ["fit_flare.add_library_flare"]
+    assert facts["of a lamp with a flare"] == ["fit_flare.add_library_flare", "fit_flare.choose_flare"]
+    assert facts["chosen"] == "Lamp 1"
+    drawn, refused = facts["no flare yet"]
+    assert drawn == [] and "The active object has no flare" in refused
+
+
+def test_the_search_finds_the_work_by_its_words(facts: Any) -> None:
+    """Block of doors.py: "menus"."""
+    assert {"Add Flare", "Open Flare", "Import Capture", "Find in Frames", "Fit", "Make Clean Frames",
+            "Bake and Composite Flares", "Set Up Compositor", "Save to Library", "Fit Flare Handbook"
+            } <= set(facts["words"])
+    assert facts["unknown"] == []
+
+
+def test_files_are_imported_and_dropped(facts: Any) -> None:
+    """Block of doors.py: "files that are dropped or imported"."""
+    assert facts["handlers"] == {"Fit Flare Capture": ["fit_flare.import_capture", ".json;.bin"],
+                                 "Fit Flare Look": ["fit_flare.open_flare", ".flare"]}
+    assert facts["dropped on"] == [True, False]
+    assert facts["a file of a capture"] == [["FINISHED"], True]
+    assert facts["a flare"] == [["FINISHED"], 1]
+
+
+def test_every_panel_links_a_page_of_the_handbook(facts: Any) -> None:
+    """Block of doors.py: "links to the handbook"."""
+    pages, exist = facts["pages"]
+    assert "" not in pages and all(exist)
+    assert all(facts["online manual"]) and facts["topics"]
+    assert facts["index"] == [True, False]
+
+
+def test_one_button_bakes_and_composites(facts: Any) -> None:
+    """Block of doors.py: "bake and composite"."""
+    assert facts["button"] == ["Bake and Composite", ""]
+    assert facts["one button"] == [True, True]
+    assert facts["anew"] == [True, 1], "a bake alone leaves the compositor as it is"
+
+
+def test_links_of_the_handbook_lead_to_its_pages() -> None:
+    pages = write_pages(ROOT / "docs" / "handbook")
+    for name, content in pages.items():
+        if name.endswith(".html"):
+            text = content.decode()
+            targets = [part.split('"')[0] for mark in ('href="', 'src="') for part in text.split(mark)[1:]]
+            for target in targets:
+                page, _, anchor = target.partition("#")
+                assert (page or name) in pages, (name, target)
+                assert not anchor or f'id="{anchor}"' in pages[page or name].decode(), (name, target)
+            assert "**" not in text and "](" not in text, name
+
+
+def test_the_handbook_keeps_code_and_drops_links_that_leave_it(tmp_path: Path) -> None:
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "README.md").write_text("# A & B\n\nSee [there](../x.md) and `a*b*c`, **bold** *this*.\n\n"
+                                        "| a | b |\n| --- | --- |\n| 1 | `2` |\n\n1. one\n2. two\n\n    code <x>\n")
+    page = write_pages(tmp_path)["index.html"].decode()
+    assert "<h1 id=\"a--b\">A &amp; B</h1>" in page
+    assert "See there and <code>a*b*c</code>, <strong>bold</strong> <em>this</em>." in page
+    assert "<tr><th>a</th><th>b</th></tr><tr><td>1</td><td><code>2</code></td></tr>" in page
+    assert "<ol><li>one</li><li>two</li></ol>" in page and "<pre>code &lt;x&gt;</pre>" in page

@@ -21,10 +21,11 @@ SOLVE_DEFAULTS = {"frames": 0, "matching": "auto", "lens": "RADIAL", "work_size"
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments to a parser."""
     parser.add_argument("source", type=Path, metavar="FRAMES_OR_VIDEO",
-                        help="folder of frames (PNG, JPEG, TIFF, EXR, DPX and others), a video, or a .blend, whose "
-                             "animated camera is used without a solve")
+                        help="folder of frames (PNG, JPEG, TIFF, EXR, DPX and others), a video, or a .blend, a Nuke "
+                             "script (.nk) or a .chan file, whose animated camera is used without a solve")
     parser.add_argument("--plates", type=Path, metavar="DIR",
-                        help="for a .blend: the frames as filmed or rendered, whose names end with their numbers")
+                        help="for a .blend, .nk or .chan: the frames as filmed or rendered, whose names end with their "
+                             "numbers")
     parser.add_argument("--lights", metavar="NAMES", help="for a .blend: objects that are lights (default: its lamps)")
     parser.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="folder for the capture")
     parser.add_argument("--frames", type=int, metavar="N",
@@ -51,7 +52,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.capture.solve import PICTURE, REPORT, SolveSettings, solve
 
     if args.plates or args.lights:
-        raise SettingsError(f"--{'plates' if args.plates else 'lights'} is only for a .blend; leave it out.")
+        raise SettingsError(f"--{'plates' if args.plates else 'lights'} is only for the camera of a file; leave it "
+                            "out.")
     settings = SolveSettings(frames=args.frames, matching=args.matching, lens=args.lens.upper(),
                              size=args.work_size, output_size=args.size, mask=not args.no_mask, seed=args.seed,
                              plate_space="" if plate_space.named_space(args) is None else args.plate_space,
@@ -71,19 +73,47 @@ def is_blend(args: argparse.Namespace) -> bool:
     return bool(args.source.suffix.lower() == ".blend")
 
 
-def import_blend(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Blender step: write a capture from the animated camera of a .blend."""
-    from ...core.capture.layout import find_model
-    from ...core.capture.transforms import FILE as TRANSFORMS
+def is_nuke(args: argparse.Namespace) -> bool:
+    """Return whether the source is a camera of Nuke."""
+    return args.source.suffix.lower() in (".nk", ".chan")
+
+
+def import_nuke(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Engine step: write a capture from the camera of a Nuke script or a .chan file."""
+    from ...core.capture.nuke_camera import read_nuke_camera, write_nuke_capture
     from ...core.conventions.frame_numbers import plates_by_number
     from ...core.images.listing import pictures_in
-    from ...flare_addon.capture.blend_shot import open_blend, write_capture
+
+    if args.lights:
+        raise SettingsError("--lights is only for a .blend; leave it out, and run `lights` on the capture.")
+    _check_camera_source(args)
+    plates = plates_by_number(pictures_in(args.plates))
+    if not plates:
+        raise CaptureError(f"{args.plates} holds no pictures; name the folder of the camera's frames.")
+    tally = write_nuke_capture(read_nuke_camera(args.source), plates, args.out, progress)
+    progress.say(f"{tally.used} frames with the camera of {args.source} are in {args.out}; next: `lights {args.out}`.")
+    return {"capture": str(args.out), "frames": tally.used, **tallies.report_tally(tally, progress)}
+
+
+def _check_camera_source(args: argparse.Namespace) -> None:
+    """Raise SettingsError without plates or with options of a solve, CaptureError where CAPTURE holds a capture."""
+    from ...core.capture.layout import find_model
+    from ...core.capture.transforms import FILE as TRANSFORMS
 
     reject_unused_options(args, SOLVE_DEFAULTS, "frames or a video that have to be solved")
     if args.plates is None or not args.plates.is_dir():
         raise SettingsError(f"{args.source} has a camera but no pictures; name the folder of its frames with --plates.")
     if (args.out / TRANSFORMS).exists() or find_model(args.out) is not None:
         raise CaptureError(f"{args.out} holds a capture already; choose another folder.")
+
+
+def import_blend(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Blender step: write a capture from the animated camera of a .blend."""
+    from ...core.conventions.frame_numbers import plates_by_number
+    from ...core.images.listing import pictures_in
+    from ...flare_addon.capture.blend_shot import open_blend, write_capture
+
+    _check_camera_source(args)
     scene = open_blend(args.source)
     plates = {number: path for number, path in plates_by_number(pictures_in(args.plates)).items()
               if scene.frame_start <= number <= scene.frame_end}
@@ -103,6 +133,9 @@ incremental mapping. CAPTURE gets images/ (undistorted), sparse/0/ (COLMAP), sol
 picture of cameras and points. The world stands upright (+z up). Frames that cannot be placed are left out and
 listed.
 
-  run.py solve shot.mp4 --out captures/shot""",
+  run.py solve shot.mp4 --out captures/shot
+  run.py solve camera.nk --plates plates/sh010 --out captures/sh010""",
     arguments, (Step("camera", "blender", import_blend, is_needed=is_blend),
-                Step("solve", "engine", run, is_needed=lambda args: not is_blend(args))), resume_rule="resumes")
+                Step("Nuke camera", "engine", import_nuke, is_needed=is_nuke),
+                Step("solve", "engine", run, is_needed=lambda args: not is_blend(args) and not is_nuke(args))),
+    resume_rule="resumes")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from core.capture.nuke_camera import read_nuke_camera
 from core.capture.plate_space import read_plate_space
 from core.capture.solve import _read_report
 from core.capture.solve.source_frames import read_record
@@ -26,6 +27,8 @@ from tests.core.videos import stripes, write_video
 from tests.faults.media import Medium
 
 LENS = "50 4 1.6 55 30\n-200 1 1 0 30\nstop 3 1 0 18\n-60 2 1.7 30 24\n60 4 1.6 60 24\n-40 40 1 0 24\n"
+NUKE = ("push 0\nCamera2 {\n inputs 0\n rot_order ZXY\n translate {{curve i x1 0 0.1 0.2} 1 5}\n rotate {"
+        "{curve x1 1 2 3} {curve x1 20 21 22} 0}\n focal {{curve x1 35 35 36}}\n haperture 24.576\n name cam\n}\n")
 LIGHTS = {"lights": [{"name": "lamp", "xyz": [1.0, 2.0, 3.0], "score": 0.5, "uncertainty": 0.1}], "found": [[1, 2, 3]]}
 FRAMES = {"stills": [{"name": "0001.png", "file": "/f/0001.png", "width": 64, "height": 48, "focal": 1.2,
                       "orientation": 1, "space": "", "config": None}], "left_out": ["0002.png is damaged"]}
@@ -40,7 +43,8 @@ def records() -> Iterator[Medium]:
             ("plate_space.json", {"space": "logc4", "ocio": None}, lambda path: read_plate_space(path.parent)),
             ("solve.json", {"request": {"a": [1]}, "frames": 8}, lambda path: _read_report(path.parent)),
             ("stills.json", FRAMES, lambda path: read_record(path.parent)),
-            ("lens.lens", LENS, read_prescription),
+            ("lens.lens", LENS, read_prescription), ("camera.nk", NUKE, read_nuke_camera),
+            ("camera.chan", "1 0 1 5 0 20 0 40\n2 0.1 1 5 0 21 0 40\n", read_nuke_camera),
             ("found.json", LIGHTS, _write_lights_again)):
         yield Medium(file, file, lambda path, content=content: path.write_text(text(content)), read)  # type: ignore[misc]
     yield Medium("make-flare settings", "settings.toml", lambda path: path.write_text(

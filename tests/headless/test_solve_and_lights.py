@@ -36,6 +36,19 @@ def test_solve_and_lights_make_a_capture_of_frames(tmp_path: Path) -> None:
     assert any("No light was found" in event["text"] for event in events if event["type"] == "say")
 
 
+def test_the_camera_of_a_nuke_script_makes_a_capture(tmp_path: Path) -> None:
+    plates = shoot(tmp_path / "plates", orbit(3, size=SIZE, arc=0.2))
+    script = tmp_path / "camera.nk"
+    script.write_text("Camera3 {\n translate {{curve x0 0 0.1} 0 4}\n rotate {0 {curve x0 0 1} 0}\n focal 30\n}\n")
+    status, events = run("solve", script, "--plates", plates, "--out", tmp_path / "c")
+    assert status == 0 and events[-1]["data"]["frames"] == 2
+    assert any("1 left out" in event["text"] for event in events if event["type"] == "say")
+    assert len(Capture.open(tmp_path / "c").views) == 2
+    for words in ((), ("--plates", plates, "--lights", "sun"), ("--plates", plates, "--lens", "OPENCV"),
+                  ("--plates", plates)):  # the last one: the capture exists
+        assert run("solve", script, *words, "--out", tmp_path / "c")[0] != 0
+
+
 def test_keep_preserves_the_names_of_lights(tmp_path: Path) -> None:
     folder = lit_capture(tmp_path / "c", 8, [(0.4, -0.5, 0.3)])
     status, events = run("lights", folder)

@@ -1,0 +1,294 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reads the animated camera of a Nuke script (.nk), or of a .chan file, and makes a capture of it with its plates.
+
+A Camera node states translation, rotation in degrees with its order (`rot_order`), focal length and horizontal
+aperture, or a matrix. Order ZXY turns about z first: the matrix is Ry Rx Rz. A .chan file has a line for each frame:
+frame, translation, rotation in Nuke's default order ZXY, vertical field of view in degrees. Nuke's world has y up; the
+capture's has z up, as Blender's. `solve` calls `read_nuke_camera` and `write_nuke_capture`.
+"""
+from __future__ import annotations
+
+import math
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import CaptureError
+from ..images.exr import read_data_window
+from ..images.size import picture_size
+from ..system.files import atomic_path
+from ..system.progress import Progress
+from ..system.reading import read_text
+from ..system.tally import Tally
+from .camera import Floats, is_rotation
+from .colmap import MAX_MAGNITUDE, ObservedFrame, PointCloud, write_model
+from .lens import Lens
+
+NUKE_SUFFIXES = (".nk", ".chan")
+ROTATION_ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
+DEFAULT_ORDER = "ZXY"
+DEFAULT_FOCAL, DEFAULT_APERTURE = 50.0, 24.576
+"""Focal length and horizontal aperture of a new camera in Nuke, millimetres."""
+_NEUTRAL = {"pivot": 0.0, "scaling": 1.0, "uniform_scale": 1.0, "skew": 0.0, "win_translate": 0.0, "win_scale": 1.0,
+            "winroll": 0.0}
+"""Knobs that must have these values: what they do is not read."""
+_CAMERA_NODE = re.compile(r"Camera\d*")
+_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
+_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From OpenCV's camera axes to those of Nuke, whose camera looks along -z with y up."""
+
+Curve = Mapping[int, float]
+"""Values by frame number."""
+
+
+@dataclass(frozen=True)
+class NukeCamera:
+    """A camera of frames by their numbers.
+
+    poses: camera to world (4, 4), in Nuke's axes. focal: focal length relative to the width of the frame, or to its
+    height where `by_height`.
+    """
+
+    poses: Mapping[int, Floats]
+    focal: Mapping[int, float]
+    by_height: bool = False
+
+    def lens(self, number: int, size: tuple[int, int], aspect: float) -> Lens:
+        """Return the lens of a frame of this size in pixels and pixel aspect ratio."""
+        width, height = size
+        focal_y = self.focal[number] * (height if self.by_height else width * aspect)
+        return Lens("PINHOLE", (focal_y / aspect, focal_y, width / 2, height / 2), width, height)
+
+
+def read_nuke_camera(path: Path) -> NukeCamera:
+    """Read the one camera of a script or a .chan file. Raises CaptureError."""
+    try:
+        text = read_text(path, errors="replace")
+    except (OSError, ValueError) as problem:
+        raise CaptureError(f"{path} cannot be read: {getattr(problem, 'strerror', None) or problem}.") from problem
+    camera = _read_chan(path, text) if path.suffix.lower() == ".chan" else _read_script(path, text)
+    for number, pose in camera.poses.items():
+        if not (np.abs(pose) < MAX_MAGNITUDE).all() or not 0 < camera.focal[number] < MAX_MAGNITUDE:
+            raise CaptureError(f"{path}, frame {number}: the camera's numbers make no sense; export it again.")
+    return camera
+
+
+def write_nuke_capture(camera: NukeCamera, plates: Mapping[int, Path], folder: Path, progress: Progress) -> Tally:
+    """Copy the plates that have a pose, and write the cameras as a COLMAP model without points; return the tally.
+
+    Raises CaptureError where no plate has a pose, and FrameError for one that cannot be read.
+    """
+    tally = Tally("frame", "written")
+    numbers = sorted(set(plates) & set(camera.poses))
+    tally.skip("the camera has no key there", *(plates[number].name for number in sorted(set(plates) - set(numbers))))
+    if not numbers:
+        known = sorted(camera.poses)
+        raise CaptureError(f"None of the plates has a pose: the camera has the frames {known[0]} to {known[-1]}, and "
+                           f"the plates {min(plates)} to {max(plates)}.")
+    lenses: dict[Lens, Lens] = {}
+    frames = []
+    progress.stage("copy the plates", len(numbers))
+    for number in numbers:
+        plate = plates[number]
+        lens = camera.lens(number, picture_size(plate), read_data_window(plate).aspect)
+        pose = np.linalg.inv(_TO_Z_UP @ camera.poses[number] @ _FROM_OPENCV)
+        frames.append(ObservedFrame(plate.name, lenses.setdefault(lens, lens), pose, np.zeros((0, 2)),
+                                    np.zeros(0, np.int64)))
+        target = folder / "images" / plate.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(target) as temporary:
+            shutil.copyfile(plate, temporary)
+        progress.advance()
+    (folder / "sparse" / "0").mkdir(parents=True, exist_ok=True)
+    write_model(folder / "sparse" / "0", frames, PointCloud.empty())
+    tally.use(len(numbers))
+    return tally
+
+
+def _read_chan(path: Path, text: str) -> NukeCamera:
+    poses: dict[int, Floats] = {}
+    focal: dict[int, float] = {}
+    for line in text.splitlines():
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            numbers = [_finite(word) for word in words]
+            frame = int(numbers[0])
+        except (ValueError, OverflowError) as problem:
+            raise CaptureError(f"{path} is not a .chan file: {line.strip()!r:.60}.") from problem
+        if len(numbers) < 8 or frame != numbers[0] or not 0 < numbers[7] < 180:
+            raise CaptureError(f"{path}, {line.strip()!r:.60}: a line has a frame number, three of translation, three "
+                               "of rotation and the vertical field of view; export the camera as a Nuke script (.nk).")
+        poses[frame] = _pose(numbers[1:4], numbers[4:7], DEFAULT_ORDER)
+        focal[frame] = 0.5 / math.tan(math.radians(numbers[7]) / 2)
+    if not poses:
+        raise CaptureError(f"{path} holds no frames; export the camera again.")
+    return NukeCamera(poses, focal, by_height=True)
+
+
+def _read_script(path: Path, text: str) -> NukeCamera:
+    nodes = [_Node(path, words[1]) for words in _commands(text)
+             if len(words) > 1 and _CAMERA_NODE.fullmatch(words[0])]
+    nodes = [node for node in nodes if node.is_animated] or nodes
+    if len(nodes) != 1:
+        names = ", ".join(node.name for node in nodes)
+        raise CaptureError(f"{path} holds {f'the cameras {names}' if nodes else 'no Camera node'}; export one camera "
+                           "into a script of its own.")
+    return nodes[0].camera()
+
+
+@dataclass
+class _Node:
+    """The knobs of a Camera node, as text."""
+
+    path: Path
+    body: str
+    knobs: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for words in _commands(self.body):
+            if len(words) > 1:
+                self.knobs[words[0]] = words[1]
+
+    @property
+    def name(self) -> str:
+        return self.knobs.get("name", "Camera")
+
+    @property
+    def is_animated(self) -> bool:
+        return any("curve" in value for value in self.knobs.values())
+
+    def camera(self) -> NukeCamera:
+        """Return the camera. Raises CaptureError for what is not read."""
+        for name, neutral in _NEUTRAL.items():
+            if name in self.knobs and any(value != neutral for curve in self._curves(name) for value in curve.values()):
+                raise self._problem(f"{name} is not {neutral:g}")
+        if self.knobs.get("projection_mode", "perspective") != "perspective":
+            raise self._problem(f"its projection is {self.knobs['projection_mode']}")
+        if self.knobs.get("xform_order", "SRT") != "SRT":
+            raise self._problem(f"its transform order is {self.knobs['xform_order']}")
+        focal, aperture = self._one("focal", DEFAULT_FOCAL), self._one("haperture", DEFAULT_APERTURE)
+        if self.knobs.get("useMatrix") == "true":
+            curves = self._curves("matrix", 16)
+            numbers = _common_frames(*curves, focal, aperture)
+            poses = {number: np.array([_at(curve, number) for curve in curves]).reshape(4, 4) for number in numbers}
+            if any(not is_rotation(pose[:3, :3]) or (pose[3] != (0, 0, 0, 1)).any() for pose in poses.values()):
+                raise self._problem("its matrix is no rotation with a translation")
+        else:
+            order = self.knobs.get("rot_order", DEFAULT_ORDER)
+            if order not in ROTATION_ORDERS:
+                raise self._problem(f"its rotation order is {order}")
+            translation, rotation = (self._curves(name, 3) for name in ("translate", "rotate"))
+            numbers = _common_frames(*translation, *rotation, focal, aperture)
+            poses = {number: _pose([_at(curve, number) for curve in translation],
+                                   [_at(curve, number) for curve in rotation], order) for number in numbers}
+        if not poses:
+            raise self._problem("its curves have no frame in common")
+        return NukeCamera(poses, {number: _at(focal, number) / (_at(aperture, number) or math.nan) for number in poses})
+
+    def _one(self, name: str, default: float) -> Curve:
+        return self._curves(name, 1)[0] if name in self.knobs else {0: default}
+
+    def _curves(self, name: str, number: int | None = None) -> list[Curve]:
+        """Return the curves of a knob; zeros where it is not in the script."""
+        if name not in self.knobs and number is not None:
+            return [{0: 0.0}] * number
+        curves = [self._curve(name, word) for word in _words(self.knobs[name])]
+        if number is not None and len(curves) != number:
+            raise self._problem(f"{name} has {len(curves)} values and not {number}")
+        return curves
+
+    def _curve(self, name: str, word: str) -> Curve:
+        """Parse a number, or "curve i x1001 1.5 1.6": values of consecutive frames, from that of the last x on."""
+        tokens = word.split()
+        is_curve = tokens[:1] == ["curve"]
+        values: dict[int, float] = {}
+        keys: list[int] = []
+        stated: int | None = None
+        try:
+            for token in tokens[1:] if is_curve else tokens:
+                if is_curve and token[0] == "x":
+                    stated = int(token[1:])
+                elif not (is_curve and token[0].isalpha()):  # letters are interpolation and slopes
+                    if stated is None and len(keys) > 1 and keys[-1] - keys[-2] != 1:
+                        raise ValueError  # a value without a frame, behind keys that are not consecutive
+                    keys.append(stated if stated is not None else keys[-1] + 1 if keys else 1)
+                    values[keys[-1]], stated = _finite(token), None
+        except (ValueError, OverflowError) as problem:
+            raise self._problem(f"{name} is an expression or damaged ({word:.40})") from problem
+        if not values or (not is_curve and len(values) > 1):
+            raise self._problem(f"{name} is an expression or damaged ({word:.40})")
+        return values
+
+    def _problem(self, what: str) -> CaptureError:
+        return CaptureError(f"{self.path}, {self.name}: {what}, which this program does not read; bake the camera's "
+                            "animation into translate, rotate, focal and haperture, and export it again.")
+
+
+def _pose(translation: Sequence[float], degrees: Sequence[float], order: str) -> Floats:
+    """Return camera to world (4, 4); the rotations are about the axes of `order`, the first one first."""
+    pose = np.eye(4)
+    for axis in order:
+        index = "XYZ".index(axis)
+        first, second = (index + 1) % 3, (index + 2) % 3
+        angle = math.radians(degrees[index])
+        turn = np.eye(3)
+        turn[first, first] = turn[second, second] = math.cos(angle)
+        turn[second, first], turn[first, second] = math.sin(angle), -math.sin(angle)
+        pose[:3, :3] = turn @ pose[:3, :3]
+    pose[:3, 3] = translation
+    return pose
+
+
+def _finite(word: str) -> float:
+    """Parse a number of a sensible size. Raises ValueError."""
+    number = float(word)
+    if not abs(number) < MAX_MAGNITUDE:
+        raise ValueError
+    return number
+
+
+def _common_frames(*curves: Curve) -> set[int]:
+    """Return the frames that all animated curves have a key at; of a still camera frame 0 alone."""
+    animated = [set(curve) for curve in curves if len(curve) > 1]
+    return set.intersection(*animated) if animated else {0}
+
+
+def _at(curve: Curve, number: int) -> float:
+    return next(iter(curve.values())) if len(curve) == 1 else curve[number]
+
+
+def _commands(text: str) -> Iterator[list[str]]:
+    """Yield the words of each command of a Tcl script, without braces and quotes around them."""
+    for line in _split(text, "\n;"):
+        words = _words(line)
+        if words and not words[0].startswith("#"):
+            yield words
+
+
+def _words(text: str) -> list[str]:
+    return [word[1:-1] if len(word) > 1 and word[0] + word[-1] in ("{}", '""') else word
+            for word in _split(text, " \t\n") if word]
+
+
+def _split(text: str, separators: str) -> Iterator[str]:
+    """Yield the pieces of a text between separators that are outside of braces and quotes."""
+    depth, is_quoted, start, at = 0, False, 0, 0
+    while at < len(text):
+        character = text[at]
+        if character == "\\":
+            at += 1
+        elif character == '"' and not depth:
+            is_quoted = not is_quoted
+        elif not is_quoted and character in "{}":
+            depth = max(depth + (1 if character == "{" else -1), 0)
+        elif not depth and not is_quoted and character in separators:
+            yield text[start:at]
+            start = at + 1
+        at += 1
+    yield text[start:]

@@ -19,6 +19,8 @@ from ..core.errors import FitFlareError, RunError, os_error_message
 from ..core.system.files import remove_file, write_json
 from ..core.system.processes import available_cores
 from . import engine, jobs, lamp_drive, looks, shots
+from .compositor.flare_node import find_node
+from .compositor.trees import forget_composited_frames
 from .properties import redraw_viewports
 from .shots import ShotReading
 
@@ -174,7 +176,10 @@ def _on_finished(job: jobs.Job) -> None:
     """Reload the layers that Blender shows, and call `ON_BAKED` for each scene with these layers."""
     from .images import reload_images
 
-    reload_images(job.folder)
+    if reload_images(job.folder):
+        for scene in bpy.data.scenes:
+            if find_node(scene) is not None:
+                forget_composited_frames(scene)
     folder = os.path.normcase(job.folder.absolute())
     for scene in bpy.data.scenes if job.state == "done" else ():
         if scene.fit_flare.layers and os.path.normcase(shots.layers_folder(scene).absolute()) == folder:

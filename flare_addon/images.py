@@ -23,10 +23,12 @@ def load_image(path: Path, source: Literal["FILE", "SEQUENCE"] = "FILE") -> Any:
     return image
 
 
-def reload_images(folder: Path) -> None:
-    """Reload the images below a folder from disk, since Blender keeps the old pixels."""
-    folder = folder.resolve()
+def reload_images(folder: Path) -> int:
+    """Reload the images below a folder from disk, since Blender keeps the old pixels; return their number."""
+    folder, count = folder.resolve(), 0
     for image in bpy.data.images:
         if image.source in ("FILE", "SEQUENCE") and image.filepath and \
                 absolute(image.filepath, image.library).resolve().is_relative_to(folder):
             image.reload()
+            count += 1
+    return count

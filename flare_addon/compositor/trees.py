@@ -98,6 +98,17 @@ def is_off_in_renders(scene: Any) -> bool:
     return effect is not None and NODE in effect.node_group.nodes and not effect.enable_for_render
 
 
+def forget_composited_frames(scene: Any) -> None:
+    """Make the interactive compositor show new files: composite again, without the frames that Blender 5.3 keeps."""
+    tree = tree_of(scene)
+    if tree is None:
+        return
+    tree.update_tag()
+    if getattr(scene.render, "use_compositor_frames_cache", False):
+        scene.render.use_compositor_frames_cache = False  # frees the frames
+        scene.render.use_compositor_frames_cache = True
+
+
 def input_sockets(tree: Any) -> list[Any]:
     """Return the inputs in the interface of a tree; [] before 5.0."""
     return [item for item in tree.interface.items_tree if getattr(item, "in_out", "") == "INPUT"] \

@@ -81,6 +81,7 @@ def test_an_artists_still_of_a_layer_stays_one(facts: Any) -> None:
 def test_a_frame_that_was_baked_again_is_shown(facts: Any) -> None:
     """Block of flares.py: "a frame that is shown is baked again"."""
     assert facts["baked again"] == [SCENE + LAMP + KEY, SCENE + RIM + KEY]
+    assert facts["keeps frames"], "the cache of composited frames (5.3) is on as before"
 
 
 def test_frames_without_layers_are_reported_and_show_no_flare(facts: Any) -> None:

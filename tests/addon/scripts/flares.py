@@ -228,10 +228,13 @@ scene = shot(["lamp"])
 ops.set_up_baked()
 first = Path(layers) / "layers.0001.exr"
 facts["baked again"] = [shown(scene)]
+if hasattr(scene.render, "use_compositor_frames_cache"):
+    scene.render.use_compositor_frames_cache = True
 kept = first.read_bytes()
 first.write_bytes((Path(out) / "again.exr").read_bytes())
 part("flare_addon.jobs").ON_FINISHED["bake"](SimpleNamespace(folder=Path(layers), state="done"))
 facts["baked again"].append(shown(scene))
+facts["keeps frames"] = getattr(scene.render, "use_compositor_frames_cache", True)
 first.write_bytes(kept)
 
 # ---- a row is touched -----------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from core.removal.jobs.provenance import check_clean_frames_current, has_exact_c
 from core.system.progress import Progress
 from tests.core.captures import make_capture
 from tests.core.removal_cases import lit_street
+from tests.core.test_capture_neighbours import turned_capture
 
 
 def test_a_capture_is_cleaned_as_its_remover_says(tmp_path: Path, flare_everywhere: Path,
@@ -41,6 +42,22 @@ def test_a_capture_is_cleaned_as_its_remover_says(tmp_path: Path, flare_everywhe
                     (clean_capture(capture, whole, Progress()), tmp_path / "plates"))
     assert (ours[58, 55:59] < plates[58, 55:59] - 5).all() and (ours[65, 65] == plates[65, 65]).all()
     assert remove_all([capture.folder / "images"], capture.folder / "removed", whole, Progress())["made"] == 0
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_clean_frames_of_turned_photographs_stand_as_their_frames(orientation: int, tmp_path: Path,
+                                                                 flare_everywhere: Path) -> None:
+    """JPEGs become PNGs, which have to keep the orientation and the profile."""
+    capture = Capture.open(turned_capture(tmp_path / "c", orientation))
+    assert all(view.upright for view in capture.views[2:3])
+    clean_capture(capture, Remover(flare_everywhere, working_size=64), Progress())
+    capture = Capture.open(capture.folder)
+    for view in capture.views:
+        frame, clean = capture.frame(view), capture.removed(view)
+        assert clean is not None and clean.size == frame.size
+        ours, other = (np.corrcoef(frame.pixels.ravel(), pixels.ravel())[0, 1]
+                       for pixels in (clean.pixels, clean.pixels[::-1, ::-1]))
+        assert ours > max(0.9, other)
 
 
 @pytest.mark.parametrize("by_the_fit", [True, False])

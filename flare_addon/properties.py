@@ -279,7 +279,7 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         name="Keep Colours Live", description="Do not bake Intensity, Tint, Mute and Solo of lights into the layers; "
         "the compositor applies them, so you can change them without baking again", default=True)
     bake_composite: BoolProperty(  # type: ignore[valid-type]
-        name="Composite after Bake", description="Also set the compositor up when the layers are baked, so that "
+        name="Composite Too", description="Also set the compositor up when the layers are baked, so that "
         "renders show the flare over the picture chosen under Over", default=True)
     over: EnumProperty(  # type: ignore[valid-type]
         name="Over", description="The picture that the compositor adds the flare to",

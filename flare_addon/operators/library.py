@@ -85,7 +85,7 @@ class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
     """Show the chosen flare of the library in this scene, at the selected objects or the lights of the same names"""
 
     bl_idname = "fit_flare.apply_flare"
-    bl_label = "Apply"
+    bl_label = "Use This Look"
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]

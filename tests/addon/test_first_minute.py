@@ -104,7 +104,7 @@ def test_the_first_render_shows_the_flare(facts: Any) -> None:
     assert facts["set up by itself"] and facts["is seen"]
     assert max(facts["first render"]) < 2e-3
     assert facts["live"] < 2e-3
-    assert facts["left alone"], "with Composite after Bake switched off"
+    assert facts["left alone"], "with Composite Too switched off"
 
 
 def test_a_flare_lies_over_a_stack_of_effects(facts: Any) -> None:

@@ -67,10 +67,10 @@ def change():
     ui.press("ESC")
     yield 0.5
     names = {item[1]: item[0] for item in module("library").items()}
-    bpy.context.window_manager.fit_flare_library = names["Anamorphic Blue"]
+    bpy.context.window_manager.fit_flare_library = names["Vintage Ring"]
     yield from ui.press_button("fit_flare.apply_flare", panel(), across=0.3)
     yield 1
-    assert Path(scene.fit_flare.flare).stem == "Anamorphic Blue"
+    assert Path(scene.fit_flare.flare).stem == "Vintage Ring"
     assert len(scene.fit_flare.lights) == 1
     shot("05_another_look")
     x, y = yield from ui.find("fit_flare.master.intensity", panel(), path=True, across=0.6)

@@ -26,7 +26,7 @@ from .borders import PictureArea, find_picture_area
 from .declared import declared_space, jpeg_profile
 from .decoders import Description, describe, file_kind, profile_space
 from .exr import has_chroma, is_exr, main_part, missing_rgb, read_exr_parts, read_luminance_chroma
-from .exr_views import check_parts
+from .exr_views import check_parts, stereo_views
 from .formats import jpeg, png, tiff
 from .formats.exif import upright_block
 from .formats.kinds import JPEG_SUFFIXES, SUFFIX_OF_KIND
@@ -54,9 +54,9 @@ class Plate:
     """A picture file with its code values.
 
     codes: (height, width, 3), the file's type, R G B; a grey file has three equal channels. encoding: "srgb" for
-    integer codes, "linear" for floats. extras: an EXR's header and other channels, written back unchanged; of several
-    parts, those of all, and the number of the main one. declared: the space that the file declares, or that the user
-    names; None for the usual one of its encoding.
+    integer codes, "linear" for floats. extras: an EXR's header and other channels, written back unchanged, and the
+    names of the channels with the codes; of several parts, those of all, and the number of the main one. declared: the
+    space that the file declares, or that the user names; None for the usual one of its encoding.
     """
 
     path: Path
@@ -299,6 +299,8 @@ def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
         channels = {**{name: pixels for name, pixels in channels.items() if name not in ("Y", "RY", "BY")},
                     **{name: colour[..., k] for k, name in enumerate("RGB")}}
     names = ["R", "G", "B"] if all(name in channels for name in "RGB") else ["Y"] if "Y" in channels else []
+    if not names and (views := stereo_views(header, channels)):  # every view behind its name
+        names = list(dict.fromkeys(views[0].channels))
     if not names:
         raise missing_rgb(path, channels)
     if any(channels[name].dtype not in (np.float16, np.float32) for name in names):
@@ -306,7 +308,7 @@ def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
     if len({channel.shape for channel in channels.values()}) > 1:
         raise FrameError(f"{path} has channels of several sizes (luminance and chroma, say); export it as R, G, B.")
     codes = np.stack([np.asarray(channels[name]) for name in (names if len(names) == 3 else names * 3)], -1)
-    extras: dict[str, Any] = {"header": header, "channels": channels}
+    extras: dict[str, Any] = {"header": header, "channels": channels, "names": names}
     if len(parts) > 1:
         extras.update(parts=parts, main=main)
     return Plate(path, codes, "linear", len(names) == 1, None, extras, space)
@@ -398,7 +400,7 @@ def write_results(results: Sequence[Path], plate: Plate, codes: NDArray[Any], fl
 def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
     """Write codes with the headers and the other channels of an EXR plate, as scanlines without loss."""
     channels = dict(plate.extras["channels"])
-    for index, name in enumerate(["Y"] if plate.grey else ["R", "G", "B"]):
+    for index, name in enumerate(plate.extras["names"]):
         channels[name] = np.ascontiguousarray(codes[..., index], channels[name].dtype)  # channels may differ in depth
     parts = list(plate.extras.get("parts", [None]))
     parts[plate.extras.get("main", 0)] = plate.extras["header"], channels

@@ -69,6 +69,23 @@ def test_both_eyes_are_cleaned(flare_everywhere: Path, tmp_path: Path, header: d
         np.testing.assert_allclose(before[name].astype(float) - after[name], flare[name], atol=2e-3)
 
 
+@pytest.mark.parametrize("colours", ["RGB", "Y"])
+def test_both_eyes_are_cleaned_where_none_is_at_the_root(colours: str, flare_everywhere: Path, tmp_path: Path) -> None:
+    path = write(tmp_path / "a.exr", [f"{eye}.{colour}" for eye in ("left", "right") for colour in f"{colours}A"])
+    remove_all([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
+               flare_folder=tmp_path / "flare")
+    before, after, flare = read(path), read(tmp_path / "out" / "a.exr"), read(tmp_path / "flare" / "a.exr")
+    assert before.keys() == after.keys()
+    for name in before:
+        if name.endswith("A"):
+            np.testing.assert_array_equal(after[name], before[name])
+        elif name.endswith(("R", "Y")):
+            removed = before[name].astype(float) - after[name]
+            assert (removed > 0).mean() > 0.3
+            stored = "R" if name.startswith("left") else "right.R"
+            np.testing.assert_allclose(removed, flare[stored], atol=2e-3)
+
+
 def test_a_change_of_the_second_eye_alone_is_written(tmp_path: Path) -> None:
     path = write(tmp_path / "a.exr", RGB + RIGHT, multiView=["left", "right"])
     plate = read_plate(path)

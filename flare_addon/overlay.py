@@ -255,16 +255,32 @@ def render(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look) ->
     return drawn
 
 
-def composite(drawn: list[Any], box: tuple[float, float, float, float], blend: str, window: DrawnRegion) -> None:
-    """Add rendered levels to the bound framebuffer, inside box (left, bottom, right, top; 0..1 of its size)."""
+def working_space() -> NDArray[np.float64]:
+    """Return the matrix (3, 3) from linear Rec. 709, the space of a look, to Blender's scene-linear working space.
+
+    Under a studio's OpenColorIO configuration that is often ACEScg; from Blender 5.0 on a .blend may choose it.
+    """
+    from mathutils import Color
+
+    return np.array([Color(axis).from_rec709_linear_to_scene_linear()[:] for axis in np.eye(3).tolist()]).T
+
+
+def composite(drawn: list[Any], box: tuple[float, float, float, float], blend: str, window: DrawnRegion,
+              space: NDArray[np.float64]) -> None:
+    """Add rendered levels to the bound framebuffer, inside box (left, bottom, right, top; 0..1 of its size).
+
+    space: matrix (3, 3) from linear Rec. 709 to the framebuffer's space.
+    """
     import gpu
     from gpu_extras.batch import batch_for_shader
+    from mathutils import Matrix
 
     shader = _shader("sum")
     shader.bind()
     shader.uniform_float("box", box)
     shader.uniform_float("extent", (window.width, window.height))
     shader.uniform_float("is_display", 1.0 if blend == "over" else 0.0)
+    shader.uniform_float("working_space", Matrix(space.tolist()).to_4x4())
     for number, offscreen in enumerate(drawn):
         shader.uniform_sampler(f"level{number}", offscreen.texture_color)
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
@@ -345,11 +361,11 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
     box = (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
            (window.y + window.height) / region[1])
     if _scene_buffer is None or has_display_footage(camera):
-        composite(drawn, box, look.blend, window)
+        composite(drawn, box, look.blend, window, np.eye(3))  # Blender's overlays are linear Rec. 709
     else:
         with _scene_buffer.bind():
             gpu.state.viewport_set(*viewport)
-            composite(drawn, box, look.blend, window)
+            composite(drawn, box, look.blend, window, working_space())
     gpu.state.viewport_set(*viewport)
 
 
@@ -404,11 +420,11 @@ def add_to_picture(target: Any, scene: Any, depsgraph: Any, camera: Any, width: 
     look = looks.look_of(scene)
     drawn = render(concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values())), window, look)
     with target.bind():
-        composite(drawn, (0, 0, 1, 1), look.blend, window)
+        composite(drawn, (0, 0, 1, 1), look.blend, window, working_space())
 
 
 def render_picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> Floats:
-    """Render the overlay to pixels (height, width, 3), scene-linear, row 0 on top. Needs a GPU context."""
+    """Render the overlay to pixels (height, width, 3) of Blender's working space, row 0 on top. Needs a GPU context."""
     import gpu
 
     target = gpu.types.GPUOffScreen(width, height, format="RGBA32F")

@@ -52,6 +52,7 @@ def sum_shader(levels: Sequence[int]) -> Any:
     info.push_constant("VEC4", "box")
     info.push_constant("VEC2", "extent")
     info.push_constant("FLOAT", "is_display")
+    info.push_constant("MAT4", "working_space")
     for number in range(len(levels)):
         info.sampler(number, "FLOAT_2D", f"level{number}")
     info.vertex_in(0, "VEC2", "corner")
@@ -85,6 +86,6 @@ def sum_shader(levels: Sequence[int]) -> Any:
                          "    sum = mix(sum / 12.92, pow((sum + 0.055) / 1.055, vec3(2.4)), "
                          "step(vec3(0.04045), sum));\n"
                          "  }\n"
-                         "  result = vec4(sum, 1.0);\n"
+                         "  result = vec4(mat3(working_space) * sum, 1.0);\n"
                          "}\n")
     return gpu.shader.create_from_info(info)

@@ -4,11 +4,13 @@ transforms and render engines, over a scene and over footage.
 
 Started by tests/window/run.py --engine "" --script tests/window/agreement.py. Writes agreement.json: for each case the
 largest and the mean difference in codes, where neither clips, and the share of pixels within two codes.
+FIT_FLARE_VIEWS: view transforms to compare, separated by commas, such as those of the configuration that OCIO names.
 """
 from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from flow import done, wait
 from measure import module
 
 WIDTH, HEIGHT = 480, 270
+VIEWS = os.environ.get("FIT_FLARE_VIEWS", "Standard,AgX,Filmic").split(",")
 MARGIN = 2  # pixels at the edge of the frame, where the camera's border is drawn
 
 EDGE = 12  # codes between neighbours, above which a pixel counts as the edge of an object, whose place is rounded
@@ -146,7 +149,7 @@ def compare(scene, engine: str, over: str, results) -> None:
     for item in scene.objects:
         item.select_set(False)
     yield 1
-    for transform in ("Standard", "AgX", "Filmic"):
+    for transform in VIEWS:
         scene.view_settings.view_transform = transform
         bpy.ops.render.render(scene=scene.name)
         rendered = saved(scene, flow.out / f"{over}_{engine}_{transform}_render.png")

@@ -43,8 +43,9 @@ def output_path(scene: Any, frame: int) -> Path:
 def size_of(scene: Any) -> tuple[int, int]:
     """Return width and height of the pictures."""
     render = scene.render
-    return tuple(max(int(length * render.resolution_percentage / 100), 1)
-                 for length in (render.resolution_x, render.resolution_y))
+    width, height = (max(int(length * render.resolution_percentage / 100), 1)
+                     for length in (render.resolution_x, render.resolution_y))
+    return width, height
 
 
 def draw(context: Any, space: Any, region: Any) -> NDArray[np.float32]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import bpy
 
+from ...core.errors import SettingsError
 from .. import viewport_render
 from ..reports import GuardedOperator, report_errors
 from ..views import largest_view
@@ -25,6 +26,9 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
     animation: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Animation", description="All frames of the scene, in place of the current one", default=False,
         options={"SKIP_SAVE"})
+
+    _frames: Iterator[int]
+    """Renders the frames one after the other."""
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
@@ -92,7 +96,10 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
         for number in numbers:
             if number != scene.frame_current:
                 scene.frame_set(number)
-            area, region, space = largest_view(context)
+            view = largest_view(context)
+            if view is None:
+                raise SettingsError("The 3D viewport was closed while it was rendered; open one, and render again.")
+            area, region, space = view
             with context.temp_override(area=area, region=region, space_data=space, region_data=space.region_3d):
                 pixels = viewport_render.draw(bpy.context, space, region)
             viewport_render.save(scene, pixels, viewport_render.output_path(scene, number))

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 sys.path.insert(0, str(Path(__file__).parent))
 import blender as made
 import driver as ui
-from measure import NAME, Gaps, Ours, module
+from measure import NAME, Gaps, Ours, Times, milliseconds, module, noted
 
 ZIP, ENGINE, OUT = (os.environ[f"FIT_FLARE_{name}"] for name in ("ZIP", "ENGINE", "OUT"))
 CAMERAS = int(os.environ.get("FIT_FLARE_CAMERAS", "400"))
@@ -42,6 +42,8 @@ def steps():
     capture = made.make_capture(out / f"capture_{CAMERAS}", CAMERAS)
     scene = bpy.context.scene
     figures: dict[str, object] = {"blender": bpy.app.version_string, "cameras": CAMERAS}
+    steps: Times = []
+    time_steps(module("operators.capture"), steps)
     for layout in ("each", "animated"):
         for item in list(bpy.data.objects):
             bpy.data.objects.remove(item)
@@ -53,7 +55,9 @@ def steps():
         while not scene.fit_flare.capture:
             yield 0.1
         yield 1
-        figures[f"import, {layout}"] = gaps.stop()
+        figures[f"import, {layout}"] = {**gaps.stop(), "longest_step_at_work_ms": milliseconds(
+            max(work for _, work in steps))}
+        steps.clear()
     if not ENGINE:  # the import alone
         save(figures)
         return
@@ -88,9 +92,27 @@ def steps():
     save(figures)
 
 
+def time_steps(target, record: Times) -> None:
+    """Measure each step of the imports that the module `target` starts."""
+    inner = target.import_in_steps
+
+    def import_in_steps(*words):
+        walk = inner(*words)
+        while True:
+            with noted(record):
+                try:
+                    next(walk)
+                except StopIteration as end:
+                    return end.value
+            yield
+
+    target.import_in_steps = import_in_steps
+
+
 def save(figures: dict[str, object]) -> None:
     (out / "blocking.json").write_text(json.dumps(figures, indent=2))
     print(json.dumps(figures, indent=2), flush=True)
+    ui.screenshot(str(out / "last.png"))
 
 
 def measured(on):

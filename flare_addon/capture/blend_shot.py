@@ -19,7 +19,7 @@ from ...core.errors import CaptureError
 from ...core.look import PlacedLight
 from ...core.look.shot import Shot, ShotFrame
 from ...core.system.files import write_json
-from .. import cameras, fcurves, lamp_drive, lights, looks
+from .. import cameras, fcurves, lamp_drive, lights, looks, properties
 from ..objects import enabled_collections, world_matrix
 from . import exporter
 
@@ -30,6 +30,8 @@ def open_blend(path: Path) -> Any:
     """Open a .blend without running its scripts; return its active scene. Raises CaptureError."""
     if not path.is_file():
         raise CaptureError(f"{path} is missing; name a .blend.")
+    if not hasattr(bpy.types.Scene, "fit_flare"):  # the extension is not enabled, as in commands
+        properties.register()
     try:
         bpy.ops.wm.open_mainfile(filepath=str(path.resolve()), load_ui=False, use_scripts=False)
     except RuntimeError as problem:
@@ -50,7 +52,7 @@ def read_shot(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[in
     if not light_objects:
         raise CaptureError(f"The scene {scene.name!r} has no lights; name objects with --lights.")
     scene.frame_set(scene.frame_start)
-    items = [_flare_of(obj, radius) for obj in light_objects]
+    items = [_flare_of(scene, obj, radius) for obj in light_objects]
     shot_frames = []
     for frame in frames:
         scene.frame_set(frame)
@@ -95,9 +97,17 @@ def _is_keyed(obj: Any, path: str) -> bool:
         curve.data_path == path for group in (*fcurves.fcurves_of(obj), data.drivers) for curve in group)
 
 
-def _flare_of(obj: Any, radius: float) -> Any:
-    """Return the settings of a flare at a light, as the add-on's flares have them by default; the scene is at its first
-    frame, to which the power of lamps is relative."""
+def _flare_of(scene: Any, obj: Any, radius: float) -> Any:
+    """Return the settings of a flare at a light: those of the scene's flare at this object, else the default ones.
+
+    The scene is at its first frame, to which the power of lamps is relative by default. A radius replaces the flare's.
+    """
+    row = next((item for item in scene.fit_flare.lights if item.target == obj), None)
+    if row is not None:
+        names = (*lamp_drive.SWITCHES, "reference_light", "reference_distance", "extent")
+        return SimpleNamespace(name=obj.name, source=obj.name, target=obj,
+                               radius=radius or row.radius or _lamp_radius(obj),
+                               **{name: getattr(row, name) for name in names})
     light = lamp_drive.light_of(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data).tolist() \
         if lamp_drive.is_lamp(obj) else (0.0, 0.0, 0.0)
     return SimpleNamespace(name=obj.name, source=obj.name, target=obj, radius=radius or _lamp_radius(obj),

@@ -45,6 +45,7 @@ def test_hidden_lamps_are_followed_in_transfers_collections_and_the_panel(facts:
     """Block of lamps.py: "lamps switch their flares"."""
     assert facts["hidden, in a transfer"] == [1, 0, 1]
     assert facts["hidden, not followed"] == [False, None, True]
+    assert facts["hidden, not followed in a transfer"] == [1, 1, 1]
     assert "switch Follow Visibility off" in facts["hidden, in the panel"]
     assert facts["in a hidden collection"] == [True, False]
 
@@ -65,4 +66,5 @@ def test_a_flare_dims_with_the_square_of_the_distance(facts: Any) -> None:
     """Block of lamps.py: "lamps switch their flares"."""
     assert facts["twice as far"] == [[1, pytest.approx(0.25, abs=2e-3)]] * 2, "in the camera view, in a bake"
     assert facts["twice as far, not followed"] == [[1, pytest.approx(1, abs=2e-3)]] * 2
+    assert facts["distance, in a transfer"] == [pytest.approx(8.016, abs=1e-3)] * 2
     assert facts["a sun has no distance"] == [0, 0]

@@ -137,7 +137,10 @@ for path in ("hide_render", "hide_viewport"):
         scene.frame_set(5)
         facts["hidden, not followed"] = [brightness(scene) > 0, setattr(item, "follow_visibility", False),
                                          brightness(scene) > 0]
+        read = blend_shot.read_shot(scene, Path(flare), [], [1, 5, 9])
+        facts["hidden, not followed in a transfer"] = [frame.lights[0].factor[0] for frame in read.frames]
         item.follow_visibility = True
+        scene.frame_set(5)
         layout = MagicMock()
         panels.FITFLARE_PT_look.draw(SimpleNamespace(layout=layout), bpy.context)
         facts["hidden, in the panel"] = " ".join(
@@ -187,6 +190,8 @@ facts["area as a point"] = factor(scene)[0]
 scene, lamp, item = lit_scene()
 keyed(lamp, "location", (1, (0.4, 8, 0.3)), (9, (0.8, 16, 0.6)))
 facts["twice as far"] = over(scene, [1, 9])
+read = blend_shot.read_shot(scene, Path(flare), [], [1, 9])
+facts["distance, in a transfer"] = [round(frame.lights[0].reference_distance, 3) for frame in read.frames]
 item.follow_distance = False
 facts["twice as far, not followed"] = over(scene, [1, 9])
 scene, sun, item = lit_scene((0, 0, 9), "SUN")

@@ -125,24 +125,31 @@ def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ri
 
     centres (n, 2) px, covariances (n, 3) px², radii (n,) Mahalanobis, light (n, 3), ring (n, 3), arcs (n, 2) px.
     """
+    centres, covariances, radii, arcs = (np.asarray(each, np.float32) for each in (centres, covariances, radii, arcs))
     xx, xy, yy = covariances.T
-    half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    half, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     long, short = np.sqrt(np.maximum(half + root, 0)), np.sqrt(np.maximum(half - root, 0))
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
-    axis = np.stack([np.cos(angle), np.sin(angle)], -1)
-    local = _CORNERS[None] * radii[:, None, None]
-    side = np.stack([-axis[:, 1], axis[:, 0]], -1)
-    place = (centres[:, None] + local[..., :1] * (long[:, None] * axis)[:, None]
-             + local[..., 1:] * (short[:, None] * side)[:, None])
-    axes = np.stack([axis / np.maximum(long, 1e-6)[:, None], side / np.maximum(short, 1e-6)[:, None]], 1)
-    members = np.einsum("nax,nx->na", axes, arcs)
-    arc = np.concatenate([members, arc_log_peak(np.hypot(*members.T), ring[:, :2])[:, None]], -1)
+    cosine = (xx - yy) / np.maximum(2 * root, np.finfo(np.float32).tiny)  # of twice the angle of the long axis
+    x, y = np.sqrt(np.clip((1 + cosine) / 2, 0, 1)), np.copysign(np.sqrt(np.clip((1 - cosine) / 2, 0, 1)), xy)
     count = len(centres)
+    place, local = np.empty((2, count, 4, 2), np.float32)
+    for corner, (p, q) in enumerate(_CORNERS.tolist()):
+        local[:, corner, 0], local[:, corner, 1] = p * radii, q * radii
+        along, aside = p * radii * long, q * radii * short
+        place[:, corner, 0] = centres[:, 0] + along * x - aside * y
+        place[:, corner, 1] = centres[:, 1] + along * y + aside * x
+    long, short = np.maximum(long, 1e-6), np.maximum(short, 1e-6)
+    arc = np.empty((count, 3), np.float32)
+    arc[:, 0] = (x * arcs[:, 0] + y * arcs[:, 1]) / long
+    arc[:, 1] = (x * arcs[:, 1] - y * arcs[:, 0]) / short
+    arc[:, 2] = arc_log_peak(np.hypot(arc[:, 0], arc[:, 1]), ring[:, :2])
     index = 4 * np.arange(count, dtype=np.uint32)[:, None, None]
     triangles = (index + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
-    return Quads(place.reshape(-1, 2).astype(np.float32), local.reshape(-1, 2).astype(np.float32),
-                 np.repeat(light, 4, 0).astype(np.float32), np.repeat(ring, 4, 0).astype(np.float32),
-                 np.repeat(arc, 4, 0).astype(np.float32),
+
+    def for_corners(values: Floats) -> Floats:
+        return np.repeat(np.asarray(values, np.float32), 4, 0)
+
+    return Quads(place.reshape(-1, 2), local.reshape(-1, 2), for_corners(light), for_corners(ring), for_corners(arc),
                  np.ascontiguousarray(triangles, np.uint32))
 
 

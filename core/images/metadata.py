@@ -104,22 +104,22 @@ def with_description(encoded: bytes, exif: bytes, xmp: bytes) -> bytes:
 
 
 def dropped_parts(path: Path) -> str:
-    """Return a sentence on what a clean picture cannot keep of this file; "" where it keeps all."""
+    """Return a sentence on what a picture with changed pixels cannot keep of this file; "" where it keeps all."""
     with open_regular(path) as stream:
         head = stream.read(_HEAD_BYTES)
         if head[4:8] == b"ftyp" and any(name in head for name in _HEIF_GAIN_MAPS):
-            return (f"{path} holds a gain map, which would still show the flare; the clean picture goes without it, "
-                    "and without the tags that claim it.")
+            return (f"{path} holds a gain map, which would show its own pixels; the result goes without it, and "
+                    "without the tags that claim it.")
         if head[:2] != b"\xff\xd8":
             return ""
         for _, content in jpeg.segments(stream):
             if content.startswith((_INDEX, _ISO_GAIN_MAP)) or (content.startswith(jpeg.XMP) and _has_claims(content)):
-                return (f"{path} holds more than one picture (a gain map, a clip or a preview), which would still show "
-                        "the flare; the clean picture goes without it, and without the tags that claim it.")
+                return (f"{path} holds more than one picture (a gain map, a clip or a preview), which would show its "
+                        "own pixels; the result goes without them, and without the tags that claim them.")
         stream.seek(-min(_TAIL_BYTES, stream.seek(0, 2)), 2)
         if not stream.read().rstrip(b"\0\r\n ").endswith(b"\xff\xd9"):  # Samsung's motion photos
-            return (f"{path} has data after its picture, such as a clip, which would still show the flare; the clean "
-                    "picture does not have it.")
+            return (f"{path} has data after its picture, such as a clip, which would show its own pixels; the result "
+                    "goes without it.")
     return ""
 
 

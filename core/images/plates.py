@@ -168,14 +168,13 @@ class Plate:
 
     @property
     def warning(self) -> str:
-        """Sentences on what the clean plate cannot keep, and on a name that is not of the file's format; "" for none.
-        """
+        """Sentences on what a plate with changed codes cannot keep, and on a name of another format; "" for none."""
         suffix, kind = self.path.suffix.lower(), file_kind(self.path)
         written, sentence = SUFFIX_KINDS.get(_format_suffix(self.path, self)), ""
         if clean_name(self.path) == self.path and kind not in ("", SUFFIX_KINDS.get(suffix)):
             sentence = f"{self.path} holds {kind.upper()} data, whatever its name; " + (
-                "so does the clean plate of that name." if written == kind else
-                f"the clean plate of that name holds {str(written).upper()} data.")
+                "so does the result of that name." if written == kind else
+                f"the result of that name holds {str(written).upper()} data.")
         return " ".join(filter(None, (sentence, dropped_parts(self.path))))
 
     @property

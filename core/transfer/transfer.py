@@ -219,10 +219,12 @@ class Transfer:
     # ---- frames -----------------------------------------------------------------------------------
 
     def frame_renderer(
-        self, frame: NumberedFrame, space: ColourSpace | None = None, out: Path | None = None
+        self, frame: NumberedFrame, space: ColourSpace | None = None, out: Path | None = None,
+        progress: Progress | None = None
     ) -> _FrameRenderer:
-        """Return the renderer of a frame; with `out` it also writes the plate with its flare there."""
-        return _FrameRenderer(self, self._index[frame.view], space or colour_space("linear"), out)
+        """Return the renderer of a frame; with `out` it also writes the plate with its flare there, and reports to
+        `progress` what that cannot keep."""
+        return _FrameRenderer(self, self._index[frame.view], space or colour_space("linear"), out, progress)
 
     def bake(self, out: Path | str, requested: Sequence[NumberedFrame] | None = None,
              settings: BakeSettings | None = None, progress: Progress | None = None, *,
@@ -240,7 +242,8 @@ class Transfer:
             settings = replace(settings, half=False)
         self._check_no_overwrite(Path(out))
         plates = Path(out) / PLATES_FOLDER
-        return bake_frames(self, frames, cameras, out, lambda frame: self.frame_renderer(frame, space, plates),
+        return bake_frames(self, frames, cameras, out,
+                           lambda frame: self.frame_renderer(frame, space, plates, progress),
                            settings, progress, overwrite=overwrite)
 
     def _check_no_overwrite(self, out: Path) -> None:
@@ -282,8 +285,10 @@ def _without_margin(visibility: float) -> float:
 class _FrameRenderer:
     """The renderer of one frame of a transfer, for `core.bake.bake.bake_frames`."""
 
-    def __init__(self, transfer: Transfer, index: int, space: ColourSpace, out: Path | None) -> None:
+    def __init__(self, transfer: Transfer, index: int, space: ColourSpace, out: Path | None,
+                 progress: Progress | None) -> None:
         self._transfer, self._index, self._space, self._out = transfer, index, space, out
+        self._progress = progress or Progress()
         self._frame = transfer.target.frames[index]
         self._plate: ColouredPlate | None = None
 
@@ -345,6 +350,8 @@ class _FrameRenderer:
         target = frame.plate_with_flare_path(self._out) if self._out is not None else None
         if target is not None:
             plate.write(target, move_to_window(self._space.to_linear(layers.flare), frame.window, stored))
+            if plate.plate.warning:
+                self._progress.say(plate.plate.warning)
         layers = replace(layers, window=frame.window)
         plate_matrix, matrix = plate.space.matrix, self._space.matrix
         if plate_matrix is not None and matrix is not None and np.allclose(plate_matrix, matrix, atol=1e-9)\

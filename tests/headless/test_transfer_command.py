@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -21,6 +22,7 @@ from core.fit.settings import override_settings
 from core.flare.file import FlareFile
 from core.flare.file import save as save_flare
 from core.gaussians.ply import read_ply
+from core.images.formats import jpeg
 from core.images.read import read_picture
 from core.images.write import write_png
 from core.look import TrainedCamera, read
@@ -55,6 +57,16 @@ def test_transfer_to_a_picture(run: Run, made: Path, tmp_path: Path) -> None:
     assert read_picture(tmp_path / "out" / "frames" / "plate.png").size == (96, 54)
     problem = run("transfer", made, "--to", tmp_path / "plate.png", "--out", tmp_path / "none", status=2)[-1]
     assert "No light was found in" in problem["text"]
+
+
+def test_a_transfer_reports_what_a_plate_cannot_keep(run: Run, made: Path, tmp_path: Path) -> None:
+    """A gain map behind a JPEG, and a name of another format."""
+    data = cv2.imencode(".jpg", np.full((54, 96, 3), 90, np.uint8))[1].tobytes()
+    (tmp_path / "a.jpg").write_bytes(data[:2] + jpeg.make_segment(jpeg.APP2, b"MPF\0MM\0*\0\0\0\x08") + data[2:] + data)
+    (tmp_path / "b.jpg").write_bytes(cv2.imencode(".png", np.full((54, 96, 3), 90, np.uint8))[1].tobytes())
+    for name, sentence in (("a.jpg", "holds more than one picture"), ("b.jpg", "holds PNG data, whatever its name")):
+        events = run("transfer", made, "--to", tmp_path / name, "--light", "sun=60,10", "--out", tmp_path / name[0])
+        assert sum(sentence in event.get("text", "") for event in events) == 1
 
 
 def test_options_that_do_not_apply_to_the_target_are_refused(run: Run, made: Path, capture: Path,

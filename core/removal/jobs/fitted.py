@@ -79,6 +79,8 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
 
         def write() -> None:
             write_results(frame.results, plate, codes, flare)
+            if plate.warning:
+                progress.say(plate.warning)
             dim.update(light for light, gain in gains.items() if gain < DIM_FLARE)
 
         return PreparedResults(write)

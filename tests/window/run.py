@@ -57,6 +57,7 @@ def main() -> int:
         environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "profile"),
                        "FIT_FLARE_ZIP": str(next(folder.glob("*.zip"))), "FIT_FLARE_CAPTURE": str(folder / "desk"),
                        "FIT_FLARE_ENGINE": words.engine, "FIT_FLARE_OUT": str(out)}
+        environment.setdefault("FIT_FLARE_WEIGHTS", str(ROOT / "core" / "removal" / "box" / "removal.safetensors"))
         if words.pictures and words.engine:  # their paths are to say nothing of this machine
             (folder / "engine").symlink_to(Path(words.engine).resolve())
             environment["FIT_FLARE_ENGINE"] = str(folder / "engine")

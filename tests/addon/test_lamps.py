@@ -66,5 +66,6 @@ def test_a_flare_dims_with_the_square_of_the_distance(facts: Any) -> None:
     """Block of lamps.py: "lamps switch their flares"."""
     assert facts["twice as far"] == [[1, pytest.approx(0.25, abs=2e-3)]] * 2, "in the camera view, in a bake"
     assert facts["twice as far, not followed"] == [[1, pytest.approx(1, abs=2e-3)]] * 2
+    assert facts["in a scaled capture"] == pytest.approx(1, abs=1e-3), "at the reference distance"
     assert facts["distance, in a transfer"] == [pytest.approx(8.016, abs=1e-3)] * 2
     assert facts["a sun has no distance"] == [0, 0]

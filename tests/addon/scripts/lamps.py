@@ -194,6 +194,12 @@ read = blend_shot.read_shot(scene, Path(flare), [], [1, 9])
 facts["distance, in a transfer"] = [round(frame.lights[0].reference_distance, 3) for frame in read.frames]
 item.follow_distance = False
 facts["twice as far, not followed"] = over(scene, [1, 9])
+scene, lamp, item = lit_scene()
+root = object_in(scene, "Root", None, (0, 0, 0))
+root.scale, scene.fit_flare.root = (2, 2, 2), root
+bpy.context.view_layer.update()
+followed, item.follow_distance = brightness(scene), False
+facts["in a scaled capture"] = round(followed / brightness(scene), 4)
 scene, sun, item = lit_scene((0, 0, 9), "SUN")
 facts["a sun has no distance"] = [item.reference_distance, placed_light(scene).reference_distance]
 

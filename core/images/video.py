@@ -59,6 +59,7 @@ MAX_VIDEO_PIXELS = 100_000_000
 MAX_NAMED_FRAMES = 8
 """Number of damaged frames that a sentence names."""
 _LIMITED, _FULL = 1, 2
+_ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
 
 def import_av() -> ModuleType:
@@ -260,10 +261,25 @@ class Video:
             self.stream: Any = best if best in streams else streams[0]
             if self.stream.codec_context is None:  # no decoder
                 raise self._unreadable()
-            self.stream.codec_context.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
-            self.stream.thread_type = "AUTO"
+            self._decoder = self._alpha_decoder() or self.stream.codec_context
+            self._decoder.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
+            self._decoder.thread_type = "AUTO"
         except (av.error.FFmpegError, OSError, ValueError, MemoryError) as problem:
             raise self._unreadable() from problem
+
+    def _alpha_decoder(self) -> Any:
+        """Return libvpx's decoder for VP8 and VP9 with alpha, which FFmpeg's own decoders leave out; None for others,
+        and where FFmpeg is built without it."""
+        name = _ALPHA_DECODERS.get(self.stream.codec_context.name)
+        if name is None or self.stream.metadata.get("alpha_mode") != "1":
+            return None
+        try:
+            decoder = import_av().CodecContext.create(name, "r")
+        except ValueError:
+            return None
+        if self.stream.codec_context.extradata:
+            decoder.extradata = self.stream.codec_context.extradata
+        return decoder
 
     def _unreadable(self) -> FrameError:
         if not self.path.exists():
@@ -284,7 +300,7 @@ class Video:
             except errors:  # the container is damaged here; what the decoder still holds comes out
                 packet = None
             try:
-                frames = self.stream.codec_context.decode(packet)
+                frames = self._decoder.decode(packet)
             except errors:
                 frames = []
             for frame in frames:

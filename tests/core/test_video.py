@@ -183,6 +183,24 @@ def test_alpha_is_kept(name: str, codec: str, pixels: str, options: dict[str, st
     assert np.array_equal(stored[..., 3], frame.alpha())
 
 
+@pytest.mark.parametrize("codec", ["libvpx", "libvpx-vp9"])
+def test_alpha_of_webm_is_kept(codec: str, tmp_path: Path) -> None:
+    """FFmpeg's own decoders of VP8 and VP9 leave it out."""
+    alpha = np.repeat(np.where(np.arange(96) < 48, 0.25, 1)[:, None], 192, 1)
+    path = write_video(tmp_path / "a.webm", codec, "yuva420p", [stripes(96)] * 3, alpha=alpha, matrix=6,
+                       options={"auto-alt-ref": "0", "crf": "4", "b": "4M"})
+    with Video(path) as video:
+        assert video.has_alpha
+        frames = list(video)
+        video.seek(2)
+        [last] = video
+    assert [frame.number for frame in frames] == [0, 1, 2] and last.time == frames[2].time
+    for frame in (*frames, last):
+        straight = frame.straight_alpha()
+        assert straight is not None and np.abs(straight[[20, 80]] - alpha[[20, 80]]).max() < 0.02
+        assert np.abs(middles(frame.pixels()).astype(float) - PATCHES).max() < 8
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize(("kind", "codec", "pixels", "name"), [("JPEG", "mjpeg", "yuvj444p", "a.avi"),
                                                                ("PNG", "png", "rgb24", "a.mov")])

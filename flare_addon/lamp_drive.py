@@ -65,6 +65,13 @@ def factor(scene: Any, depsgraph: Any, item: Any) -> Gain:
     return red, green, blue
 
 
+def gain(scene: Any, depsgraph: Any, item: Any, matrix: Any, eye: Any) -> Gain:
+    """Return the linear RGB factor of a flare by the power and the direction of its lamp; matrix: its matrix_world."""
+    red, green, blue = factor(scene, depsgraph, item)
+    share = direction_factor(item, depsgraph, matrix, eye) if item.follow_direction else 1.0
+    return red * share, green * share, blue * share
+
+
 def is_sun(target: Any) -> bool:
     """Return whether a light object is a sun, which has no distance."""
     return is_lamp(target) and target.data.type == "SUN"

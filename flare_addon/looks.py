@@ -277,16 +277,18 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
     rendered: `lamp_drive.rendered_collections` of the scene.
     """
     eye, target = camera.translation, item.target
-    if item.follow_visibility and not lamp_drive.is_shown(target, depsgraph, rendered):
+    is_dark = item.follow_visibility and not lamp_drive.is_shown(target, depsgraph, rendered)
+    try:
+        placed = world_matrix(target, depsgraph)
+    except CaptureError:
+        if not is_dark:
+            raise
         xyz = (to_capture @ np.array([*target.matrix_world.translation, 1.0]))[:3]
-        return PlacedLight(item.name, item.source, xyz, factor=lamp_drive.DARK)
-    placed = world_matrix(target, depsgraph)
+        return PlacedLight(item.name, item.source, xyz, 0.0, factor=lamp_drive.DARK)
     position = light_position(target, placed, eye)
     xyz = (to_capture @ np.array([*position, 1.0]))[:3]
-    gain = lamp_drive.factor(scene, depsgraph, item)
-    if item.follow_direction:
-        share = lamp_drive.direction_factor(item, depsgraph, placed, eye)
-        gain = (gain[0] * share, gain[1] * share, gain[2] * share)
+    # A dark light has its visibility too, since a transfer smooths visibilities over neighbouring frames.
+    gain = lamp_drive.DARK if is_dark else lamp_drive.gain(scene, depsgraph, item, placed, eye)
     reference = item.reference_distance if item.follow_distance and not lamp_drive.is_sun(target) else 0.0
     reference *= float(np.cbrt(abs(np.linalg.det(to_capture[:3, :3]))))
     extent = light_extents.extent_of(item, depsgraph, placed)

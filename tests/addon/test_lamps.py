@@ -48,6 +48,8 @@ def test_hidden_lamps_are_followed_in_transfers_collections_and_the_panel(facts:
     assert facts["hidden, not followed in a transfer"] == [1, 1, 1]
     assert "switch Follow Visibility off" in facts["hidden, in the panel"]
     assert facts["in a hidden collection"] == [True, False]
+    assert facts["hidden behind a wall"] == 0, "it is smoothed over frames"
+    assert facts["disabled and animated"] == [0, 0, 0], "and not refused"
 
 
 def test_the_cone_of_a_spot_limits_its_flare(facts: Any) -> None:

@@ -149,6 +149,16 @@ scene, lamp, item = lit_scene()
 lamp.driver_add("hide_render").driver.expression = "frame == 5"
 facts["driven hide_render"] = over(scene, [1, 5, 9])
 scene, lamp, item = lit_scene()
+wall = object_in(scene, "Wall", bpy.data.meshes.new("Wall"), (0, 0, 0))
+wall.data.from_pydata([(-9, 6, -9), (9, 6, -9), (9, 6, 9), (-9, 6, 9)], [], [(0, 1, 2, 3)])
+lamp.hide_render = True
+bpy.context.view_layer.update()
+facts["hidden behind a wall"] = placed_light(scene).visibility
+lamp.hide_viewport = True
+lamp.keyframe_insert("location", frame=1)
+bpy.context.view_layer.update()
+facts["disabled and animated"] = list(placed_light(scene).factor)
+scene, lamp, item = lit_scene()
 group = bpy.data.collections.new("Lamps")
 scene.collection.children.link(group)
 group.objects.link(lamp)

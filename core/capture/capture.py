@@ -42,7 +42,7 @@ from .frame_sizes import checked_size, size_or_model_size
 from .lens import PINHOLES, Lens
 from .lights import Light, LightState, check_places, paths_of, read_lights
 from .orientation import TurnedFrame, find_upright
-from .pictures import PictureCache
+from .pictures import PictureCache, read_mask
 from .plate_space import read_plate_space
 from .unsolved import cameras_without_solve
 
@@ -291,15 +291,13 @@ class Capture:
     def mask(self, view: View, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
         """Return (height, width) which pixels of the view count; None without a mask.
 
-        A mask is black where something moves or must not be learned from. Pixels that a black one reaches count as
-        black. Raises FrameError.
+        A mask is black, or transparent, where something moves or must not be learned from. Pixels that a black one
+        reaches count as black. Raises FrameError.
         """
         if view.name not in self._masks:
             return None
         path, size = self._masks[view.name], size or view.camera.size
-        picture = self._pictures.upright(read_picture(path), view, path)
-        codes = picture.display()
-        picture = Picture((codes / max(float(codes.max()), 1e-6) > 0.5).astype(np.float32), "linear")
+        picture = self._pictures.upright(read_mask(path), view, path)
         if view.lens is not None:
             picture = self._pictures.undistorted(picture, view, path)
         return np.asarray(picture.resized(*size).pixels.min(axis=2) > MIN_MASK_VALUE)

@@ -8,15 +8,30 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..colour import ColourSpace
 from ..errors import FrameError
+from ..images.exr import is_exr
 from ..images.formats.exif import apply_orientation, read_exif
 from ..images.picture import Picture, same_aspect
+from ..images.plates import read_plate
 from ..images.read import read_picture
 from .lens import undistort_picture
 
 if TYPE_CHECKING:
     from .capture import View
+
+
+def read_mask(path: Path) -> Picture:
+    """Read a mask as 0 and 1: 1 where it is light and opaque; one that is painted in black on transparent ground is 1
+    where it is transparent. Raises FrameError."""
+    values = read_picture(path).display()
+    alpha = None if is_exr(path) else read_plate(path).straight_alpha
+    if alpha is not None:
+        visible = values * alpha[..., None]
+        values = visible if visible.max() > 0 else np.repeat(np.float32(1) - alpha[..., None], 3, -1)
+    return Picture((values / max(float(values.max()), 1e-6) > 0.5).astype(np.float32), "linear")
 
 
 class PictureCache:

@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from core.capture import Capture
 from core.capture.layout import count_images
@@ -434,6 +435,23 @@ def test_masks_are_undistorted_with_their_frames(tmp_path: Path) -> None:
     capture = Capture.open(folder)
     frame, kept = capture.frame(capture.views[0]).pixels.min(axis=2), capture.mask(capture.views[0])
     assert kept is not None and np.abs(frame - kept).mean() < 0.1 and 0.1 < kept.mean() < 0.9
+
+
+@pytest.mark.parametrize("form", ["white with alpha", "black on transparent", "grey with alpha", "opaque",
+                                  "premultiplied"])
+def test_masks_with_alpha_are_read_as_they_look(form: str, tmp_path: Path) -> None:
+    folder = make_transforms(tmp_path / "t")
+    (folder / "masks").mkdir()
+    counts = np.full((SIZE[1], SIZE[0]), 255, np.uint8)
+    counts[:12] = 0
+    white = np.full_like(counts, 255)
+    codes = {"white with alpha": (white, counts), "black on transparent": (0 * white, 255 - counts),
+             "grey with alpha": (counts, white), "opaque": (counts, white), "premultiplied": (counts, counts)}[form]
+    planes = codes if form == "grey with alpha" else (codes[0], codes[0], *codes)
+    Image.fromarray(np.stack(planes, -1)).save(folder / "masks" / "0000.png")
+    capture = Capture.open(folder)
+    mask = capture.mask(capture.views[0])
+    assert mask is not None and mask[16:].all() and not mask[:10].any()
 
 
 def test_a_missing_mask_is_refused(tmp_path: Path) -> None:

@@ -110,6 +110,7 @@ def write_nuke_capture(camera: NukeCamera, plates: Mapping[int, Path], folder: P
 
 
 def _read_chan(path: Path, text: str) -> NukeCamera:
+    """Return the camera in the text of a .chan file. Raises CaptureError."""
     poses: dict[int, Floats] = {}
     focal: dict[int, float] = {}
     for line in text.splitlines():

@@ -447,7 +447,7 @@ RENAMED_VALUES = {("exposure", "found"): "measured"}
 def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
     """Return settings by dotted name under their present names and values, and the present name of each old one used.
 
-    Of an old and a present name of one setting the later counts.
+    If an old and a present name of one setting occur, the later one in `values` counts.
     """
     current, renamed = {}, {}
     for name, value in values.items():

@@ -158,8 +158,8 @@ def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]
               size: tuple[int, int]) -> dict[str, Any]:
     """Return the content of eval.json: means over views, then each view. Numbers that are not finite become null.
 
-    A flare's PSNR, that of an empty one and the relative error are means over the views whose reference holds a flare:
-    where it is black, an empty flare has an infinite PSNR.
+    The PSNR of the flare, the PSNR of an empty flare and the relative error are means over the views whose reference
+    holds a flare, because an empty flare has an infinite PSNR where the reference is black.
     """
     mean = {layer: _mean([scores[layer] for _, scores in views if layer in scores]) for layer in LAYERS}
     return {

@@ -90,7 +90,7 @@ def read_blend(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 def run_flare(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Bake a .flare, for the cameras of a capture with the lights where it was learned, or for a .blend."""
+    """Bake a .flare: for the cameras of a capture, with the lights where the .flare has them, or for a .blend."""
     from ...core.capture import Capture
     from ...core.look import read
     from ...core.transfer.target import cameras_target

@@ -48,7 +48,11 @@ def step_lanes(parameter, first, second, at, gradient, rate, constants):
 
 @inlined
 def step_array(parameter, gradient, first, second, rates, constants):
-    """Step all numbers of a parameter; rates: a multiple of 16 numbers, repeated along the parameter."""
+    """Step all numbers of a parameter, with their `first` and `second` moments.
+
+    rates: the learning rates of a multiple of 16 numbers, repeated along the parameter. constants: the tuple of
+    `unpack_constants`.
+    """
     n, period = parameter.size, rates.size
     place, vector_end = 0, n - n % LANES
     for i in range(0, vector_end, LANES):

@@ -117,8 +117,11 @@ def as_dict(recipe: Recipe) -> dict[str, Any]:
 
 
 def from_dict(data: dict[str, Any]) -> Recipe:
-    """Return the recipe of a dictionary; the inverse of `as_dict`. Retired names are read, and of a retired and a
-    present name the later counts. Raises SettingsError for unknown names and for values of another type."""
+    """Return the recipe of a dictionary; the inverse of `as_dict`.
+
+    Raises SettingsError for unknown names and for values of another type. Retired names are read:
+    if a retired and a present name of one setting occur, the later one in `data` counts.
+    """
     present = {RETIRED.get(name, name): value for name, value in data.items()}
     unknown = set(present) - {field.name for field in fields(Recipe)} - {None}
     if unknown:

@@ -38,7 +38,7 @@ def require_ximgproc() -> None:
 
 
 def augment(random: Random, draw_view: DrawView, width: int, height: int) -> Pixels:
-    """Return (height, width, 3) linear light: a view as drawn in one of six cases, else changed in some of the ways
+    """Return (height, width, 3) linear light: a view in a random pose, in four of five cases with some of the changes
     below."""
     scene = _random_pose(random, draw_view, width, height)
     if random.random() < 0.12:

@@ -60,7 +60,7 @@ class Batches:
         return Batch(frame, scene, scene_with_glow, len(pairs) / count)
 
     def draw_pair(self, iteration: int, number: int, width: int, height: int) -> Pair:
-        """Return one frame of an iteration in that size."""
+        """Return frame `number` of an iteration, of this size in pixels, with and without its flare."""
         self._synthesis_bank.renew(self.recipe.bank_size + iteration // self.recipe.renew_every, iteration)
         # number + 1, since seeds (1, 2) and (1, 2, 0) are equal
         random = np.random.default_rng((self.recipe.seed, iteration, number + 1))

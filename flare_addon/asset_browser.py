@@ -34,7 +34,7 @@ def folder() -> Path:
 def why_not() -> str:
     """Return why looks cannot be offered as assets, for the tooltip; "" where they can."""
     if not hasattr(bpy.app.handlers, "blend_import_post"):
-        return "The Asset Browser needs Blender 4.3 for this: older ones do not report a dropped asset"
+        return "Looks as assets need Blender 4.3 or later: earlier versions do not report a dropped asset"
     return "" if library.files() else "The library is empty: save a flare to it first"
 
 

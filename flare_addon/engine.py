@@ -73,7 +73,7 @@ def missing_reason() -> str:
         return ""
     source, path = configured_engine()
     if path:
-        return f"The engine named by {source} is missing: {path}. Name a Python that has torch, or leave it empty"
+        return f"The engine named by {source} is missing: {path}. Name a Python that has torch, or name none"
     return "No engine is set up. Open the preferences of Fit Flare and set one up, or name a Python that has torch"
 
 

@@ -108,7 +108,7 @@ def _draw_weights(layout: Any) -> None:
         return
     label_lines(box, "Clean frames by the network, and fits with Estimated Clean Frames, need them (20 MB). "
                 + ("Set Up Engine downloads them too." if weights.source_url() else
-                   "The place that this extension was installed from does not offer them: name their file above."))
+                   "This extension was not installed from a repository that offers them: name their file above."))
     set_up = engine.set_up_job()
     error = job.error if job is not None else ""
     if not error and set_up is not None:
@@ -182,8 +182,8 @@ class FITFLARE_OT_download_weights(GuardedOperator, bpy.types.Operator):
         if not bpy.app.online_access:
             return "Allow Online Access in Preferences > System > Network first"
         if weights.find() is not None:
-            return "The weights are there"
-        return "" if weights.source_url() else "The place that this extension was installed from does not offer them"
+            return "The weights are installed already"
+        return "" if weights.source_url() else "This extension was not installed from a repository that offers them"
 
     def act(self, _context: bpy.types.Context) -> None:
         weights.download()

@@ -164,20 +164,23 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
         name="Light", description="The light object of this flare; the flare follows it",
         type=bpy.types.Object, update=_update_target)
     follow_power: BoolProperty(  # type: ignore[valid-type]
-        name="Follow Power", description="Power and colour of the lamp brighten, dim and colour its flare, relative to "
-        "the first frame of the scene", default=True, update=redraw_viewports)
+        name="Follow Power", description="Power and colour of the lamp brighten, dim and colour its flare: relative to "
+        "the first frame of the scene if they are animated, else to the time when the lamp got its flare",
+        default=True, update=redraw_viewports)
     follow_visibility: BoolProperty(  # type: ignore[valid-type]
-        name="Follow Visibility", description="No flare where the light object is disabled in renders, or a lamp in "
-        "viewports", default=False, update=redraw_viewports)
+        name="Follow Visibility", description="No flare while the light object is disabled in renders; for a lamp or a "
+        "mesh, also while it is disabled in viewports or no collection of it is rendered", default=False,
+        update=redraw_viewports)
     follow_direction: BoolProperty(  # type: ignore[valid-type]
-        name="Follow Direction", description="The flare is as bright as the part of the lamp's light that goes to the "
-        "camera: in the cone of a spot, in front of an area light", default=False, update=redraw_viewports)
+        name="Follow Direction", description="The flare dims with the lamp's light in the direction of the camera: at "
+        "the edge of a spot's cone, and beside an area light that flares as a point", default=False,
+        update=redraw_viewports)
     follow_distance: BoolProperty(  # type: ignore[valid-type]
         name="Follow Distance", description="The flare dims with the square of the distance from the camera to the "
         "light", default=False, update=redraw_viewports)
     reference_distance: FloatProperty(  # type: ignore[valid-type]
         name="Reference", description="Distance from the camera to the light at which the flare has its own "
-        "brightness: the distance when the flare got its light object", default=0.0, min=0.0, subtype="DISTANCE",
+        "brightness; it is measured when the flare gets its light object", default=0.0, min=0.0, subtype="DISTANCE",
         update=redraw_viewports)
     is_at_artists_light: BoolProperty()  # type: ignore[valid-type]  # not at a light of the capture, nor without one
     reference_light: FloatVectorProperty(size=3, default=(0.0, 0.0, 0.0))  # type: ignore[valid-type]

@@ -55,7 +55,7 @@ def missing_reason() -> str:
         return ""
     source, path = configured()
     if path:
-        return f"The weights named by {source} are missing: {path}. Name a file of weights, or leave it empty"
+        return f"The weights named by {source} are missing: {path}. Name a file that exists, or name none"
     return ("The removal network needs its weights. Open the preferences of Fit Flare and "
             f"{'download them' if source_url() else 'name their file under Removal Weights'}")
 

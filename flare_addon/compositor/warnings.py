@@ -10,8 +10,8 @@ from ...core.conventions.frame_numbers import NumberedFrame, missing_numbers
 from ...core.images.picture import same_aspect
 from . import drivers, flare_node, setup, trees
 
-STEREO = ("This scene renders stereo, and both eyes get the flare of one camera; bake each eye's camera by itself, and "
-          "composite each eye in a scene of its own.")
+STEREO = ("This scene renders stereo, and both eyes get the flare of one camera; for each eye, make a scene with "
+          "its own camera, and bake and composite there.")
 
 
 def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:

@@ -30,7 +30,7 @@ class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
         name="Selected Cameras", description="Bake from every selected camera, each to its own folder",
         default=False)
     composite: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Composite", description="Set the compositor up for the layers when they are baked, anew if it is set up "
+        name="Composite", description="Set the compositor up for the layers when they are baked, even if it is set up "
         "already", default=False, options={"SKIP_SAVE"})
     replace: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Replace Others", description="Delete other frames in the folder that were baked with other settings",

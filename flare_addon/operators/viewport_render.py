@@ -17,14 +17,14 @@ INTERVAL_S = 0.005
 
 
 class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
-    """Render the camera view with its flare to the folder of Output, with the shading of the 3D viewport"""
+    """Render the camera view with its flare and the shading of the 3D viewport to the path in Output"""
 
     bl_idname = "fit_flare.viewport_render"
     bl_label = "Viewport Render with Flare"
     changes_scene = False
 
     animation: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Animation", description="All frames of the scene, in place of the current one", default=False,
+        name="Animation", description="Render all frames of the scene instead of the current one", default=False,
         options={"SKIP_SAVE"})
 
     _frames: Iterator[int]

@@ -52,8 +52,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.capture.solve import PICTURE, REPORT, SolveSettings, solve
 
     if args.plates or args.lights:
-        raise SettingsError(f"--{'plates' if args.plates else 'lights'} is only for the camera of a file; leave it "
-                            "out.")
+        what = "--plates is only for a .blend, .nk or .chan" if args.plates else "--lights is only for a .blend"
+        raise SettingsError(f"{what}; leave it out.")
     settings = SolveSettings(frames=args.frames, matching=args.matching, lens=args.lens.upper(),
                              size=args.work_size, output_size=args.size, mask=not args.no_mask, seed=args.seed,
                              plate_space="" if plate_space.named_space(args) is None else args.plate_space,

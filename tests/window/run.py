@@ -25,9 +25,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = 77
-VIEW, PREFERENCES = (0, 28, 1313, 908), (168, 55, 1313, 465)
+VIEW, PREFERENCES = (0, 28, 1313, 908), (168, 55, 1313, 640)
 PICTURES = {
-    "preferences": ("01_preferences", PREFERENCES), "setting_up": ("11_setting_up", (168, 310, 1313, 465)),
+    "preferences": ("01_preferences", PREFERENCES), "setting_up": ("11_setting_up", (168, 405, 1313, 560)),
     "imported": ("03_imported", VIEW), "fitting": ("04_fitting", VIEW), "flare": ("05_flare", VIEW),
     "look": ("06_look_and_bake", (325, 75, 1312, 600)),
     "compositor": ("07_compositor", (0, 0, 1600, 1000)),

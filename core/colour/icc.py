@@ -159,9 +159,9 @@ def _power(gamma: float) -> Table:
 def _parametric(kind: int, numbers: list[float]) -> Table:
     """Return a parametric curve (ICC.1:2022, table 68)."""
     g, a, b, c, d, e, f = (numbers + [0.0] * 7)[:7]
-    _power(g)
+    power = _power(g)  # raises where no picture has such an exponent
     if kind == 0:
-        return _power(g)
+        return power
     if a == 0:
         raise UnreadableProfile("has a curve that no picture has")
     if kind in (1, 2):  # 0, or c, below -b / a

@@ -69,8 +69,9 @@ class Frames:
 
     def __init__(self, capture: Capture, width: int = 0, memory: int = MEMORY, *,
                  display_white: float = 1.0, frames_only: bool = False, truth: bool = True) -> None:
-        """frames_only: ignore the capture's clean frames; truth: use exact layers where there are no other clean
-        frames."""
+        """width: largest width of the pictures, pixels, 0 for that of the frames; memory: bytes for decoded pictures;
+        frames_only: ignore the capture's clean frames; truth: use exact layers where there are no other clean frames.
+        """
         self.capture = capture
         self.display_white = display_white
         self._width = width

@@ -91,7 +91,8 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
 def read_ply(path: Path | str) -> SceneGaussians:
     """Read a scene; properties may have any order, and unknown ones are ignored.
 
-    Raises FlareFileError for a file that is no PLY of Gaussians, is cut short, or holds NaN or infinity.
+    Raises FlareFileError for a file that is no PLY of Gaussians, is cut short, or holds numbers that are not finite
+    other than the LEGAL_INFINITIES.
     """
     path = Path(path)
     try:

@@ -69,7 +69,7 @@ class PictureCache:
             return None
 
     def put(self, name: str, codes: Codes) -> None:
-        """Store an array under a name."""
+        """Store an array under a name, in memory or on disk; without room in both it is not stored."""
         if codes.nbytes <= self._left:
             self._left -= codes.nbytes
             self._in_memory[name] = codes

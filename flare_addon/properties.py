@@ -40,11 +40,9 @@ PRESETS: tuple[tuple[Preset, str, str], ...] = (
 )
 MODES: tuple[tuple[Mode, str, str, int], ...] = (  # a .blend stores the numbers
     ("default", "Exact Clean Frames", "Use the clean frames in the capture's folder removed/ (or truth/scene/) and "
-                                      "take "
-     "them as exact", 0),
-    ("estimated", "Estimated Clean Frames", "Use clean frames that Make Clean Frames estimates, or the fit itself "
-                                            "before "
-     "it starts. The rest of the flare in them is separated by parallax. The fit takes a fifth longer", 2),
+     "take them as exact", 0),
+    ("estimated", "Estimated Clean Frames", "Use clean frames that the removal network makes: by Make Clean "
+     "Frames, or when the fit starts. The fit separates their remaining flare by parallax and takes a fifth longer", 2),
     ("split", "No Clean Frames", "Separate scene and flare by parallax alone. The fit takes a fifth longer", 1),
 )
 
@@ -240,7 +238,7 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     preset: EnumProperty(  # type: ignore[valid-type]
         name="Preset", description="Length and size of the fit", items=PRESETS, default="draft")
     mode: EnumProperty(  # type: ignore[valid-type]
-        name="Learn From", description="The frames that the fit learns the scene without flare from",
+        name="Learn From", description="Where the fit gets clean frames, which show the scene without flare",
         items=MODES)
     width: IntProperty(  # type: ignore[valid-type]
         name="Width", description="Largest width in pixels of the frames in the fit; 0 uses the width of the frames",
@@ -307,8 +305,7 @@ class FITFLARE_PG_object(bpy.types.PropertyGroup):
     view: StringProperty(name="Frame", description="Name of the capture's frame that this camera belongs to")  # type: ignore[valid-type]
     exposure: FloatProperty(  # type: ignore[valid-type]
         name="Exposure", description="Exposure of this camera relative to the median frame: a factor on its flare. A "
-                                     "fit "
-        "sets and animates it for a capture whose exposure changes", default=1.0, min=MIN_EXPOSURE,
+        "fit sets and animates it for a capture whose exposure changes", default=1.0, min=MIN_EXPOSURE,
         max=1 / MIN_EXPOSURE, soft_min=0.1, soft_max=10.0, update=redraw_viewports, override=OVERRIDABLE)
 
 

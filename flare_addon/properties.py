@@ -41,8 +41,9 @@ PRESETS: tuple[tuple[Preset, str, str], ...] = (
 MODES: tuple[tuple[Mode, str, str, int], ...] = (  # a .blend stores the numbers
     ("default", "Exact Clean Frames", "Use the clean frames in the capture's folder removed/ (or truth/scene/) and "
      "take them as exact", 0),
-    ("estimated", "Estimated Clean Frames", "Use clean frames that the removal network makes: by Make Clean "
-     "Frames, or when the fit starts. The fit separates their remaining flare by parallax and takes a fifth longer", 2),
+    ("estimated", "Estimated Clean Frames", "Use the clean frames of Make Clean Frames, or those that the "
+     "removal network makes when the fit starts. Parallax separates their remaining flare. The fit takes a fifth "
+     "longer", 2),
     ("split", "No Clean Frames", "Separate scene and flare by parallax alone. The fit takes a fifth longer", 1),
 )
 

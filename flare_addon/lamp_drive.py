@@ -126,10 +126,14 @@ def _cosine(rotation: Any, offset: Any) -> float:
     return max(float(normal.dot(offset)) / length, 0.0) if length > 0 else 1.0
 
 
-def dark_reason(scene: Any, depsgraph: Any, item: Any) -> str:
-    """Return why a flare is dark at the current frame by its switches, and what to do; "" where it is not."""
+def dark_reason(scene: Any, depsgraph: Any, item: Any, rendered: set[Any] | None = None) -> str:
+    """Return why a flare is dark at the current frame by its switches, and what to do; "" where it is not.
+
+    rendered: the `rendered_collections`, where they are known.
+    """
     target = item.target
-    if item.follow_visibility and not is_shown(target, depsgraph, rendered_collections(scene)):
+    rendered = rendered_collections(scene) if rendered is None else rendered
+    if item.follow_visibility and not is_shown(target, depsgraph, rendered):
         return f"{target.name} is disabled, and its flare with it: enable it, or switch Follow Visibility off."
     if item.follow_direction and scene.camera is not None and has_direction(item):
         matrix, eye = target.evaluated_get(depsgraph).matrix_world, scene.camera.matrix_world.translation

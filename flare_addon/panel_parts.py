@@ -26,9 +26,23 @@ def draw_switches(column: Any, scene: Any, item: Any) -> None:
         column.prop(item, "follow_distance")
         if item.follow_distance:
             column.prop(item, "reference_distance")
-    if looks.is_placed(item, scene) and (
-            dark := lamp_drive.dark_reason(scene, bpy.context.view_layer.depsgraph, item)):
-        label_lines(column, dark, "INFO")
+    reasons = _dark_reasons(scene)
+    if reasons.get(item.name) and not all(reasons.values()):
+        label_lines(column, reasons[item.name], "INFO")
+
+
+def _dark_reasons(scene: Any) -> dict[str, str]:
+    """Return why each placed flare is dark by its switches, by name; "" for one that is not."""
+    depsgraph, rendered = bpy.context.view_layer.depsgraph, lamp_drive.rendered_collections(scene)
+    return {item.name: lamp_drive.dark_reason(scene, depsgraph, item, rendered) for item in scene.fit_flare.lights
+            if looks.is_placed(item, scene)}
+
+
+def draw_darkness(layout: Any, scene: Any) -> None:
+    """Draw why there is no flare to see, where the switches make all flares dark."""
+    reasons = _dark_reasons(scene)
+    if reasons and all(reasons.values()):
+        label_lines(layout, next(iter(reasons.values())), "INFO")
 
 
 def _changes(scene: Any, light: Any) -> bool:

@@ -272,6 +272,7 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
             return
         if overlay.last_error:
             label_lines(layout, overlay.last_error, "ERROR")
+        panel_parts.draw_darkness(layout, scene)
         view = context.space_data if getattr(context.space_data, "type", "") == "VIEW_3D" else None
         if scene.camera is None:
             label_lines(layout, "The scene has no camera; add one to see the flare.", "ERROR")

@@ -5,6 +5,7 @@ The trainers call it before a run is written, and `run` reads the file.
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -45,13 +46,20 @@ STEP_SCALE = 0.05
 """Change of brightness from frame to frame that counts as usual."""
 MIN_CERTAINTY = 1e-3
 """Certainty of a brightness that a frame does not show."""
+FLARE_ERROR, OUTSIDE_ERROR, PRIOR_ERROR = 0.1, 0.3, 0.1
+"""Standard deviations of a brightness by the flare, at the least, of one by the flare of a light outside the frame, and
+of one in the lights' file: a plate that holds part of the flare biases the first, the second has only ghosts, and
+clipping and glare bias the third."""
+MIN_PRIOR_CONFIDENCE = 0.5
+"""Confidence of a key of a light below which its brightness is only a first guess."""
 TV_REWEIGHTINGS, TV_EPSILON = 30, 1e-3
 
 
 @torch.no_grad()
 def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, render_view: RenderView) -> None:
     """Set the brightness of the lights in these views, in the order of the shot, by least errors of frame - scene over
-    the present flares; smooth in time, with steps, where single frames are uncertain (`smooth_with_steps`).
+    the present flares, and by the brightness in the lights' file; smooth in time, with steps, where single frames are
+    uncertain (`smooth_with_steps`).
 
     The flare stays as it is. In frames that the fit has not seen, only its strength is read off, as `lights` reads the
     places.
@@ -69,9 +77,20 @@ def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, r
         columns = [rendered.layers.flares[name].numpy() if name in rendered.layers.flares else None
                    for name in flare.names]
         solved[number], certainty[number] = _solve(frames.targets(view), rendered.layers.scene.numpy(), columns, start)
+    prior = lights.prior[rows].numpy().astype(np.float64)
+    prior_certainty = np.isfinite(prior) / PRIOR_ERROR**2
+    inside = np.array([_lights_in_frame(lights, view) for view in views])
+    certainty = np.minimum(certainty, 1 / np.where(inside, FLARE_ERROR, OUTSIDE_ERROR) ** 2)
+    total = certainty + prior_certainty
+    solved = (certainty * solved + prior_certainty * np.nan_to_num(prior)) / np.maximum(total, 1e-9)
     for light in range(len(flare.names)):
-        smooth = smooth_with_steps(solved[:, light], certainty[:, light])
+        smooth = smooth_with_steps(solved[:, light], total[:, light])
         weight[rows, light] = torch.from_numpy(smooth.clip(0, MAX_BRIGHTNESS)).float()
+
+
+def _lights_in_frame(lights: FrameLights, view: View) -> NDArray[np.bool_]:
+    """Return (lights,) which lights lie on the frame of a view."""
+    return view.camera.contains(*view.camera.project(lights.positions[lights.rows[view.name]].numpy()))
 
 
 def smooth_with_steps(values: NDArray[np.float64], certainty: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -136,8 +155,7 @@ def normalise_brightness(flare: FlareModel, views: Sequence[View]) -> None:
     if lights is None:
         return
     for number, light in enumerate(flare.lights):
-        inside = [lights.rows[view.name] for view in views if view.camera.contains(
-            *view.camera.project(lights.positions[lights.rows[view.name], number].numpy()))[0]]
+        inside = [lights.rows[view.name] for view in views if _lights_in_frame(lights, view)[number]]
         rows = inside or [lights.rows[view.name] for view in views]
         brightest = float(lights.brightness.weight[rows, number].max())
         if brightest <= 0:
@@ -232,9 +250,13 @@ def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
 
 
 def read_frame_lights(capture: Capture, names: Sequence[str]) -> FrameLights:
-    """Return places and brightness of these lights of a capture, in every view; an unknown brightness starts at 1."""
+    """Return places and brightness of these lights of a capture, in every view; an unknown brightness starts at 1, and a
+    doubtful one is a first guess."""
     by_name = {light.name: light for light in capture.lights}
     states = [[capture.light_state(by_name[name], view) for name in names] for view in capture.views]
     positions = torch.tensor(np.array([[state.xyz for state in row] for row in states]), dtype=torch.float64)
     prior = torch.tensor([[np.nan if state.on is None else state.on for state in row] for row in states])
-    return FrameLights([view.name for view in capture.views], positions, prior)
+    lights = FrameLights([view.name for view in capture.views], positions, prior)
+    doubtful = torch.tensor([[state.confidence < MIN_PRIOR_CONFIDENCE for state in row] for row in states])
+    lights.prior.masked_fill_(doubtful, math.nan)
+    return lights

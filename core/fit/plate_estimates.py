@@ -1,44 +1,54 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Improves the plates of a shot by what neighbouring frames show of the same background.
 
-The removal network cleans each frame by itself, and errs differently in each. Where the background stands still, or the
-camera only turns, other frames show it without flare. So every frame is compared with the median of its neighbours'
-plates, each aligned to it by a homography. In a small window a local line, frame = gain * background + flare, separates
-the two: a flare adds light that does not depend on the background's texture, and light on the walls changes the gain.
-Where the background has no texture, or something hides it, nothing is certain, and the network's plate stays.
+The removal network cleans each frame by itself, and misses the same sharp ghosts in many. Other frames show the
+background without flare in that place. So each frame is compared with the median of its aligned neighbours, the
+background, times a gain that changes smoothly over the picture, since light on the walls changes from frame to frame.
+The gain follows the network's plate, which keeps light on walls, and ignores what is small and brighter: missed ghosts.
+
+A flare adds light and hides nothing. So something before the background shows itself: a channel is darker than the
+background, the background's texture is absent, or the gain is far from 1. There the network's plate stays. Elsewhere
+the plate is the lowest of frame, network's plate and background.
 
 `plate_trainer` calls it before a fit, and a few times during it with the fitted flare subtracted from the neighbours.
 """
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..colour.srgb import LUMINANCE, linear_from_srgb, srgb_from_linear
+from ..colour.srgb import linear_from_srgb, srgb_from_linear
+from .plate_alignment import Alignment
 
 Pixels = NDArray[np.float32]
-Matrix = NDArray[np.float64]
 
-NEIGHBOUR_OFFSETS = (2, 4, 6, 9, 12, 16, 20, 25)
-"""Distances in frames, before and after, of the neighbours of a plate: by then a flare is elsewhere, a background is
-not."""
-WINDOW_SHARE = 0.02
-"""Standard deviation of the window of the local line, as a share of the frame's width."""
+DARK = 0.02
+"""Linear light that is added to denominators, so that relative errors of dark pixels are those of display values."""
+MIN_NEIGHBOURS = 3
+"""Number of aligned neighbours from which the background counts fully."""
+GAIN_WINDOW, TEXTURE_WINDOW = 0.06, 0.012
+"""Standard deviations of the windows of the gain and of the test of texture, as shares of the frame's width."""
+GAIN_ERROR, EXCESS_FACTOR, GAIN_REWEIGHTINGS = 0.04, 1.5, 8
+"""Relative error at which a pixel counts half for the gain, the factor on errors of pixels that are too bright, and the
+number of reweightings."""
+USABLE = 0.9
+"""Linear light above which a frame is as good as clipped."""
 NOISE = 0.004
 """Noise of display values, as a standard deviation."""
-GAIN_TOLERANCE = 0.3
-"""Deviation of the local gain from 1 at which a background counts as half certain: light on it changes the gain."""
-FEATURES, MATCH_RATIO, MIN_INLIERS, MIN_INLIER_SHARE, MAX_ERROR_PX = 800, 0.8, 25, 0.4, 1.5
-"""Features of a frame, ratio test, and what a homography between two frames needs; errors in pixels of the fit."""
-SMOOTHING_SHARE = 0.006
-"""Standard deviation, as a share of the frame's width, by which differences from a plate are smoothed: those of aligned
-frames have both signs at every edge, those of a flare have one."""
-MIN_EXCESS = 0.006
-"""Largest difference that is no flare, display values."""
+DISPLAY_SLOPE = 2.4
+"""Change of the logarithm of linear light with that of display values."""
+WINDOW_SAMPLES, TEXTURE_TOLERANCE, MAX_DEVIATION = 20.0, 0.25, 2.0
+"""Independent pixels of the window of texture; error of the local gain where the fit is exact; and deviations below 1
+at which the local gain says that the background's texture is absent."""
+MAX_DEFICIT = 0.08
+"""Mean relative deficit of a channel at which the background counts as half hidden."""
+MAX_GAIN = 2.2
+"""Gain, or its inverse, at which the background counts as half hidden."""
+CLOSING, GROWTH = 0.05, 0.012
+"""Radii by which hidden areas are closed and grown, as shares of the frame's width."""
 
 
 @dataclass(frozen=True)
@@ -48,144 +58,113 @@ class ShotFrames:
     frames: Mapping[str, Pixels]
     plates: Mapping[str, Pixels]
 
-    @property
-    def names(self) -> list[str]:
-        """Names of the frames, in the order of the shot."""
-        return list(self.frames)
-
-
-@dataclass(frozen=True)
-class _Features:
-    points: NDArray[np.float32]
-    descriptors: Any
-
 
 class PlateEstimator:
     """Estimates plates of a shot; the alignments of its frames are computed once."""
 
     def __init__(self, shot: ShotFrames) -> None:
         self._shot = shot
-        self._features: dict[str, _Features] = {}
-        self._alignments: dict[tuple[str, str], Matrix | None] = {}
+        self._alignment = Alignment(shot.plates)
 
     def estimate(self, name: str, cleaned: Mapping[str, Pixels] | None = None) -> Pixels:
         """Return the plate of a frame, display values.
 
         cleaned: frames minus the fitted flare, which show the neighbours' background in place of the network's plates.
-        The frame's own plate stays the network's: a flare subtracted from its own frame would grow.
+        The frame itself stays as filmed: a flare subtracted from its own frame would hide its own errors.
         """
-        shot = self._shot
-        own, plates = shot.plates[name], shot.plates if cleaned is None else cleaned
-        aligned = [warped for other in self._neighbours(name)
-                   if (warped := self._aligned(plates[other], other, name)) is not None]
+        shot, alignment = self._shot, self._alignment
+        plates = shot.plates if cleaned is None else cleaned
+        aligned = [warped for other in alignment.neighbours(name)
+                   if (warped := alignment.aligned(plates[other], other, name)) is not None]
         if not aligned:
-            return own
+            return shot.plates[name]
         stack = np.stack([plates[name], *aligned])
-        with np.errstate(all="ignore"):
-            background = np.nanmedian(stack, 0).astype(np.float32)
-            count = np.isfinite(stack[..., 0]).sum(0)
-        fitted, confidence = local_line(linear_from_srgb(shot.frames[name]),
-                                        linear_from_srgb(np.nan_to_num(background)))
-        confidence = confidence * np.clip((count - 1) / 3, 0, 1)[..., None].astype(np.float32)
-        excess = _smooth(own - np.minimum(srgb_from_linear(fitted), shot.frames[name]), confidence)
-        excess = np.sign(excess) * np.maximum(np.abs(excess) - MIN_EXCESS, 0)
-        return np.asarray(np.clip(own - confidence * excess, 0, None), np.float32)
-
-    def _neighbours(self, name: str) -> Sequence[str]:
-        names = self._shot.names
-        index = names.index(name)
-        return [names[other] for offset in NEIGHBOUR_OFFSETS for other in (index - offset, index + offset)
-                if 0 <= other < len(names)]
-
-    def _aligned(self, plate: Pixels, source: str, target: str) -> Pixels | None:
-        """Return a plate as the target frame's camera would show it, NaN beyond its edges; None if it cannot be
-        aligned."""
-        import cv2
-
-        matrix = self._alignment(source, target)
-        if matrix is None:
-            return None
-        height, width = plate.shape[:2]
-        warped = cv2.warpPerspective(plate, matrix, (width, height), flags=cv2.INTER_LINEAR,
-                                     borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 3)
-        return np.asarray(warped, np.float32)
-
-    def _alignment(self, source: str, target: str) -> Matrix | None:
-        """Return the homography (3, 3) from pixels of one frame to those of another; None where none fits."""
-        if (source, target) not in self._alignments:
-            matrix = self._match(source, target)
-            self._alignments[source, target] = matrix
-            self._alignments[target, source] = None if matrix is None else np.linalg.inv(matrix)
-        return self._alignments[source, target]
-
-    def _match(self, source: str, target: str) -> Matrix | None:
-        import cv2
-
-        first, second = self._described(source), self._described(target)
-        if min(len(first.points), len(second.points)) < MIN_INLIERS:
-            return None
-        matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, 2)
-        pairs = [(near.queryIdx, near.trainIdx) for near, *other in matches
-                 if other and near.distance < MATCH_RATIO * other[0].distance]
-        if len(pairs) < MIN_INLIERS:
-            return None
-        ends = first.points[[pair[0] for pair in pairs]], second.points[[pair[1] for pair in pairs]]
-        cv2.setRNGSeed(0)
-        matrix, inliers = cv2.findHomography(*ends, cv2.RANSAC, MAX_ERROR_PX)
-        if matrix is None or inliers.sum() < max(MIN_INLIERS, MIN_INLIER_SHARE * len(pairs)):
-            return None
-        moved = np.abs(ends[1] - ends[0])[inliers[:, 0] > 0]
-        if np.median(moved) < 0.1:  # a camera that stands
-            return np.eye(3)
-        return np.asarray(matrix, np.float64)
-
-    def _described(self, name: str) -> _Features:
-        import cv2
-
-        if name not in self._features:
-            plate = self._shot.plates[name]
-            grey = np.clip(plate @ LUMINANCE * 255 + 0.5, 0, 255).astype(np.uint8)
-            keys, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(grey, np.array([]))
-            self._features[name] = _Features(np.array([key.pt for key in keys], np.float32).reshape(-1, 2), descriptors)
-        return self._features[name]
+        count = np.isfinite(stack[..., 0]).sum(0) - 1
+        background = linear_from_srgb(_median(stack))
+        frame, own = linear_from_srgb(shot.frames[name]), linear_from_srgb(shot.plates[name])
+        usable = (frame.max(-1, keepdims=True) < USABLE).astype(np.float32)
+        gain = smooth_gain(own, background, usable)
+        hidden = hidden_share(frame, gain * background, gain)
+        confidence = ((1 - hidden) * np.clip(count / MIN_NEIGHBOURS, 0, 1))[..., None]
+        plate = own + confidence * (np.minimum(np.minimum(gain * background, frame), own) - own)
+        return np.asarray(srgb_from_linear(np.clip(plate, 0, None)), np.float32)
 
 
-def _smooth(values: Pixels, weights: Pixels) -> Pixels:
-    """Return the weighted means of values (height, width, 3) in a small window; weights (height, width, 1)."""
+def _median(stack: Pixels) -> Pixels:
+    """Return the medians of (n, height, width, 3) over n, without NaN; the first picture is finite."""
+    count = np.isfinite(stack[..., 0]).sum(0)
+    ordered = np.sort(stack, 0)  # NaN comes last
+    low, high = ((count - 1) // 2)[None, ..., None], (count // 2)[None, ..., None]
+    middle = np.take_along_axis(ordered, low, 0)[0] + np.take_along_axis(ordered, high, 0)[0]
+    return np.asarray(middle / 2, np.float32)
+
+
+def _blur(values: Pixels, sigma: float) -> Pixels:
     import cv2
 
-    sigma = max(SMOOTHING_SHARE * values.shape[1], 0.5)
-    total = cv2.GaussianBlur(weights[..., 0], (0, 0), sigma)[..., None]
-    return np.asarray(cv2.GaussianBlur(weights * values, (0, 0), sigma) / (total + 1e-3), np.float32)
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), np.float32).reshape(values.shape)
 
 
-def local_line(frame: Pixels, background: Pixels) -> tuple[Pixels, Pixels]:
-    """Return gain * background (height, width, 3) of the local line frame = gain * background + flare, and how certain
-    it is (height, width, 1), 0..1.
+def smooth_gain(plate: Pixels, background: Pixels, usable: Pixels) -> Pixels:
+    """Return the gain (height, width, 3) of a plate over a background that changes smoothly over the picture.
 
-    frame, background: linear light. The channels share one gain. Where the background has little texture, the gain
-    tends to 1; a gain far from 1 says that something hides the background.
+    Linear light. usable: (height, width, 1) weights of the pixels. Pixels that are too bright for the gain around them
+    count less, for they may hold flare.
+    """
+    sigma = max(GAIN_WINDOW * plate.shape[1], 1.0)
+    base = usable / (background + DARK) ** 2
+    weight, prior = base, 1e-5  # of a gain of 1, where nothing is usable
+    for _ in range(GAIN_REWEIGHTINGS):
+        gain = (_blur(weight * plate * background, sigma) + prior) / (_blur(weight * background**2, sigma) + prior)
+        error = (plate - gain * background) / (background + DARK)
+        weight = base / (1 + (np.where(error > 0, EXCESS_FACTOR * error, error) / GAIN_ERROR) ** 2)
+    return np.asarray(gain, np.float32)
+
+
+def hidden_share(frame: Pixels, expected: Pixels, gain: Pixels) -> NDArray[np.float32]:
+    """Return (height, width), 0..1, how likely something hides the background of a frame.
+
+    frame, expected: linear light, the expected frame without flare; gain: that of the background, see `smooth_gain`.
     """
     import cv2
 
-    sigma = max(WINDOW_SHARE * frame.shape[1], 1.0)
+    width = frame.shape[1]
+    sigma = max(TEXTURE_WINDOW * width, 1.0)
+    deficit = _blur(np.maximum(-((frame - expected) / (expected + DARK)).min(-1), 0).clip(0, 1), sigma)
+    visible = expected.mean(-1) > NOISE
+    change = np.abs(np.log(np.maximum(gain.mean(-1), 1e-3)))
+    hidden = np.maximum(_step(deficit, MAX_DEFICIT, 60), _step(_texture_deviation(frame, expected, sigma),
+                                                               MAX_DEVIATION, 4))
+    hidden = np.maximum(hidden, visible * _step(change, np.log(MAX_GAIN), 8)).astype(np.float32)
 
-    def blur(values: Pixels) -> Pixels:
-        return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), np.float32)
+    def disc(share: float) -> NDArray[np.uint8]:
+        return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(share * width) + 1,) * 2), np.uint8)
 
-    # Errors are those of display values: relative in bright parts.
-    weight = 1 / (background.mean(-1, keepdims=True) + 0.02) ** 2
-    total = blur(weight[..., 0])[..., None]
-    mean_frame, mean_background = (blur(weight * values) / total for values in (frame, background))
-    variance = (blur(weight * background**2) / total - mean_background**2).sum(-1).clip(0)
-    covariance: Pixels = (blur(weight * frame * background) / total - mean_frame * mean_background).sum(-1)
-    residual = (blur(weight * frame**2) / total - mean_frame**2).sum(-1).clip(0)
-    noise = 3 * (NOISE * (mean_background.mean(-1) + 0.02) * 2.4) ** 2
+    hidden = cv2.dilate(cv2.morphologyEx(hidden, cv2.MORPH_CLOSE, disc(CLOSING)), disc(GROWTH))
+    return _blur(np.asarray(hidden, np.float32), max(GROWTH * width / 2, 0.5))
+
+
+def _step(values: Pixels, middle: float, steepness: float) -> Pixels:
+    """Return a smooth step from 0 to 1 at `middle`."""
+    return np.asarray(1 / (1 + np.exp(np.clip(-steepness * (values - middle), -50, 50))), np.float32)
+
+
+def _texture_deviation(frame: Pixels, expected: Pixels, sigma: float) -> Pixels:
+    """Return (height, width), by how many standard errors the gain of a local line frame = gain * expected + flare lies
+    below 1: a flare adds light that does not depend on the texture, and what hides the background has another texture.
+    """
+    weight = 1 / (expected.mean(-1, keepdims=True) + DARK) ** 2
+    total = _blur(weight, sigma)
+
+    def mean(values: Pixels) -> Pixels:
+        return _blur(np.asarray(weight * values, np.float32), sigma) / total
+
+    mean_frame, mean_expected = mean(frame), mean(expected)
+    variance = (mean(expected**2) - mean_expected**2).sum(-1).clip(0)
+    covariance = (mean(frame * expected) - mean_frame * mean_expected).sum(-1)
+    spread = (mean(frame**2) - mean_frame**2).sum(-1).clip(0)
+    noise = 3 * (NOISE * (mean_expected.mean(-1) + DARK) * DISPLAY_SLOPE) ** 2
     gain = (covariance + noise) / (variance + noise)
-    explained = np.clip(gain, 0, 2) * covariance
-    unexplained = (residual - explained).clip(0)
-    texture = variance / (variance + 10 * noise)
-    near_one = 1 / (1 + ((gain - 1) / GAIN_TOLERANCE) ** 4)
-    fits = variance / (variance + 0.5 * unexplained + noise)
-    confidence = np.asarray(texture * near_one * fits, np.float32)[..., None]
-    return np.asarray(np.clip(gain, 0.5, 1.5)[..., None] * background, np.float32), confidence
+    unexplained = (spread - np.clip(gain, 0, 2) * covariance).clip(0)
+    error = np.sqrt((unexplained + noise) / (WINDOW_SAMPLES * (variance + noise)) + TEXTURE_TOLERANCE**2)
+    return np.asarray((1 - gain) / error, np.float32)

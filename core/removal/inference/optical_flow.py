@@ -28,6 +28,12 @@ def to_grey_codes(display: Pixels) -> NDArray[np.uint8]:
 
 def compute_flow(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> Pixels:
     """Return the flow from a frame to another, (h / DOWNSAMPLING, w / DOWNSAMPLING, 2): x and y, in pixels of the flow.
+    """
+    return downsample(dense_flow(source, target)) / DOWNSAMPLING
+
+
+def dense_flow(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> Pixels:
+    """Return the flow from a frame to another, (h, w, 2): x and y, in pixels of the frame.
 
     One thread computes it: the search propagates within the part of the frame that a thread gets, so that with several
     threads the result would depend on their number.
@@ -38,10 +44,9 @@ def compute_flow(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> Pixels
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        flow = np.asarray(search.calc(source, target, None), np.float32)  # type: ignore[call-overload]
+        return np.asarray(search.calc(source, target, None), np.float32)  # type: ignore[call-overload]
     finally:
         cv2.setNumThreads(threads)
-    return downsample(flow) / DOWNSAMPLING
 
 
 def warp(values: Pixels, flow: Pixels) -> Pixels:

@@ -9,9 +9,11 @@ from typing import Any, Literal
 import bpy
 
 from ..core.capture import REMOVED
+from ..core.choices import OUR_PRESETS
 from ..core.conventions import exposures
 from ..core.conventions.run_files import CONFIG, FLARE, SMALL_PREVIEW
 from ..core.errors import CaptureError, FitFlareError, RunError
+from ..core.images.video import is_video
 from ..core.look import Look, read
 from ..core.system.reading import MAX_PATH_BYTES, read_text
 from . import engine, jobs, lights, looks, plate_space, weights
@@ -26,6 +28,8 @@ TRUE_SCENE = Path("truth", "scene")
 
 FitState = Literal["none", "running", "resumable", "finished", "lost"]
 """resumable: stopped or failed before its end. lost: the folder of the run does not exist any more."""
+SHOT_RUN = "run"
+"""Folder of the run in the folder of the command `shot`."""
 
 
 def run_folder(scene: Any) -> Path | None:
@@ -124,9 +128,38 @@ def start(scene: Any) -> Job:
         raise
 
 
+def start_from_footage(scene: Any, source: Path) -> Job:
+    """Start the command `shot` on a video or on the folder of a frame, in a new folder; its run becomes the scene's.
+
+    Raises EngineError without an engine, CaptureError without the footage, RunError for an unusable folder.
+    """
+    footage = source.parent if is_file(source) and not is_video(source) else source
+    if not source.name or not footage.exists():
+        raise CaptureError(f"{source} is missing; choose a video, or a frame of a folder of frames.")
+    engine.command()  # raises before anything is written
+    base, number = (Path(bpy.data.filepath).parent / "fits" if bpy.data.filepath else footage.parent), 1
+    while (out := base / f"{footage.stem}_flare_{number}").exists():
+        number += 1
+    state, before = scene.fit_flare, scene.fit_flare.run
+    state.run = blend_relative(out / SHOT_RUN)
+    folder = run_folder(scene) or out / SHOT_RUN  # as the stored path resolves
+    args: list[object] = ["shot", footage.resolve(), "--out", folder.parent,
+                          "--preset", state.preset if state.preset in OUR_PRESETS else "standard"]
+    if state.width:
+        args += ["--size", state.width]
+    try:
+        return engine.run("fit", folder, args)
+    except FitFlareError:
+        state.run = before
+        raise
+
+
 def resume(scene: Any) -> Job:
     """Resume the run of the scene. Raises as `start` does."""
     capture, folder = capture_folder(scene), run_folder(scene)
+    stopped = fit_job(scene)
+    if folder is not None and stopped is not None and stopped.args[:1] == ["shot"]:
+        return engine.run("fit", folder, stopped.args)  # goes on with the steps after the fit too
     if folder is None or not is_file(folder / CONFIG):
         raise RunError(f"There is no fit to resume in {folder}; start a new one.")
     fitted = _capture_of_run(folder)

@@ -62,7 +62,7 @@ class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
         folder = fits.capture_folder(context.scene)
         if folder is None:
             label_lines(layout, "Footage with a camera solve: a folder with images/ and sparse/0/ (COLMAP) or "
-                          "transforms.json.", "INFO")
+                          "transforms.json. Flare from Footage needs only a clip.", "INFO")
         elif not is_folder(folder):
             label_lines(layout, f"The capture {folder} does not exist any more: choose its present folder.", "ERROR")
         row = layout.row()
@@ -74,6 +74,7 @@ class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
             if fits.has_clean_frames(context.scene):
                 layout.row().prop(state, "footage", expand=True)
         column = layout.column()
+        column.operator("fit_flare.flare_from_footage", icon="FILE_MOVIE")
         column.operator("fit_flare.capture_from_camera", icon="CAMERA_DATA")
 
 

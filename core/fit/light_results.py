@@ -42,11 +42,11 @@ PRIOR_WEIGHT = 1e-6
 """Weight per pixel of the present brightness."""
 CORRELATION_SHARE = 0.005
 """Share of a frame's pixels whose errors count as one, because neighbouring errors of a plate are alike."""
-STEP_SCALE = 0.05
+STEP_SCALE = 0.2
 """Change of brightness from frame to frame that counts as usual."""
 MIN_CERTAINTY = 1e-3
 """Certainty of a brightness that a frame does not show."""
-FLARE_ERROR, OUTSIDE_ERROR, PRIOR_ERROR = 0.1, 0.3, 0.1
+FLARE_ERROR, OUTSIDE_ERROR, PRIOR_ERROR = 0.1, 0.5, 0.1
 """Standard deviations of a brightness by the flare, at the least, of one by the flare of a light outside the frame, and
 of one in the lights' file: a plate that holds part of the flare biases the first, the second has only ghosts, and
 clipping and glare bias the third."""

@@ -47,6 +47,8 @@ MAX_DEFICIT = 0.08
 """Mean relative deficit of a channel at which the background counts as half hidden."""
 MAX_GAIN = 2.2
 """Gain, or its inverse, at which the background counts as half hidden."""
+MAX_MISSED_FLARE = 0.35
+"""Difference of display values that the network does not miss: a larger one counts as half hidden."""
 CLOSING, GROWTH = 0.05, 0.012
 """Radii by which hidden areas are closed and grown, as shares of the frame's width."""
 
@@ -86,8 +88,10 @@ class PlateEstimator:
         gain = smooth_gain(own, background, usable)
         hidden = hidden_share(frame, gain * background, gain)
         confidence = ((1 - hidden) * np.clip(count / MIN_NEIGHBOURS, 0, 1))[..., None]
-        plate = own + confidence * (np.minimum(np.minimum(gain * background, frame), own) - own)
-        return np.asarray(srgb_from_linear(np.clip(plate, 0, None)), np.float32)
+        lowest = srgb_from_linear(np.minimum(np.minimum(gain * background, frame), own).clip(0))
+        change = lowest - shot.plates[name]
+        confidence = confidence / (1 + (change.min(-1, keepdims=True) / MAX_MISSED_FLARE) ** 4)
+        return np.asarray(shot.plates[name] + confidence * change, np.float32)
 
 
 def _median(stack: Pixels) -> Pixels:

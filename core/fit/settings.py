@@ -182,8 +182,9 @@ class PlateSettings:
     them later. excess_weight: factor on squares where the frame is brighter than the composite, relative to the rest:
     estimated plates more often contain flare than lack light.
 
-    aligned: improve estimated plates by aligned neighbours (`plate_estimates`), at the start, and from the share
-    `refine_at` of the iterations on, whenever the brightness is solved, with the fitted flare subtracted.
+    aligned: improve estimated plates by aligned neighbours (`plate_estimates`) at the start. refine_at: share of the
+    iterations from which this is repeated, whenever the brightness is solved, with the fitted flare subtracted; 1
+    repeats nothing. A flare that is too large makes the plates too dark, and grows by them.
     """
 
     squares_until: float = 0.5
@@ -191,7 +192,7 @@ class PlateSettings:
     l1_weight: float = 1.0
     excess_weight: float = 3.0
     aligned: bool = True
-    refine_at: float = 0.3
+    refine_at: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -342,6 +343,8 @@ SCENE_ONLY_UNTIL = 0.08
 CORRECTION_WEIGHT = 0.1
 """`flare.correction_weight` of our form: far below the gradients by which frames with a flare determine delta_l, far
 above the noise of frames without one."""
+PLATES_BASE = 2
+"""Largest resolution of the coarsest grid in a fit over plates."""
 FINAL_RATIO = 0.05
 """`flare.rates.final_ratio` of the short presets."""
 
@@ -385,10 +388,14 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
 
 def over_plates(settings: FitSettings) -> FitSettings:
     """Return the settings for a scene of plates: nothing in it hides lights, and no scene is fitted before the flare.
+
+    A shot shows its lights at fewer places than a capture, so the grids are coarser.
     """
     length, density = settings.iterations, settings.flare.density
     density = replace(density, start=max(round(length * 0.1), density.every))
-    flare = replace(settings.flare, occlusion=False, snap_lights=False, scene_only_until=0.0, density=density)
+    form = replace(settings.flare.form, base=min(settings.flare.form.base, PLATES_BASE))
+    flare = replace(settings.flare, form=form, occlusion=False, snap_lights=False, scene_only_until=0.0,
+                    density=density)
     return replace(settings, scene=replace(settings.scene, kind="plates"), flare=flare)
 
 

@@ -52,6 +52,31 @@ class FITFLARE_OT_resume(GuardedOperator, bpy.types.Operator):
         fits.resume(context.scene)
 
 
+class FITFLARE_OT_flare_from_footage(GuardedOperator, bpy.types.Operator):
+    """Learn the flare of a clip or a folder of frames: finds the lights, cleans the frames, fits and bakes"""
+
+    bl_idname = "fit_flare.flare_from_footage"
+    bl_label = "Flare from Footage"
+    bl_options = {"UNDO"}
+
+    filepath: bpy.props.StringProperty(name="Clip", description="A video, or a frame of a folder of frames",  # type: ignore[valid-type]
+                                       subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+
+    @classmethod
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return engine.missing_reason() or ("A fit is running" if fits.fit_state(context.scene) == "running" else "")
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def act(self, context: bpy.types.Context) -> None:
+        fits.start_from_footage(context.scene, Path(bpy.path.abspath(self.filepath)))
+
+
 class FITFLARE_OT_clean_frames(GuardedOperator, bpy.types.Operator):
     """Remove the flares from the frames: with the fit if it is finished, else with the removal network"""
 
@@ -199,8 +224,8 @@ def _show_in_editor(context: bpy.types.Context, kind: str, show: Callable[[Any],
     show(area.spaces.active)
 
 
-_CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_clean_frames, FITFLARE_OT_cancel,
-            FITFLARE_OT_cancel_by_key, FITFLARE_OT_show_log, FITFLARE_OT_show_preview, FITFLARE_OT_use_result)
+_CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_flare_from_footage, FITFLARE_OT_clean_frames,
+            FITFLARE_OT_cancel, FITFLARE_OT_cancel_by_key, FITFLARE_OT_show_log, FITFLARE_OT_show_preview, FITFLARE_OT_use_result)
 
 
 def register() -> None:

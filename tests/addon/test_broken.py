@@ -227,3 +227,12 @@ def test_a_flare_is_made_from_a_lens(said: Any) -> None:
     assert is_sentence(said["a name that is taken"])
     assert "35 mm f/1.3 (US3576360)" in said["lenses"]
     assert said["lenses"][-1] == "Lens File"
+
+
+def test_flare_from_footage_runs_shot_on_the_clip(said: Any) -> None:
+    """Block of broken.py: "Flare from Footage"."""
+    missing, refused = said["footage"]
+    assert "none.mp4 is missing; choose a video" in missing
+    assert "The frames are not there; put them back." in refused
+    assert said["footage that failed changes no run"] and said["footage in the panel"]
+    assert said["footage's command"] == ["shot", "X/clip.mp4", "--out", "X/clip_flare_1", "--preset", "standard"]

@@ -168,6 +168,19 @@ preferences.engine = str(folder / "nowhere")
 said["test of another engine"] = engine.last_test() is None
 preferences.engine = sham
 
+# ---- Flare from Footage ------------------------------------------------------------------------------
+behave("refuses")
+clip = folder / "clip.mp4"
+clip.touch()
+before = scene.fit_flare.run
+said["footage"] = [refusal(lambda path=path: ops.flare_from_footage(filepath=str(path)))
+                   for path in (folder / "none.mp4", clip)]
+said["footage that failed changes no run"] = scene.fit_flare.run == before
+said["footage's command"] = [word.replace(str(folder.resolve()), "X").replace(str(folder), "X")
+                             for word in jobs.find(folder / "clip_flare_1" / "run").args]
+said["footage in the panel"] = "Flare from Footage needs only a clip" in said["panels of an empty scene"][0]
+shutil.rmtree(folder / "clip_flare_1")
+
 # ---- work that goes on while Blender is closed, found again and cancelled ---------------------------
 behave("sleeps")
 run = folder / "long"

@@ -250,8 +250,10 @@ def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
 
 
 def read_frame_lights(capture: Capture, names: Sequence[str]) -> FrameLights:
-    """Return places and brightness of these lights of a capture, in every view; an unknown brightness starts at 1, and a
-    doubtful one is a first guess."""
+    """Return places and brightness of these lights of a capture, in every view.
+
+    An unknown brightness starts at 1, and a doubtful one is a first guess.
+    """
     by_name = {light.name: light for light in capture.lights}
     states = [[capture.light_state(by_name[name], view) for name in names] for view in capture.views]
     positions = torch.tensor(np.array([[state.xyz for state in row] for row in states]), dtype=torch.float64)

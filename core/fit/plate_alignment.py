@@ -43,10 +43,11 @@ class _Features:
 
 @dataclass(frozen=True)
 class _Match:
-    """A homography (3, 3) from one frame's pixels to another's, None where none fits, and its share of inliers."""
+    """A homography (3, 3) from one frame's pixels to another's, None where none fits, and its share of
+    inliers, None with too few matches."""
 
     matrix: Matrix | None
-    inlier_share: float
+    inlier_share: float | None
 
 
 class Alignment:
@@ -89,8 +90,9 @@ class Alignment:
 
     def _camera_travels(self) -> bool:
         pairs = list(zip(self._names, self._names[PROBED_OFFSET:], strict=False))
-        shares = [self._match(*pair).inlier_share for pair in pairs[::max(len(pairs) // PROBES, 1)]]
-        return bool(shares) and float(np.median(shares)) < TURNING_INLIER_SHARE
+        probed = [self._match(*pair).inlier_share for pair in pairs[::max(len(pairs) // PROBES, 1)]]
+        shares = [share for share in probed if share is not None]
+        return bool(pairs) and (not shares or float(np.median(shares)) < TURNING_INLIER_SHARE)
 
     def _flow(self, source: str, target: str) -> Pixels:
         if (source, target) not in self._flows:
@@ -113,12 +115,12 @@ class Alignment:
 
         first, second = self._described(source), self._described(target)
         if min(len(first.points), len(second.points)) < MIN_INLIERS:
-            return _Match(None, 0.0)
+            return _Match(None, None)
         matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, 2)
         pairs = [(near.queryIdx, near.trainIdx) for near, *other in matches
                  if other and near.distance < MATCH_RATIO * other[0].distance]
         if len(pairs) < MIN_INLIERS:
-            return _Match(None, 0.0)
+            return _Match(None, None)
         ends = first.points[[pair[0] for pair in pairs]], second.points[[pair[1] for pair in pairs]]
         cv2.setRNGSeed(0)
         matrix, inliers = cv2.findHomography(*ends, cv2.RANSAC, MAX_ERROR_PX)

@@ -66,7 +66,7 @@ class PlateEstimator:
 
     def __init__(self, shot: ShotFrames) -> None:
         self._shot = shot
-        self._alignment = Alignment(shot.plates)
+        self.alignment = Alignment(shot.plates)
 
     def estimate(self, name: str, cleaned: Mapping[str, Pixels] | None = None) -> Pixels:
         """Return the plate of a frame, display values.
@@ -74,7 +74,7 @@ class PlateEstimator:
         cleaned: frames minus the fitted flare, which show the neighbours' background in place of the network's plates.
         The frame itself stays as filmed: a flare subtracted from its own frame would hide its own errors.
         """
-        shot, alignment = self._shot, self._alignment
+        shot, alignment = self._shot, self.alignment
         plates = shot.plates if cleaned is None else cleaned
         aligned = [warped for other in alignment.neighbours(name)
                    if (warped := alignment.aligned(plates[other], other, name)) is not None]

@@ -225,7 +225,8 @@ def _show_in_editor(context: bpy.types.Context, kind: str, show: Callable[[Any],
 
 
 _CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_flare_from_footage, FITFLARE_OT_clean_frames,
-            FITFLARE_OT_cancel, FITFLARE_OT_cancel_by_key, FITFLARE_OT_show_log, FITFLARE_OT_show_preview, FITFLARE_OT_use_result)
+            FITFLARE_OT_cancel, FITFLARE_OT_cancel_by_key, FITFLARE_OT_show_log, FITFLARE_OT_show_preview,
+            FITFLARE_OT_use_result)
 
 
 def register() -> None:

@@ -43,6 +43,8 @@ Pixels = NDArray[np.float32]
 SHOTS = "torch", "drive", "pan"
 NETWORK = "network"
 """Folder in a shot with the clean frames that `remove` makes by itself."""
+MIN_FLARE = 0.005
+"""Linear light below which a frame shows no flare."""
 COLUMNS = ("shot", "seed", "no flare", "network", "fit", "brightness", "filmed", "network clean", "fit clean")
 
 
@@ -126,7 +128,7 @@ def _score_view(run: Run, capture: Capture, view: View, size: int, folder: Path,
     assert truth is not None and flare_truth is not None
     scene, exact = np.clip(truth.display(), 0, 1), flare_truth.linear()
     reference = np.abs(frame.display() - scene)
-    if reference.max() < 0.01:
+    if exact.max() < MIN_FLARE:
         return None
     mask = ~unscored_mask(capture, view, camera.size)
     layers = run.render(camera)

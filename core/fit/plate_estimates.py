@@ -47,7 +47,7 @@ MAX_DEFICIT = 0.08
 """Mean relative deficit of a channel at which the background counts as half hidden."""
 MAX_GAIN = 2.2
 """Gain, or its inverse, at which the background counts as half hidden."""
-MAX_MISSED_FLARE = 0.35
+MAX_MISSED_FLARE = 0.6
 """Difference of display values that the network does not miss: a larger one counts as half hidden."""
 CLOSING, GROWTH = 0.05, 0.012
 """Radii by which hidden areas are closed and grown, as shares of the frame's width."""

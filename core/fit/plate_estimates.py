@@ -4,13 +4,15 @@
 The removal network cleans each frame by itself, and misses the same sharp ghosts in many. Other frames show the
 background without flare in that place. So each frame is compared with the median of its aligned neighbours, the
 background, times a gain that changes smoothly over the picture, since light on the walls changes from frame to frame.
-The gain follows the network's plate, which keeps light on walls, and ignores what is small and brighter: missed ghosts.
+The gain follows the network's plate, which keeps light on walls, and ignores what is small: missed ghosts. It follows
+the texture too, for light on a wall raises its texture, and a flare does not.
 
 A flare adds light and hides nothing. So something before the background shows itself: a channel is darker than the
 background, the background's texture is absent, or the gain is far from 1. There the network's plate stays. Elsewhere
-the plate is the lowest of frame, network's plate and background.
+the background replaces what is small and brighter in the network's plate. Differences over large areas stay, because
+they come from the gain as often as from a flare.
 
-`plate_trainer` calls it before a fit, and a few times during it with the fitted flare subtracted from the neighbours.
+`plate_trainer` calls it before a fit, and during it with the fitted flare subtracted, if the settings say so.
 """
 from __future__ import annotations
 
@@ -31,9 +33,10 @@ MIN_NEIGHBOURS = 3
 """Number of aligned neighbours from which the background counts fully."""
 GAIN_WINDOW, TEXTURE_WINDOW = 0.06, 0.012
 """Standard deviations of the windows of the gain and of the test of texture, as shares of the frame's width."""
-GAIN_ERROR, EXCESS_FACTOR, GAIN_REWEIGHTINGS = 0.04, 1.5, 8
-"""Relative error at which a pixel counts half for the gain, the factor on errors of pixels that are too bright, and the
-number of reweightings."""
+GAIN_ERROR, GAIN_REWEIGHTINGS = 0.04, 8
+"""Relative error at which a pixel counts half for the gain, and the number of reweightings."""
+LIGHT_WINDOW, MAX_LOCAL_GAIN = 0.025, 2.5
+"""Standard deviation of the window of the local gain, as a share of the frame's width, and the largest local gain."""
 USABLE = 0.9
 """Linear light above which a frame is as good as clipped."""
 NOISE = 0.004
@@ -47,6 +50,8 @@ MAX_DEFICIT = 0.08
 """Mean relative deficit of a channel at which the background counts as half hidden."""
 MAX_GAIN = 2.2
 """Gain, or its inverse, at which the background counts as half hidden."""
+GHOST_RADIUS = 0.06
+"""Half the side of the window, as a share of the frame's width, about which missed flare is smaller."""
 MAX_MISSED_FLARE = 0.6
 """Difference of display values that the network does not miss: a larger one counts as half hidden."""
 CLOSING, GROWTH = 0.05, 0.012
@@ -86,10 +91,11 @@ class PlateEstimator:
         frame, own = linear_from_srgb(shot.frames[name]), linear_from_srgb(shot.plates[name])
         usable = (frame.max(-1, keepdims=True) < USABLE).astype(np.float32)
         gain = smooth_gain(own, background, usable)
+        gain = gain * local_gain(own, gain * background)
         hidden = hidden_share(frame, gain * background, gain)
         confidence = ((1 - hidden) * np.clip(count / MIN_NEIGHBOURS, 0, 1))[..., None]
         lowest = srgb_from_linear(np.minimum(np.minimum(gain * background, frame), own).clip(0))
-        change = lowest - shot.plates[name]
+        change = -_small_parts(shot.plates[name] - lowest)
         confidence = confidence / (1 + (change.min(-1, keepdims=True) / MAX_MISSED_FLARE) ** 4)
         return np.asarray(shot.plates[name] + confidence * change, np.float32)
 
@@ -103,6 +109,17 @@ def _median(stack: Pixels) -> Pixels:
     return np.asarray(middle / 2, np.float32)
 
 
+def _small_parts(excess: Pixels) -> Pixels:
+    """Return an excess (height, width, 3), display values from 0, above its median nearby: the network misses what is
+    small, and a gain that is wrong over a large area has no say."""
+    import cv2
+
+    size = 2 * max(int(GHOST_RADIUS * excess.shape[1]), 1) + 1
+    codes = np.clip(excess * 255 + 0.5, 0, 255).astype(np.uint8)
+    wide = np.stack([cv2.medianBlur(codes[..., channel], size) for channel in range(3)], -1)
+    return np.asarray(np.maximum(excess - wide.astype(np.float32) / 255, 0), np.float32)
+
+
 def _blur(values: Pixels, sigma: float) -> Pixels:
     import cv2
 
@@ -112,7 +129,7 @@ def _blur(values: Pixels, sigma: float) -> Pixels:
 def smooth_gain(plate: Pixels, background: Pixels, usable: Pixels) -> Pixels:
     """Return the gain (height, width, 3) of a plate over a background that changes smoothly over the picture.
 
-    Linear light. usable: (height, width, 1) weights of the pixels. Pixels that are too bright for the gain around them
+    Linear light. usable: (height, width, 1) weights of the pixels. Pixels whose gain differs from that around them
     count less, for they may hold flare.
     """
     sigma = max(GAIN_WINDOW * plate.shape[1], 1.0)
@@ -121,7 +138,7 @@ def smooth_gain(plate: Pixels, background: Pixels, usable: Pixels) -> Pixels:
     for _ in range(GAIN_REWEIGHTINGS):
         gain = (_blur(weight * plate * background, sigma) + prior) / (_blur(weight * background**2, sigma) + prior)
         error = (plate - gain * background) / (background + DARK)
-        weight = base / (1 + (np.where(error > 0, EXCESS_FACTOR * error, error) / GAIN_ERROR) ** 2)
+        weight = base / (1 + (error / GAIN_ERROR) ** 2)
     return np.asarray(gain, np.float32)
 
 
@@ -153,9 +170,30 @@ def _step(values: Pixels, middle: float, steepness: float) -> Pixels:
     return np.asarray(1 / (1 + np.exp(np.clip(-steepness * (values - middle), -50, 50))), np.float32)
 
 
+def local_gain(plate: Pixels, expected: Pixels) -> Pixels:
+    """Return the gain (height, width, 1) of the texture of a plate over that of the expected plate, linear light.
+
+    Light on a wall raises its texture too, a flare adds light alone. It is the
+    least that the texture makes likely.
+    """
+    sigma = max(LIGHT_WINDOW * plate.shape[1], 1.0)
+    gain, error = _line_gain(plate, expected, sigma)
+    change = np.clip(gain - error, 1, MAX_LOCAL_GAIN)
+    return np.asarray(change, np.float32)[..., None]
+
+
 def _texture_deviation(frame: Pixels, expected: Pixels, sigma: float) -> Pixels:
     """Return (height, width), by how many standard errors the gain of a local line frame = gain * expected + flare lies
     below 1: a flare adds light that does not depend on the texture, and what hides the background has another texture.
+    """
+    gain, error = _line_gain(frame, expected, sigma)
+    return np.asarray((1 - gain) / np.hypot(error, TEXTURE_TOLERANCE), np.float32)
+
+
+def _line_gain(frame: Pixels, expected: Pixels, sigma: float) -> tuple[Pixels, Pixels]:
+    """Return the gain of a local line frame = gain * expected + flare, and its standard error, (height, width) each.
+
+    sigma: standard deviation of the window, pixels. The channels share one gain.
     """
     weight = 1 / (expected.mean(-1, keepdims=True) + DARK) ** 2
     total = _blur(weight, sigma)
@@ -170,5 +208,4 @@ def _texture_deviation(frame: Pixels, expected: Pixels, sigma: float) -> Pixels:
     noise = 3 * (NOISE * (mean_expected.mean(-1) + DARK) * DISPLAY_SLOPE) ** 2
     gain = (covariance + noise) / (variance + noise)
     unexplained = (spread - np.clip(gain, 0, 2) * covariance).clip(0)
-    error = np.sqrt((unexplained + noise) / (WINDOW_SAMPLES * (variance + noise)) + TEXTURE_TOLERANCE**2)
-    return np.asarray((1 - gain) / error, np.float32)
+    return gain, np.sqrt((unexplained + noise) / (WINDOW_SAMPLES * (variance + noise)))

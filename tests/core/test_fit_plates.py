@@ -17,7 +17,7 @@ from core.conventions.frame_numbers import number_views
 from core.conventions.run_files import CHECKPOINT, FRAME_LIGHTS, PLATES
 from core.errors import Cancelled, CaptureError, RunError
 from core.fit import FitSettings, Run, fit, preset
-from core.fit.light_results import select_flaring, share_sentences
+from core.fit.light_results import read_frame_lights, select_flaring, share_sentences
 from core.fit.settings import over_plates, override_settings
 from core.images.write import write_png
 from core.metrics.pictures import relative_l2
@@ -109,6 +109,17 @@ def test_a_light_without_flare_is_left_out_and_named(run: Run) -> None:
     assert run.lights == ("lamp",)
     log = (run.folder / "log.txt").read_text()
     assert "Shares of the flare by light: lamp" in log and "they do not flare" in log and "dark" in log
+
+
+def test_a_doubtful_brightness_is_only_a_first_guess(tmp_path: Path) -> None:
+    folder = make_shot(tmp_path, count=4)
+    data = json.loads((folder / "lights.json").read_text())
+    for number, key in enumerate(data["lights"][0]["frames"].values()):
+        key.update(on=0.2, confidence=0.9 if number % 2 else 0.1)
+    (folder / "lights.json").write_text(json.dumps(data))
+    lights = read_frame_lights(Capture.open(folder, need_cameras=False), ["lamp"])
+    np.testing.assert_allclose(lights.brightness.weight.detach(), 0.2)
+    assert lights.prior.isnan()[:, 0].tolist() == [True, False, True, False]
 
 
 def test_all_lights_stay_where_none_flares() -> None:

@@ -31,7 +31,7 @@ from ..flare.file import FlareFile
 from ..flare.model import FlareModel, LightFlare, ViewOfLight, plane_scale
 from ..look import TrainedCamera, store_elements
 from ..optics.flare import LensSetup, build_optics, render_flare
-from ..optics.ghosts import draw_ghosts
+from ..optics.ghosts import draw_ghosts, limited
 from ..optics.lenses import find_lens
 from ..system.files import atomic_path
 from ..system.processes import available_cores
@@ -64,6 +64,8 @@ SHARE_AT_LIGHT, SHARE_AT_GHOSTS = 0.35, 0.55
 the line."""
 RAY_LENGTHS = 0.004, 0.9
 """Smallest and largest distance of the rays from the light, relative to half the frame's width."""
+GAIN_STEPS = 6
+"""Steps in which the ghosts' gain is found where some of them reach their limit."""
 CORE_GAUSSIANS, CORE_SIZES, CORE_OPACITY = 24, (0.3, 4.0), 0.2
 """Number, range of standard deviations (pixels) and opacity of the initial Gaussians in the light itself."""
 SQUARED_WEIGHT = 0.3
@@ -131,15 +133,25 @@ def exposed_setup(settings: TracedFlareSettings) -> LensSetup:
         return replace(setup, ghosts=replace(setup.ghosts, count=0))
     optics, pairs = build_optics(setup)
     camera = traced_camera(settings)
-    drawing = replace(setup.ghosts, bands=3 if settings.ghosts.dispersion else 1, supersample=1)
-    squares = [np.square(draw_ghosts(optics, pairs, drawing, (x / setup.squeeze, y),
+    drawing = replace(setup.ghosts, bands=3 if settings.ghosts.dispersion else 1, supersample=1, limit=math.inf)
+    pictures = np.stack([draw_ghosts(optics, pairs, drawing, (x / setup.squeeze, y),
                                      (camera.fx * setup.squeeze, camera.fy), (camera.cx, camera.cy), camera.width,
-                                     camera.height)).mean() for x, y in _in_frame(settings, PROBES)]
-    strength = math.sqrt(float(np.mean(squares)))
+                                     camera.height) for x, y in _in_frame(settings, PROBES)])
+    strength = _root_mean_square(pictures)
     if not strength > 0:
         raise SettingsError(f"No ghost of the lens {settings.lens} reaches the frame; check that its file lists clear "
                             "diameters, or set ghosts.level=0.")
-    return replace(setup, ghosts=replace(setup.ghosts, gain=settings.ghosts.level / strength))
+    gain = settings.ghosts.level / strength
+    for _ in range(GAIN_STEPS):  # what the limit takes, the rest has to make up for
+        if gain * pictures.max() <= settings.ghosts.limit:
+            break
+        gain *= settings.ghosts.level / _root_mean_square(limited(gain * pictures, settings.ghosts.limit))
+    return replace(setup, ghosts=replace(setup.ghosts, gain=gain))
+
+
+def _root_mean_square(pictures: Pictures) -> float:
+    """Return the root mean square of pictures (n, height, width, 3)."""
+    return math.sqrt(float(np.mean([np.square(picture).mean() for picture in pictures])))
 
 
 def _in_frame(settings: TracedFlareSettings, fractions: Sequence[Sequence[float]] | Places) -> Places:

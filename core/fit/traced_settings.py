@@ -63,12 +63,14 @@ class GlassSettings:
 class TracedGhosts:
     """The ghosts. level: their root mean square over the frame and over several places of the light, relative to white.
     count: number of ghosts, the brightest first. dispersion: True if the glass splits colours. rim: how much brighter a
-    ghost's edge is than its inside."""
+    ghost's edge is than its inside. limit: largest light of a pixel, relative to white. Where a ghost is in focus, or
+    its rays cross in a caustic, the tracing has no bound, and a pixel would outshine the light itself."""
 
     level: float = 0.02
     count: int = 18
     dispersion: bool = True
     rim: float = 0.35
+    limit: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ class TracedFlareSettings:
             scratches=self.glass.scratches, hood=(HOOD[0] * scale, HOOD[1] * scale),
             ghosts=GhostSettings(count=self.ghosts.count, gain=1.0, rim=self.ghosts.rim, size=LIGHT_SIZE * scale,
                                  bands=self.tracing.bands if self.ghosts.dispersion else 1,
-                                 supersample=self.tracing.supersample),
+                                 supersample=self.tracing.supersample, limit=self.ghosts.limit),
             starburst=replace(self.starburst, extent=self.starburst.extent * scale,
                               core=max(self.starburst.core * scale, MIN_CORE * 2 * self.reach / self.tracing.width)),
             glow=replace(self.glow, radius=self.glow.radius * scale, wide_radius=self.glow.wide_radius * scale),
@@ -192,9 +194,9 @@ BOUNDS: dict[str, Bounds] = {
     "iris.rotation": Bounds(-360, 360), "iris.unevenness": Bounds(0, 0.2),
     "glass.coating": Bounds(0, 1.5), "glass.dust": Bounds(0, 10_000), "glass.scratches": Bounds(0, 10_000),
     "glass.seed": Bounds(0, MAX_SEED), "ghosts.level": _NON_NEGATIVE, "ghosts.count": Bounds(0, 200),
-    "ghosts.rim": Bounds(0, 10), "starburst.gain": _NON_NEGATIVE, "starburst.extent": _POSITIVE,
-    "starburst.core": _POSITIVE, "starburst.peak": _POSITIVE, "glow.gain": _NON_NEGATIVE, "glow.radius": _POSITIVE,
-    "glow.power": Bounds(0, 10, exclusive_minimum=True), "glow.wide_gain": _NON_NEGATIVE,
+    "ghosts.rim": Bounds(0, 10), "ghosts.limit": _POSITIVE, "starburst.gain": _NON_NEGATIVE,
+    "starburst.extent": _POSITIVE, "starburst.core": _POSITIVE, "starburst.peak": _POSITIVE, "glow.gain": _NON_NEGATIVE,
+    "glow.radius": _POSITIVE, "glow.power": Bounds(0, 10, exclusive_minimum=True), "glow.wide_gain": _NON_NEGATIVE,
     "glow.wide_radius": _POSITIVE, "glow.floor": _NON_NEGATIVE,
     "tracing.width": Bounds(32, 1920), "tracing.positions": Bounds(4, 4096), "tracing.field": Bounds(0.1, 3),
     "tracing.bands": Bounds(1, 64), "tracing.supersample": Bounds(1, 8),

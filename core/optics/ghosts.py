@@ -45,7 +45,8 @@ class GhostSettings:
     """How ghosts are drawn. count: number of ghosts, the brightest first. grid: rays along each side of the grid.
     bands: number of wavelengths. gain: factor of their light. rim: how much brighter the edge is than the inside
     (diffraction at the stop). size: standard deviation (tan) of the blur by the extent of the light. supersample:
-    samples along each side of a pixel."""
+    samples along each side of a pixel. limit: largest light of a pixel in any channel; infinite where a sensor that
+    saturates is applied later."""
 
     count: int = 22
     grid: int = 40
@@ -54,6 +55,7 @@ class GhostSettings:
     rim: float = 0.35
     size: float = 0.0014
     supersample: int = 2
+    limit: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -235,7 +237,15 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
                        optics.aperture.radius, edges, settings.rim, bands[band], picture)
     soft = cv2.GaussianBlur(picture, (0, 0), max(settings.size * focal[0] * supersample, 0.3))
     small = cv2.resize(soft, (width, height), interpolation=cv2.INTER_AREA)
-    return (small * np.float32(settings.gain)).astype(np.float32)
+    return limited((small * np.float32(settings.gain)).astype(np.float32), settings.limit)
+
+
+def limited(light: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
+    """Return light (..., 3) that no channel has more of than `limit`, in the same hues."""
+    brightest = light.max(-1, keepdims=True)
+    if brightest.max() <= limit:
+        return light
+    return np.asarray(light * np.minimum(limit / np.maximum(brightest, 1e-6), 1), np.float32)
 
 
 def _trace_arguments(optics: Optics, wavelength: float) -> tuple[Any, ...]:

@@ -14,7 +14,7 @@ from core.fit.traced_flare import make_flare
 from core.fit.traced_settings import REFERENCE_REACH, TracedFlareSettings
 from core.look import ViewOfLight, draw, read
 from core.optics.flare import build_optics
-from core.optics.ghosts import draw_ghosts
+from core.optics.ghosts import draw_ghosts, limited
 from core.optics.lenses import find_lens, lens_names
 from core.optics.prescription import parse_prescription
 from core.optics.starburst import starburst_texture
@@ -93,6 +93,17 @@ def test_ghosts_have_their_level() -> None:
     squares = [np.square(draw_ghosts(optics, pairs, setup.ghosts, tuple(half * probe), (camera.fx, camera.fy),
                                      (camera.cx, camera.cy), 64, 36)).mean() for probe in traced_flare.PROBES]
     assert np.sqrt(np.mean(squares)) == pytest.approx(0.05, rel=0.1)
+
+
+def test_ghosts_in_focus_have_a_limit_and_the_same_level() -> None:
+    """At 64 pixels the level alone would give this lens pixels of five times white."""
+    values = {**SMALL, "ghosts.level": 0.1}
+    free = traced_flare.exposed_setup(TracedFlareSettings().override({**values, "ghosts.limit": 1e6}))
+    setup = traced_flare.exposed_setup(TracedFlareSettings().override({**values, "ghosts.limit": 0.2}))
+    assert setup.ghosts.gain > 1.02 * free.ghosts.gain
+    light = np.array([[[0.1, 0.4, 0.2]], [[0.1, 0.1, 0.2]]], np.float32)
+    np.testing.assert_allclose(limited(light, 0.2), [[[0.05, 0.2, 0.1]], [[0.1, 0.1, 0.2]]], rtol=1e-6)
+    assert limited(light, 0.4) is light
 
 
 def test_tangents_scale_with_the_frame() -> None:

@@ -46,10 +46,13 @@ STEP_SCALE = 0.2
 """Change of brightness from frame to frame that counts as usual."""
 MIN_CERTAINTY = 1e-3
 """Certainty of a brightness that a frame does not show."""
-FLARE_ERROR, OUTSIDE_ERROR, PRIOR_ERROR = 0.1, 0.5, 0.1
+FLARE_ERROR, OUTSIDE_ERROR, PRIOR_ERROR = 0.1, 2.0, 0.1
 """Standard deviations of a brightness by the flare, at the least, of one by the flare of a light outside the frame, and
 of one in the lights' file: a plate that holds part of the flare biases the first, the second has only ghosts, and
 clipping and glare bias the third."""
+EDGE_SHARE = 0.03
+"""Distance from the frame's edge, as a share of its width, within which a light counts as outside for its brightness:
+its core may be cut off."""
 MIN_PRIOR_CONFIDENCE = 0.5
 """Confidence of a key of a light below which its brightness is only a first guess."""
 TV_REWEIGHTINGS, TV_EPSILON = 30, 1e-3
@@ -79,7 +82,7 @@ def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, r
         solved[number], certainty[number] = _solve(frames.targets(view), rendered.layers.scene.numpy(), columns, start)
     prior = lights.prior[rows].numpy().astype(np.float64)
     prior_certainty = np.isfinite(prior) / PRIOR_ERROR**2
-    inside = np.array([_lights_in_frame(lights, view) for view in views])
+    inside = np.array([_lights_in_frame(lights, view, EDGE_SHARE) for view in views])
     certainty = np.minimum(certainty, 1 / np.where(inside, FLARE_ERROR, OUTSIDE_ERROR) ** 2)
     total = certainty + prior_certainty
     solved = (certainty * solved + prior_certainty * np.nan_to_num(prior)) / np.maximum(total, 1e-9)
@@ -88,9 +91,14 @@ def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, r
         weight[rows, light] = torch.from_numpy(smooth.clip(0, MAX_BRIGHTNESS)).float()
 
 
-def _lights_in_frame(lights: FrameLights, view: View) -> NDArray[np.bool_]:
-    """Return (lights,) which lights lie on the frame of a view."""
-    return view.camera.contains(*view.camera.project(lights.positions[lights.rows[view.name]].numpy()))
+def _lights_in_frame(lights: FrameLights, view: View, edge: float = 0.0) -> NDArray[np.bool_]:
+    """Return (lights,) which lights lie on the frame of a view. edge: width of its border that does not count, as a
+    share of the frame's width."""
+    camera = view.camera
+    pixels, depth = camera.project(lights.positions[lights.rows[view.name]].numpy())
+    margin = edge * camera.width
+    return camera.contains(pixels, depth) & camera.contains(pixels - margin, depth) & camera.contains(
+        pixels + margin, depth)
 
 
 def smooth_with_steps(values: NDArray[np.float64], certainty: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ from core.images.video import Video
 
 SIZE = 1920, 1080
 TO_709 = np.array([[1.04, -0.03, -0.01], [-0.02, 1.04, -0.02], [-0.01, -0.03, 1.04]], np.float32)
-"""A matrix of the same cost as the correction."""
+"""In place of the matrix from BT.601 to BT.709: other numbers, the same cost."""
 
 
 def write_inputs(folder: Path, frames: int) -> dict[str, Path]:
@@ -57,7 +57,7 @@ def write_inputs(folder: Path, frames: int) -> dict[str, Path]:
 
 
 def read_by_capture(path: Path) -> int:
-    """Read a video by OpenCV, with right colours."""
+    """Decode a video by OpenCV to float R G B, with the work that right colours cost; return the number of frames."""
     capture, count = cv2.VideoCapture(str(path)), 0
     while True:
         good, frame = capture.read()

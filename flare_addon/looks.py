@@ -192,11 +192,12 @@ def _was_learned_here(look: Look, state: Any, objects: dict[str, Any], depsgraph
     shared = [light for light in look.lights if light.name in objects]
     if not (root is not None or state.capture) or not shared:
         return False
-    extent = max(float(np.linalg.norm(light.query_range.camera_high - light.query_range.camera_low))
+    camera_span = max(float(np.linalg.norm(light.query_range.camera_high - light.query_range.camera_low))
                  for light in shared)
     try:
-        return all(np.linalg.norm(capture_position(objects[light.name], root, depsgraph) - light.xyz) < 0.05 * extent
-                   for light in shared)
+        return all(
+            np.linalg.norm(capture_position(objects[light.name], root, depsgraph) - light.xyz) < 0.05 * camera_span
+            for light in shared)
     except CaptureError:  # the position of one is unknown
         return False
 

@@ -79,11 +79,12 @@ class PlateTrainer(FlareTrainer):
         return PlateEstimator(ShotFrames(frames, plates))
 
     @torch.no_grad()
-    def _estimate_plates(self, flare: FlareModel | None = None) -> None:
-        """Estimate the plates of all frames by their neighbours, whose fitted flare is subtracted if there is one."""
+    def _estimate_plates(self, *, subtract_flare: bool = False) -> None:
+        """Estimate the plates of all frames by their neighbours: by the clean frames, or with `subtract_flare` by the
+        frames minus the fitted flare."""
         if self._estimator is None:
             return
-        cleaned = None if flare is None else {view.name: self._without_flare(view) for view in self.capture.views}
+        cleaned = {view.name: self._without_flare(view) for view in self.capture.views} if subtract_flare else None
         self._progress.stage("estimate plates", len(self.capture.views))
         for view in self.capture.views:
             if not self._is_lit(view):  # the frame as filmed has no flare
@@ -159,7 +160,7 @@ class PlateTrainer(FlareTrainer):
             assert self.flare is not None
             solve_brightness(self.flare, self.capture.views, self.frames, self.render_view)
             if self.iteration >= self.settings.plates.refine_at * self.settings.iterations:
-                self._estimate_plates(self.flare)
+                self._estimate_plates(subtract_flare=True)
 
     def _loss(self, picture: Tensor, frame: Tensor) -> Tensor:
         """Return the loss of a composite against its frame: squares alone at first, then with L1 and SSIM."""

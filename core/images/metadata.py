@@ -124,19 +124,21 @@ def dropped_parts(path: Path) -> str:
 
 
 def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
-    """Return a JPEG with the source's segments, in their order, behind the JFIF header of the source or its own."""
+    """Return the encoded JPEG with the segments of the source `data`, in their order, behind a JFIF header: the
+    source's if it has one, else that of the encoded JPEG."""
     header, at = b"", 2
     if encoded[2:4] == b"\xff\xe0":
         at = 4 + int.from_bytes(encoded[4:6], "big")
         header = encoded[2:at]
     segments = list(jpeg.segments(io.BytesIO(data)))
-    has_original = any(content.startswith(jpeg.XMP) and _ORIGINAL.encode() in content for _, content in segments)
+    has_refocus_original = any(content.startswith(jpeg.XMP) and _ORIGINAL.encode() in content
+                               for _, content in segments)
     copied = []
     for marker, content in _without_resource_thumbnails(segments):
-        if marker == 0xE0 and content.startswith(b"JFIF\0") and len(content) >= 14:
+        if marker == jpeg.APP0 and content.startswith(b"JFIF\0") and len(content) >= 14:
             header = jpeg.make_segment(marker, content[:12] + b"\0\0")  # density, without its thumbnail
-        elif has_original and content.startswith(jpeg.EXTENDED_XMP):
-            continue
+        elif has_refocus_original and content.startswith(jpeg.EXTENDED_XMP):
+            continue  # it holds that original, which shows the flare
         elif marker in _MARKERS and not content.startswith((_INDEX, _ISO_GAIN_MAP)):
             if content.startswith(jpeg.XMP):
                 content = _without_claims(content)

@@ -187,13 +187,13 @@ def _to_light(chain: Chain, capture: Capture, diagonal: float) -> TrackedLight:
     for frame, place, error, on in zip(frames, places, errors, brightness, strict=True):
         confidence = 1 / (1 + (error / tolerated) ** 2)
         inside = bool(((place > 0) & (place < size)).all())
-        known = None if np.isnan(on) else float(on) if on >= DARK else 0.0
-        if frame in shown:
-            known = None if known is None or shown[frame].detection.is_cut else max(known, CLIPPED_ON)
+        measured = None if np.isnan(on) else float(on) if on >= DARK else 0.0
+        if frame in shown:  # a detected light clips, so it is on; of one that the edge cuts, the profile is not known
+            measured = None if measured is None or shown[frame].detection.is_cut else max(measured, CLIPPED_ON)
         else:
-            # A place that is off its light shows no glow, so only a dark one is believed where the place is doubtful.
-            known = (0.0 if known is None or confidence < DOUBTFUL else known) if inside else None
-        keys[capture.views[frame].name] = LightKey(None, place, known, float(confidence))
+            # Not detected here. At a doubtful place the glow may be another light's, so the light counts as out.
+            measured = (0.0 if measured is None or confidence < DOUBTFUL else measured) if inside else None
+        keys[capture.views[frame].name] = LightKey(None, place, measured, float(confidence))
     colour = np.median([source.detection.colour for source in chain.sources], axis=0)
     return TrackedLight(keys, tuple(capture.views[frame].name for frame in chain.frames), chain.evidence,
                         colour / max(float(colour.max()), 1e-6),

@@ -57,7 +57,7 @@ class Glow:
 class Ring:
     """A ring. radius: tan at 0.55 micrometres. width: width of one wavelength's ring, relative to the radius. follow:
     position of the centre on the line from the principal point (0) to the light (1). lean: how much brighter the side
-    away from the principal point is. grow: additional radius per tan of the field angle. dispersion: 1 for the colours
+    towards the principal point is. grow: additional radius per tan of the field angle. dispersion: 1 for the colours
     of grooves, 0 for a white ring."""
 
     gain: float = 0.05
@@ -124,18 +124,19 @@ def draw_glow(settings: Glow, x: Pixels, y: Pixels) -> Pixels:
 
 
 def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) -> Pixels:
-    """Return a ring at image coordinates (x, y) (tan from the principal point), (height, width, 3)."""
+    """Return a ring at image coordinates (x, y), (height, width, 3). x, y and light: tan from the principal point."""
     u, v = x - settings.follow * light[0], y - settings.follow * light[1]
     distance = np.hypot(u, v)
     field = math.hypot(*light)
+    # The cosine to the direction away from the principal point; it fades to 0 for a light on the axis.
     side = (u * light[0] + v * light[1]) / np.maximum(distance, 1e-6) / math.sqrt(field**2 + 0.05)
     bright = settings.gain * np.maximum(1 - settings.lean * side, 0)
     ring = np.zeros((*x.shape, 3), np.float32)
-    for wavelength, share in zip(wavelengths(BANDS), responses(BANDS), strict=True):
+    for wavelength, rgb in zip(wavelengths(BANDS), responses(BANDS), strict=True):
         stretch = 1 + settings.dispersion * (wavelength / REFERENCE_WAVELENGTH - 1)
         radius = (settings.radius + settings.grow * field) * stretch
         bell = np.exp(-0.5 * ((distance - radius) / (settings.width * radius)) ** 2) / stretch
-        ring += (bright * bell)[..., None] * share.astype(np.float32)
+        ring += (bright * bell)[..., None] * rgb.astype(np.float32)
     return ring
 
 

@@ -67,7 +67,8 @@ def append_text(path: Path | str, text: str) -> None:
 
 
 def read_bytes(path: Path | str, limit: int | None = None) -> bytes:
-    """Read a regular file whole. Raises OSError, for one of more than `limit` bytes too."""
+    """Read a regular file whole. limit: in bytes; None for no bound on a file that states its size. Raises OSError,
+    also for a file of more bytes, and for one that grows by more than _MAX_UNSIZED_BYTES while it is read."""
     with open_regular(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         if limit is None:
@@ -75,7 +76,8 @@ def read_bytes(path: Path | str, limit: int | None = None) -> bytes:
         if size <= limit:
             data = stream.read(size + 1) or b""
             if len(data) > size:  # it grows, or states no size
-                data += stream.read(min(limit, size + _MAX_UNSIZED_BYTES) + 1 - len(data)) or b""
+                limit = min(limit, size + _MAX_UNSIZED_BYTES)
+                data += stream.read(limit + 1 - len(data)) or b""
             if len(data) <= limit:
                 return data
     raise OSError(errno.EFBIG, f"it has more than {limit} bytes", str(path))

@@ -42,7 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lights", metavar="NAMES", help="objects of the .blend that are lights (default: its lamps)")
     parser.add_argument("--without-engine", action="store_true",
                         help="for a shot: draw it with numpy in this Python, slower, and without the scene of a fit")
-    parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)  # that the Blender step of --blend has written
     jobs.add_option(parser)
 
 

@@ -81,7 +81,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "that each file declares)")
     layers.add_options(plates, half="unless a plate has more", producer="transfer",
                        edits="an edit, as for `bake`, by the lights of the target; repeatable")
-    parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)  # that the Blender step of --blend has written
     jobs.add_option(parser)
 
 

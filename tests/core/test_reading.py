@@ -27,6 +27,7 @@ from core.look import read
 from core.look.keyed import KeyedEdits
 from core.system import tensor_files
 from core.system.files import atomic_path, file_lock, read_json, write_text
+from core.system import reading
 from core.system.reading import append_text, open_regular, parse_json, parse_toml, read_bytes, read_text
 from tests.core.flared import flared_capture
 
@@ -175,3 +176,13 @@ def test_a_pipe_that_lies_where_a_result_goes_stays(tmp_path: Path) -> None:
         cv2.imwrite(str(temporary), np.zeros((2, 2), np.uint8))
     assert path.is_fifo()
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs a file that states no size")
+def test_a_file_without_a_size_is_whole_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = read_bytes("/proc/self/status")
+    assert len(whole) > 100
+    monkeypatch.setattr(reading, "_MAX_UNSIZED_BYTES", 100)
+    for limit in (None, 10**6):
+        with pytest.raises(OSError, match="more than 100 bytes"):
+            read_bytes("/proc/self/status", limit)

@@ -168,7 +168,8 @@ def _ssim_derivatives(mu, xx, xy, mu_y, s_y):
 
 @inlined
 def _compute_maps(x, y, mu_y, s_y, band, length, height, rows, maps, sums):
-    """Write the maps (3, BAND, length) of a band, zeros below the picture, and the row sums (h, 2) of |x - y| and S."""
+    """Write the maps of S by mu, E[xx], E[xy] of a band, (3, BAND, length), zeros below the picture, and the row sums
+    (h, 2) of |x - y| and S. band: its first row. length: numbers in a row, 3 w. rows: scratch."""
     end = min(band + BAND, height)
     _columns_of_moments(x, y, band, end, length, height, rows)
     if end < band + BAND:

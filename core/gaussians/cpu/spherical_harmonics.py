@@ -115,27 +115,28 @@ def coefficients_backward(degree, x, y, z, v, b, transposed):
 @inlined
 def slope(transposed, degree, x, y, z, channel):
     """Return the gradient of a colour by the direction, sum_k sh_k grad b_k, not yet projected on the sphere."""
-    h, three = transposed[channel * LANES :], 3 * LANES
+    rows, stride = transposed[channel * LANES :], 3 * LANES  # coefficient k is at row k * stride
     zero = splat(ZERO)
     dx, dy, dz = zero, zero, zero
     if degree >= 1:
-        dx, dy, dz = load(h, 3 * three) * -C1, load(h, three) * -C1, load(h, 2 * three) * C1
+        dx, dy, dz = load(rows, 3 * stride) * -C1, load(rows, stride) * -C1, load(rows, 2 * stride) * C1
     if degree >= 2:
-        h4, h5, h7 = load(h, 4 * three) * C20, load(h, 5 * three) * -C20, load(h, 7 * three) * -C20
-        h6, h8 = load(h, 6 * three) * (C21 * TWO), load(h, 8 * three) * (C22 * TWO)
+        h4, h5, h7 = load(rows, 4 * stride) * C20, load(rows, 5 * stride) * -C20, load(rows, 7 * stride) * -C20
+        h6, h8 = load(rows, 6 * stride) * (C21 * TWO), load(rows, 8 * stride) * (C22 * TWO)
         dx = dx + h4 * y + h7 * z + (h8 - h6) * x
         dy = dy + h4 * x + h5 * z - (h8 + h6) * y
         dz = dz + h5 * y + h7 * x + h6 * TWO * z
     if degree >= 3:
         xx, yy, zz = x * x, y * y, z * z
-        h9, h10, h11 = load(h, 9 * three) * (C30 * -THREE), load(h, 10 * three) * C31, load(h, 11 * three) * -C32
-        h12, h13 = load(h, 12 * three) * (C33 * THREE), load(h, 13 * three) * -C32
-        h14, h15 = load(h, 14 * three) * C34, load(h, 15 * three) * (C30 * -THREE)
-        xy, difference = x * y * TWO, xx - yy
-        mixed = h12 * z * -TWO
-        dx = dx + h9 * xy + h10 * y * z - h11 * xy + mixed * x + h13 * (zz * FOUR - xx * THREE - yy)
-        dx = dx + h14 * x * z * TWO + h15 * difference
-        dy = dy + h9 * difference + h10 * x * z + h11 * (zz * FOUR - xx - yy * THREE) + mixed * y
-        dy = dy - h13 * xy - h14 * y * z * TWO - h15 * xy
-        dz = dz + h10 * x * y + (h11 * y + h13 * x) * z * EIGHT + h12 * (zz * TWO - xx - yy) + h14 * difference
+        h9, h10 = load(rows, 9 * stride) * (C30 * -THREE), load(rows, 10 * stride) * C31
+        h11, h13 = load(rows, 11 * stride) * -C32, load(rows, 13 * stride) * -C32
+        h12 = load(rows, 12 * stride) * (C33 * THREE)
+        h14, h15 = load(rows, 14 * stride) * C34, load(rows, 15 * stride) * (C30 * -THREE)
+        two_xy, xx_less_yy = x * y * TWO, xx - yy
+        h12_z = h12 * z * -TWO
+        dx = dx + h9 * two_xy + h10 * y * z - h11 * two_xy + h12_z * x + h13 * (zz * FOUR - xx * THREE - yy)
+        dx = dx + h14 * x * z * TWO + h15 * xx_less_yy
+        dy = dy + h9 * xx_less_yy + h10 * x * z + h11 * (zz * FOUR - xx - yy * THREE) + h12_z * y
+        dy = dy - h13 * two_xy - h14 * y * z * TWO - h15 * two_xy
+        dz = dz + h10 * x * y + (h11 * y + h13 * x) * z * EIGHT + h12 * (zz * TWO - xx - yy) + h14 * xx_less_yy
     return dx, dy, dz

@@ -8,7 +8,7 @@ from typing import BinaryIO, NamedTuple
 
 SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers of frame headers (SOF): precision, height, width, number of components."""
-SOS, APP1, APP2, APP13, COMMENT = 0xDA, 0xE1, 0xE2, 0xED, 0xFE
+SOS, APP0, APP1, APP2, APP13, COMMENT = 0xDA, 0xE0, 0xE1, 0xE2, 0xED, 0xFE
 EXIF, XMP, EXTENDED_XMP = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
 """First bytes of the segments APP1 that hold these."""
 PHOTOSHOP = b"Photoshop 3.0\0"

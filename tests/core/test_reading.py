@@ -25,9 +25,8 @@ from core.images.read import read_picture
 from core.images.video import Video
 from core.look import read
 from core.look.keyed import KeyedEdits
-from core.system import tensor_files
+from core.system import reading, tensor_files
 from core.system.files import atomic_path, file_lock, read_json, write_text
-from core.system import reading
 from core.system.reading import append_text, open_regular, parse_json, parse_toml, read_bytes, read_text
 from tests.core.flared import flared_capture
 

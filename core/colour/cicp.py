@@ -13,23 +13,26 @@ PRIMARIES: dict[int, Chromaticities] = {
     22: (0.630, 0.340, 0.295, 0.605, 0.155, 0.077, 0.3127, 0.3290)}
 """Primaries by number; 2 is unspecified."""
 _GAMMAS = {4: 2.2, 5: 2.8}
+"""Exponents of the transfer characteristics that are plain powers, by number."""
 PQ, HLG = 16, 18
+"""Numbers of the transfer characteristics."""
 
 
 def space_of_code_points(primaries: int, transfer: int) -> ColourSpace | None:
-    """Return the space of two code points; None where the standard has none, or they are unspecified.
+    """Return the space of two code points; None where one of them is not known here.
 
-    The curves of video cameras (1, 6, 14, 15) are shown by screens as sRGB, which still pictures mean by them.
+    Unspecified primaries (2) count as Rec. 709, and an unspecified transfer (2) as sRGB's (13). So do the curves of
+    video cameras (1, 6, 14, 15), which screens show as sRGB: still pictures mean that by them.
     """
     chromaticities = PRIMARIES.get(primaries)
     if chromaticities is None:
         return None
     if transfer in (PQ, HLG):
         base = colour_space("pq" if transfer == PQ else "hlg")
-        if chromaticities == REC_2020 or transfer == HLG:
+        if chromaticities == REC_2020 or transfer == HLG:  # HLG decodes with the luminance of Rec. 2020 alone
             return base
         return curved_space("pq of other primaries", light_from_pq, pq_from_light, chromaticities, has_headroom=True)
-    if transfer == 8:
+    if transfer == 8:  # linear
         name = "linear"
         return colour_space(name) if chromaticities == REC_709 else curved_space(
             "linear by its code points", *power_curve(1.0), chromaticities)

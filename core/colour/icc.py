@@ -36,7 +36,7 @@ def space_of_profile(profile: bytes) -> ColourSpace:
     Raises UnreadableProfile for one that is damaged, not for R G B or grey, or of tables.
     """
     tags = _read_tags(profile)
-    if b"cicp" in tags and len(tags[b"cicp"]) >= 12:
+    if b"cicp" in tags and len(tags[b"cicp"]) >= 12:  # code points say what the curves round
         from .cicp import space_of_code_points
 
         space = space_of_code_points(*tags[b"cicp"][8:10])
@@ -49,10 +49,10 @@ def space_of_profile(profile: bytes) -> ColourSpace:
         raise UnreadableProfile(f"is for {profile[16:20].decode('latin-1').strip()}, not for R G B")
     needed = (b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC")
     if not all(tag in tags for tag in needed):
-        if "srgb" in name.lower():
+        if "srgb" in name.lower():  # some sRGB profiles consist of tables
             return colour_space("srgb")
         raise UnreadableProfile("consists of tables")
-    columns = [_parse_xyz(tags[tag]) for tag in needed[:3]]
+    columns = [_parse_xyz(tags[tag]) for tag in needed[:3]]  # X, Y, Z of each primary, under white D50
     matrix = np.linalg.inv(_to_d50(matrix_to_xyz(REC_709))) @ np.array(columns).T
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-6:
         raise UnreadableProfile("has primaries that span no space")
@@ -67,7 +67,7 @@ def _space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> Colou
     if is_709 and np.abs(decoded - linear_from_srgb(ramp)).max() < SRGB_TOLERANCE:
         return colour_space("srgb")
     forward, inverse = matrix.T.astype(np.float32), np.linalg.inv(matrix).T.astype(np.float32)
-    increasing = [np.maximum.accumulate(channel) for channel in decoded]
+    increasing = [np.maximum.accumulate(channel) for channel in decoded]  # as the inverse by samples needs
 
     def to_linear(pixels: NDArray[Any]) -> Pixels:
         clipped = np.clip(np.asarray(pixels, np.float32), 0, 1)
@@ -83,7 +83,10 @@ def _space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> Colou
 
 
 def _invert(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) -> Pixels:
-    """Invert a curve: by its samples, then one step by the secant, since samples are coarse where it is steep."""
+    """Return the values 0..1 at which `curve` gives `light`: the nearest by its samples, moved by one secant step.
+
+    decoded: the curve's samples at `ramp`, never decreasing. They alone are coarse where the curve is flat or steep.
+    """
     value = np.interp(light, decoded, ramp)
     step = np.float32(0.5 / _SAMPLES)
     above, below = (curve(np.clip(value + way * step, 0, 1).astype(np.float32)) for way in (1, -1))
@@ -95,7 +98,7 @@ def _invert(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) -> Pixel
 
 def _read_tags(profile: bytes) -> dict[bytes, bytes]:
     """Read the tag table. Raises UnreadableProfile."""
-    if len(profile) < 132 or profile[36:40] != b"acsp":
+    if len(profile) < 132 or profile[36:40] != b"acsp":  # the header of 128 bytes has this signature
         raise UnreadableProfile("is damaged")
     count = int.from_bytes(profile[128:132], "big")
     tags = {}
@@ -111,7 +114,7 @@ def _read_tags(profile: bytes) -> dict[bytes, bytes]:
 
 
 def _description(tags: dict[bytes, bytes]) -> str:
-    """Return the profile's name, of version 2 or 4."""
+    """Return the profile's name: of version 4 ("mluc") in its first language, of version 2 ("desc") in ASCII."""
     text = tags.get(b"desc", b"")
     if text[:4] == b"mluc" and len(text) >= 28:
         length, at = struct.unpack(">II", text[20:28])
@@ -138,7 +141,7 @@ def _parse_curve(data: bytes) -> Table:
         if count == 0:
             return lambda x: np.asarray(x, np.float32)
         if count == 1:
-            return _power(float(values[0]) / 256)
+            return _power(float(values[0]) / 256)  # the exponent, with 8 bits behind the point
         table, places = values.astype(np.float64) / 65535, np.linspace(0, 1, count)
         return lambda x: np.interp(x, places, table).astype(np.float32)
     if data[:4] == b"para" and len(data) >= 12:
@@ -157,14 +160,17 @@ def _power(gamma: float) -> Table:
 
 
 def _parametric(kind: int, numbers: list[float]) -> Table:
-    """Return a parametric curve (ICC.1:2022, table 68)."""
+    """Return a parametric curve (ICC.1:2022, table 68): (a x + b)**g + e from x = d on, c x + f below.
+
+    kind: the number of the function, 0..4. numbers: its parameters, in the order g, a, b, c, d, e, f.
+    """
     g, a, b, c, d, e, f = (numbers + [0.0] * 7)[:7]
     power = _power(g)  # raises where no picture has such an exponent
     if kind == 0:
         return power
     if a == 0:
         raise UnreadableProfile("has a curve that no picture has")
-    if kind in (1, 2):  # 0, or c, below -b / a
+    if kind in (1, 2):  # begin at x = -b / a; below it is 0 (kind 1), or c, which is also added above (kind 2)
         c, d, e, f = 0.0, -b / a, c if kind == 2 else 0.0, c if kind == 2 else 0.0
 
     def decode(x: NDArray[Any]) -> Pixels:
@@ -175,8 +181,8 @@ def _parametric(kind: int, numbers: list[float]) -> Table:
 
 
 def _to_d50(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Adapt a matrix to X, Y, Z from white D65 to the D50 of profiles (Bradford)."""
+    """Adapt a matrix (3, 3) from R, G, B to X, Y, Z from its own white to the D50 of profiles (Bradford)."""
     from .spaces import _BRADFORD
 
-    white = _BRADFORD @ matrix.sum(1)
+    white = _BRADFORD @ matrix.sum(1)  # X, Y, Z of R = G = B = 1
     return np.asarray(np.linalg.inv(_BRADFORD) @ np.diag(_BRADFORD @ np.array(_D50) / white) @ _BRADFORD @ matrix)

@@ -63,7 +63,7 @@ def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
                             f"{', '.join(list(opened.getColorSpaceNames())[:12])}, …")
     if opened.isColorSpaceLinear(name, library.REFERENCE_SPACE_SCENE):
         processor = _processor(library, opened, name, forward=True)
-        matrix = _apply_processor(processor, np.eye(3, dtype=np.float32)).T.astype(np.float64)
+        matrix = _apply_processor(processor, np.eye(3, dtype=np.float32)).T.astype(np.float64)  # columns: primaries
         known = _built_in_space(configured)
         return linear_space(name, matrix, known.chromaticities if known else _chromaticities(matrix))
     forward, inverse = (_processor(library, opened, name, forward=is_forward) for is_forward in (True, False))
@@ -84,7 +84,7 @@ def camera_space(name: str) -> ColourSpace:
 
 
 def _library() -> ModuleType:
-    """Import PyOpenColorIO; as a Python module Blender keeps its own where only Blender looks."""
+    """Import PyOpenColorIO: the installed package, else Blender's own, which lies where Python does not search."""
     if importlib.util.find_spec("PyOpenColorIO"):
         return importlib.import_module("PyOpenColorIO")
     blender = sys.modules.get("bpy")
@@ -101,7 +101,10 @@ def _library() -> ModuleType:
 
 
 def _processor(library: ModuleType, config: Any, name: str, *, forward: bool) -> Any:
-    """Return the processor from the space to linear Rec. 709 (`forward`), or back."""
+    """Return the processor from the space to linear Rec. 709 (`forward`), or back.
+
+    A configuration without a name for linear Rec. 709 is converted through OpenColorIO's own one.
+    """
     linear = next((name for name in CONFIGURED_NAMES["linear"] if config.getColorSpace(name) is not None), None)
     try:
         if linear is not None:
@@ -123,7 +126,7 @@ def _apply_processor(processor: Any, pixels: NDArray[Any]) -> NDArray[np.float32
 
 
 def _built_in_space(space: Any) -> ColourSpace | None:
-    """Return the built-in space that has one of this space's names, or None."""
+    """Return ACEScg or ACES2065-1 for a configuration's space that has such a name or alias; None for others."""
     for name in (space.getName(), *space.getAliases()):
         plain = name.lower().replace("aces - ", "").strip()
         if plain in ("acescg", "aces2065-1"):
@@ -132,11 +135,12 @@ def _built_in_space(space: Any) -> ColourSpace | None:
 
 
 def _chromaticities(matrix: NDArray[np.float64]) -> tuple[float, float, float, float, float, float, float, float]:
-    """Derive primaries from a matrix, with the white of Rec. 709, where nothing better is known."""
+    """Derive primaries from a space's matrix (3, 3) to linear Rec. 709, with the white of Rec. 709: the matrix has its
+    own white adapted to that."""
     from .spaces import matrix_to_xyz
 
     xyz = matrix_to_xyz(REC_709) @ matrix
-    points = [*xyz.T, xyz.sum(1)]
+    points = [*xyz.T, xyz.sum(1)]  # X, Y, Z of red, green, blue and white
     flat = [float(value) for point in points for value in point[:2] / point.sum()]
     return (flat[0], flat[1], flat[2], flat[3], flat[4], flat[5], flat[6], flat[7])
 

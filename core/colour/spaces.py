@@ -48,7 +48,7 @@ class ColourSpace:
 
     to_linear, from_linear: convert pixels (..., 3) to and from scene-linear Rec. 709, float32. matrix: (3, 3) to linear
     Rec. 709, of a linear space; None for one with a curve. chromaticities: for the header of a file, where they are
-    known.
+    known. has_headroom: True for a curve whose signal 0..1 holds light above white, 1.
     """
 
     name: str
@@ -96,7 +96,7 @@ def _white(chromaticities: Chromaticities) -> NDArray[np.float64]:
 
 
 def linear_space(name: str, matrix: NDArray[np.float64], chromaticities: Chromaticities | None) -> ColourSpace:
-    """Make a linear space from its matrix to linear Rec. 709."""
+    """Make a linear space from its matrix (3, 3) to linear Rec. 709. chromaticities: None where unknown."""
     if np.allclose(matrix, np.eye(3), atol=1e-12):
         return ColourSpace(name, _identity, _identity, np.eye(3), chromaticities)
     forward, inverse = matrix.T.astype(np.float32), np.linalg.inv(matrix).T.astype(np.float32)
@@ -106,7 +106,8 @@ def linear_space(name: str, matrix: NDArray[np.float64], chromaticities: Chromat
 
 def curved_space(name: str, decode: Curve, encode: Curve, chromaticities: Chromaticities, *,
                  has_headroom: bool = False) -> ColourSpace:
-    """Make a space from its curve, to and from light in its own primaries, and those primaries."""
+    """Make a space with a curve. decode, encode: the curve to and from light in the space's own primaries, which are
+    `chromaticities`; has_headroom: see `ColourSpace`."""
     matrix = matrix_between(chromaticities, REC_709)
     if np.allclose(matrix, np.eye(3), atol=1e-4):
         return ColourSpace(name, decode, encode, None, chromaticities, has_headroom)
@@ -127,7 +128,7 @@ def space_of_chromaticities(chromaticities: Chromaticities) -> ColourSpace:
     try:
         with np.errstate(divide="ignore", invalid="ignore"):
             matrix = matrix_between(chromaticities, REC_709)
-            np.linalg.inv(matrix)
+            np.linalg.inv(matrix)  # raises where colours cannot be converted back
     except np.linalg.LinAlgError:
         matrix = np.full((3, 3), np.nan)
     if not np.isfinite(matrix).all():
@@ -180,7 +181,8 @@ def is_plate_name(name: str) -> bool:
 
 
 def _plain(name: str) -> str:
-    """Return a name as the tables below have it: without what people write differently."""
+    """Return a name as the tables below have it: lower case, letters and digits alone, since people write the others
+    differently."""
     return "".join(character for character in name.lower() if character.isalnum())
 
 
@@ -189,7 +191,7 @@ def _identity(pixels: NDArray[Any]) -> Pixels:
 
 
 def _rec709_from_linear(linear: NDArray[Any]) -> Pixels:
-    """Encode with the camera curve of ITU-R BT.709, continued as compositors do."""
+    """Encode with the camera curve of ITU-R BT.709, continued unclipped above 1 and mirrored below 0."""
     size = np.abs(np.asarray(linear, np.float32))
     curve = 1.099 * np.power(np.maximum(size, 0.018), np.float32(0.45)) - 0.099
     return np.copysign(np.where(size < 0.018, 4.5 * size, curve), linear).astype(np.float32)
@@ -206,6 +208,7 @@ _LINEAR: dict[str, Chromaticities] = {"linear": REC_709, "acescg": AP1, "aces206
 
 
 def _linear(name: str) -> Callable[[], ColourSpace]:
+    """Return a function that makes the built-in linear space of this name."""
     return lambda: linear_space(name, matrix_between(_LINEAR[name], REC_709), _LINEAR[name])
 
 
@@ -240,4 +243,4 @@ _CAMERAS = {
     **dict.fromkeys(("clog3", "canonlog3", "clog3cgamut"), "clog3"),
     "applelog": "applelog",
 }
-"""Names of the cameras' spaces by what people write."""
+"""Names of the cameras' spaces by what people write, as `_plain` returns it."""

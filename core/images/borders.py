@@ -46,9 +46,10 @@ class Borders(NamedTuple):
         return Borders(*map(min, self, other))
 
     def area(self, width: int, height: int, margin: int = 0) -> PictureArea:
-        """Return the area inside letterboxes and pillars of a picture of this size, less `margin` lines next to each.
+        """Return the area inside the borders of a picture of this size, less `margin` lines next to each border.
 
         Facing borders count by the narrower one: a night sky makes one of them wider, and is no border by itself.
+        An area with a side below MIN_AREA_SIDE becomes the whole picture.
         """
         top, bottom = _symmetric(self.top, self.bottom)
         left, right = _symmetric(self.left, self.right)
@@ -84,7 +85,8 @@ def find_picture_area(picture: NDArray[Any],
 
 
 def _symmetric(first: int, last: int) -> tuple[int, int]:
-    """Return the line counts of two facing borders, made equal where they differ; zeros where either is no border."""
+    """Return the line counts of two facing borders: both the lower one where they differ by more than MIN_BORDER_LINES,
+    zeros where either is no border."""
     if min(first, last) < MIN_BORDER_LINES:
         return 0, 0
     return (first, last) if abs(first - last) <= MIN_BORDER_LINES else (min(first, last),) * 2
@@ -97,13 +99,16 @@ def _count_border_lines(line: Callable[[int], NDArray[Any]], count: int) -> tupl
 
 
 def _count_leading_lines(line: Callable[[int], NDArray[Any]], order: Iterable[int]) -> int:
-    """Count the even, black lines in this order, up to the first other one."""
+    """Count the even, black lines in this order, up to the first other one.
+
+    line: returns the pixels (length, 3) at a position, as display values. All must have the first one's colour.
+    """
     colour, number = None, -1
     for number, position in enumerate(order):
         pixels = line(position)
         if colour is None:
             colour = np.median(pixels, 0)
-            if not colour.max() <= MAX_BORDER_LEVEL:
+            if not colour.max() <= MAX_BORDER_LEVEL:  # so written, NaN is no border
                 return 0
         difference = np.abs(pixels - colour).max(-1)
         if (difference <= LEVEL_TOLERANCE).mean() < MIN_EVEN_SHARE or not difference.max() <= 3 * LEVEL_TOLERANCE:

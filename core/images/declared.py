@@ -61,26 +61,27 @@ def jpeg_profile(stream: BinaryIO) -> bytes:
 
 
 def _png_space(path: Path) -> ColourSpace | None:
-    """Return the space of a PNG, by the order of its specification (third edition, 4.3): cICP, iCCP, sRGB, gAMA."""
+    """Return the space of a PNG; None for none. The first of these chunks counts, by the order of the specification
+    (third edition, 4.3): cICP, iCCP, sRGB, then gAMA with cHRM."""
     with open_regular(path) as stream:
         contents = dict(png.chunks(stream, (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM"), before_pixels=True))
     points = contents.get(b"cICP", b"")
     if len(points) == 4 and (space := space_of_code_points(points[0], points[1])) is not None:
         return space
     if b"iCCP" in contents:
-        space = profile_space(path, _inflate(contents[b"iCCP"].partition(b"\0")[2][1:]))
+        space = profile_space(path, _inflate(contents[b"iCCP"].partition(b"\0")[2][1:]))  # behind name and method
         if space is not None:
             return space
     if b"sRGB" in contents:
         return colour_space("srgb")
-    gamma = int.from_bytes(contents.get(b"gAMA", b""), "big")
+    gamma = int.from_bytes(contents.get(b"gAMA", b""), "big")  # 100 000 times the exponent that encodes
     primaries = _chromaticities(contents.get(b"cHRM", b""))
     if not gamma and primaries is None:
         return None
     if not gamma or _SRGB_GAMMAS[0] <= gamma <= _SRGB_GAMMAS[1]:
         srgb = colour_space("srgb")
         return srgb if primaries is None else curved_space("sRGB curve", srgb.to_linear, srgb.from_linear, primaries)
-    if not 5000 <= gamma <= 1_000_000:
+    if not 5000 <= gamma <= 1_000_000:  # damaged: exponents of 0.05 to 10 are usable
         return None
     return curved_space(f"gamma {100_000 / gamma:.3g}", *power_curve(100_000 / gamma), primaries or REC_709)
 
@@ -93,6 +94,7 @@ def _chromaticities(chunk: bytes) -> Chromaticities | None:
     values: Chromaticities = (*rest, white_x, white_y)
     if np.abs(np.subtract(values, REC_709)).max() < CHROMATICITY_TOLERANCE:
         return None
+    # Its determinant is twice the area between the primaries.
     triangle = np.array([[*rest[0:2], 1], [*rest[2:4], 1], [*rest[4:6], 1]])
     return values if min(values[1::2]) > 0 and abs(np.linalg.det(triangle)) > 0.01 else None
 

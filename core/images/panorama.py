@@ -30,7 +30,7 @@ _MAX_XMP_BYTES = 1 << 22
 
 
 def wraps_around(path: Path, header: Mapping[str, Any] | None = None) -> bool:
-    """Return whether a picture is a panorama of 360 degrees by what its file says. header: of an EXR, if it is one.
+    """True if a picture is a panorama of 360 degrees by what its file says. header: of an EXR, if it is one.
 
     False for a part of a panorama, for a cube map, and for a file that cannot be read.
     """
@@ -53,11 +53,13 @@ def do_sides_meet(columns: Pixels) -> bool:
     left, right = columns[:, 0].ravel(), columns[:, 3].ravel()
     if min(left.std(), right.std()) < MIN_VARIETY or np.corrcoef(left, right)[0, 1] < MIN_CORRELATION:
         return False
+    # Half a code of noise keeps very smooth sides from failing.
     beside = np.abs(columns[:, (0, 3)] - columns[:, (1, 2)]).mean()
     return float(np.abs(left - right).mean()) <= MAX_STEP_RATIO * (float(beside) + 0.5 / 255)
 
 
 def _is_full_panorama(packet: bytes) -> bool:
+    """True if XMP names a projection of the whole circle, and no crop of it."""
     match = _PROJECTION.search(packet)
     if match is None or match[1].decode().lower() not in _PROJECTIONS:
         return False
@@ -66,6 +68,7 @@ def _is_full_panorama(packet: bytes) -> bool:
 
 
 def _number(packet: bytes, name: bytes) -> int | None:
+    """Return the whole number of an XMP property, as attribute or element; None where it is missing."""
     match = re.search(name + rb"\s*(?:=\s*[\"']|>)\s*(\d{1,9})", packet)
     return int(match[1]) if match else None
 

@@ -64,7 +64,8 @@ def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
 
 
 def _exr_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """Return the size of the frame, or the dataWindow where that is too large to be opened."""
+    """Return the size of the displayWindow; of the dataWindow where that is missing, empty or too large to be opened,
+    so that `checked_size` refuses the file."""
     sizes = exr_header.windows(stream)
     stored = sizes.get("dataWindow")
     whole = stored is not None and min(stored) > 0 and stored[0] * stored[1] <= MAX_PIXELS

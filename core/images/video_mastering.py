@@ -16,6 +16,7 @@ _RATIONALS = struct.Struct("<20i2i")
 """FFmpeg's AVMasteringDisplayMetadata: x and y of red, green, blue and white, the least and the greatest luminance, as
 numerators and denominators; then whether the chromaticities and the luminances are set."""
 _CHROMATICITY_STEPS, _LUMINANCE_STEPS = 50_000, 10_000
+"""x265's units: steps to 1, and to 1 cd/m²."""
 
 
 def x265_options(frame: Any) -> str:
@@ -25,6 +26,7 @@ def x265_options(frame: Any) -> str:
 
 
 def _display_option(data: bytes) -> str:
+    """Return the option for a mastering display, in x265's order G, B, R, white; "" where a part of it is not set."""
     if len(data) < _RATIONALS.size:
         return ""
     *numbers, has_primaries, has_luminance = _RATIONALS.unpack_from(data)
@@ -38,6 +40,7 @@ def _display_option(data: bytes) -> str:
 
 
 def _levels_option(data: bytes) -> str:
+    """Return the option for the greatest level of a pixel and the greatest mean of a frame, cd/m²; "" for none."""
     if len(data) < 8:
         return ""
     content, average = struct.unpack_from("<2I", data)

@@ -39,7 +39,10 @@ class DataWindow:
                    for origin, size, frame in zip(self.origin, self.size, self.frame, strict=True))
 
     def oriented(self, orientation: int) -> DataWindow:
-        """Return the window of a picture as viewers show it, by its Exif orientation; only whole frames have one."""
+        """Return the window of a picture as viewers show it, by its Exif orientation.
+
+    Formats with an orientation store the whole frame, so that swapped sides are all that changes.
+    """
         if orientation < TRANSPOSED:
             return self
         return replace(self, size=self.size[::-1], origin=self.origin[::-1], frame=self.frame[::-1],
@@ -73,7 +76,8 @@ def move_to_window(pixels: Pixels, source: DataWindow, target: DataWindow) -> Pi
 
 
 def crop_to_display_window(pixels: Pixels, window: DataWindow) -> Pixels:
-    """Return the display window of a file's pixels (height, width, ...), 0 outside their data window."""
+    """Return the frame (the display window) of pixels (height, width, ...) that `window` places; 0 where there are
+    none."""
     if window.is_frame:
         return pixels
     (width, height), (x, y) = window.frame, window.origin

@@ -48,6 +48,7 @@ def concatenate(flares: Mapping[str, PlaneGaussians]) -> PlaneGaussians | None:
     if not sets:
         return None
     means, covariances, opacities, colours = (torch.cat(parts) for parts in zip(*(s[:4] for s in sets), strict=True))
+    # A ring of r0 = 0 and w = 1, and an arc of 0, are a plain Gaussian.
     rings = _concatenate_rows([(s.rings, len(s.means)) for s in sets], means.new_tensor([0.0, 1.0]))
     arcs = _concatenate_rows([(s.arcs, len(s.means)) for s in sets], means.new_zeros(2))
     return PlaneGaussians(means, covariances, opacities, colours, rings, arcs)
@@ -61,8 +62,11 @@ def _concatenate_rows(parts: list[tuple[Tensor | None, int]], plain: Tensor) -> 
 
 
 def composite(scene: Tensor, flare: Splats | None, blend: Blend, white: float = 1.0) -> Tensor:
-    """Return the composite of scene (height, width, 3) and flare, in display space. white: display value at which added
-    light is clipped."""
+    """Return the composite (height, width, 3) of scene and flare, display values.
+
+    scene: (height, width, 3), display values. flare: splats of all lights, None without any. white: display value at
+    which added light is clipped.
+    """
     if flare is None:
         return scene
     if blend == "over":
@@ -80,7 +84,7 @@ class _AddLight(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, scene: Tensor, light: Tensor, white: float) -> Tensor:
-        linear, within = decode_with_slope(scene.clamp(0, white))
+        linear, within = decode_with_slope(scene.clamp(0, white))  # within: slope of decode
         display, slope = encode_with_slope(linear.add_(light))
         ctx.save_for_backward(within if ctx.needs_input_grad[0] else None, slope)
         return display.clamp_(0, white)
@@ -103,10 +107,11 @@ class LinearLayers(NamedTuple):
 
 
 def linear_layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend, white: float = 1.0) -> LinearLayers:
-    """Return layers from the scene's picture in display space, clipped at `white`, and each light's splats.
+    """Return layers from the scene's picture, display values, and each light's splats.
 
-    `over` is not a sum: a light's layer is the increase of the linear picture when that light is put before those that
-    follow it, so that the layers sum to the composite exactly.
+    white: display value at which the scene is clipped; the composite is not. `over` is not a sum: a light's layer is
+    the increase of the linear picture when that light is put before those that follow it, so that the layers sum to the
+    composite exactly.
     """
     display = scene.clamp(0, white)
     scene_linear = decode(display)

@@ -41,8 +41,9 @@ class QueryRange:
     def of(cls, cameras: Tensor, lights: Tensor, reach: float = math.inf) -> QueryRange:
         """Return the range of training views: camera positions (v, 3), normalised light positions (v, 2).
 
-        reach: distance of the frame's corners from the principal point, normalised. A light that passes the camera's
-        plane comes to lie at a hundred times that; a grid over all of it would leave the frame a part of one cell.
+        reach: distance of the frame's corners from the principal point, normalised; it bounds `light_high` by
+        RANGE_FACTOR. A light that passes the camera's plane comes to lie at a hundred times that; a grid over all of it
+        would leave the frame a part of one cell. Boxes are 5 % larger than the range on each side.
         """
         low, high = cameras.amin(0), cameras.amax(0)
         # A camera that hardly moves along an axis must not have its noise stretched over the whole grid.
@@ -64,7 +65,7 @@ class DeformationNetwork(nn.Module):
     """Offsets of `heads` (name: width) for n Gaussians, and delta_l, from one light and one camera.
 
     `positions` is the width of the canonical position (1 on the line, 2 for the free plane of mode `2d`); `latent` the
-    width of a code for each Gaussian, 0 in the paper's form.
+    width of a code for each Gaussian, 0 in the paper's form. levels, base: of both `HashGrid`.
     """
 
     camera_low: Tensor
@@ -76,7 +77,8 @@ class DeformationNetwork(nn.Module):
         super().__init__()
         self.light_grid = HashGrid(LIGHT_BITS, LIGHT_GROWTH, levels, base=base)
         self.camera_grid = HashGrid(CAMERA_BITS, CAMERA_GROWTH, levels, base=base)
-        view = 2 * 2 * levels
+        view = 2 * 2 * levels  # two grids of two features on each level
+        # The two halves of the first layer add up, so one bias is enough.
         self.view_layer = nn.Linear(view, HIDDEN_WIDTH)
         self.gaussian_layer = nn.Linear(2 * BANDS * positions + latent, HIDDEN_WIDTH, bias=False)
         self.layers = nn.ModuleList(nn.Linear(HIDDEN_WIDTH, HIDDEN_WIDTH) for _ in range(HIDDEN_LAYERS - 1))
@@ -97,12 +99,15 @@ class DeformationNetwork(nn.Module):
     def view_features(self, camera: Tensor, light: Tensor) -> Tensor:
         """Return features (4 levels,) of a camera position (3,), world units, and a light (2,), normalised coordinates.
         """
-        # A wide extent along one axis and none along another still maps by one scale for each axis.
+        # One scale for each axis; `QueryRange.of` makes every extent larger than 0.
         camera_input = (camera - self.camera_low) / self.camera_extent
         return torch.cat([self.light_grid(light_input(light) / self.light_high), self.camera_grid(camera_input)])
 
     def forward(self, positions: Tensor, latent: Tensor | None, features: Tensor) -> dict[str, Tensor]:
-        """Return offsets by name, (n, width) each, for canonical positions (n, 1 or 2) and latent codes (n, d)."""
+        """Return offsets by name, (n, width) each, for canonical positions (n, 1 or 2) and latent codes (n, d).
+
+        features: of the view, from `view_features`.
+        """
         encoded = frequency_encoding(positions, BANDS)
         if latent is not None:
             encoded = torch.cat([encoded, latent], -1)
@@ -112,5 +117,5 @@ class DeformationNetwork(nn.Module):
         return dict(zip(self.names, self.head(x).split(self.widths, -1), strict=True))
 
     def light_correction(self, features: Tensor) -> Tensor:
-        """Return delta_l (2,), normalised coordinates (paper, eq. 4)."""
+        """Return delta_l (2,) (paper, eq. 4), normalised coordinates over `LightFlare.scale`. features: of the view."""
         return self.correction(features)

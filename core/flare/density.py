@@ -36,9 +36,10 @@ class DensitySettings:
 
 def clone_and_prune(flare: LightFlare, optimiser: Adam, names: Mapping[str, str], settings: DensitySettings,
                     generator: torch.Generator) -> None:
-    """Clone and prune one light's canonical Gaussians in place, with their moments.
+    """Clone and prune one light's canonical Gaussians in place.
 
-    names: the optimiser's name of each of `flare.gaussians`.
+    The optimiser's moments follow the rows; those of clones are 0. names: the optimiser's name of each of
+    `flare.gaussians`.
     """
     opacity = flare.gaussians["opacity_logits"].detach().sigmoid()[:, 0]
     keep = (opacity >= settings.prune_below).nonzero()[:, 0]

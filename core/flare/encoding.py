@@ -21,8 +21,9 @@ TABLE = "table.weight"
 class HashGrid(nn.Module):
     """Multiresolution hash grid over the unit cube (Müller et al. 2022, section 3).
 
-    levels x features table entries, level k at resolution `base * growth**k`; levels that fit in the table are stored
-    densely, the others hashed. Input (3,) in 0..1 (clamped), output (levels * features,).
+    Level k has resolution floor(base * growth**k) and at most 2**table_bits rows of `features` values; levels whose
+    corners fit in so many rows are stored densely, the others hashed. Input (3,) in 0..1 (clamped), output (levels *
+    features,).
     """
 
     _resolutions: Tensor
@@ -58,10 +59,10 @@ class HashGrid(nn.Module):
         return (rows * weights[..., None]).sum(1).reshape(-1)
 
     def _cell(self, point: Tensor) -> tuple[Tensor, Tensor]:
-        """Return rows (levels, 8) of the corners around the point and their trilinear weights."""
+        """Return the table's rows of the corners around a point (3,), and their trilinear weights, (levels, 8) each."""
         resolutions, rows, primes, corners = self._resolutions, self._rows, self._primes, self._corners
         scaled = point.clamp(0, 1)[None] * resolutions[:, None]
-        low = torch.minimum(scaled.floor(), resolutions[:, None] - 1.0)
+        low = torch.minimum(scaled.floor(), resolutions[:, None] - 1.0)  # 1 lies in the last cell
         fraction = (scaled - low)[:, None]  # (levels, 1, 3)
         corner = low.long()[:, None] + corners  # (levels, 8, 3)
         weights = torch.where(corners.bool(), fraction, 1 - fraction).prod(-1)

@@ -84,7 +84,10 @@ def _to_triple(values: Any) -> tuple[float, float, float]:
 
 
 def _pack(model: FlareModel) -> dict[str, Tensor]:
-    """Return the state, with every hash table as its rows that are not zero."""
+    """Return the tensors of all lights by "number.parameter", with every hash table as its rows that are not zero.
+
+    `LightFlare.scale` is multiplied in, since the file does not store it.
+    """
     packed: dict[str, Tensor] = {}
     states = {f"{number}.{name}": tensor for number, light in enumerate(model.lights)
               for name, tensor in light.state_without_scale().items()}
@@ -99,14 +102,15 @@ def _pack(model: FlareModel) -> dict[str, Tensor]:
 
 
 def _unpack(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> FlareFile:
-    """Make the model from description and tensors. Raises ValueError, KeyError or RuntimeError where they are
-    damaged."""
+    """Make the model from description and tensors, the inverse of `save`. Raises ValueError, KeyError or RuntimeError
+    where they are damaged."""
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise ValueError(f"{name} holds values that are not finite")
     flares, names, positions, clear = [], [], [], []
     for light in description["lights"]:
         low, high, reach = (_to_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
+        # The generator draws first values only, which the file's replace below.
         flares.append(LightFlare(FlareForm(**light["form"]), QueryRange(low, high, reach), int(light["count"]),
                                  torch.Generator()))
         names.append(str(light["name"]))

@@ -75,14 +75,16 @@ def plane_scale(reach: float) -> float:
 class LightFlare(nn.Module):
     """Canonical Gaussians of one light and their deformation.
 
-    `gaussians` holds one row for each Gaussian: positions (n, 1) along the line or (n, 2) on the plane, log_scales (n,
-    3 | 2), rotations (n, 4) quaternions or (n, 2) directions, opacity_logits (n, 1), sh (n, k * 3), and where the form
-    has them offsets (n, 2), rings (n, 2) as r0 and log w, arcs (n, 2) in deviations along the axes, latent (n, d).
+    `gaussians` holds one row for each Gaussian: positions (n, 1) along the line or (n, 2) on the plane, log_scales and
+    rotations, (n, 3) and quaternions (n, 4) if the form is solid, else (n, 2) and directions (n, 2), opacity_logits (n,
+    1), sh (n, k * 3), and where the form has them offsets (n, 2), rings (n, 2) as r0 and log w, arcs (n, 2) in
+    deviations along the axes, latent (n, d).
     """
 
     def __init__(self, form: FlareForm, query_range: QueryRange, count: int, generator: torch.Generator,
                  opacity: float = 0.05, scale: float = 1.0) -> None:
-        """scale: the `plane_scale` of the frames that the flare is fitted to."""
+        """count, opacity: of the initial Gaussians. scale: the `plane_scale` of the frames that the flare is fitted to.
+        """
         super().__init__()
         self.form, self.query_range, self.scale = form, query_range, scale
         self.gaussians = nn.ParameterDict(
@@ -147,24 +149,30 @@ class LightFlare(nn.Module):
         if "plane_offset" in names:
             first = sum(widths[:names.index("plane_offset")])
             head[first:first + 2] = self.scale
+        # "correction.2" is the last layer of the network's Sequential `correction`.
         for layer, factor in (("head", head), ("correction.2", torch.full((2,), self.scale))):
             for part, values in (("weight", factor[:, None]), ("bias", factor)):
                 state[f"network.{layer}.{part}"] = state[f"network.{layer}.{part}"] * values
         return state
 
     def _colours(self, sh: Tensor, means: Tensor, rotation: Tensor) -> Tensor:
+        """Return colours (n, 3) in the world's direction of each mean. sh: (n, k * 3). rotation: world to camera."""
         rays = torch.cat([means, torch.ones_like(means[:, :1])], -1)
         return colours(rays @ rotation, sh.unflatten(-1, (-1, 3)), self.form.sh_degree)
 
 
 def _rings(raw: Tensor) -> Tensor:
-    """Return r0 as learned and w = exp(log w), kept wide enough for the pixel grid of a picture."""
+    """Return rings (n, 2) as r0 and w from raw rows of r0 and log w. log w is kept in -3..3, so that a ring is wide
+    enough for the pixel grid of a picture."""
     return torch.stack([raw[:, 0], raw[:, 1].clamp(-3, 3).exp()], -1)
 
 
 def _initial_gaussians(form: FlareForm, count: int, opacity: float, scale: float, generator: torch.Generator
                        ) -> dict[str, Tensor]:
-    """Return `count` Gaussians spread along the line, of log-uniform INITIAL_SIZES that leave most of the frame free.
+    """Return the rows of `count` Gaussians, by name, of log-uniform INITIAL_SIZES that leave most of the frame free.
+
+    They are spread along the line, from beyond the light's mirror image (-1) to beyond the light (1), or at random over
+    a square with sides of `scale` about the principal point.
     """
     if form.line:
         positions = torch.linspace(-1.2, 1.4, count)[:, None]
@@ -187,7 +195,8 @@ def _initial_gaussians(form: FlareForm, count: int, opacity: float, scale: float
     if form.static_offset:
         rows["offsets"] = torch.zeros(count, 2)
     if form.rings:
-        # A disc finds the way to a ring through worse pictures; so some begin as rings.
+        # A disc finds the way to a ring through worse pictures; so some begin as rings. The others have r0 = 0 and
+        # log w = 0: plain Gaussians. The radius of a ring grows with the size of its Gaussian: one fraction gives both.
         rows["rings"] = torch.zeros(count, 2)
         rows["rings"][::RING_INTERVAL, 0] = _log_interpolate(*INITIAL_RING_RADII, fraction[::RING_INTERVAL, 0]).exp()
         rows["rings"][::RING_INTERVAL, 1] = math.log(INITIAL_RING_WIDTH)
@@ -243,9 +252,10 @@ class FlareModel(nn.Module):
         return [ViewOfLight.of(world_to_camera, xyz) for xyz in self.positions_in(frame)]
 
     def training_views(self, poses: Sequence[Tensor], frames: Sequence[str] = ()) -> dict[str, list[list[float]]]:
-        """Return by light camera x, y, z and normalised light x, y in each of these poses (4, 4) that has it in front.
+        """Return, by the light's name, a list [camera x, y, z, light x, y] for each pose (4, 4) that has it in front.
 
-        frames: names of their frames, where lights move.
+        Cameras are in world units, lights in normalised coordinates. frames: names of the poses' frames, where lights
+        move.
         """
         views_by_light: dict[str, list[list[float]]] = {name: [] for name in self.names}
         for pose, frame in zip(poses, frames or [""] * len(poses), strict=True):
@@ -256,7 +266,7 @@ class FlareModel(nn.Module):
         return views_by_light
 
     def light_corrections(self, world_to_camera: Tensor, frame: str = "") -> Tensor:
-        """Return delta_l (n, 2) of the n lights in front of one pose (4, 4), normalised coordinates.
+        """Return delta_l (n, 2) of the n lights in front of one pose (4, 4), normalised coordinates over `scale`.
 
         Its gradient stops at the view's features, which the whole flare shares: rows of the grids that only a view with
         a hidden light touches would move by full steps because of it.
@@ -271,8 +281,8 @@ class FlareModel(nn.Module):
         """Return the Gaussians of every light in front of the camera, by the light's name.
 
         visibilities: of each light, 0..1 (see `visibility`); they scale the opacities, as the brightness of each light
-        in `frame` does. A light below MIN_TRAINING_VISIBILITY gives no gradient to its flare: there is next to nothing
-        to learn, and Adam would learn it at full rate, from the error of the visibility.
+        in `frame` does. A light with a product below MIN_TRAINING_VISIBILITY gives no gradient to its flare: there is
+        next to nothing to learn, and Adam would learn it at full rate, from the error of the visibility.
         """
         lights = zip(self.names, self.lights, self.views(world_to_camera, frame), strict=True)
         flares = {name: flare(view) for name, flare, view in lights if view.depth > 0}
@@ -285,7 +295,7 @@ class FlareModel(nn.Module):
                 for name, gaussians in flares.items()}
 
     def shares(self, visibilities: Mapping[str, Tensor] | None, frame: str) -> Mapping[str, Tensor] | None:
-        """Return visibility times brightness of each light; None where neither is known."""
+        """Return visibility times brightness of each light, by name; None where neither is known, for 1."""
         brightness = None if self.frame_lights is None else self.frame_lights.brightness_in(frame)
         if brightness is None:
             return visibilities

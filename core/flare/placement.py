@@ -24,8 +24,8 @@ class PlaneGaussians(NamedTuple):
 
     means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1 (with arcs above 1, too: see `opacity_gain`),
     colours (n, 3), and rings (n, 2) as r0 and w in Mahalanobis radii (ours) or None. arcs (n, 2) or None: covariance
-    times b, a vector of the plane from the mean towards the side that exp(b·d) brightens; it scales and turns with the
-    plane.
+    times b, a vector of the plane from the mean towards the side that exp(b·d) brightens, d the offset from the mean;
+    it scales and turns with the plane.
     """
 
     means: Tensor
@@ -56,7 +56,8 @@ def covariance_of_solid(means: Tensor, log_scales: Tensor, quaternions: Tensor) 
 
 
 def covariance_of_ellipse(log_scales: Tensor, directions: Tensor) -> Tensor:
-    """Return covariances (n, 3) of ellipses: log_scales (n, 2), directions (n, 2) of the first axis, any length."""
+    """Return covariances (n, 3) as xx, xy, yy of ellipses: log_scales (n, 2), logarithms of the standard deviations;
+    directions (n, 2) of the first axis, any length."""
     axis = functional.normalize(directions, dim=-1, eps=1e-12)
     variances = (2 * log_scales).exp()
     c, s = axis[:, 0], axis[:, 1]
@@ -65,18 +66,21 @@ def covariance_of_ellipse(log_scales: Tensor, directions: Tensor) -> Tensor:
 
 
 def arcs_of_ellipse(arcs: Tensor, log_scales: Tensor, directions: Tensor) -> Tensor:
-    """Return arcs (n, 2) on the plane of arcs (n, 2) in deviations along the axes: R diag(s) a, so that |a| is the
-    strength beta at every size."""
+    """Convert arcs a (n, 2), in deviations along the axes of an ellipse, to arcs (n, 2) on the plane: R diag(s) a.
+
+    The strength |a| = beta does not depend on the ellipse's size. log_scales, directions: see `covariance_of_ellipse`.
+    """
     axis = functional.normalize(directions, dim=-1, eps=1e-12)
     along, across = (arcs * log_scales.exp()).unbind(-1)
     return along[:, None] * axis + across[:, None] * torch.stack([-axis[:, 1], axis[:, 0]], -1)
 
 
 def opacity_gain(arcs: Tensor, rings: Tensor) -> Tensor:
-    """Return the factors (n,) that make opacities smooth in arcs (n, 2), in deviations, at zero.
+    """Return factors (n,) on opacities, which make the picture smooth in arcs (n, 2), in deviations, at zero.
 
-    A profile that keeps its peak loses r0 beta from its mean logarithm, and beta has a kink at zero. A strength that is
-    quadratic at first and beta soon replaces it there: an opacity is that of the brightest point, up to 3 % of r0.
+    Rasterizers keep the peak of a profile at its opacity, so an arc subtracts r0 beta from the profile's logarithm, and
+    beta has a kink at zero. The factor replaces this beta by beta^2 / sqrt(beta^2 + ARC_SOFTNESS^2), which has none and
+    is soon beta again. The peak is therefore above the opacity, by a factor of exp(0.03 r0) at most.
     """
     squared = arcs.square().sum(-1)
     beta = squared.clamp(min=STRENGTH2_MIN).sqrt()
@@ -109,10 +113,10 @@ def to_pixels(gaussians: PlaneGaussians, intrinsics: Tensor,
 
 
 def arcs_to_pixels(arcs: Tensor, covariances: Tensor, intrinsics: Tensor) -> Tensor:
-    """Return b (n, 2), px^-1, of arcs (n, 2) on the plane, for Gaussians of covariances (n, 3), px^2, under intrinsics.
+    """Return b (n, 2), px^-1: the inverse of covariances (n, 3), px^2, times arcs (n, 2) on the plane, in pixels.
 
-    With the low-pass in the covariance it is exact for a plain Gaussian, whose mean an arc shifts: the shift stays. In
-    double precision, for needles.
+    covariances: of `to_pixels`, with the low-pass. An arc shifts the mean of a plain Gaussian by covariance times b,
+    and the low-pass leaves this shift as it is. In double precision, for needles.
     """
     x, y = (arcs * intrinsics.diagonal()[:2]).double().unbind(-1)
     xx, xy, yy = covariances.double().unbind(-1)

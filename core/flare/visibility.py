@@ -37,8 +37,9 @@ OCCLUSION_WEIGHT, MIN_VISIBILITY = 1e-4, 1e-6
 
 @dataclass(frozen=True)
 class VisibilitySettings:
-    """radius: of the light's disk, relative to its distance. margin: Gaussians nearer to the light than this part of
-    its distance do not hide it, since they show the lamp itself. pixels: side of the small picture."""
+    """radius: standard deviation of the light's soft disk, relative to its distance. margin: Gaussians nearer to the
+    light than this part of its distance do not hide it, since they show the lamp itself. pixels: side of the small
+    picture."""
 
     radius: float = LIGHT_RADIUS
     margin: float = LIGHT_MARGIN
@@ -58,7 +59,8 @@ def light_visibilities(scene: SceneGaussians, model: FlareModel, world_to_camera
 
 
 def relative_to_clear(visibility: Tensor, clear: Tensor | float) -> Tensor:
-    """Return a visibility relative to that of the light where nothing hides it; see `FlareModel.clear`."""
+    """Return a visibility, 0..1, relative to `clear`, that of the light where nothing hides it; 1 where that is
+    unknown (0, see `FlareModel.clear`)."""
     return (visibility / clear).clamp(max=1) if clear > 0 else torch.ones(())
 
 
@@ -92,6 +94,7 @@ def visibility_behind(scene: SceneGaussians, world_to_camera: NDArray[np.float64
         if own > 0:
             offsets = np.linalg.norm(sampled.points[sampled.cells == cell] - centre, axis=1)
             distance = max(float(np.linalg.norm(centre - eye)), 1e-9)
+            # The standard deviation of the cell's points along one axis across the line of sight.
             radius = min(max(float(np.sqrt((offsets**2).mean() / 2)) / distance, MIN_RADIUS), MAX_RADIUS)
             own *= visibility_from(scene, eye, centre, replace(settings, radius=radius), clear)
         shares.append(own)
@@ -142,7 +145,7 @@ def light_visibility(scene: SceneGaussians, camera: Tensor, light: Tensor, setti
     pose = _look_along(camera.float(), direction / distance)
     rows = _occluders(scene, pose, distance, settings)
     size, half = settings.pixels, settings.pixels / 2
-    # The disk's edge, two deviations of the window, is the picture's edge.
+    # The picture's edge is at twice the disk's radius, which is the window's standard deviation.
     focal = half / (2 * settings.radius)
     intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
     near = _near_plane(scene, distance)
@@ -157,15 +160,16 @@ def light_visibility(scene: SceneGaussians, camera: Tensor, light: Tensor, setti
 
 
 def _near_plane(scene: SceneGaussians, distance: float) -> float:
-    """Return the depth from which Gaussians hide a light so far away: whatever a picture shows hides one at any
-    distance."""
+    """Return the depth from which Gaussians hide a light at a distance, world units: at most the scene's near plane, so
+    that all that a picture shows can hide a light."""
     return min(1e-3 * distance, scene.near)
 
 
 def _occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
-    """Return rows of the Gaussians between camera and light that may touch the small picture, none of them far.
+    """Return rows of the Gaussians between camera and light that may touch the small picture, without the far layer.
 
-    Uses numpy, which takes a third of torch's time on columns of three.
+    pose: (4, 4) of the small camera. distance: of the light. Uses numpy, which takes a third of torch's time on columns
+    of three.
     """
     means, scales, rigid = (part.detach().cpu().numpy() for part in (scene.means, scene.log_scales, pose))
     x, y, depth = (means @ rigid[:3, :3].T + rigid[:3, 3]).T
@@ -174,12 +178,13 @@ def _occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: V
     if scene.far is not None:
         between &= ~scene.far.contains(scene.means).cpu().numpy()
     off_axis = np.sqrt(x * x + y * y)
+    # The picture's corners are at 2 sqrt(2) radii from its middle.
     rows = np.flatnonzero(between & (off_axis < depth * settings.radius * 4 + reach))
     return torch.from_numpy(rows).to(scene.means.device)
 
 
 def _look_along(position: Tensor, forward: Tensor) -> Tensor:
-    """Return world_to_camera (4, 4) of a camera that looks along the unit vector `forward`."""
+    """Return world_to_camera (4, 4) of a camera that looks along the unit vector `forward`, turned about it anyhow."""
     helper = torch.eye(3)[int(forward.abs().argmin())]
     right = torch.linalg.cross(helper, forward)
     right = right / right.norm()

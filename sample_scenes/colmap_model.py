@@ -17,10 +17,14 @@ from .description import Pinhole, SceneDescription
 MAX_REPROJECTION_ERROR = 1.5
 """Pixels; points with a larger mean error are left out."""
 MIN_TRACK_LENGTH = 3
+"""Frames that have to show a point at least."""
 
 
 def write_model(scene: SceneDescription, out: Path, progress: Progress) -> None:
-    """Write sparse/0, binary. The features are SIFT of the frames as filmed, with flares and noise."""
+    """Write sparse/0, binary, unless it exists.
+
+    The features are SIFT of the frames as filmed, with flares and noise; the poses are the true ones.
+    """
     target = out / "sparse" / "0"
     if (target / "points3D.bin").is_file():
         return
@@ -90,6 +94,7 @@ def _filter_points(reconstruction: Any) -> Any:
     filtered = pycolmap.Reconstruction()
     for camera in reconstruction.cameras.values():
         filtered.add_camera_with_trivial_rig(camera)
+    # Index of an image point in the filtered model, by its image and its index before.
     new_index: dict[tuple[int, int], int] = {}
     for number, image in sorted(reconstruction.images.items()):
         observations = [(index, point.xy) for index, point in enumerate(image.points2D)

@@ -27,7 +27,7 @@ class Pinhole:
     cy: float
 
     def scaled(self, width: int, height: int) -> Pinhole:
-        """The same camera with another number of pixels."""
+        """Return the same camera with another number of pixels; the aspect may change."""
         x, y = width / self.width, height / self.height
         return Pinhole(width, height, self.fx * x, self.fy * y, self.cx * x, self.cy * y)
 
@@ -107,14 +107,15 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
 
 
 def camera_positions(world_to_camera: Array) -> Array:
-    """Centres (n, 3) of cameras (n, 4, 4)."""
+    """Return the centres (n, 3) of cameras (n, 4, 4)."""
     return -np.einsum("nij,ni->nj", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])
 
 
 def disc_points(centre: Array, eye: Array, radius: float, count: int, up: tuple[float, float, float]) -> Array:
     """Return points (count, 3), spread evenly over a disc that faces `eye`: a sunflower spiral.
 
-    up: a direction that the line of sight is not parallel to.
+    Each point is turned by the golden angle from the one before. up: a direction that the line of sight is not parallel
+    to.
     """
     axis = (centre - eye) / np.linalg.norm(centre - eye)
     side = np.cross(axis, up)

@@ -61,6 +61,7 @@ SHORT_FIT = {"tracing.positions": 48, "fit.iterations": 1200, "fit.gaussians": 8
 GHOST_FIT = {"tracing.positions": 96, "fit.iterations": 1500, "fit.gaussians": 1600, "fit.max_gaussians": 2000}
 """Settings of the fits of looks with strong ghosts."""
 BARE = (0.0,)
+"""A coating of glass that has none."""
 WHITE, BLUE, AMBER = (1.0, 1.0, 1.0), (0.2, 0.45, 1.0), (1.0, 0.55, 0.2)
 
 LOOKS = (
@@ -140,7 +141,7 @@ def read_index(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def make_library(folder: Path, names: list[str], progress: Progress) -> None:
-    """Make the looks with these names, all if there are none; looks with the same settings are kept."""
+    """Make the looks with these names, all for an empty list; a file made with the same settings is kept."""
     folder.mkdir(parents=True, exist_ok=True)
     for look in LOOKS:
         settings, file = look.settings, folder / f"{look.name}.flare"
@@ -170,7 +171,7 @@ def write_sheet(folder: Path, file: Path) -> None:
 
 
 def main() -> int:
-    """The command."""
+    """Make the library, its sheet or its table, as the arguments say; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="looks to make (default: all)")
     parser.add_argument("--out", type=Path, default=LIBRARY, metavar="FOLDER", help="default: the extension's library")

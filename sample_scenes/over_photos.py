@@ -35,7 +35,11 @@ from sample_scenes.flares import LENS_SETUPS, LensSetup, render_flare
 
 def add_flares(capture: Capture, out: Path, setup: LensSetup, light: NDArray[np.float64], colour: tuple[float, ...],
                intensity: float, width: int, progress: Progress) -> None:
-    """Write the new capture; views that exist already are kept. light: world coordinates (3,)."""
+    """Write the new capture; views that exist already are kept.
+
+    light: world coordinates (3,). colour: of the light, linear R G B. intensity: factor on its flare in a frame of
+    exposure 1. width: of the new frames, pixels.
+    """
     capture = capture.with_exposures(metering.measure_exposures(capture, Frames(capture, width)))
     progress.stage("flares", len(capture.views))
     for view in capture.views:
@@ -44,7 +48,7 @@ def add_flares(capture: Capture, out: Path, setup: LensSetup, light: NDArray[np.
                                out / "truth" / "flare" / f"{stem}.exr")
         if not (frame.is_file() and clean.is_file() and layer.is_file()):
             camera = view.camera.scaled(width)
-            photo = np.round(capture.frame(view, camera.size).display() * 255) / np.float32(255)
+            photo = np.round(capture.frame(view, camera.size).display() * 255) / np.float32(255)  # as stored in 8 bits
             pose = view.camera.world_to_camera
             flare = render_flare(setup, camera, pose[:3, :3] @ light + pose[:3, 3], colour=colour,
                                  intensity=intensity * camera.exposure)
@@ -69,7 +73,7 @@ def _write_model(capture: Capture, folder: Path, width: int) -> None:
 
 
 def main() -> int:
-    """The command."""
+    """Make the capture that the arguments ask for; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("capture", type=Path, help="folder with images/ and sparse/0")
     parser.add_argument("--out", type=Path, required=True, help="capture folder to write")

@@ -22,6 +22,8 @@ def panorama(rng: np.random.Generator, height: int, sun: tuple[float, float]) ->
     cosine = np.sin(elevation) * np.sin(sun[1]) + np.cos(elevation) * np.cos(sun[1]) * np.cos(azimuth - sun[0])
     angle = np.arccos(cosine.clip(-1, 1)).astype(np.float32)[..., None]
     picture = _linear_sky(rng, height, elevation, angle)
+    # Two ridges of hills, the farther first: elevations (radians), noise cell (pixels), share of haze. Palettes are
+    # display values, which ** 2.2 makes linear.
     for low, high, cell, haze in ((0.02, 0.13, 420, 0.75), (0.0, 0.075, 260, 0.45)):
         ridge = low + (high - low) * _ring(rng, width, cell)
         wood = gradient(noise(rng, height, width, 26, 4), ((30, 44, 34), (72, 92, 58), (124, 120, 84))) ** 2.2
@@ -35,7 +37,10 @@ def panorama(rng: np.random.Generator, height: int, sun: tuple[float, float]) ->
 
 
 def _linear_sky(rng: np.random.Generator, height: int, elevation: Texture, angle: Texture) -> Texture:
-    """Return linear light (height, 2 height, 3) of a clouded evening sky; angle: to the sun, radians, (..., 1)."""
+    """Return linear light (height, 2 height, 3) of a clouded evening sky.
+
+    elevation: (height, 1), radians. angle: (height, 2 height, 1), of each direction to the sun, radians.
+    """
     up = (elevation.clip(0, None) / (np.pi / 2))[..., None] ** 0.5
     clear = np.array((0.62, 0.44, 0.30), np.float32) * (1 - up) + np.array((0.06, 0.13, 0.34), np.float32) * up
     warm = np.array((1.0, 0.72, 0.42), np.float32)
@@ -49,14 +54,18 @@ def _linear_sky(rng: np.random.Generator, height: int, elevation: Texture, angle
 
 
 def _ring(rng: np.random.Generator, width: int, cell: float) -> Texture:
-    """Return (width,) noise 0..1 that wraps."""
+    """Return (width,) noise 0..1 along a ridge: two stretches of noise, cross-faded. cell: pixels."""
     line = noise(rng, 4, 2 * width, cell, 6)[1]
     ramp = np.linspace(0, 1, width, dtype=np.float32)
     return line[:width] * (1 - ramp) + line[width:] * ramp
 
 
 def _fields(rng: np.random.Generator, azimuth: Texture, elevation: Texture) -> Texture:
-    """Return linear light of flat land below the horizon: patches with furrows, in perspective."""
+    """Return linear light (height, width, 3) of flat land in perspective: patches with furrows.
+
+    Only the part below the horizon is meaningful. azimuth: (1, width), elevation: (height, 1), radians.
+    """
+    # In heights of the eye above the land; bounded, since it is infinite at the horizon.
     distance = 1 / np.tan(np.maximum(-elevation, 0.012))
     x, y = distance * np.sin(azimuth), distance * np.cos(azimuth)
     side = 512
@@ -98,11 +107,11 @@ def _draw_trees(rng: np.random.Generator, picture: Texture, pixel: float) -> Non
     height, width = picture.shape[:2]
     leaves = gradient(noise(rng, height // 4, width, 9, 3), ((14, 26, 14), (52, 80, 34), (128, 140, 70))) ** 2.2
     for _ in range(90):
-        depth = rng.random()
+        depth = rng.random()  # 0 far, 1 near: nearer trees are larger and stand lower
         size = (0.016 + 0.075 * depth**2) / pixel
         x, foot = int(rng.integers(width)), height / 2 + (0.012 + 0.12 * depth**2) / pixel
         shape = np.zeros((height // 4, width), np.uint8)
-        top = height // 2 - height // 8
+        top = height // 2 - height // 8  # first row of the band that trees are drawn into
         trunk = int(max(size * 0.12, 2))
         for _ in range(12):
             centre = (int(x + rng.normal() * size * 0.35), int(foot - top - size * (1.1 + rng.normal() * 0.32)))

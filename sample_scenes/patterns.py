@@ -24,7 +24,11 @@ STONE: Palette = ((120, 113, 108), (168, 162, 158), (87, 83, 78), (214, 211, 209
 
 def noise(rng: np.random.Generator, height: int, width: int, cell: float, octaves: int = 4,
           stretch: float = 1.0) -> Texture:
-    """Return smooth noise 0..1: octaves of interpolated random grids, `cell` pixels at the coarsest."""
+    """Return smooth noise (height, width), 0..1: a sum of `octaves` interpolated random grids.
+
+    cell: pixels between the points of the coarsest grid; each further one is twice as fine and half as strong.
+    stretch: factor on the cells' width. The darkest and the brightest hundredth are clipped.
+    """
     total = np.zeros((height, width), np.float32)
     for octave in range(octaves):
         size = cell / 2**octave
@@ -36,7 +40,7 @@ def noise(rng: np.random.Generator, height: int, width: int, cell: float, octave
 
 
 def gradient(values: Texture, palette: Palette) -> Texture:
-    """Map values 0..1 to colours along the palette."""
+    """Map values (...), 0..1, to colours (..., 3), 0..1, along the palette."""
     colours = np.array(palette, np.float32) / 255
     positions = np.clip(values, 0, 1) * (len(colours) - 1)
     low = np.minimum(positions.astype(int), len(colours) - 2)
@@ -50,7 +54,7 @@ def random_colour(rng: np.random.Generator, palette: Palette) -> tuple[int, int,
 
 
 def poster(rng: np.random.Generator, height: int, width: int, palette: Palette, shapes: int = 60) -> Texture:
-    """Draw overlapping discs, rings, polygons, bars and lines."""
+    """Draw overlapping discs, rings, polygons, bars and lines, the largest first and so behind."""
     picture = np.full((height, width, 3), random_colour(rng, palette), np.uint8)
     size = min(height, width)
     for index in range(shapes):
@@ -77,7 +81,7 @@ def poster(rng: np.random.Generator, height: int, width: int, palette: Palette, 
 
 
 def framed(picture: Texture, border: float = 0.07, colour: tuple[int, int, int] = (235, 230, 220)) -> Texture:
-    """Return a picture with a plain margin."""
+    """Return a picture whose rim is a plain margin. border: its width, relative to the shorter side."""
     margin = int(border * min(picture.shape[:2]))
     result = picture.copy()
     for edge in (np.s_[:margin], np.s_[-margin:], np.s_[:, :margin], np.s_[:, -margin:]):
@@ -87,7 +91,7 @@ def framed(picture: Texture, border: float = 0.07, colour: tuple[int, int, int] 
 
 def writing(rng: np.random.Generator, height: int, width: int, paper: tuple[int, int, int],
             ink: tuple[int, int, int], line: int = 26) -> Texture:
-    """Draw a sheet with rows of marks of word length, a heading and a figure."""
+    """Draw a sheet with a heading bar and rows of marks of word length. line: height of a row, pixels."""
     picture = np.full((height, width, 3), paper, np.uint8)
     top = int(1.2 * line)
     cv2.rectangle(picture, (line, line // 2), (int(width * 0.6), top), ink, -1)
@@ -104,7 +108,7 @@ def writing(rng: np.random.Generator, height: int, width: int, paper: tuple[int,
 
 
 def planks(rng: np.random.Generator, height: int, width: int, palette: Palette, rows: int = 6) -> Texture:
-    """Draw boards along x with grain, knots and gaps."""
+    """Draw `rows` boards along x with grain, growth rings, spots and dark gaps."""
     picture = np.zeros((height, width, 3), np.float32)
     edges = np.linspace(0, height, rows + 1).astype(int)
     for low, high in pairwise(edges):
@@ -129,9 +133,9 @@ def marble(rng: np.random.Generator, height: int, width: int, palette: Palette) 
 
 
 def map_of_islands(rng: np.random.Generator, height: int, width: int) -> Texture:
-    """Draw land, sea, mountains, a grid of meridians; it wraps in x."""
+    """Draw land, sea and mountains with a grid of meridians and parallels."""
     field = noise(rng, height, 2 * width, height / 4, 6)
-    ramp = np.linspace(0, 1, width, dtype=np.float32)
+    ramp = np.linspace(0, 1, width, dtype=np.float32)  # cross-fades the two halves
     field = field[:, :width] * (1 - ramp) + field[:, width:] * ramp
     field = (field - field.min()) / (field.max() - field.min())
     sea = gradient(field / 0.5, ((8, 40, 80), (20, 84, 130), (70, 150, 180)))
@@ -148,7 +152,7 @@ def map_of_islands(rng: np.random.Generator, height: int, width: int) -> Texture
 
 def tiles(rng: np.random.Generator, height: int, width: int, palette: Palette, rows: int, columns: int,
           joint: tuple[int, int, int] = (60, 56, 52), offset: bool = False) -> Texture:
-    """Draw tiles or bricks of different tones with spots."""
+    """Draw tiles of different tones, some with a round mark. joint: colour between them. offset: lay them as bricks."""
     picture = np.full((height, width, 3), joint, np.float32) / 255
     grain = noise(rng, height, width, height / rows / 2, 4)
     tall, wide = height / rows, width / columns
@@ -192,7 +196,7 @@ def weave(rng: np.random.Generator, height: int, width: int, palette: Palette) -
 
 
 def facade(rng: np.random.Generator, height: int, width: int, palette: Palette, floors: int, bays: int) -> Texture:
-    """Draw the front of a house: plaster, rows of windows with shutters, a door or two, a cornice."""
+    """Draw the front of a house: plaster, windows with shutters, some doors, a cornice. bays: windows in a row."""
     plaster = np.array(random_colour(rng, palette), np.float32) / 255
     picture = plaster * (0.75 + 0.35 * noise(rng, height, width, height / 5, 4)[..., None])
     tall, wide = height / floors, width / bays
@@ -218,7 +222,10 @@ def facade(rng: np.random.Generator, height: int, width: int, palette: Palette, 
 
 def sky(rng: np.random.Generator, height: int, width: int, low: tuple[int, int, int], high: tuple[int, int, int],
         cloud: tuple[int, int, int]) -> Texture:
-    """Draw an evening sky for the inside of a dome: glow at the horizon (the picture's middle), streaks of cloud."""
+    """Draw an evening sky for the inside of a dome, with streaks of cloud.
+
+    low, high: colours at the horizon, which is the picture's middle row, and at the zenith; cloud: of the clouds.
+    """
     up = np.clip(1 - 2 * (np.arange(height, dtype=np.float32) + 0.5) / height, 0, 1)[:, None, None] ** 0.6
     colours = [np.array(colour, np.float32) / 255 for colour in (low, high, cloud)]
     clouds = noise(rng, height, width, height / 5, 5, stretch=5.0)

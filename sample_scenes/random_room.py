@@ -21,14 +21,16 @@ from .command import silence_blender
 from .description import Pinhole, look_at
 
 SIZE = (480, 336)
+"""Width and height of a landscape picture, pixels."""
 SAMPLES = 10
+"""Samples of Cycles for each pixel."""
 Random = np.random.Generator
 Colour = tuple[float, float, float]
 Position = tuple[float, float, float]
 
 
 def random_colour(random: Random, saturation: float | None = None) -> Colour:
-    """Return a fully bright colour, mostly a pale one."""
+    """Return a colour of full value and random hue, mostly a pale one. saturation: 0..1, or None for a random one."""
     return colorsys.hsv_to_rgb(random.random(), random.random() ** 1.5 if saturation is None else saturation, 1.0)
 
 
@@ -41,7 +43,10 @@ def load_image(path: Path) -> Any:
 
 
 class Room:
-    """A room, or a yard under a sky, with objects and lamps: floor at z = 0, the camera looks along y."""
+    """A room, or a yard under a sky, with objects and lamps: floor at z = 0, the camera looks along y.
+
+    photos: textures. maps: environment maps. The constructor builds the scene in Blender, at random.
+    """
 
     def __init__(self, random: Random, photos: Sequence[Path], maps: Sequence[Path]) -> None:
         self.random, self.photos, self.maps = random, photos, maps
@@ -124,7 +129,10 @@ class Room:
             metallic=float(random.random() < 0.2), glass=random.random() < 0.08))
 
     def _add_lamp(self) -> None:
-        """Add a visible lamp: a bulb, a screen, a tube or a spot."""
+        """Add a lamp: a bulb, a screen or a tube that is seen, or a spot, which only lights.
+
+        Its power is divided by about its surface; a small constant bounds the radiance of the smallest.
+        """
         random = self.random
         position = self._random_position(random.uniform(0.6, self.height * 0.95), min_distance=2)
         size = math.exp(random.uniform(-3.2, -0.9))
@@ -177,7 +185,11 @@ class Room:
 
     def _material(self, *, photo: bool, colour: Sequence[float], roughness: float = 0.5, metallic: float = 0.0,
                   strength: float = 0.0, glass: bool = False, repeat: float = 1.0) -> Any:
-        """Return a material; strength: of the emission, in the material's colour or that of its photograph."""
+        """Return a material, half of the time with a bumpy surface.
+
+        photo: show a random photograph in place of `colour`. strength: of the emission, in the colour or that of the
+        photograph. repeat: how often the photograph is repeated.
+        """
         random = self.random
         material = bpy.data.materials.new("Surface")
         material.use_nodes = True
@@ -206,10 +218,13 @@ class Room:
         return material
 
     def render(self) -> Pixels:
-        """Return scene-linear light (height, width, 3), through the air of the room, which is misty in one of seven."""
+        """Return scene-linear light (height, width, 3) of a random view.
+
+        Three of ten views have a small depth of field, and one of seven has mist.
+        """
         random = self.random
         width, height = SIZE if random.random() < 0.75 else SIZE[::-1]
-        focal = max(width, height) * random.uniform(16, 45) / 36
+        focal = max(width, height) * random.uniform(16, 45) / 36  # a lens of 16 to 45 mm on a sensor of 36 mm
         camera = shots.set_up_render(Pinhole(width, height, focal, focal, width / 2, height / 2), SAMPLES)
         eye = np.array([random.uniform(-0.25, 0.25) * self.width, random.uniform(-1, 0.5),
                         random.uniform(0.4, min(2.2, self.height * 0.8))])
@@ -231,6 +246,7 @@ class Room:
             depth = np.minimum(_channel_with_suffix(channels, ".Z"), self.depth * 6)
             transmission = np.exp(depth * (-math.exp(random.uniform(-2.5, 0.5)) / self.depth))[..., None]
             air = np.array(random_colour(random, random.random() * 0.4), np.float32)
+            # The mist has the brightness of a random percentile of the frame.
             airlight = air * np.percentile(light.mean(-1), random.uniform(50, 97))
             light = light * transmission + airlight * (1 - transmission)
         return np.asarray(light, np.float32)

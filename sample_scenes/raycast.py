@@ -63,7 +63,10 @@ def quad(corner: Sequence[float], u: Sequence[float], v: Sequence[float], textur
 
 
 def box(low: Sequence[float], high: Sequence[float], texture: Pixels) -> list[Quad]:
-    """Return the five sides of a box that a camera above its bottom may see."""
+    """Return five sides of a box between the corners `low` and `high`: all but the bottom, which no camera sees.
+
+    y grows downwards, so the bottom is at the y of `high`.
+    """
     (x0, y0, z0), (x1, y1, z1) = low, high
     return [quad((x0, y0, z0), (x1 - x0, 0, 0), (0, y1 - y0, 0), texture),
             quad((x0, y0, z1), (x1 - x0, 0, 0), (0, y1 - y0, 0), texture),
@@ -89,7 +92,9 @@ class Hits:
 
 
 def camera_rays(camera: Pinhole, rotation: Array) -> Pixels:
-    """Return unit directions (n, 3) in the world of the rays of all pixels, in rows. rotation: (3, 3) world to camera.
+    """Return the unit directions (n, 3), in world axes, of RAYS_PER_SIDE x RAYS_PER_SIDE rays per pixel, row by row.
+
+    rotation: (3, 3) world to camera.
     """
     width, height = camera.width * RAYS_PER_SIDE, camera.height * RAYS_PER_SIDE
     x, y = np.meshgrid(((np.arange(width) + 0.5) / RAYS_PER_SIDE - camera.cx) / camera.fx,
@@ -99,7 +104,11 @@ def camera_rays(camera: Pinhole, rotation: Array) -> Pixels:
 
 
 def cast(quads: Sequence[Quad], eye: Array, rays: Pixels) -> Hits:
-    """Return the nearest hits of rays (n, 3) from `eye`."""
+    """Return the nearest hits of unit rays (n, 3) from `eye`.
+
+    Where nothing is hit, the distance is infinite and the rest 0. Normals face the eye. A rectangle that emits reflects
+    nothing.
+    """
     count = len(rays)
     hits = Hits(np.full(count, np.inf, np.float32), *(np.zeros((count, 3), np.float32) for _ in range(3)))
     for item in quads:
@@ -109,9 +118,11 @@ def cast(quads: Sequence[Quad], eye: Array, rays: Pixels) -> Hits:
             continue
         height, width = item.texture.shape[:2]
         columns, rows = a[index] * (width - 1), b[index] * (height - 1)
+        # OpenCV maps fewer than 32768 rows at once.
         colour = cv2.remap(item.texture, columns.reshape(-1, 1), rows.reshape(-1, 1), cv2.INTER_LINEAR).reshape(-1, 3) \
             if len(index) < 32000 else _sample(item.texture, columns, rows)
         normal = np.cross(item.u, item.v)
+        # Towards the eye; the sign is 0 for an eye in the plane.
         normal = normal / np.linalg.norm(normal) * (-np.sign(normal @ (item.corner - eye)) or 1.0)
         hits.distance[index] = distance[index]
         hits.albedo[index] = 0.0 if item.radiance else colour
@@ -121,16 +132,19 @@ def cast(quads: Sequence[Quad], eye: Array, rays: Pixels) -> Hits:
 
 
 def _sample(texture: Pixels, columns: Pixels, rows: Pixels) -> Pixels:
-    """Sample a texture bilinearly at many points; OpenCV takes fewer than 32768 rows at once."""
+    """Sample a texture bilinearly at (n,) columns and rows, in parts that OpenCV accepts; return (n, 3)."""
     parts = [cv2.remap(texture, columns[start:start + 32000].reshape(-1, 1), rows[start:start + 32000].reshape(-1, 1),
                        cv2.INTER_LINEAR).reshape(-1, 3) for start in range(0, len(columns), 32000)]
     return np.concatenate(parts).astype(np.float32)
 
 
 def _intersect(item: Quad, eye: Array, rays: Pixels) -> tuple[Pixels, Pixels, Pixels]:
-    """Return distance (infinite behind the eye) and the two coordinates on the rectangle, each (n,)."""
+    """Return where rays meet the plane of a rectangle: distances along them, and coordinates along u and v, each (n,).
+
+    Behind the eye and on parallel rays the distance is infinite. Coordinates are 0..1 inside the rectangle.
+    """
     normal = np.cross(item.u, item.v)
-    # Projecting onto the two edges beforehand saves the hit points.
+    # The rays are projected onto the edges, so that no hit points have to be stored.
     along = rays @ normal.astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.float32((item.corner - eye) @ normal) / along
@@ -142,7 +156,10 @@ def _intersect(item: Quad, eye: Array, rays: Pixels) -> tuple[Pixels, Pixels, Pi
 
 
 def shade(hits: Hits, eye: Array, rays: Pixels, lamps: Sequence[Lamp], ambient: Array) -> Pixels:
-    """Return the radiance (n, 3) of hits: emission, ambient light, and the light of the lamps; discs in front."""
+    """Return the radiance (n, 3) along rays: emission, and ambient and lamp light that the surface reflects.
+
+    Where a lamp's disc is nearer than the surface, the ray has the lamp's radiance. ambient: (3,).
+    """
     seen = np.isfinite(hits.distance)
     points = eye.astype(np.float32) + np.where(seen, hits.distance, 0)[:, None] * rays
     light = np.broadcast_to(ambient.astype(np.float32), hits.albedo.shape).copy()
@@ -150,11 +167,11 @@ def shade(hits: Hits, eye: Array, rays: Pixels, lamps: Sequence[Lamp], ambient: 
         if not lamp.power:
             continue
         towards = lamp.xyz.astype(np.float32) - points
-        squared = (towards * towards).sum(1) + np.float32(0.02)
+        squared = (towards * towards).sum(1) + np.float32(0.02)  # keeps the light finite close to the lamp
         distance = np.sqrt(squared)
         cosine = np.maximum((towards * hits.normal).sum(1) / distance, 0)
         strength = lamp.power * cosine / squared
-        if lamp.beam is not None:
+        if lamp.beam is not None:  # a headlight: the cube of the cosine to its beam
             strength *= np.maximum(-(towards @ lamp.beam.astype(np.float32)) / distance, 0) ** 3
         light += strength[:, None] * lamp.colour.astype(np.float32)
     radiance = hits.emission + hits.albedo * light
@@ -166,15 +183,16 @@ def shade(hits: Hits, eye: Array, rays: Pixels, lamps: Sequence[Lamp], ambient: 
 
 
 def _disc(lamp: Lamp, eye: Array, rays: Pixels, distance: Pixels) -> NDArray[np.bool_]:
-    """Return (n,), which rays meet a lamp before anything else."""
+    """Return (n,), which rays meet a lamp's sphere before the surfaces at these distances (n,)."""
     towards = lamp.xyz - eye
     along = rays @ towards.astype(np.float32)
+    # The squared distance of the sphere's centre from the ray.
     off = np.float32(towards @ towards) - along * along
     return np.asarray((along > 0) & (off < lamp.radius**2) & (along - lamp.radius < distance))
 
 
 def average(radiance: Pixels, camera: Pinhole) -> Pixels:
-    """Average the rays of each pixel: (n, 3) to (height, width, 3)."""
+    """Average the rays of each pixel, in the order of `camera_rays`: (n, 3) to (height, width, 3)."""
     side = RAYS_PER_SIDE
     grid = radiance.reshape(camera.height, side, camera.width, side, 3)
     return np.asarray(grid.mean((1, 3)), np.float32)

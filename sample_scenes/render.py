@@ -30,7 +30,7 @@ CACHE = Path(__file__).resolve().parents[1] / "build" / "sample_scenes"
 
 
 def render_scene(scene: SceneDescription, out: Path, progress: Progress) -> None:
-    """Render truth/scene and compute truth/visible_share.json in Blender."""
+    """Render truth/scene and compute truth/visible_share.json in Blender; views that exist are kept."""
     target, table = out / "truth" / "scene", out / "truth" / "visible_share.json"
     names, poses = scene.stems, scene.poses
     missing = [i for i, name in enumerate(names) if not (target / f"{name}.exr").is_file()]
@@ -52,7 +52,10 @@ def render_scene(scene: SceneDescription, out: Path, progress: Progress) -> None
 
 
 def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
-    """Write truth/flare, images and removed."""
+    """Write truth/flare, images and removed, of views that lack one of them.
+
+    A frame and its clean frame have the same noise.
+    """
     names, poses = scene.stems, scene.poses
     shares = read_json(out / "truth" / "visible_share.json", CaptureError)
     setup = LENS_SETUPS[scene.lens]
@@ -77,7 +80,7 @@ def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
 
 
 def write_lists(scene: SceneDescription, out: Path) -> None:
-    """Write lights.json and split.json."""
+    """Write lights.json, and split.json: every eighth view is held out, and those of `scene.held_out`."""
     write_json(out / LIGHTS, {"lights": [
         {"name": light.name, "xyz": list(light.xyz), "radius": light.radius, "colour": list(light.colour)}
         for light in scene.lights]})
@@ -96,7 +99,7 @@ def make_capture(scene: SceneDescription, out: Path, progress: Progress) -> None
 
 
 def main() -> int:
-    """The command."""
+    """Make the capture that the arguments name; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, help="capture folder to write; else build/sample_scenes/SCENE")
     parser.add_argument("--scene", choices=sorted(SCENES), default="desk")

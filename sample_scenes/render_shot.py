@@ -43,7 +43,10 @@ def draft_setup(name: str) -> LensSetup:
 
 
 def render_scene(scene: ShotScene, state: FrameState, standing: Hits | None) -> NDArray[np.float32]:
-    """Return the scene layer of a frame, (height, width, 3). standing: hits of the rectangles that do not move."""
+    """Return the scene layer of a frame, (height, width, 3), linear.
+
+    standing: hits of the rectangles that do not move, where the camera stands too; None to cast their rays here.
+    """
     rays = camera_rays(scene.camera, state.rotation)
     hits = standing if standing is not None else cast(scene.quads, state.eye, rays)
     if state.moving:
@@ -52,7 +55,10 @@ def render_scene(scene: ShotScene, state: FrameState, standing: Hits | None) -> 
 
 
 def light_values(scene: ShotScene, state: FrameState) -> dict[str, dict[str, Any]]:
-    """Return pixel, visible share and strength of the flare of each light in a frame."""
+    """Return values of each light in a frame, by its name.
+
+    local: place (3,) in camera axes. xy: pixels. share: visible part of its disc, 0..1. strength: of its flare.
+    """
     values = {}
     for name, lamp in state.lamps.items():
         local = state.rotation @ (lamp.xyz - state.eye)
@@ -66,7 +72,10 @@ def light_values(scene: ShotScene, state: FrameState) -> dict[str, dict[str, Any
 
 
 def make_shot(name: str, seed: int, out: Path, progress: Progress) -> None:
-    """Make the whole folder; frames that exist are rendered again only where one of their files is missing."""
+    """Make the whole folder; frames whose files all exist are kept.
+
+    A frame and its clean frame have the same noise.
+    """
     scene = SHOTS[name](seed)
     setup = draft_setup(scene.lens)
     names = [f"{index + 1:04d}" for index in range(FRAMES)]
@@ -101,7 +110,11 @@ def make_shot(name: str, seed: int, out: Path, progress: Progress) -> None:
 
 def write_truth(name: str, scene: ShotScene, states: list[FrameState], values: list[dict[str, dict[str, Any]]],
                 out: Path, names: list[str]) -> None:
-    """Write truth/lights.json, truth/camera.json and split.json."""
+    """Write truth/lights.json, truth/camera.json and split.json.
+
+    values: of `light_values`, by frame. names: stems of the frames. "on" is the strength of a light's flare,
+    relative to its largest in the shot.
+    """
     lights = []
     for light in states[0].lamps:
         largest = max(value[light]["strength"] for value in values)
@@ -120,7 +133,7 @@ def write_truth(name: str, scene: ShotScene, states: list[FrameState], values: l
 
 
 def main() -> int:
-    """The command."""
+    """Make the shot that the arguments name; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--shot", choices=sorted(SHOTS), required=True)
     parser.add_argument("--seed", type=int, default=0)

@@ -30,7 +30,11 @@ from sample_scenes.random_room import Room
 
 
 def develop(random: np.random.Generator, light: Pixels) -> Pixels:
-    """Return display values 0..1, exposed by all but the brightest twentieth."""
+    """Return display values 0..1 of linear light, with a random exposure and tone curve.
+
+    The exposure brings the scene's level to about 0.13. The level is the mean of the 60th percentile and of the average
+    with the brightest twentieth clipped, so that lamps count little.
+    """
     grey = light.mean(-1)
     level = (np.percentile(grey, 60) + np.minimum(grey, np.percentile(grey, 95)).mean()) / 2
     light = light * min(math.exp(random.normal(math.log(0.13), 0.55)) / max(float(level), 1e-4), 500)
@@ -63,7 +67,7 @@ def make_rooms(folder: Path, photos: Sequence[Path], maps: Sequence[Path], count
 
 
 def main() -> int:
-    """The command."""
+    """Render the rooms that the arguments ask for; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder to write the pictures to")
     parser.add_argument("--photos", type=Path, required=True, help="folder of clean photographs")

@@ -45,7 +45,7 @@ def contact_sheet(capture: Path, columns: int, rows: int, width: int) -> NDArray
 
 
 def main() -> int:
-    """The command."""
+    """Write the sheet that the arguments ask for; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("capture", type=Path)
     parser.add_argument("--out", type=Path, required=True)

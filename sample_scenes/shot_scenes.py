@@ -59,7 +59,7 @@ class ShotScene:
 
 
 def _albedo(texture: Pixels, dim: float = 1.0) -> Pixels:
-    """Return the reflectance of a texture of display values, at most 0.85."""
+    """Return the reflectance of a texture of display values, at most 0.85. dim: a further factor."""
     return np.asarray(linear_from_srgb(np.clip(texture, 0, 1)) * np.float32(0.85 * dim), np.float32)
 
 
@@ -73,7 +73,7 @@ def _camera(rng: np.random.Generator) -> Pinhole:
 
 
 def _walker(rng: np.random.Generator, height: float, shirt: Sequence[float]) -> list[Quad]:
-    """Return a figure that stands on y = 0 at the origin, made of boxes."""
+    """Return a figure that stands on y = 0 at the origin, made of boxes. height: metres. shirt: linear R G B."""
     trousers = _albedo(patterns.weave(rng, 64, 48, patterns.PLUM), 0.4)
     parts = [((-0.2, -0.48 * height, -0.12), (0.2, 0, 0.12), trousers),
              ((-0.25, -0.84 * height, -0.14), (0.25, -0.48 * height, 0.14), _plain(*shirt)),
@@ -94,7 +94,7 @@ def _pitch(angle: float) -> Array:
 
 
 def torch(seed: int) -> ShotScene:
-    """A locked-off camera in a room in which somebody carries a torch about."""
+    """Return the shot of a locked-off camera in a room in which somebody carries a torch about."""
     rng = np.random.default_rng((seed, 1))
     camera = _camera(rng)
     wall = patterns.poster(rng, 300, 700, patterns.STONE, 30) * 0.6 + 0.1
@@ -106,13 +106,15 @@ def torch(seed: int) -> ShotScene:
     for left in (-3.4, -0.4, 2.2):
         picture = patterns.framed(patterns.poster(rng, 160, 220, patterns.MOSS, 40))
         room.append(quad((left, -1.7, 6.98), (1.7, 0, 0), (0, 1.2, 0), _albedo(picture)))
+    # A window, bright but no lamp.
     window = np.clip(0.8 + 0.4 * patterns.noise(rng, 40, 60, 12), 0, 1)[..., None] * np.array([0.9, 1.0, 1.1])
     room.append(quad((-1.2 + rng.uniform(-1.5, 2.0), -2.4, 6.96), (1.1, 0, 0), (0, 0.5, 0),
                      window.astype(np.float32), 1.15))
-    screen = rng.uniform(-1.3, 0.6)
+    screen = rng.uniform(-1.3, 0.6)  # left edge of the screen that hides the torch at times
     room += box((screen, -0.9, 3.1), (screen + 0.75, 1.2, 3.25), _albedo(patterns.weave(rng, 200, 120, patterns.SEA)))
     room += box((1.5, 0.3, 4.4), (2.6, 1.2, 5.2), _albedo(patterns.planks(rng, 120, 160, patterns.WARM), 0.7))
     walker = _walker(rng, 1.8, (0.88, 0.87, 0.85))
+    # wave: frames of one round of the torch; direction: of the walker; start: where the walker is in the first frame.
     phase, wave, direction = rng.uniform(0, 2 * np.pi, 4), rng.uniform(26, 34), rng.choice([-1.0, 1.0])
     colour = np.array([1.0, 0.9, 0.75]) if seed % 2 else np.array([0.85, 0.95, 1.0])
     start = rng.uniform(2.4, 3.0)
@@ -130,7 +132,7 @@ def torch(seed: int) -> ShotScene:
 
 
 def drive(seed: int) -> ShotScene:
-    """A drive through a street at dusk; a car comes the other way, one headlight of which fails."""
+    """Return the shot of a drive through a street at dusk; a car comes the other way, and one headlight of it fails."""
     rng = np.random.default_rng((seed, 2))
     camera = _camera(rng)
     street = [quad((-60, -70, 90), (120, 0, 0), (0, 72, 0), _plain(0.5, 0.42, 0.45), 0.28),
@@ -149,6 +151,8 @@ def drive(seed: int) -> ShotScene:
     car = box((-0.85, -0.15, 0), (0.85, 0.95, 3.6), _plain(0.05, 0.06, 0.09))
     car += box((-0.7, -0.65, 0.9), (0.7, -0.15, 2.9), _plain(0.03, 0.035, 0.04))
     colour = np.array([1.0, 0.93, 0.78]) if seed % 2 == 0 else np.array([0.88, 0.94, 1.0])
+    # By frame: jitter of the camera's place, shake of its direction, flicker of the headlight. Of the car: its lane,
+    # the frame in which the headlight goes out, its distance at the start and its approach per frame.
     jitter, lane = rng.normal(size=(FRAMES, 3)) * (0.012, 0.012, 0.0), rng.uniform(-1.9, -1.5)
     shake = np.cumsum(rng.normal(size=(FRAMES, 2)), 0) * 0.0012
     out = int(rng.integers(17, 21))
@@ -183,7 +187,7 @@ def _road(rng: np.random.Generator) -> Pixels:
 
 
 def pan(seed: int) -> ShotScene:
-    """A camera that turns from one side to the other past a lamp on a stand, while two things cross."""
+    """Return the shot of a camera that turns past a lamp on a stand from side to side; a walker and a cart cross."""
     rng = np.random.default_rng((seed, 3))
     camera = _camera(rng)
     floor = patterns.tiles(rng, 400, 600, patterns.STONE, 16, 28)
@@ -202,6 +206,7 @@ def pan(seed: int) -> ShotScene:
     cart = box((-0.6, -2.7, 0), (0.6, 0, 0.8), _albedo(patterns.poster(rng, 120, 120, patterns.SEA, 40)))
     walker = _walker(rng, 2.6, (0.9, 0.9, 0.88))
     colour = np.array([1.0, 0.82, 0.58]) if seed % 2 == 0 else np.array([1.0, 0.95, 0.9])
+    # reach: radians that the camera turns to either side; passes: frames in which walker and cart hide the lamp.
     direction, passes = rng.choice([-1.0, 1.0]), rng.uniform((12, 20), (16, 24))
     reach = rng.uniform(0.50, 0.58)
     tremble = np.cumsum(rng.normal(size=(FRAMES, 2)), 0) * 0.0006

@@ -17,11 +17,15 @@ from core.images.read import read_picture
 from .description import Array, LightSource, Pinhole, disc_points
 
 SHARE_SAMPLES = 512
+"""Points on a light's disc whose visibility is tested."""
 Rendered = TypeVar("Layers")
 
 
 def set_up_render(camera: Pinhole, samples: int) -> Any:
-    """Set the render settings and return a camera object with the intrinsics of `camera` (square pixels)."""
+    """Set the render settings and return a camera object with the intrinsics of `camera` (square pixels).
+
+    samples: of Cycles for each pixel; the result is denoised.
+    """
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.device = "CPU"
@@ -45,6 +49,7 @@ def set_up_render(camera: Pinhole, samples: int) -> Any:
     data = bpy.data.cameras.new("Camera")
     data.sensor_fit = "HORIZONTAL"
     data.lens = camera.fx * data.sensor_width / camera.width
+    # Shifts are relative to the width, in both directions; y points up.
     data.shift_x = (camera.width / 2 - camera.cx) / camera.width
     data.shift_y = (camera.cy - camera.height / 2) / camera.width
     data.clip_start, data.clip_end = 0.01, 1000.0
@@ -55,7 +60,7 @@ def set_up_render(camera: Pinhole, samples: int) -> Any:
 
 
 def set_pose(camera: Any, world_to_camera: Array) -> None:
-    """Move the camera object to a pose in OpenCV's axes."""
+    """Move the camera object to a pose (4, 4) in OpenCV's axes; Blender's cameras look along -z with y up."""
     pose = np.linalg.inv(world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
     camera.matrix_world = Matrix(pose.tolist())
     bpy.context.view_layer.update()
@@ -90,6 +95,7 @@ def visible_share(light: LightSource, eye: Array) -> float:
         bulb.hide_viewport = True
     depsgraph.update()
     visible = 0
+    # The bulbs themselves, which are hidden now, would stop the rays.
     for point in points:
         ray = point - origin
         length = float(np.linalg.norm(ray))

@@ -24,11 +24,11 @@ def empty_scene() -> Any:
 
 
 def picture_material(name: str, texture: Texture, roughness: float = 0.7) -> Any:
-    """Return a matt material that shows `texture` by the UV map."""
+    """Return a matt material that shows `texture` (h, w, 3), sRGB 0..1, by the UV map."""
     height, width = texture.shape[:2]
     image = bpy.data.images.new(name, width, height)
     pixels = np.ones((height, width, 4), np.float32)
-    pixels[..., :3] = texture[::-1]
+    pixels[..., :3] = texture[::-1]  # Blender's rows begin at the bottom
     image.pixels.foreach_set(pixels.ravel())
     image.pack()
     material = bpy.data.materials.new(name)
@@ -77,9 +77,10 @@ def place(obj: Any, location: Vec, turn: float = 0.0, tilt: Vec = (0.0, 0.0)) ->
 
 def box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: float = 0.0,
         tilt: Vec = (0.0, 0.0), bevel: float = 0.0) -> Any:
-    """Add a box of `size`, its base centre at `location`.
+    """Add a box of `size`, its base centre at `location`; turn and tilt as for `place`.
 
-    materials: one for all faces, or one each for the sides (-y, +x, +y, -x) and top; each face shows its whole texture.
+    materials: one for all faces, or one each for the sides (-y, +x, +y, -x) and top; the bottom has the last one. Each
+    face shows its whole texture. bevel: width of the rounded edges, 0 for none.
     """
     x, y, z = size[0] / 2, size[1] / 2, size[2]
     mesh = bmesh.new()
@@ -104,7 +105,10 @@ def box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: flo
 
 def sheet(name: str, width: float, height: float, location: Vec, material: Any, turn: float = 0.0,
           tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
-    """Add a rectangle in x and y about its centre (tilt by 90 about x to stand it up)."""
+    """Add a rectangle in x and y about its centre; tilt (90, 0) stands it up.
+
+    repeat: how often the texture is repeated across and up. turn and tilt: as for `place`.
+    """
     mesh = bmesh.new()
     uv = mesh.loops.layers.uv.new("UVMap")
     x, y = width / 2, height / 2
@@ -116,14 +120,18 @@ def sheet(name: str, width: float, height: float, location: Vec, material: Any, 
 
 def lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, material: Any,
           segments: int = 48, turn: float = 0.0, tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
-    """Add a surface of revolution about z: `profile` is (radius, height) from below to the top."""
+    """Add a surface of revolution about z: `profile` is (radius, height) from below to the top.
+
+    segments: quads around. repeat: how often the texture is repeated around the axis and along the profile. turn and
+    tilt: as for `place`.
+    """
     mesh = bmesh.new()
     uv = mesh.loops.layers.uv.new("UVMap")
     angles = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     rings = [[mesh.verts.new((r * np.cos(a), r * np.sin(a), h)) for a in angles] for r, h in profile]
     lengths = np.hypot(*np.diff(np.array(profile), axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(lengths)]) / max(lengths.sum(), 1e-9)
-    for low in range(len(profile) - 1):
+    for low in range(len(profile) - 1):  # from the ring `low` to the next above
         for side in range(segments):
             after = (side + 1) % segments
             around = [rings[low][side], rings[low][after], rings[low + 1][after], rings[low + 1][side]]
@@ -138,6 +146,7 @@ def ball(name: str, radius: float, location: Vec, material: Any, turn: float = 0
          tilt: Vec = (0.0, 0.0)) -> Any:
     """Add a sphere about `location`."""
     steps = np.linspace(-np.pi / 2, np.pi / 2, 33)
+    # At the poles a tiny radius keeps the vertices of a ring apart.
     profile = [(max(radius * float(np.cos(a)), 1e-4), radius * float(np.sin(a))) for a in steps]
     return lathe(name, profile, location, material, 64, turn, tilt)
 
@@ -220,7 +229,10 @@ def uniform_world(colour: Vec, strength: float) -> None:
 
 
 def far_world(texture: Texture) -> None:
-    """Set a world that shows a panorama in linear light (`panorama`) and lights the scene by it, without parallax."""
+    """Set a world that shows a panorama (h, 2 h, 3) in linear light (`panorama`) and lights the scene by it.
+
+    It is infinitely far, so it has no parallax.
+    """
     height, width = texture.shape[:2]
     image = bpy.data.images.new("surrounding", width, height, float_buffer=True)
     image.colorspace_settings.name = "Linear Rec.709"
@@ -239,7 +251,7 @@ def far_world(texture: Texture) -> None:
 
 
 def dome(radius: float, texture: Texture, strength: float) -> Any:
-    """Add a sky: a sphere about the origin that emits inwards."""
+    """Add a sky: a sphere about the origin that emits `texture` times `strength`."""
     material = picture_material("sky", texture)
     nodes, links = material.node_tree.nodes, material.node_tree.links
     emission = nodes.new("ShaderNodeEmission")
@@ -249,7 +261,7 @@ def dome(radius: float, texture: Texture, strength: float) -> Any:
     output = next(node for node in nodes if node.type == "OUTPUT_MATERIAL")
     links.new(emission.outputs[0], output.inputs["Surface"])
     shell = ball("sky", radius, (0, 0, 0), material)
-    shell.visible_shadow = False  # a sun stands outside
+    shell.visible_shadow = False  # the light of a sun, which stands outside, passes
     return shell
 
 
@@ -258,7 +270,7 @@ def poster_box(name: str, rng: np.random.Generator, size: Vec, location: Vec, pa
     """Add a box with a different drawing on each side, as crates, cubes and plinths have."""
     x, y, z = size
     sides = [(x, z), (y, z), (x, z), (y, z), (x, y)]
-    scale = 420 / max(size)
+    scale = 420 / max(size)  # the longest edge has a texture of 420 pixels
     textures = [framed(poster(rng, max(int(scale * high), 60), max(int(scale * wide), 60), palette, 12), 0.08)
                 for wide, high in sides]
     return box(name, size, location, [picture_material(f"{name} {i}", t, 0.75) for i, t in enumerate(textures)], turn)

@@ -14,7 +14,10 @@ SUN = LightSource("sun", (float(DISTANCE * np.sin(AZIMUTH) * np.cos(ELEVATION)),
 
 
 def path(numbers: Array) -> Array:
-    """Return poses of a walk along the terrace that turns with it until the sun leaves the frame."""
+    """Return poses (n, 4, 4), world to camera, of a walk along the terrace.
+
+    The camera turns with it until the sun leaves the frame.
+    """
     poses = []
     for t in np.asarray(numbers) / 60:
         azimuth = np.radians(48 * np.sin(2 * np.pi * t))

@@ -10,7 +10,10 @@ SUN = LightSource("sun", (4.0, 118.0, 19.0), (1.0, 0.82, 0.6), 0.95, 60.0, 2.6, 
 
 
 def path(numbers: Array) -> Array:
-    """Return poses of a walk up the street that sways from side to side and pans until the sun leaves the frame."""
+    """Return poses (n, 4, 4), world to camera, of a walk up the street.
+
+    It sways from side to side and pans until the sun leaves the frame.
+    """
     poses = []
     for t in np.asarray(numbers) / 40:
         eye = np.array([1.9 * np.sin(2 * np.pi * t), -9.5 + 4.5 * t, 1.7 + 0.45 * np.sin(4 * np.pi * t + 1)])

@@ -25,7 +25,7 @@ def world(x: float, y: float, z: float) -> tuple[float, float, float]:
 
 
 def path(numbers: Array) -> Array:
-    """Return poses on an arc from left to right, rising and coming nearer, with a pan."""
+    """Return poses (n, 4, 4), world to camera, on an arc from left to right, rising and coming nearer, with a pan."""
     poses = []
     for t in np.asarray(numbers) / 31:
         azimuth, distance = np.radians(-33 + 66 * t), 5.9 - 0.5 * t

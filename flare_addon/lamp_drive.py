@@ -50,7 +50,10 @@ def is_lamp(target: Any) -> bool:
 
 
 def factor(scene: Any, depsgraph: Any, item: Any) -> Gain:
-    """Return the linear RGB factor of a flare at the current frame; 1 where it does not follow its lamp's power."""
+    """Return the linear RGB factor of a flare (`item`) at the current frame: the light of its lamp over the reference.
+
+    It is 1 where the flare does not follow its lamp's power, and where the reference is dark.
+    """
     target = item.target
     if not item.follow_power or not is_lamp(target):
         return WHITE
@@ -66,7 +69,10 @@ def factor(scene: Any, depsgraph: Any, item: Any) -> Gain:
 
 
 def gain(scene: Any, depsgraph: Any, item: Any, matrix: Any, eye: Any) -> Gain:
-    """Return the linear RGB factor of a flare by the power and the direction of its lamp; matrix: its matrix_world."""
+    """Return the linear RGB factor of a flare by the power and the direction of its lamp.
+
+    matrix: matrix_world of the lamp. eye: position of the camera in the world.
+    """
     red, green, blue = factor(scene, depsgraph, item)
     share = direction_factor(item, depsgraph, matrix, eye) if item.follow_direction else 1.0
     return red * share, green * share, blue * share
@@ -110,17 +116,18 @@ def direction_factor(item: Any, depsgraph: Any, matrix: Any, eye: Any) -> float:
     data = item.target.evaluated_get(depsgraph).data
     if data.type == "AREA":
         return 1.0 if item.extent != "point" else _cosine(matrix.to_3x3(), eye - matrix.translation)
-    local = matrix.inverted_safe() @ eye
+    local = matrix.inverted_safe() @ eye  # in the axes of the spot, which shines along -Z
     if local.length < 1e-9:
         return 1.0
     edge = float(np.cos(data.spot_size / 2))
+    # 0 at the edge of the cone, 1 where its soft border ends, measured in cosines.
     inside = (-local.z / local.length - edge) / max((1 - edge) * data.spot_blend, _MIN_BLEND)
     share = min(max(inside, 0.0), 1.0)
     return share * share * (3 - 2 * share)  # as Blender's renderers soften the edge
 
 
 def _cosine(rotation: Any, offset: Any) -> float:
-    """Return the cosine of the angle between a lamp's -Z and an offset in the world; 0 behind the lamp."""
+    """Return the cosine of the angle between a lamp's -Z and an offset in the world; 0 behind the lamp, 1 at it."""
     normal = -rotation.col[2]
     length = normal.length * offset.length
     return max(float(normal.dot(offset)) / length, 0.0) if length > 0 else 1.0
@@ -239,9 +246,10 @@ def measure_driven(scene: Any) -> None:
 
 
 def on_target(item: Any, _context: Any) -> None:
-    """Measure the references when a flare gets another light object, and set its switches when it is the first one.
+    """Measure the references of a flare that gets another light object, and set its switches.
 
-    The switches are on, or off for a light of the capture.
+    At a light of the capture they are switched off. At an object of the artist they are switched on, unless the flare
+    was at one before: then they stay as the artist set them.
     """
     scene, target = item.id_data, item.target
     if not isinstance(scene, bpy.types.Scene) or target is None:
@@ -254,4 +262,4 @@ def on_target(item: Any, _context: Any) -> None:
     item.reference_distance = _distance(scene, target)
     if is_lamp(target):
         item.reference_light = light_of(target.data).tolist()
-        item.reference_is_driven = False
+        item.reference_is_driven = False  # `measure_driven` measures a driven lamp at the first frame

@@ -48,7 +48,7 @@ def _of_lamp(data: Any, linear: Floats) -> LightExtent | None:
     if data.type == "AREA":
         wide = data.size
         high = data.size_y if data.shape in ("RECTANGLE", "ELLIPSE") else wide
-        # It emits along its -Z, and the core to the side of the first axis times the second.
+        # Half axes in this order, since the core's light emits along their cross product, and Blender's along its -Z.
         axes = np.array([linear @ (wide / 2, 0, 0), linear @ (0, -high / 2, 0)])
         if not np.linalg.norm(axes, axis=1).all():
             return None

@@ -34,7 +34,8 @@ def frame_numbers(folder: Path) -> dict[str, int]:
 
 
 def moves(item: Any, root: Any) -> bool:
-    """Return whether an object may move: by animation, constraints, or a parent below `root` that does."""
+    """Return whether an object may move: by animation, constraints, a vertex or bone as its parent, or a parent below
+    `root` that moves."""
     while item is not None and item != root:
         if item.animation_data is not None or item.constraints or item.parent_type != "OBJECT":
             return True
@@ -49,9 +50,10 @@ def has_animated_light(item: Any) -> bool:
 
 def world_paths(scene: Any, items: Mapping[str, Any], folder: Path, place: Callable[[Any], Any]
                 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return the keys of the lights that move or change, by name and by frame: {"xyz": [x, y, z], "on": 0..1}.
+    """Return the keys of the lights that move or change, by name and by picture: {"xyz": [x, y, z], "on": 0..1}.
 
-    items: light objects by name. place: returns the place (3,) of an object at the scene's current frame, in the
+    Each picture of the capture in `folder` is evaluated at its frame of the scene. "on" is the power relative to the
+    largest one. items: light objects by name. place: returns the place (3,) of an object at the scene's current frame, in the
     capture's coordinates. A light that stands has keys without xyz. The scene's frame is restored.
     """
     numbers = frame_numbers(folder)
@@ -81,7 +83,10 @@ def _power(item: Any) -> float:
 
 
 def _keys(names: Sequence[str], places: Sequence[Any], powers: Sequence[float]) -> dict[str, dict[str, Any]]:
-    """Return the keys of a light by frame; {} if it neither moves nor changes."""
+    """Return the keys of a light by picture; {} if it neither moves nor changes.
+
+    names: of the pictures, with the place (3,) and the power of the light in each.
+    """
     xyz = np.array(places)
     is_standing = np.ptp(xyz, axis=0).max() <= STANDING * max(1.0, float(np.abs(xyz).max()))
     is_constant = max(powers) - min(powers) <= 1e-6 * max(max(powers), 1e-9)
@@ -98,8 +103,9 @@ def _keys(names: Sequence[str], places: Sequence[Any], powers: Sequence[float]) 
 
 def merge_entry(known: Mapping[str, Any], name: str, xyz: Sequence[float], keys: Mapping[str, Mapping[str, Any]]
                 ) -> dict[str, Any]:
-    """Return the entry of a light for lights.json. known: its entry so far, whose other values stay.
+    """Return the entry of a light for lights.json.
 
+    known: its entry so far, whose other values stay. xyz: its place if it does not move. keys: from `world_paths`.
     Brightness and confidence of the entry stay where the scene does not animate them. A place that an artist corrected
     is no longer doubtful.
     """
@@ -160,10 +166,11 @@ def clip_folder(clip: Any) -> Path:
 
 
 def _picture_names(clip: Any) -> dict[int, str]:
-    """Return the names of a clip's pictures by frame of the clip, which begins at 1 with the file that it names."""
+    """Return the names of a clip's pictures by frame of the clip: frame 1 is the file that the clip names, moved on by
+    its frame offset."""
     path = absolute(clip.filepath, clip.library)
     numbered = {frame.view: frame.number for frame in number_views(PictureIndex(path.parent).names)
-                if "/" not in frame.view}
+                if "/" not in frame.view}  # pictures of subfolders are not of the clip
     if path.name not in numbered:
         raise CaptureError(f"{path} is missing; load the clip again.")
     first = numbered[path.name] + clip.frame_offset
@@ -178,7 +185,7 @@ def write_tracks(clip: Any, only_selected: bool = False) -> int:
     names, (width, height) = _picture_names(clip), tuple(clip.size)
     tracks = [track for track in clip.tracking.tracks if track.select or not only_selected]
     path = clip_folder(clip) / LIGHTS
-    read_lights(path)  # checks it
+    read_lights(path)  # raises where the file is invalid
     data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
     entries = {str(entry["name"]): entry for entry in data.get("lights", [])}
     count = 0
@@ -188,8 +195,10 @@ def write_tracks(clip: Any, only_selected: bool = False) -> int:
         for marker in track.markers:
             name = names.get(marker.frame)
             if name is not None and not marker.mute:
+                # Markers are in parts of the picture, counted from the lower left corner.
                 place = [round(marker.co[0] * width, 3), round((1 - marker.co[1]) * height, 3)]
                 before = earlier.get(name) or {}
+                # A marker that stays within 0.02 px was not moved, and keeps place, brightness and confidence.
                 same = before.get("xy") is not None and np.allclose(before["xy"], place, atol=0.02)
                 values = before if same else {label: value for label, value in before.items() if label == "on"}
                 frames[name] = {**values, "xy": before["xy"] if same else place}
@@ -208,8 +217,8 @@ def write_tracks(clip: Any, only_selected: bool = False) -> int:
 def read_tracks(clip: Any) -> int:
     """Add the paths on the picture of lights.json as tracks of a clip; return their number.
 
-    A track of the same name is replaced. Markers of doubtful places are muted. Raises CaptureError where there are
-    none.
+    A track of the same name is renamed to "... (before)", since scripts cannot delete tracks. Markers of doubtful
+    places are muted. Raises CaptureError where there are no such paths.
     """
     names, (width, height) = _picture_names(clip), tuple(clip.size)
     path = clip_folder(clip) / LIGHTS

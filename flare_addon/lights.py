@@ -33,7 +33,7 @@ def scene_lights(scene: Any) -> list[Any]:
 
 
 def _belongs_to_other_capture(light: Any, root: Any) -> bool:
-    """Return whether a light belongs to another imported capture than the one below `root`."""
+    """Return whether a light belongs to another imported capture than the one below `root`; False without a root."""
     parent = light.parent if root is not None else None
     while parent is not None and parent != root:
         if parent.fit_flare.is_root:
@@ -120,6 +120,7 @@ def write_to_capture(scene: Any, folder: Path) -> int:
     data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
     known = {entry.get("name"): entry for entry in data.get("lights", []) if isinstance(entry, dict)}
     lights = [known[name] for name in new_names(scene, folder)]
+    # The camera's position, from which a sun is placed.
     eye = scene.camera.matrix_world.translation if scene.camera is not None else objects[0].matrix_world.translation
 
     def place(item: Any) -> Any:
@@ -185,6 +186,7 @@ def import_new(scene: Any, folder: Path) -> int:
     size = max((item.empty_display_size for item in existing if item.type == "EMPTY"), default=0.2)
     keyed = light_paths.keyed_capture(folder, new_lights)
     for light in new_lights:
+        # The position of a light that moves is NaN; its keys place it.
         item = add_light(collection, scene.fit_flare.root, light.name, np.nan_to_num(light.xyz), size)
         if keyed is not None and light.moves:
             light_paths.key_path(item, light, *keyed)
@@ -201,10 +203,11 @@ def _move_to(light: Any, xyz: ArrayLike) -> None:
 
 
 def move_to_fit(scene: Any, fitted: Mapping[str, ArrayLike], capture: Path | None) -> None:
-    """Move lights to the positions (3,) from a fit, by name, in the capture's coordinates.
+    """Move lights to their positions from a fit.
 
-    Only lights at their position in the capture's lights.json are moved, the one that the fit started from, and none
-    that is animated.
+    Only lights that are still at their position in the capture's lights.json, from which the fit started, are moved,
+    and none that is animated or has another parent than the root. fitted: positions (3,) by name, in the capture's
+    coordinates. capture: its folder; None moves nothing.
     """
     path = None if capture is None else capture / LIGHTS
     fitted_from = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}

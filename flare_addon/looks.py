@@ -55,14 +55,15 @@ def is_placed(item: Any, scene: Any) -> bool:
 
 
 def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add: bool = False) -> Look:
-    """Show a .flare in the scene, at its flares, at light objects with the names of the look's lights, at `targets`.
+    """Show a .flare in the scene; return its look. Raises FlareFileError.
 
-    A flare that is there keeps its light object and its sliders. Where the look has no light of its name, it shows the
-    light with the same number, counted over the lights of the earlier look. A light of the look without a flare gets
-    one where a light object has its name, or where the scene had no flare at all. Sliders that the artist has not moved
-    follow the edits in the file. Flares without a light object are placed at `targets`; with `add`, each remaining
-    target gets a flare of its own. A target that has a flare gets no second one. Returns the look. Raises
-    FlareFileError.
+    A flare that the scene has keeps its light object and its sliders. It shows the look's light of the same name as
+    before; if there is none, the light with the same number, counted over the lights of the earlier look. Sliders that
+    the artist has not moved follow the edits in the file.
+
+    A light of the look without a flare gets one if a light object has its name, or if the scene had no flare at all.
+    Flares without a light object are placed at the objects `targets`. add: each remaining target gets a flare of its
+    own. A target that has a flare gets no second one.
     """
     path = Path(path)
     look = read(path)
@@ -96,7 +97,7 @@ def _place_at(scene: Any, look: Look, targets: Sequence[Any], add: bool) -> None
     remaining = [target for target in targets if target not in _targets(state)]
     for item in [item for item in state.lights if item.target is None][:len(remaining)]:
         item.target = remaining.pop(0)
-        if len(look.lights) == 1 and item.name == item.source:  # it tells an artist nothing
+        if len(look.lights) == 1 and item.name == item.source:  # a name of the file tells an artist nothing
             item.name = free_name(item.target.name, {entry.name for entry in state.lights if entry != item})
         lamp_drive.measure(scene, item)
     for target in remaining if add else ():
@@ -136,7 +137,7 @@ def _change_look(scene: Any, before: LookEdits, look: Look) -> None:
 
 
 def _follow_edit(sliders: Any, before: Edit, after: Edit) -> None:
-    """Set each slider that has the value of `before` to that of `after`."""
+    """Set each slider that still has the value of `before` to that of `after`."""
     present = edit_of(sliders)
     for name in EDIT_NAMES:
         if np.allclose(getattr(present, name), getattr(before, name), rtol=1e-5, atol=1e-6):
@@ -184,8 +185,9 @@ def remove_flare(scene: Any, number: int) -> None:
 
 
 def _was_learned_here(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> bool:
-    """Return whether the look was learned from the scene's capture, by the positions of the lights.
+    """Return whether the look was learned from the scene's capture: lights of the same name are at the same positions.
 
+    Positions may differ by 5% of the extent of the look's training cameras. objects: the scene's light objects by name.
     A capture that was made from Blender's own camera has no root; its world is Blender's.
     """
     root = state.root
@@ -272,10 +274,10 @@ def place_lights(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.fl
 
 def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.float64], item: Any, *,
                 hides: bool, rendered: set[Any]) -> PlacedLight:
-    """Return the light of a flare as a camera of this matrix_world sees it. Raises CaptureError.
+    """Return the light of a flare as a camera sees it. Raises CaptureError.
 
-    to_capture: matrix (4, 4) from Blender's world to the coordinates of the result. hides: whether objects hide it.
-    rendered: `lamp_drive.rendered_collections` of the scene.
+    camera: matrix_world of the camera. to_capture: matrix (4, 4) from Blender's world to the coordinates of the result.
+    item: the flare. hides: whether objects hide the light. rendered: `lamp_drive.rendered_collections` of the scene.
     """
     eye, target = camera.translation, item.target
     is_dark = item.follow_visibility and not lamp_drive.is_shown(target, depsgraph, rendered)
@@ -284,6 +286,7 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
     except CaptureError:
         if not is_dark:
             raise
+        # Of a disabled object the last known position is good enough, since its flare is dark.
         xyz = (to_capture @ np.array([*target.matrix_world.translation, 1.0]))[:3]
         return PlacedLight(item.name, item.source, xyz, 0.0, factor=lamp_drive.DARK)
     position = light_position(target, placed, eye)
@@ -291,7 +294,7 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
     # A dark light has its visibility too, since a transfer smooths visibilities over neighbouring frames.
     gain = lamp_drive.DARK if is_dark else lamp_drive.gain(scene, depsgraph, item, placed, eye)
     reference = item.reference_distance if item.follow_distance and not lamp_drive.is_sun(target) else 0.0
-    reference *= float(np.cbrt(abs(np.linalg.det(to_capture[:3, :3]))))
+    reference *= float(np.cbrt(abs(np.linalg.det(to_capture[:3, :3]))))  # scene units to units of the capture
     extent = light_extents.extent_of(item, depsgraph, placed)
     if extent is None:
         visibility = occlusion.visibility(scene, depsgraph, eye, item) if hides else 1.0
@@ -306,7 +309,7 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
 
 def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | None = None
                     ) -> dict[str, PlaneGaussians]:
-    """Evaluate every flare of the scene for a camera at the current frame.
+    """Evaluate every flare of the scene for a camera object at the current frame; return the Gaussians by flare's name.
 
     edits: in place of those of the scene's sliders. Raises FlareFileError and CaptureError.
     """

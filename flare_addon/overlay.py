@@ -105,8 +105,10 @@ def camera_frame(context: Any, scene: Any, camera: Any) -> CameraFrame | None:
 class Quads:
     """Vertices of n quads.
 
-    place (4n, 2): pixels of the drawn region. local (4n, 2): Mahalanobis coordinates. light (4n, 3): at the peak.
-    ring (4n, 3): r0, w and opacity. arc (4n, 3): in the unit of local, and its level. triangles (2n, 3): vertices.
+    place (4n, 2): pixels of the level that they are drawn in. local (4n, 2): Mahalanobis coordinates, along the long
+    axis and across it. light (4n, 3): colour times opacity. ring (4n, 3): radius r0 and width w in the unit of local,
+    and opacity. arc (4n, 3): vector to the brighter side in the unit of local, and the logarithm of the peak that it
+    gives, which the shader subtracts. triangles (2n, 3): indices of vertices.
     """
 
     place: Floats
@@ -123,13 +125,15 @@ _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
 def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ring: Floats, arcs: Floats) -> Quads:
     """Return a quad about each ellipse, in their order.
 
-    centres (n, 2) px, covariances (n, 3) px², radii (n,) Mahalanobis, light (n, 3), ring (n, 3), arcs (n, 2) px.
+    centres (n, 2) px, covariances (n, 3) xx, xy, yy in px², radii (n,) Mahalanobis, arcs (n, 2) px. light (n, 3) and
+    ring (n, 3): as in `Quads`.
     """
     centres, covariances, radii, arcs = (np.asarray(each, np.float32) for each in (centres, covariances, radii, arcs))
     xx, xy, yy = covariances.T
     half, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     long, short = np.sqrt(np.maximum(half + root, 0)), np.sqrt(np.maximum(half - root, 0))
     cosine = (xx - yy) / np.maximum(2 * root, np.finfo(np.float32).tiny)  # of twice the angle of the long axis
+    # Unit vector (x, y) of the long axis, by the half-angle formulas; (-y, x) is the short one.
     x, y = np.sqrt(np.clip((1 + cosine) / 2, 0, 1)), np.copysign(np.sqrt(np.clip((1 - cosine) / 2, 0, 1)), xy)
     count = len(centres)
     place, local = np.empty((2, count, 4, 2), np.float32)
@@ -154,17 +158,20 @@ def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ri
 
 
 def level_indices(covariances: Floats, rings: Floats | None) -> NDArray[np.int64]:
-    """Return the index in LEVELS (n,) that each Gaussian is drawn in, by its narrow side in pixels."""
+    """Return the index in LEVELS (n,) that each Gaussian is drawn in, by its narrow side in pixels.
+
+    covariances: (n, 3) px². rings: (n, 2) r0 and w, or None.
+    """
     xx, xy, yy = covariances.T
     half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     narrow = np.sqrt(np.maximum(half - root, 0))
     if rings is not None:
-        narrow = narrow * np.minimum(rings[:, 1], 1)
+        narrow = narrow * np.minimum(rings[:, 1], 1)  # the line of a ring is thinner than its ellipse
     return np.clip(np.searchsorted(np.array(LEVELS), narrow / MIN_TEXELS, side="right") - 1, 0, len(LEVELS) - 1)
 
 
 def touch_region(centres: Floats, covariances: Floats, radii: Floats, width: int, height: int) -> NDArray[np.bool_]:
-    """Return which ellipses (n,) touch the picture; degenerate ones do not."""
+    """Return which ellipses (n,) touch a picture of this size; degenerate ones do not. Arguments as in `quads`."""
     xx, xy, yy = covariances.T
     reach_x, reach_y = radii * np.sqrt(np.maximum(xx, 0)), radii * np.sqrt(np.maximum(yy, 0))
     x, y = centres.T
@@ -182,11 +189,11 @@ def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -
     opacities = gaussians.opacities if blend == "add" else np.minimum(gaussians.opacities, OPACITY_MAX)
     rings = gaussians.rings
     if rings is None:
-        rings = np.tile(np.array([0, 1], np.float32), (len(gaussians), 1))
+        rings = np.tile(np.array([0, 1], np.float32), (len(gaussians), 1))  # radius 0, width 1: a plain Gaussian
     light, ring = gaussians.colours * opacities[:, None], np.concatenate([rings, opacities[:, None]], -1)
     if blend == "over":  # the first is in front, so it is drawn last
         rows = rows[::-1]
-        chosen = np.zeros(len(gaussians), np.int64)
+        chosen = np.zeros(len(gaussians), np.int64)  # all at full size
     else:
         chosen = level_indices(covariances, gaussians.rings)
     by_level: dict[int, Quads] = {}
@@ -276,7 +283,8 @@ def composite(drawn: list[Any], box: tuple[float, float, float, float], blend: s
               space: NDArray[np.float64]) -> None:
     """Add rendered levels to the bound framebuffer, inside box (left, bottom, right, top; 0..1 of its size).
 
-    space: matrix (3, 3) from linear Rec. 709 to the framebuffer's space.
+    drawn: the buffers of `render`. With the blend "over" they hold display values, which the shader converts to linear
+    light. space: matrix (3, 3) from linear Rec. 709 to the framebuffer's space.
     """
     import gpu
     from gpu_extras.batch import batch_for_shader
@@ -318,7 +326,11 @@ def _draw_outlines() -> None:
 
 
 def _draw_with(draw: Callable[[Any, Any, Any], None]) -> None:
-    """Call a function with context, scene and camera where the current 3D view shows the flare."""
+    """Call a function with context, scene and camera where the current 3D view shows the flare.
+
+    Nothing is drawn while a bake reads the scene, since that moves the timeline. A FitFlareError is stored in
+    `last_error`.
+    """
     global last_error
     context = bpy.context
     scene, space = context.scene, context.space_data
@@ -419,7 +431,10 @@ def has_display_footage(camera: Any) -> bool:
 
 
 def add_to_picture(target: Any, scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> None:
-    """Add the flares of the scene to a picture of the whole frame, in a buffer off screen. Needs a GPU context."""
+    """Add the flares of the scene to a picture of the whole frame. Needs a GPU context.
+
+    target: offscreen buffer of (width, height) pixels, in Blender's working space.
+    """
     evaluated = camera.evaluated_get(depsgraph)
     core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
     window = drawn_region(CameraFrame(0, 0, width, height), (width, height), core)

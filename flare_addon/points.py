@@ -51,6 +51,7 @@ def _draw() -> None:
     if not context.space_data.overlay.show_overlays:
         return
     for item in context.visible_objects:
+        # The importer sets the display as bounds; with another one, Blender draws the vertices itself.
         if item.type != "MESH" or item.display_type != "BOUNDS" or ATTRIBUTE not in item.data.color_attributes:
             continue
         if not item.fit_flare.is_points or not len(item.data.vertices):

@@ -33,9 +33,10 @@ MAX_PROCESSES = 8
 
 
 class Preparation:
-    """A scene that is being read for a bake. error: why the reading ended early; "" where it did not."""
+    """A scene that is being read for a bake."""
 
     def __init__(self, reading: ShotReading, own_folder: bool, folder: Path) -> None:
+        """own_folder: a single camera has a folder of its own too. folder: of the layers."""
         self.reading, self.error = reading, ""
         self._own_folder, self._folder = own_folder, folder
 
@@ -93,11 +94,12 @@ def why_not(scene: Any) -> str:
         return "A bake is running"
     if scene.fit_flare.bake_scene and engine.find_engine() is None:
         return f"Fitted Scene Too needs the engine. {engine.missing_reason()}"
+    # Without any engine Blender's Python draws; one that is configured but missing is an error.
     return engine.missing_reason() if engine.configured_engine()[1] else ""
 
 
 def start(scene: Any, camera_objects: Sequence[Any], *, replace_others: bool = False) -> None:
-    """Start a bake of these cameras, or of the scene's camera. Without a window it has ended on return.
+    """Start a bake of these camera objects, or of the scene's camera for []. Without a window it has ended on return.
 
     replace_others: delete layers that `shots.frames_to_replace` returns; without it they are an error. Raises
     FitFlareError.
@@ -158,7 +160,7 @@ def _end(error: str) -> None:
 
 
 def _start_process(folder: Path, frames: int) -> None:
-    """Start the process that bakes the shot in a folder."""
+    """Start the process that bakes the shot in a folder. frames: their number."""
     args = ["bake", folder / shots.SHOT_FILE, "--out", folder, "--overwrite"]
     if engine.find_engine() is not None or engine.configured_engine()[1]:
         engine.run("bake", folder, args)

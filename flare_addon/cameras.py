@@ -18,6 +18,7 @@ from .objects import world_matrix
 Floats = NDArray[np.float64]
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Matrix between the axes of Blender's cameras and the core's, in both directions."""
 
 
 def pixel_aspect(fx: float, fy: float) -> tuple[float, float]:
@@ -26,7 +27,10 @@ def pixel_aspect(fx: float, fy: float) -> tuple[float, float]:
 
 
 def lens_of(camera: Camera, sensor_width: float, aspect: tuple[float, float]) -> tuple[float, float, float]:
-    """Return focal length in mm, shift_x and shift_y for a Blender camera with sensor_fit HORIZONTAL."""
+    """Return focal length in mm, shift_x and shift_y for a Blender camera with sensor_fit HORIZONTAL.
+
+    sensor_width: mm. aspect: the scene's pixel aspect, from `pixel_aspect`.
+    """
     lens = camera.fx * sensor_width / camera.width
     shift_x = (camera.width / 2 - camera.cx) / camera.width
     shift_y = (camera.cy - camera.height / 2) / camera.width * (aspect[1] / aspect[0])
@@ -50,13 +54,14 @@ def intrinsics_of(data: Any, render: Any) -> tuple[float, float, float, float]:
     if data.type != "PERSP":
         raise CaptureError(f"The camera {data.name!r} is not a perspective camera; a flare needs one.")
     width, height = render_size(render)
-    tall = render.pixel_aspect_y / render.pixel_aspect_x
+    tall = render.pixel_aspect_y / render.pixel_aspect_x  # height of a pixel over its width
     fit = data.sensor_fit
     if fit == "AUTO":
         fit = "HORIZONTAL" if width * render.pixel_aspect_x >= height * render.pixel_aspect_y else "VERTICAL"
-        sensor = data.sensor_width
+        sensor = data.sensor_width  # along the longer side, whichever it is
     else:
         sensor = data.sensor_width if fit == "HORIZONTAL" else data.sensor_height
+    # Length of the side that the sensor fits, in widths of a pixel; Blender's shifts are parts of it.
     reach = width if fit == "HORIZONTAL" else height * tall
     fx = data.lens * reach / sensor
     return fx, fx / tall, width / 2 - data.shift_x * reach, height / 2 + data.shift_y * reach / tall
@@ -88,7 +93,7 @@ def core_camera(data: Any, matrix: Any, render: Any) -> Camera:
 def world_to_capture(root: Any, depsgraph: Any) -> Floats:
     """Return the matrix (4, 4) from Blender's world to the capture's, by the current transform of its root.
 
-    The identity without a root. Raises CaptureError as `world_matrix` does.
+    The identity without a root, and for a root that is scaled to zero. Raises CaptureError as `world_matrix` does.
     """
     if root is None:
         return np.eye(4)
@@ -102,7 +107,7 @@ def point_in_capture(point: Any, root: Any, depsgraph: Any) -> Floats:
 
 
 def pose_in_capture(matrix: Any, root: Any, depsgraph: Any) -> Floats:
-    """Return world_to_camera (4, 4) in the capture's coordinates for a matrix_world. Raises CaptureError."""
-    placed = world_to_capture(root, depsgraph) @ camera_to_world(matrix)
+    """Return world_to_camera (4, 4) in the capture's coordinates for a camera's matrix_world. Raises CaptureError."""
+    placed = world_to_capture(root, depsgraph) @ camera_to_world(matrix)  # with the scale of the root
     placed[:3, :3] /= np.linalg.norm(placed[:3, :3], axis=0)
     return np.linalg.inv(placed)

@@ -107,7 +107,7 @@ def new_run_folder(scene: Any) -> Path:
 
 
 def start(scene: Any) -> Job:
-    """Start a fit in a new folder, with the present lights of the scene.
+    """Start a fit in a new folder, with the present lights of the scene; the folder becomes the scene's run.
 
     Raises EngineError without an engine, CaptureError without a capture or lights, RunError for an unusable folder.
     """
@@ -155,7 +155,7 @@ def start_from_footage(scene: Any, source: Path) -> Job:
 
 
 def resume(scene: Any) -> Job:
-    """Resume the run of the scene. Raises as `start` does."""
+    """Resume the run of the scene, from the capture that it was started with. Raises as `start` does."""
     capture, folder = capture_folder(scene), run_folder(scene)
     stopped = fit_job(scene)
     if folder is not None and stopped is not None and stopped.args[:1] == ["shot"]:
@@ -171,7 +171,7 @@ def resume(scene: Any) -> Job:
 
 
 def _run_fit(scene: Any, capture: Path, folder: Path) -> Job:
-    """Start the command `fit` with the scene's settings."""
+    """Start the command `fit` with the scene's settings and no held-out views."""
     state = scene.fit_flare
     args: list[object] = ["fit", capture.resolve(), "--out", folder, "--resume", "--preset", state.preset, "--mode",
                           state.mode, "--holdout", 0]
@@ -195,7 +195,10 @@ def show_result(scene: Any, folder: Path) -> Look:
 
 
 def expose_cameras(scene: Any, folder: Path | None) -> None:
-    """Set the exposure of the imported cameras from a run, unless it is a run of another capture. Raises RunError."""
+    """Set the exposure of the imported cameras from a run, if the run names its capture and it may be this one.
+
+    Raises RunError.
+    """
     capture = capture_folder(scene)
     if folder is None or capture is None or scene.fit_flare.root is None:
         return

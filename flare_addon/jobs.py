@@ -77,6 +77,7 @@ class Job:
     def __init__(self, kind: str, folder: Path, origin: Origin, args: Sequence[str] = (),
                  process: subprocess.Popen[bytes] | None = None) -> None:
         self.kind, self.folder, self.origin = kind, folder, origin
+        # Without --overwrite, so that arguments are equal where the result is.
         self.args = [arg for arg in args if arg != "--overwrite"]
         self.state: State = "running"
         self.stage, self.done, self.total = "starting", 0, 0
@@ -165,6 +166,7 @@ class Job:
             name, done, total = str(event["name"]), int(event["done"]), int(event["total"])
             self.stage, self.done, self.total, self.eta_s = name, done, total, None
         elif kind == "progress":
+            # left_s: the name of eta_s in an earlier version
             done, total, eta_s = int(event["done"]), int(event["total"]), event.get("eta_s", event.get("left_s"))
             figures = {str(name): float(value) for name, value in event["figures"].items()}
             self.done, self.total, self.eta_s = done, total, None if eta_s is None else float(eta_s)
@@ -178,7 +180,7 @@ class Job:
             self.error = str(event["text"])
 
     def _is_alive(self) -> bool:
-        """Return whether the process of the job is running."""
+        """Return whether the process of the job is running; of one on another machine, whether its events say so."""
         if self._process is not None:
             return self._process.poll() is None
         if self.origin.host != HOST:
@@ -307,12 +309,14 @@ def find(folder: Path | str | None) -> Job | None:
         return known
     try:
         record = parse_json(read_text(folder / RECORD))
-        pid, host = int(record["pid"]), str(record.get("host", HOST))  # an early version stored none,
-        host = HOST if host == platform.node() else host  # and the next the name of a Mac
+        # The first version stored no host, and a later one the host name, which on a Mac is not the machine's id.
+        pid, host = int(record["pid"]), str(record.get("host", HOST))
+        host = HOST if host == platform.node() else host
         started = float(record["started"])
         is_running = host == HOST and processes.is_same_process(pid, started)
         origin = Origin(pid if is_running else 0, host, str(record.get("host_name", "")), started,
                         int(record.get("log_from", 0)))
+        # words: the name of args in an earlier version
         job = Job(str(record["kind"]), folder, origin, list(map(str, record.get("args", record.get("words", ())))))
     except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return None

@@ -52,9 +52,10 @@ def world_paths(scene: Any, items: Mapping[str, Any], folder: Path, place: Calla
                 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Return the keys of the lights that move or change, by name and by picture: {"xyz": [x, y, z], "on": 0..1}.
 
-    Each picture of the capture in `folder` is evaluated at its frame of the scene. "on" is the power relative to the
-    largest one. items: light objects by name. place: returns the place (3,) of an object at the scene's current frame, in the
-    capture's coordinates. A light that stands has keys without xyz. The scene's frame is restored.
+    Each picture of the capture in `folder` is evaluated at its frame of the scene, which is restored afterwards. "on"
+    is the power relative to the light's largest one. A light that stands has keys without xyz, one that does not change
+    has keys without on. items: light objects by name. place: returns the place (3,) of an object at the scene's current
+    frame, in the capture's coordinates.
     """
     numbers = frame_numbers(folder)
     animated = {name: item for name, item in items.items()

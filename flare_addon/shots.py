@@ -110,7 +110,7 @@ def scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int],
 
 
 def shot_frame(scene: Any, depsgraph: Any, camera: Any, frame: int) -> ShotFrame:
-    """Return the frame of a shot for one camera at the current frame of the scene."""
+    """Return the frame of a shot for one camera at the current frame of the scene. frame: its number."""
     evaluated = camera.evaluated_get(depsgraph)
     pose, lights = looks.place_lights(scene, depsgraph, camera)
     core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
@@ -138,7 +138,10 @@ def _for_lights(edits: LookEdits, names: set[str]) -> LookEdits:
 
 
 def live_record(state: Any, names: Sequence[str]) -> dict[str, list[str]]:
-    """Return the contents of LIVE_FILE: the names of the baked lights, and ids that stay when a flare is renamed."""
+    """Return the contents of LIVE_FILE: the names of the baked lights, and ids that stay when a flare is renamed.
+
+    A flare without an id gets one. state: the scene's properties. names: of the baked lights.
+    """
     identities = {}
     for item in state.lights:
         item.identity = item.identity or uuid4().hex
@@ -149,12 +152,14 @@ def live_record(state: Any, names: Sequence[str]) -> dict[str, list[str]]:
 def live_layers(state: Any, folder: Path) -> dict[str, int] | None:
     """Return the index of the scene's flare for each layer that was baked without intensity and tint.
 
-    Layers of removed flares are left out. None where neither the folder nor its parent has a LIVE_FILE.
+    state: the scene's properties. folder: of the layers, or of those of one camera, whose parent has the LIVE_FILE.
+    Layers of removed flares are left out. None where neither the folder nor its parent has a readable LIVE_FILE.
     """
     folder = next((place for place in (folder, folder.parent) if (place / LIVE_FILE).is_file()), folder)
     try:
         live = parse_json(read_text(folder / LIVE_FILE))
         baked = layer_names(live["lights"])
+        # Earlier versions stored no ids.
         identities = dict(zip(live["lights"], live.get("identities", live["lights"]), strict=True))
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -198,7 +203,7 @@ def choose_layers_folder(scene: Any) -> Path:
 def camera_folder(layers: Path, camera: Any) -> Path:
     """Return the folder of a camera's layers, inside the folder of a bake or that folder itself.
 
-    Raises FrameError where there are layers of other cameras only.
+    camera: a camera object, or None. Raises FrameError where there are layers of other cameras only.
     """
     try:
         last = Shot.read(layers / SHOT_FILE).folders
@@ -206,6 +211,7 @@ def camera_folder(layers: Path, camera: Any) -> Path:
         return layers
     folders = {**_baked_folders(layers), **last}
     name = camera.name if camera is not None else ""
+    # Where the last bake wrote into the folder itself (""), or EXRs are there, they serve any camera.
     if name not in folders and "" not in last.values() and not any(layers.glob("*.exr")):
         raise FrameError(f"{layers} has no layers of the camera {name!r}, only of {', '.join(map(repr, folders))}; "
                          "bake it too, or make one of those the scene's camera. A renamed camera needs its old name.")

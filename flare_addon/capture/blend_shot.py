@@ -100,7 +100,9 @@ def _is_keyed(obj: Any, path: str) -> bool:
 def _flare_of(scene: Any, obj: Any, radius: float) -> Any:
     """Return the settings of a flare at a light: those of the scene's flare at this object, else the default ones.
 
-    The scene is at its first frame, to which the power of lamps is relative by default. A radius replaces the flare's.
+    They have the attributes of a flare in `scene.fit_flare.lights` that `looks.place_light` reads. The scene is at its
+    first frame, to which the power of lamps is relative by default. radius: world units; 0 for that of the flare, else
+    of the lamp.
     """
     row = next((item for item in scene.fit_flare.lights if item.target == obj), None)
     if row is not None:

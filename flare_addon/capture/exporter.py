@@ -29,6 +29,7 @@ from .. import cameras
 from ..paths import absolute, blend_relative
 
 MAX_POINTS = 100_000
+"""Points above whose double a cloud is thinned."""
 MAKER = "Fit Flare"
 """The value of made_by in a transforms.json from here; only such a file is overwritten."""
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")
@@ -57,8 +58,8 @@ def footage_of(camera: Any) -> Footage | None:
         if background.source == "IMAGE" and background.image is not None and background.image.source == "SEQUENCE":
             user, path = background.image_user, absolute(background.image.filepath, background.image.library)
             match = _NUMBER.search(path.stem)
+            # The sequence shows file number `frame - frame_start + 1 + frame_offset`; the number is this file's.
             start_frame = user.frame_start - user.frame_offset - 1 + int(match[1]) if match else user.frame_start
-            # The sequence shows file number `frame - frame_start + 1 + frame_offset`.
             return Footage(path, start_frame)
         if background.source == "MOVIE_CLIP" and background.clip is not None and background.clip.source == "SEQUENCE":
             return Footage(absolute(background.clip.filepath, background.clip.library),
@@ -131,6 +132,7 @@ def _check_free(folder: Path, plates: Mapping[int, Path]) -> None:
         picture = folder / _picture_path(frame, plate)
         if not picture.exists() or _is_copy(picture, plate):
             continue
+        # Pictures of an earlier export may be replaced, but not by plates of the same folder.
         if not is_capture or plate.parent.resolve() == picture.parent.resolve():
             raise CaptureError(f"{picture} exists already and would be replaced by {plate}; choose another folder.")
 
@@ -156,7 +158,8 @@ def write_cameras(folder: Path, entries: list[dict[str, Any]]) -> None:
 def write_frame(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> dict[str, Any]:
     """Link or copy the picture of a frame into the capture; return the frame's entry for transforms.json.
 
-    Raises CaptureError for a camera that is mirrored or skewed.
+    The scene must be at this frame. path: the picture. folder: of the capture. Raises CaptureError for a camera that is
+    mirrored or skewed.
     """
     depsgraph = bpy.context.evaluated_depsgraph_get()
     evaluated = camera.evaluated_get(depsgraph)
@@ -206,7 +209,7 @@ _UNSUPPORTED_DISTORTION = {"DIVISION": ("division_k1", "division_k2"), "NUKE": (
 
 
 def lens_distortion(camera: Any, path: Path) -> dict[str, float]:
-    """Return the distortion coefficients k1, k2, k3 from the motion tracker, for a picture of the clip itself.
+    """Return the distortion coefficients k1, k2, k3 from the motion tracker, for a picture in the folder of the clip.
 
     {} without distortion, and for other pictures, which count as undistorted. Raises CaptureError for a distortion
     model other than Polynomial, which transforms.json cannot represent.
@@ -238,7 +241,10 @@ def bundle_matrix(camera: Any) -> Any:
 
 
 def scene_points(scene: Any, camera: Any) -> np.ndarray[Any, Any]:
-    """Return the points (n, 3) of the clip's solved tracks and of the scene's meshes, in Blender's world."""
+    """Return the points (n, 3) of the clip's solved tracks and of the scene's meshes, in Blender's world.
+
+    Of more than 2 MAX_POINTS, every second, third, ... is returned.
+    """
     parts: list[np.ndarray[Any, Any]] = []
     for background in camera.data.background_images:
         if background.source == "MOVIE_CLIP" and background.clip is not None:

@@ -282,7 +282,7 @@ def set_exposures(root: Any, exposures: Mapping[str, float]) -> None:
         for curves in fcurves.fcurves_of(camera):  # from an earlier fit
             for curve in [curve for curve in curves if curve.data_path == EXPOSURE_PATH]:
                 curves.remove(curve)
-        state.exposure = exposures.get(state.view, 1.0)
+        state.exposure = exposures.get(state.view, 1.0)  # of an animated camera, the view is a folder
         for frame in number_views(exposures):
             if Path(frame.view).parent.as_posix() == state.view:
                 state.exposure = exposures[frame.view]
@@ -290,7 +290,10 @@ def set_exposures(root: Any, exposures: Mapping[str, float]) -> None:
 
 
 def insert_keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -> None:
-    """Insert linear keys on a data block in bulk. channels: values (frames, width) by RNA path."""
+    """Insert linear keys on a data block in bulk, in a new action.
+
+    channels: values (frames, components of the property) by RNA path.
+    """
     action = bpy.data.actions.new(f"{block.name} Action")
     block.animation_data_create().action = action
     curves: Any
@@ -312,8 +315,11 @@ def insert_keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[
 
 
 def _show_sequence(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequence[int]) -> bool:
-    """Show the frames as a sequence behind the camera; where their names are no sequence, show the first, return
-    False."""
+    """Show the frames as a sequence behind the camera; return whether all are shown.
+
+    Blender finds the pictures of a sequence by their names: the same text with the number of the frame. Where the names
+    differ otherwise, only the first is shown. numbers: frame of each view.
+    """
     paths = [capture.frame_path(view) for view in views]
     patterns = {(path.parent, _NUMBER.sub("#", path.name)) for path in paths}
     matches = [_NUMBER.search(path.stem) for path in paths]
@@ -323,6 +329,7 @@ def _show_sequence(camera: Any, capture: Capture, views: Sequence[View], numbers
         _add_background(camera, load_image(paths[0]))
         return len(paths) == 1
     user = _add_background(camera, load_image(paths[0], "SEQUENCE")).image_user
+    # Blender shows file number `frame - frame_start + 1 + frame_offset`.
     user.frame_start, user.frame_offset = numbers[0], numbers[0] - 1
     user.frame_duration = numbers[-1] - numbers[0] + 1
     user.use_auto_refresh = True
@@ -345,6 +352,7 @@ def show_footage(scene: Any, which: str) -> int:
         showing.setdefault(user.image, []).append(user)
     changed = 0
     for image, users in showing.items():
+        # inner: the picture's path in images/ or removed/; None for a picture from elsewhere
         path = absolute(image.filepath, image.library).resolve()
         inner = next((path.relative_to((base / name).resolve()) for name in ("images", REMOVED)
                       if path.is_relative_to((base / name).resolve())), None)
@@ -365,7 +373,7 @@ def _background_images(root: Any) -> Iterator[Any]:
 
 def _own_image(image: Any, users: Sequence[Any]) -> Any:
     """Return the image of these users, or a copy that replaces it where it has other users too."""
-    if image.users - image.use_fake_user > len(users):
+    if image.users - image.use_fake_user > len(users):  # Blender counts a fake user as one
         image = image.copy()
         for user in users:
             user.image = image

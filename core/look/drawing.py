@@ -31,6 +31,7 @@ def extent(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
         radius = np.sqrt(2 * np.log(np.maximum(peaks / ALPHA_MIN, 1)))
     if gaussians.rings is not None:
         r0, w = gaussians.rings.T
+        # The last term is how far an arc moves the peak outwards.
         radius = np.maximum(r0 + w * radius + w * w * gaussians.arc_strengths, 0)
     return np.asarray(radius, np.float32)
 
@@ -74,7 +75,9 @@ def draw_with_transmittance(flares: Iterable[PlaneGaussians], intrinsics: ArrayL
 
 
 def bounding_box(centre: Floats, covariance: Floats, radius: float, width: int, height: int) -> Box | None:
-    """Return the bounding box of a Gaussian in the picture; None if it is outside."""
+    """Return the bounding box of a Gaussian in the picture; None if it is outside, or flat, or not finite.
+
+    centre (2,), px; covariance (3,), px²; radius: Mahalanobis, see `extent`."""
     xx, xy, yy = (float(value) for value in covariance)
     if not xx * yy - xy * xy > 0:
         return None
@@ -88,8 +91,9 @@ def bounding_box(centre: Floats, covariance: Floats, radius: float, width: int, 
 
 
 def profile_in(box: Box, centre: Floats, covariance: Floats, ring: NDArray[Any] | None, pixel_arc: Floats) -> Floats:
-    """Return the profile (rows, columns) of a Gaussian in a box of pixels, 1 at its peak; ring (2,): r0 and w, or None.
-    """
+    """Return the profile (rows, columns) of a Gaussian in a box of pixels, 1 at its peak.
+
+    centre (2,), px; covariance (3,), px²; ring (2,): r0 and w, or None; pixel_arc (2,): see `arcs_to_pixels`."""
     xx, xy, yy = covariance
     dx = np.arange(box[0], box[2], dtype=np.float32) + 0.5 - centre[0]
     dy = (np.arange(box[1], box[3], dtype=np.float32) + 0.5 - centre[1])[:, None]

@@ -170,7 +170,7 @@ class LookEdits:
             change = _parse_change(text, property_name.rstrip(), value.strip())
             for target in _parse_targets(text, whom, lights, elements):
                 before = edits_by_target.get(target, NEUTRAL)
-                after = before.combine(change)
+                after = before.combine(change)  # without solo
                 edits_by_target[target] = replace(after, solo=before.solo or change.solo)
         return cls(edits_by_target.pop((ALL, ""), NEUTRAL),
                    {light: edit for (light, part), edit in edits_by_target.items() if not part},
@@ -183,7 +183,7 @@ class LookEdits:
         return [f"{name}.{property_name}" for name, edit in (*light_edits, *parts) for property_name in _to_texts(edit)]
 
     def interpolate(self, other: LookEdits, share: float) -> LookEdits:
-        """Interpolate linearly between these edits (share 0) and others (1); mute and solo change at 1."""
+        """Interpolate linearly between these edits (share 0) and others (1); mute and solo are these until share 1."""
         def between(a: Edit, b: Edit) -> Edit:
             if a == b:
                 return a
@@ -202,7 +202,9 @@ class LookEdits:
 
 def _parse_targets(text: str, whom: str, lights: Sequence[str],
                    elements: Mapping[str, Sequence[str]] | None) -> list[tuple[str, str]]:
-    """Return the (light, element or "") pairs that an edit applies to."""
+    """Return the (light, element or "") pairs that an edit applies to.
+
+    text: the whole edit, for the SettingsError. whom: what it names. lights, elements: see `LookEdits.parse`."""
     if not any(whom == light or whom.startswith(f"{light}/") for light in lights):
         whom = whom.lstrip()  # only here, since a light's name may begin with a blank
     if whom in lights:
@@ -298,7 +300,9 @@ def apply_edits(gaussians: PlaneGaussians, light: str, light_position: NDArray[A
 
 
 def apply_colour(part: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:
-    """Return the Gaussians with the colours and opacities of an edit."""
+    """Return the Gaussians with the colours and opacities of an edit.
+
+    With the blend "over" an intensity below 1 lowers the opacities, one above 1 brightens the colours."""
     if not edit.changes_colour:
         return part
     if blend == "add":
@@ -311,7 +315,10 @@ def apply_colour(part: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussia
 
 
 def _apply_shape(part: PlaneGaussians, edit: Edit, light_position: NDArray[Any], streak: bool) -> PlaneGaussians:
-    """Transform an element as a whole: x' = c' + A (x - c), covariance' = A covariance A^T, arc' = A arc."""
+    """Transform an element as a whole: x' = c' + A (x - c), covariance' = A covariance A^T, arc' = A arc.
+
+    c: the element's centre. c' = l + spread (c - l), l the light. A: streak along the long axis, then scale and
+    rotation. streak: whether the element is a streak."""
     length = edit.streak if streak else 1.0
     if (edit.scale, edit.spread, edit.rotation, length) == (1.0, 1.0, 0.0, 1.0):
         return part

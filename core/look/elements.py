@@ -63,7 +63,7 @@ def read_elements(entries: Sequence[Mapping[str, Any]], light: str, count: int) 
         rows = np.unique(np.asarray(entry["members"], np.int64).reshape(-1))
         if len(rows) and (rows[0] < 0 or rows[-1] >= count):
             raise ValueError(f"the element {entry.get('name')!r} names Gaussians that are not there")
-        rows = rows[is_unassigned[rows]]
+        rows = rows[is_unassigned[rows]]  # a Gaussian belongs to the first element that names it
         is_unassigned[rows] = False
         kind = entry.get("kind")
         elements.append(Element(_unique_name(str(entry.get("name", "element")), elements),
@@ -102,7 +102,7 @@ def group_elements(gaussians: PlaneGaussians, mu: Floats | None) -> list[Element
 
 
 def _extent_and_colour(gaussians: PlaneGaussians, energy: Floats) -> tuple[float, tuple[float, float, float]]:
-    """Return extent and colour of a group of Gaussians."""
+    """Return extent and colour of a group of Gaussians, as in `Element`; energy (n,): of each Gaussian."""
     weights = energy / energy.sum()
     offsets = gaussians.means - weights @ gaussians.means
     spread = gaussians.covariances[:, 0] + gaussians.covariances[:, 2]
@@ -120,6 +120,7 @@ def _colour(values: Any) -> tuple[float, float, float]:
 
 
 def _classify(gaussians: PlaneGaussians) -> NDArray[np.str_]:
+    """Return "ring", "streak" or "compact" for each Gaussian (n,)."""
     xx, xy, yy = gaussians.covariances.T
     half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     long = np.sqrt((half + root) / np.maximum(half - root, 1e-12)) >= MIN_STREAK_RATIO
@@ -130,10 +131,13 @@ def _classify(gaussians: PlaneGaussians) -> NDArray[np.str_]:
 
 
 def _split_at_valleys(mu: Floats, energy: Floats) -> list[NDArray[np.int64]]:
-    """Split rows at the valleys of the energy along the line."""
+    """Split Gaussians at the valleys of their energy along the line; return the indices of each part.
+
+    mu (n,): positions on the line. energy (n,): of each."""
     low, high = float(mu.min()), float(mu.max())
     if high - low < 2 * DENSITY_SIGMA:
         return [np.arange(len(mu))]
+    # Four bins to a standard deviation; the blur reaches 12 bins, three deviations, to either side.
     bins = min(max(int((high - low) / DENSITY_SIGMA * 4), 8), 2048)
     edges = np.linspace(low, high, bins + 1)
     density, _ = np.histogram(mu, edges, weights=energy)
@@ -155,7 +159,9 @@ def _split_at_valleys(mu: Floats, energy: Floats) -> list[NDArray[np.int64]]:
 
 def _merge_faint(parts: list[tuple[str, NDArray[np.int64]]], energy: Floats,
                  mu: Floats | None) -> list[tuple[str, NDArray[np.int64]]]:
-    """Merge the faintest groups into the nearest of their kind, or of any kind, until there are MAX_ELEMENTS."""
+    """Merge the faintest groups into the nearest of their kind, or of any kind where there is no other of theirs.
+
+    Ends with at most MAX_ELEMENTS groups, each with a thousandth of the light's energy or more."""
     parts = list(parts)
 
     def position(rows: NDArray[np.int64]) -> float:

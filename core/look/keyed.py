@@ -66,12 +66,13 @@ class KeyedEdits:
         numbers = sorted(self.frames)
         previous = max((number for number in numbers if number <= frame), default=numbers[0])
         following = min((number for number in numbers if number >= frame), default=numbers[-1])
-        if previous >= following:
+        if previous >= following:  # on a keyframe, before the first or after the last
             return parsed(previous if previous in (frame, numbers[-1]) else following)
         return parsed(previous).interpolate(parsed(following), (frame - previous) / (following - previous))
 
 
 def _read_toml(path: Path) -> Any:
+    """Read a TOML file. Raises SettingsError."""
     try:
         return parse_toml(read_text(path, MAX_TOML_BYTES, UTF8_SIG))
     except OSError as problem:
@@ -81,6 +82,7 @@ def _read_toml(path: Path) -> Any:
 
 
 def _check_texts(texts: Any) -> tuple[str, ...]:
+    """Return a list of texts as a tuple. Raises ValueError for anything else."""
     if not isinstance(texts, list) or not all(isinstance(word, str) for word in texts):
         raise ValueError("edits are a list of texts")
     return tuple(texts)

@@ -66,7 +66,7 @@ class TrainedCamera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def pixel_ratio(self, width: int, height: int) -> float:
-        """Return the ratio of a picture's pixels to this camera's across its field of view.
+        """Return how many pixels of a picture of this size, with this field of view, lie along one of this camera's.
 
         Compares widths; for a portrait and a landscape picture the long sides, since the camera is turned then."""
         turned = (width < height) != (self.width < self.height)
@@ -101,6 +101,7 @@ class LightLook:
         """The elements in the file, or else those that `group_elements` makes of the canonical Gaussians."""
         if self._listed:
             return self._listed
+        # A light off both axes, at 0.65 of its largest distance in training: elements lie apart along the line.
         along = self.query_range.light_high[2] * np.array([0.55, 0.35], np.float32)
         middle = (self.query_range.camera_low + self.query_range.camera_high) / 2
         view = ViewOfLight(middle, np.eye(3, dtype=np.float32), np.asarray(along, np.float32), 1.0)
@@ -125,7 +126,9 @@ class LightLook:
         return gaussians
 
     def _gaussians(self, view: ViewOfLight, query: ViewOfLight | None) -> tuple[PlaneGaussians, Floats]:
-        """Return Gaussians on the plane (paper, eq. 1 to 3), and the light's position with delta_l."""
+        """Return Gaussians on the plane (paper, eq. 1 to 3), and the light's position (2,) with delta_l.
+
+        query: see `evaluate`."""
         form, rows, queried = self.form, self._rows, query or view
         features = self._network.view_features(queried.camera, queried.light)
         offsets = self._network.offsets(features)
@@ -141,13 +144,14 @@ class LightLook:
         scales, rotations = rows["log_scales"] + offsets["log_scales"], rows["rotations"] + offsets["rotations"]
         covariances = (covariance_of_solid(means, scales, rotations) if form.solid
                        else covariance_of_ellipse(scales, rotations))
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore"):  # an exponential that overflows gives opacity 0
             opacities = 1 / (1 + np.exp(-(rows["opacity_logits"] + offsets["opacity_logits"])[:, 0]))
+        # From camera to world: a row times the rotation is its transpose times the vector.
         rays = np.concatenate([means, np.ones_like(means[:, :1])], -1) @ view.rotation
         sh = (rows["sh"] + offsets["sh"]).reshape(len(means), (self.form.sh_degree + 1) ** 2, 3)
         rings = arcs = None
         if form.rings:
-            raw = rows["rings"] + offsets["rings"]
+            raw = rows["rings"] + offsets["rings"]  # r0, and the logarithm of w
             rings = np.stack([raw[:, 0], np.exp(np.clip(raw[:, 1], -3, 3))], -1)
         if form.arcs and rings is not None:
             own_rows = rows["arcs"] + offsets["arcs"]
@@ -216,8 +220,9 @@ class Look:
         """Return the plane Gaussians of each placed light of `visible_lights` with a visibility above 0, by its name.
 
         edits: by the names of the placed lights; lights that mute and solo turn off are omitted.
-        query: the view at which the network is evaluated: "target" the view itself; "trained" the view, clipped to the
-        range of the training views; "source" the middle of that range. Placement always follows the view.
+        query: the view at which the network is evaluated: "target" the view itself; "trained" camera and light, clipped
+        to the range of the training views; "source" the middle of the range of cameras, and the clipped light.
+        Placement always follows the view.
         """
         flares: dict[str, PlaneGaussians] = {}
         for light, source in self.visible_lights(lights, edits):
@@ -233,7 +238,7 @@ class Look:
 
     def visible_lights(self, lights: Sequence[PlacedLight], edits: LookEdits | None = None
                        ) -> Iterator[tuple[PlacedLight, LightLook]]:
-        """Yield each placed light with its source.
+        """Yield each placed light with its source, the look's light whose flare it shows.
 
         Omits lights that mute and solo turn off, and lights whose source the look lacks."""
         sources = {light.name: light for light in self.lights}
@@ -291,7 +296,7 @@ def write_annotated(source: Path | str, target: Path | str, *, notes: str, licen
 
 
 def _parse_json(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Parse JSON of a .flare's metadata. Raises FlareFileError."""
+    """Return the description in a .flare's metadata; checks its version alone. Raises FlareFileError."""
     if METADATA_KEY not in metadata:
         raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.")
     try:
@@ -322,7 +327,7 @@ def parse_description(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]
         if not all(isinstance(text, str) for text in description.get("edits", [])):
             raise ValueError("edits are a list of texts")
         for rows in description.get("seen", {}).values():
-            if any(len([float(value) for value in row]) != 5 for row in rows):
+            if any(len([float(value) for value in row]) != 5 for row in rows):  # camera x, y, z, light x, y
                 raise ValueError("a training view is not valid")
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as problem:
         raise FlareFileError(f"{path} is damaged: its description is not valid ({problem}); save it again."
@@ -331,7 +336,10 @@ def parse_description(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]
 
 
 def _check_light(path: Path, entry: Mapping[str, Any], listed: Any) -> str:
-    """Validate the description of a light, and return its name."""
+    """Validate the description of a light, and return its name.
+
+    entry: of the light. listed: the elements of all lights. Raises FlareFileError, and what the caller converts to it.
+    """
     unknown = set(entry["form"]) - {field.name for field in fields(FlareForm)}
     if unknown:
         raise FlareFileError(f"{path} was written by a newer Fit Flare (its form has {', '.join(sorted(unknown))}); "
@@ -369,7 +377,7 @@ def read(path: Path | str) -> Look:
 
 def _read_light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: Blend,
                 listed: Any) -> LightLook:
-    """Make the look of light `number` of a file. listed: its elements in the file."""
+    """Make the look of light `number` of a file. entry: its description; listed: the elements of all lights."""
     form, name, count = FlareForm(**entry["form"]), str(entry["name"]), int(entry["count"])
     xyz = np.array([float(value) for value in entry["xyz"]], np.float64)
     own_rows = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
@@ -396,5 +404,5 @@ def _head_widths(form: FlareForm, rows: Mapping[str, Floats]) -> dict[str, int]:
     known = sorted(name for name in _row_widths(form) if name not in ("offsets", "latent"))  # as torch sorts parameters
     heads = {name: rows[name].shape[1] for name in known}
     if form.line and form.plane_offset:
-        heads["plane_offset"] = 2
+        heads["plane_offset"] = 2  # without the line, positions have two coordinates already
     return heads

@@ -33,6 +33,7 @@ MAX_CACHE_BYTES = 64 << 20
 """Most bytes of offsets that are kept: those of some hundred lights of a look."""
 
 _numbers = itertools.count()
+"""Numbers of the networks, for their entries in the cache."""
 
 
 class _OffsetsCache:
@@ -70,7 +71,8 @@ class HashGrid:
 
     def __init__(self, bits: int, growth: float, levels: int, base: int, rows: NDArray[Any],
                  values: NDArray[Any]) -> None:
-        """rows: ascending indices of the stored table rows, (k,), the others are zero; values: (k, features)."""
+        """bits, growth: see `LIGHT_BITS`. levels, base: see `FlareForm`. rows (k,): ascending indices of the stored
+        table rows, the others are zero. values (k, features): the stored rows."""
         size = 1 << bits
         self._resolutions = np.array([math.floor(base * growth**level) for level in range(levels)], np.int64)
         self._sizes = np.minimum((self._resolutions + 1) ** 3, size)
@@ -81,10 +83,12 @@ class HashGrid:
             raise ValueError("a hash table's rows are not valid")
 
     def __call__(self, point: Floats) -> Floats:
-        """Return features (levels * features,) of a point (3,), clamped to 0..1."""
+        """Return features (levels * features,) of a point (3,), clamped to 0..1.
+
+        They are, for each level, the values at the corners of the point's cell, interpolated linearly."""
         resolutions = self._resolutions[:, None]
         scaled = (np.clip(point, 0, 1).astype(np.float32)[None] * resolutions.astype(np.float32))
-        low = np.minimum(np.floor(scaled), resolutions.astype(np.float32) - 1)
+        low = np.minimum(np.floor(scaled), resolutions.astype(np.float32) - 1)  # 1 lies in the last cell
         fraction = (scaled - low)[:, None]
         corner = low.astype(np.int64)[:, None] + CORNERS
         weights = np.where(CORNERS.astype(bool), fraction, 1 - fraction).prod(-1)
@@ -92,6 +96,7 @@ class HashGrid:
         dense = corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])
         mixed = corner * PRIMES
         hashed = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % self._sizes[:, None]
+        # A level all of whose corners fit its table needs no hash.
         rows = np.where(side**3 <= self._sizes[:, None], dense, hashed) + self._starts[:, None]
         return np.asarray((self._row_values(rows) * weights[..., None]).sum(1).reshape(-1), np.float32)
 
@@ -132,7 +137,9 @@ class QueryRange:
         return cls(*parts)
 
     def clip(self, camera: Floats, light: Floats) -> tuple[Floats, Floats]:
-        """Clip camera (3,) and light (2,) to the range of the training views."""
+        """Clip camera (3,) and light (2,) to the range of the training views.
+
+        The light moves straight towards the principal point."""
         camera = np.clip(camera, self.camera_low, self.camera_high)
         norm = float(np.linalg.norm(light))
         sizes = np.append(np.abs(light), norm)
@@ -170,7 +177,9 @@ class Network:
         return self._encode_gaussians(self._encoded)
 
     def view_features(self, camera: Floats, light: Floats) -> Floats:
-        """Return the features of a camera position (3,), world units, and a light (2,), normalised coordinates."""
+        """Return the features of a camera position (3,), world units, and a light (2,), normalised coordinates.
+
+        Lights that mirror each other in the axes of the picture have the same features."""
         extent = self._range.camera_high - self._range.camera_low
         folded = np.append(np.abs(light), np.linalg.norm(light)).astype(np.float32)
         position = (camera.astype(np.float32) - self._range.camera_low) / extent

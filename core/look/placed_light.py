@@ -76,7 +76,7 @@ class PlacedLight:
         """Return a text that changes with everything that the light's flare depends on."""
         plain: tuple[Any, ...] = (self.name, self.source, self.xyz.tolist(), self.visibility)
         if self.extent is None and self.factor == (1.0, 1.0, 1.0) and not self.reference_distance:
-            return repr(plain)  # as before there were others, so that their layers stay valid
+            return repr(plain)  # the rest changes nothing here; layers that were baked with this key stay valid
         extent = None if self.extent is None else self.extent.to_json()
         return repr((*plain, extent, self.shares, self.factor, self.reference_distance))
 
@@ -117,24 +117,28 @@ def _point(pose: NDArray[np.float64], xyz: NDArray[np.float64], visibility: floa
 
 def _sum_over_cells(light: PlacedLight, extent: LightExtent, pose: NDArray[np.float64], eye: NDArray[np.float64],
                     blend: Blend, evaluate: Evaluate, low_pass: float) -> PlaneGaussians | None:
-    """Return the flare of a light with an extent: the sum over its cells. low_pass: see `_low_pass`."""
+    """Return the flare of a light with an extent: the sum over its cells; None if none is lit and in front.
+
+    pose (4, 4): world to camera. eye (3,): position of the camera. low_pass: see `_low_pass`."""
     sampled = extent.sampled(light.xyz, pose)
     shares = np.ones(sampled.count) if light.shares is None else np.asarray(light.shares, np.float64)
     strengths = sampled.weights * shares * sampled.emission
     if not strengths.any():
         return None
     seen = (sampled.points - eye) @ pose[:3, :3].T
+    # A cell is in front of the camera if all of its samples are.
     is_in_front = np.bincount(sampled.cells, seen[:, 2] > 0) == np.bincount(sampled.cells)
     plane = seen[:, :2] / np.where(seen[:, 2] > 0, seen[:, 2], np.inf)[:, None]
     centres = sampled.centres
     factors = np.array([fall_off(float(distance), light.reference_distance)
                         for distance in np.linalg.norm(centres - eye, axis=1)])[:, None] * light.factor
-    if sampled.factors is not None:
+    if sampled.factors is not None:  # the cells are lights of their own, each with a whole flare
         factors *= sampled.factors
     elif is_in_front.all() and np.ptp(plane, axis=0).max() < 2 * SMALLEST_EXTENT:
+        # Too small to be seen: evaluated once, as a point.
         gaussians = _point(pose, centres.mean(0), light.visibility * float(strengths.sum()), evaluate)
         return None if gaussians is None else multiply(gaussians, factors.mean(0), blend)
-    # Hidden cells are evaluated too: they show how the Gaussians follow the light.
+    # Hidden cells are evaluated too, unless they are lights of their own: they show how the Gaussians follow the light.
     parts, places, cells = [], [], []
     for cell in np.flatnonzero(is_in_front & (strengths > 0 if sampled.factors is not None else True)):
         part = _point(pose, centres[cell], light.visibility, evaluate)
@@ -144,7 +148,7 @@ def _sum_over_cells(light: PlacedLight, extent: LightExtent, pose: NDArray[np.fl
             cells.append(int(cell))
     if not parts:
         return None
-    are_points = sampled.count == len(sampled.points)
+    are_points = sampled.count == len(sampled.points)  # a cell of one sample has no size to blur by
     motions = None if are_points else _motions(parts, np.array(places))
     visible = []
     for part, cell in zip(parts, cells, strict=True):
@@ -162,7 +166,7 @@ def multiply(gaussians: PlaneGaussians, factor: ArrayLike, blend: Blend) -> Plan
     values = np.asarray(factor, np.float64)
     if (values == 1).all():
         return gaussians
-    strongest = float(values.max())
+    strongest = float(values.max())  # the tint's largest channel is 1, as `apply_colour` needs for the blend "over"
     red, green, blue = (values / strongest if strongest > 0 else values).tolist()
     return apply_colour(gaussians, Edit(intensity=strongest, tint=(red, green, blue)), blend)
 
@@ -170,9 +174,11 @@ def multiply(gaussians: PlaneGaussians, factor: ArrayLike, blend: Blend) -> Plan
 def _motions(parts: Sequence[PlaneGaussians], places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how each Gaussian moves with the light (n, 2, 2), by least squares over the cells.
 
-    places (k, 2): of the light on the plane. Element [i, a, b] is the motion of coordinate a by coordinate b."""
+    parts: the flare of each cell. places (k, 2): of the cells on the plane.
+    Element [i, a, b] is the motion of coordinate a by coordinate b."""
     means = np.stack([part.means for part in parts]).astype(np.float64)
     offsets = places - places.mean(0)
+    # The cut-off leaves out the direction across a light that is seen as a line: there is no motion to measure.
     slopes = np.linalg.pinv(offsets, rcond=1e-3) @ (means - means.mean(0)).reshape(len(parts), -1)
     return slopes.reshape(2, -1, 2).transpose(1, 2, 0)
 
@@ -181,6 +187,7 @@ def _blurred(gaussians: PlaneGaussians, motions: NDArray[np.float64], spread: ND
              ) -> PlaneGaussians:
     """Return the Gaussians convolved with a light of the covariance `spread` (2, 2), with the same drawn light.
 
+    motions: see `_motions`. low_pass: see `_low_pass`.
     A ring is widened by the mean of the blur in its own coordinates, since its ellipse is not the shape of its line.
     """
     xx, xy, yy = gaussians.covariances.T.astype(np.float64)
@@ -192,6 +199,7 @@ def _blurred(gaussians: PlaneGaussians, motions: NDArray[np.float64], spread: ND
         radius, width = rings.T.astype(np.float64)
         is_plain = radius <= width
         determinant = np.maximum(xx * yy - xy * xy, 1e-30)
+        # Half the trace of the inverse covariance times the blur's.
         relative = (yy * ax - 2 * xy * axy + xx * ay) / determinant / 2
         rings = np.stack([radius, np.where(is_plain, width, np.sqrt(width**2 + relative))], -1).astype(np.float32)
     # A plain profile has the standard deviation w times that of its ellipse.

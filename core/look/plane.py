@@ -81,7 +81,8 @@ class PlaneGaussians:
 
 
 def covariance_of_solid(means: Floats, log_scales: Floats, quaternions: Floats) -> Floats:
-    """Return (n, 3) covariances on the plane of 3D Gaussians at depth PLANE_DEPTH (Zwicker et al. 2002)."""
+    """Return (n, 3) covariances on the plane of 3D Gaussians at depth PLANE_DEPTH, projected to first order (Zwicker et
+    al. 2002). log_scales: (n, 3). quaternions: (n, 4) wxyz, of any length but zero."""
     q = quaternions / np.maximum(np.linalg.norm(quaternions, axis=-1, keepdims=True), 1e-12)
     w, x, y, z = q.T
     rotation = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -108,7 +109,10 @@ def arcs_of_ellipse(arcs: Floats, log_scales: Floats, directions: Floats) -> Flo
 
 
 def opacity_gain(arcs: Floats, rings: Floats) -> Floats:
-    """Return (n,) factors of the opacities that make them smooth at zero in arcs (n, 2), in standard deviations."""
+    """Return (n,) factors of the opacities; arcs (n, 2) in standard deviations along the axes, rings (n, 2).
+
+    A profile is divided by its peak, whose logarithm has a kink where the arc's strength is 0. The factor replaces the
+    strength by one that is quadratic there, so that the profile changes smoothly."""
     squared = (arcs * arcs).sum(-1)
     softened = squared / np.sqrt(squared + ARC_SOFTNESS**2)
     return np.asarray(np.exp(rings[:, 0] * (np.sqrt(squared) - softened)), np.float32)
@@ -153,16 +157,19 @@ def to_pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike,
 
 
 def arcs_to_pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike) -> Floats:
-    """Return (n, 2) arcs in pixels for intrinsics (3, 3), 0 without arcs: the inverse covariance (of `to_pixels`) times
-    this is b, the slope of the profile's logarithm."""
+    """Return (n, 2) arcs in pixels for intrinsics (3, 3), 0 without arcs.
+
+    The inverse covariance (of `to_pixels`) times an arc is b, the slope of the profile's logarithm."""
     if gaussians.arcs is None:
         return np.zeros_like(gaussians.means)
     return gaussians.arcs * np.asarray(intrinsics, np.float32).diagonal()[:2]
 
 
 def arc_log_peak(strength: Any, ring: Any) -> Any:
-    """Return m, the logarithm of the peak that an arc of this strength gives a profile; ring (n, 2); see
-    `normalise_arcs` in core/gaussians/rendering.py."""
+    """Return m, the logarithm of the peak that an arc gives a profile; see `normalise_arcs` in
+    core/gaussians/rendering.py.
+
+    strength (n,): see `arc_strengths`. ring (n, 2), or (2,) for one."""
     r0, w = np.asarray(ring).T
     return strength * (r0 + strength * w * w / 2)
 

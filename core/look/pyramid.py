@@ -37,12 +37,14 @@ _WEIGHTS = (-0.0703125, 0.8671875, 0.2265625, -0.0234375)
 
 def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, ...] = LEVELS,
                   min_texels: float = MIN_TEXELS) -> NDArray[np.int64]:
-    """Return the index in `levels` (n,) of the grid for each Gaussian, by its narrow side; covariances (n, 3) in px².
+    """Return the index in `levels` (n,) of the grid for each Gaussian; covariances (n, 3) in px².
+
+    It is the coarsest grid on which the Gaussian's narrow side has a deviation of `min_texels`, else the finest.
     """
     xx, xy, yy = covariances.T
     half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     narrow = np.sqrt(np.maximum(half - root, 0))
-    if rings is not None:
+    if rings is not None:  # the line of a ring has the width w
         narrow = narrow * np.minimum(rings[:, 1], 1)
     return np.clip(np.searchsorted(np.array(levels), narrow / min_texels, side="right") - 1, 0, len(levels) - 1)
 
@@ -57,7 +59,7 @@ def draw_added(gaussians: PlaneGaussians, look: Look, intrinsics: ArrayLike, wid
         divisor = LEVELS[index]
         rows = np.flatnonzero(indices == index)
         if picture is None and not len(rows) and index:
-            continue
+            continue  # coarser grids than the first with a Gaussian stay empty; there is a finest grid always
         size = -(-height // divisor) + 2 * _MARGIN, -(-width // divisor) + 2 * _MARGIN
         grid = np.zeros((*size, 3), np.float32) if picture is None else _enlarge(picture, size)
         for row in rows.tolist():
@@ -72,7 +74,9 @@ def draw_added(gaussians: PlaneGaussians, look: Look, intrinsics: ArrayLike, wid
 
 def _add(grid: Floats, centre: Floats, covariance: Floats, radius: float, ring: Floats | None, arc: Floats,
          light: Floats) -> None:
-    """Add one Gaussian to a grid (rows, columns, 3), in texels of the grid."""
+    """Add one Gaussian to a grid (rows, columns, 3). Lengths are in texels of the grid.
+
+    radius: see `drawing.extent`. arc: see `arcs_to_pixels`. light: RGB at the peak."""
     box = bounding_box(centre, covariance, radius, grid.shape[1], grid.shape[0])
     for part in () if box is None else _bands(box, centre, covariance, radius):
         profile = profile_in(part, centre, covariance, ring, arc)
@@ -83,9 +87,12 @@ def _add(grid: Floats, centre: Floats, covariance: Floats, radius: float, ring: 
 
 
 def _bands(box: Box, centre: Floats, covariance: Floats, radius: float) -> Iterator[Box]:
-    """Yield rectangles inside `box` that cover the ellipse of this radius."""
+    """Yield rectangles inside `box` that cover the ellipse of this Mahalanobis radius.
+
+    They are `box` itself, or horizontal bands of a large thin ellipse."""
     left, top, right, bottom = box
     xx, xy, yy = (float(value) for value in covariance)
+    # The ellipse's area relative to that of its bounding box.
     share = math.pi / 4 * math.sqrt(max(xx * yy - xy * xy, 0) / (xx * yy))
     if (right - left) * (bottom - top) < _LARGE_BOX or share > _FULL_SHARE:
         yield box
@@ -109,22 +116,26 @@ def _bands(box: Box, centre: Floats, covariance: Floats, radius: float) -> Itera
 
 
 def _row_reach(dy: float, xx: float, xy: float, yy: float, radius: float) -> tuple[float, float]:
-    """Return from where to where the ellipse reaches in the row `dy` below its centre; its tip beyond its end."""
+    """Return the left and right end of the ellipse, relative to its centre, in the row `dy` below the centre.
+
+    In a row above or below the ellipse, both are those of its highest or lowest point."""
     inside = min(max(dy, -radius * math.sqrt(yy)), radius * math.sqrt(yy))
     half = math.sqrt(max((radius * radius - inside * inside / yy) * (xx - xy * xy / yy), 0))
     return xy / yy * inside - half, xy / yy * inside + half
 
 
 def _enlarge(grid: Floats, size: tuple[int, int]) -> Floats:
-    """Return a grid with its margin at twice the resolution, (rows, columns, 3) of `size` with its own margin."""
+    """Return a grid at twice the resolution. size: rows and columns of the result; both have a margin of `_MARGIN`."""
     return _double(_double(grid, size[0]).swapaxes(0, 1), size[1]).swapaxes(0, 1)
 
 
 def _double(grid: Floats, count: int) -> Floats:
-    """Interpolate along the first axis: `count` rows, the first of which lies `_MARGIN` rows before the picture."""
+    """Interpolate to twice the resolution along the first axis: `count` rows, the first of which lies `_MARGIN` rows
+    before the picture."""
     first = (np.arange(count) - _MARGIN) // 2 + _MARGIN  # the coarse row that holds each fine one
     odd = (np.arange(count) - _MARGIN) % 2 == 1
     result = np.zeros((count, *grid.shape[1:]), np.float32)
+    # An even fine row lies a quarter of a row before the middle of its coarse row, an odd one a quarter after it.
     for is_odd, weights, offset in ((False, _WEIGHTS[::-1], -2), (True, _WEIGHTS, -1)):
         rows = first[odd == is_odd]
         result[odd == is_odd] = sum(np.float32(weights[tap]) * grid[np.clip(rows + offset + tap, 0, len(grid) - 1)]

@@ -144,7 +144,9 @@ class Shot:
 
 
 def _read_frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
-    """Parse one frame of a shot; data: the whole file. Raises ValueError, KeyError or TypeError where it is invalid."""
+    """Parse one frame of a shot. data: the whole file, whose size holds where the frame has none.
+
+    Raises ValueError, KeyError or TypeError where it is invalid."""
     width, height = (_to_int(entry.get(key, data.get(key))) for key in ("width", "height"))
     fx, fy, cx, cy = (_to_float(value) for value in entry["intrinsics"])
     pose = np.array([[_to_float(value) for value in row] for row in entry["world_to_camera"]])

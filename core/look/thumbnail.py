@@ -14,8 +14,9 @@ PLACE = -0.45, -0.38
 
 
 def draw_thumbnail(look: Look, width: int, height: int) -> NDArray[np.float32]:
-    """Return display values (height, width, 3): the flare of a look's first light, which is at the upper left, in the
-    middle part of the look's own camera. The look must add light."""
+    """Return display values (height, width, 3): the flare of a look's first light, which is at the upper left.
+
+    The camera is the look's own, cropped about the centre to this aspect ratio. The look must add light."""
     focal = look.camera.fx / look.camera.width * max(width, height * look.camera.width / look.camera.height)
     k = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     place = np.array([PLACE[0] * width / 2 / focal, PLACE[1] * height / 2 / focal], np.float32)

@@ -36,20 +36,22 @@ def edge_radius(aperture: Aperture, sectors: int) -> Array:
     angles = np.arange(sectors) / sectors * 2 * np.pi
     normals = np.radians(aperture.turn) + (np.arange(aperture.blades) + 0.5) / aperture.blades * 2 * np.pi
     apothem = np.cos(np.pi / aperture.blades) * (1 + aperture.uneven * rng.standard_normal(aperture.blades))
+    # A blade is a straight line at its apothem; it bounds the directions that it faces.
     facing = np.cos(angles[:, None] - normals)
     straight = np.where(facing > 0.05, apothem / np.maximum(facing, 0.05), np.inf).min(axis=1)
     return (1 - aperture.curved) * straight + aperture.curved
 
 
 def transmission(aperture: Aperture, size: int, fill: float) -> Array:
-    """Return the stop as a picture (size, size), 0..1, its radius `fill` of half the side, with dust and
-    scratches on the glass."""
+    """Return the stop as a picture (size, size), 0..1, its radius `fill` of half the side.
+
+    Dust and scratches on the glass let a tenth of the light through."""
     axis = (np.arange(size) + 0.5) / size * 2 - 1
     x, y = np.meshgrid(axis / fill, axis / fill)
     radius, angle = np.hypot(x, y), np.arctan2(y, x)
-    table = edge_radius(aperture, 1440)
+    table = edge_radius(aperture, 1440)  # in steps of a quarter of a degree
     edge = np.interp(angle % (2 * np.pi), np.arange(1441) / 1440 * 2 * np.pi, np.append(table, table[0]))
-    mask = np.clip((edge - radius) * fill * size / 2 + 0.5, 0, 1)
+    mask = np.clip((edge - radius) * fill * size / 2 + 0.5, 0, 1)  # distances in pixels: an edge is one pixel wide
     rng = np.random.default_rng(aperture.seed + 1)
     for _ in range(aperture.dust):
         far, azimuth, speck = np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi), rng.uniform(0.004, 0.02)

@@ -51,6 +51,7 @@ class LensSetup:
     """A lens and how it flares.
 
     lens: name or file of a prescription, see `find_lens`. stop_down: radius of the stop relative to the widest.
+    blades, turn, curved, uneven, seed: see `Aperture`.
     squeeze: of an anamorphic lens, which stretches its ghosts along x. coating: wavelengths in micrometres, in turn
     over the air-glass surfaces. focal_length: mm, to which the prescription is scaled; 0 for its own. dust, scratches:
     on the glass at the stop. hood: tan of the field angles where the lens hood begins to shade, and where it lets no
@@ -96,7 +97,7 @@ def render_flare(setup: LensSetup, camera: Camera, light: Sequence[float] | NDAr
 
     light: (x, y, z) in the camera's axes (x right, y down, z forward; any unit), or normalised (x/z, y/z) of a light in
     front. The flare is zero for a light behind the camera, one that is hidden, and one so far to the side that the hood
-    shades it. colour: linear RGB. visible_share: 0..1, scales the flare.
+    shades it. colour: linear RGB. intensity: factor. visible_share: 0..1, scales the flare.
     """
     black = np.zeros((camera.height, camera.width, 3), np.float32)
     if len(light) == 3:
@@ -105,11 +106,12 @@ def render_flare(setup: LensSetup, camera: Camera, light: Sequence[float] | NDAr
         light = (light[0] / light[2], light[1] / light[2])
     position = (float(light[0]), float(light[1]))
     shade = min(max((setup.hood[1] - math.hypot(*position)) / (setup.hood[1] - setup.hood[0]), 0.0), 1.0)
-    shade *= shade * (3 - 2 * shade)
+    shade *= shade * (3 - 2 * shade)  # smoothstep
     strength = intensity * visible_share * shade
     if strength <= 0:
         return black
     optics, pairs = build_optics(setup)
+    # Ghosts are traced in the coordinates of the lens without its squeeze.
     flare = draw_ghosts(optics, pairs, setup.ghosts, (position[0] / setup.squeeze, position[1]),
                         (camera.fx * setup.squeeze, camera.fy), (camera.cx, camera.cy), camera.width, camera.height)
     x, y = np.meshgrid(((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx).astype(np.float32),

@@ -72,7 +72,9 @@ class Optics:
         return float(self.lens.vertices[-1] + self.lens.back_focus())
 
     def pairs(self, count: int, fill: float = 0.12) -> list[tuple[int, int]]:
-        """Return the `count` brightest pairs (first, second) for a light at tan(field angle) = `fill`."""
+        """Return the `count` pairs (first, second) of surfaces whose ghosts have the most light by area on the sensor.
+
+        fill: tan of the field angle of the light for which they are compared."""
         surfaces = _trace_arguments(self, REFERENCE_WAVELENGTH)
         optical = [index for index in range(len(self.coating)) if index != self.lens.stop]
         scored = []
@@ -84,6 +86,7 @@ class Optics:
                 passes = arrived & (rays[..., STRAY] < 1) & (radius < self.aperture.radius)
                 if passes.sum() < 2:
                     continue
+                # A focused ghost has no area; the added length keeps it from passing all others.
                 spread = np.ptp(rays[passes][:, :2], axis=0).max() + 0.02 * self.lens.focal_length()
                 scored.append((rays[passes][:, WEIGHT].sum() / spread**2, first, second))
         return [(first, second) for _, first, second in sorted(scored, reverse=True)[:count]]
@@ -92,7 +95,8 @@ class Optics:
 def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.0) -> Array:
     """Return the coating of each surface (n,), as the wavelength for which it is a quarter wave thick, micrometres.
 
-    The wavelengths of `design` take turns over the surfaces between glass and air; all other surfaces get `cemented`.
+    The wavelengths of `design` take turns over the surfaces between glass and air; all other surfaces get `cemented`,
+    0 for none.
     """
     values = np.full(len(lens.index), cemented)
     previous, design_index = 1.0, 0
@@ -106,7 +110,9 @@ def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.
 
 @compile_cached
 def _non_negative_span(start: float, slope: float, left: float, right: float) -> tuple[float, float]:
-    """Return the part of left..right where start + slope u is not negative."""
+    """Return the part of left..right, values of u, where start + slope u is not negative.
+
+    The ends of an empty part are in the wrong order."""
     if slope > 0.0:
         return max(left, -start / slope), right
     if slope < 0.0:
@@ -122,7 +128,7 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
 
     rays: (rows, columns, FIELDS). arrived: which of them reach the sensor. px, py: where, in pixels. light: their
     density. stop_x, stop_y: (rows, columns, passages) on the stop, mm, of radius `radius`; edges: its `edge_radius`.
-    rim: see `GhostSettings`.
+    rim: see `GhostSettings`. colour (3,): of this wavelength.
     """
     rows, columns = px.shape
     height, width = picture.shape[0], picture.shape[1]
@@ -171,6 +177,7 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
                         if mask == 0.0:
                             continue
                         rim_glow = 0.0
+                        # A passage that a ray does not make repeats the first one.
                         for passage in range(3):
                             if passage > 0 and stop_x[r0, c0, passage] == s0x:
                                 break
@@ -195,7 +202,9 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
 
 def _density(x: Array, y: Array, cell: float) -> Array:
     """Return the density of light at each ray: the area of its cell where it enters the lens, relative to pi f^2,
-    divided by the cell's area on the sensor, tan^2. x, y: (rows, columns), where the rays meet the sensor."""
+    divided by the cell's area on the sensor, tan^2; at most MAX_DENSITY.
+
+    x, y: (rows, columns), where the rays meet the sensor, tan. cell: the cell's area where it enters, as above."""
     xr, xc = np.gradient(x)
     yr, yc = np.gradient(y)
     stretch = (xr * yc - xc * yr) / cell
@@ -229,6 +238,7 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
             # The sensor's picture is upside down; set it upright and turn it to the light's azimuth.
             x, y = -rays[..., SENSOR_X] / length, -rays[..., SENSOR_X + 1] / length
             cell = (grid[0][1] - grid[0][0]) * (grid[1][1] - grid[1][0]) / (math.pi * length**2)
+            # The root is the cosine of the field angle, at which the beam enters.
             dense = _density(x, y, cell) * rays[..., WEIGHT] / math.sqrt(1 + slope**2)
             px = supersample * (centre[0] + focal[0] * (cosine * x - sine * y))
             py = supersample * (centre[1] + focal[1] * (sine * x + cosine * y))
@@ -241,7 +251,7 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
 
 
 def limited(light: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
-    """Return light (..., 3) that no channel has more of than `limit`, in the same hues."""
+    """Return light (..., 3), dimmed in the same hue where a channel exceeds `limit`."""
     brightest = light.max(-1, keepdims=True)
     if brightest.max() <= limit:
         return light
@@ -259,7 +269,8 @@ def _find_bundle(optics: Optics, slope: float, pair: tuple[int, int], surfaces: 
             ) -> tuple[Array, Array] | None:
     """Return x and y of a grid of rays that covers the bundle which passes the lens; None if no ray passes.
 
-    The bundle's bounds are those of the rays of a coarse grid that pass."""
+    The bundle's bounds are those of the rays of a coarse grid that pass, or nearly do, and one cell more.
+    slope: tan of the field angle. surfaces: see `_trace_arguments`. grid: rays along each side."""
     extent = 1.15 * optics.lens.semi_aperture[0]
     axis = np.linspace(-extent, extent, COARSE_RAYS)
     rays, arrived = trace_grid(axis, axis, slope, *pair, *surfaces)

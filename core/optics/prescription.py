@@ -53,7 +53,7 @@ class Prescription:
 
     def indices(self, wavelength: float) -> Array:
         """Return the refractive index behind each surface at a wavelength in micrometres: Cauchy's first two terms,
-        through the index at the d line and the Abbe number."""
+        through the index at the d line and the Abbe number; Abbe number 0 is glass without dispersion."""
         slope = np.where(self.abbe > 0, (self.index - 1) / np.maximum(self.abbe, 1e-6) / (LINE_F**-2 - LINE_C**-2), 0.0)
         return self.index + slope * (wavelength**-2 - LINE_D**-2)
 
@@ -70,7 +70,7 @@ class Prescription:
     def widest_f_number(self) -> float:
         """Return the f-number with the stop fully open: focal length / diameter of the entrance pupil, paraxially."""
         system, before, index = np.eye(2), 1.0, self.indices(LINE_D)
-        for k in range(self.stop):
+        for k in range(self.stop):  # a ray parallel to the axis meets the stop at system[0, 0] times its height
             system = _transfer(self.thickness[k], index[k]) @ _refraction(before, index[k], self.curvature[k]) @ system
             before = index[k]
         entrance = float(self.semi_aperture[self.stop] / max(abs(system[0, 0]), 1e-9))
@@ -87,6 +87,7 @@ class Prescription:
         return np.concatenate([[0.0], np.cumsum(self.thickness[:-1])])
 
     def _system_matrix(self, index: Array) -> Array:
+        """Return the matrix (2, 2) from before the first surface to behind the last, for these indices."""
         system, before = np.eye(2), 1.0
         for k in range(len(index)):
             system = _refraction(before, index[k], self.curvature[k]) @ system
@@ -113,10 +114,12 @@ class GhostPath:
 
 
 def _refraction(before: float, after: float, curvature: float) -> Array:
+    """Return the matrix of a surface on (height, reduced slope: index times slope); before, after: indices."""
     return np.array([[1.0, 0.0], [-(after - before) * curvature, 1.0]])
 
 
 def _transfer(length: float, index: float) -> Array:
+    """Return the matrix of a gap on (height, reduced slope)."""
     return np.array([[1.0, length / index], [0.0, 1.0]])
 
 
@@ -138,11 +141,15 @@ def trace_ghost_pairs(lens: Prescription) -> list[GhostPath]:
 
 
 def _index_before(index: Array, k: int) -> float:
+    """Return the index before surface k; air before the first."""
     return float(index[k - 1]) if k else 1.0
 
 
 def _trace_path(lens: Prescription, index: Array, i: int, j: int, focus: float) -> tuple[Array, Array, Array]:
-    """Return rows (a, b) for stop, stop at the last passage, and sensor: height there = a h + b u."""
+    """Return (a, b) for the first and last passage of the stop, and for the sensor: the height there is a h + b u.
+
+    i < j: the surfaces that reflect. index: of the glass behind each surface. focus: from the last surface to the
+    sensor, mm."""
     system = np.eye(2)
     crossings = []
     c, t, last = lens.curvature, lens.thickness, len(index) - 1
@@ -158,6 +165,7 @@ def _trace_path(lens: Prescription, index: Array, i: int, j: int, focus: float) 
         return system
 
     system = forward(system, 0, j)
+    # Reflected at j, back to i, reflected there, and on to the sensor. Backwards, curvatures change their signs.
     system = np.array([[1.0, 0.0], [2 * _index_before(index, j) * c[j], 1.0]]) @ system
     for k in range(j - 1, i, -1):
         system = _transfer(t[k], index[k]) @ system
@@ -174,7 +182,7 @@ def _trace_path(lens: Prescription, index: Array, i: int, j: int, focus: float) 
 
 
 def reflectance(n0: Array, n2: Array, wavelengths: Array, coating: float) -> Array:
-    """Return the reflectance of a surface between indices n0 and n2 at normal incidence.
+    """Return the reflectance of a surface between indices n0 and n2 at normal incidence; arrays by wavelength.
 
     coating: the wavelength (micrometres) for which a layer of magnesium fluoride is a quarter wave thick, 0 for bare
     glass; cemented surfaces have none.
@@ -182,7 +190,7 @@ def reflectance(n0: Array, n2: Array, wavelengths: Array, coating: float) -> Arr
     bare: Array = np.square((n0 - n2) / (n0 + n2))
     if coating <= 0 or min(float(np.min(n0)), float(np.min(n2))) > 1.01:
         return bare
-    n1 = 1.38
+    n1 = 1.38  # magnesium fluoride
     r01, r12 = (n0 - n1) / (n0 + n1), (n1 - n2) / (n1 + n2)
     phase = np.cos(np.pi * coating / wavelengths)
     top = r01**2 + r12**2 + 2 * r01 * r12 * phase

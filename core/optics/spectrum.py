@@ -11,6 +11,7 @@ MIN_WAVELENGTH, MAX_WAVELENGTH = 0.40, 0.70
 """Micrometres."""
 PEAKS = (0.605, 0.540, 0.455)
 WIDTHS = (0.046, 0.044, 0.036)
+"""Peaks and standard deviations of the responses in R, G, B, micrometres."""
 
 
 def wavelengths(count: int) -> Array:

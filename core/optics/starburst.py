@@ -56,9 +56,9 @@ class Glow:
 @dataclass(frozen=True)
 class Ring:
     """A ring. radius: tan at 0.55 micrometres. width: width of one wavelength's ring, relative to the radius. follow:
-    position of the centre on the line from the principal point (0) to the light (1). lean: how much brighter the side
-    towards the principal point is. grow: additional radius per tan of the field angle. dispersion: 1 for the colours
-    of grooves, 0 for a white ring."""
+    position of the centre on the line from the principal point (0) to the light (1). lean: how much darker the side in
+    the direction from the principal point to the light is, and how much brighter the other. grow: additional radius per
+    tan of the field angle. dispersion: 1 for the colours of grooves, 0 for a white ring."""
 
     gain: float = 0.05
     radius: float = 0.3
@@ -72,8 +72,8 @@ class Ring:
 @dataclass(frozen=True)
 class Streak:
     """A streak: a line through the light at `turn` degrees, gain / (1 + (along / length)^2)^power along it, a Gaussian
-    of standard deviation `width` (tan) across it. colour: linear RGB. mirror: brightness of a second streak through the
-    mirrored light, relative to the first."""
+    of standard deviation `width` (tan) across it. colour: linear RGB. mirror: brightness of a second
+    streak, relative to the first; it passes through -0.7 times the light's position."""
 
     gain: float = 0.6
     length: float = 0.12
@@ -87,7 +87,7 @@ class Streak:
 @lru_cache(maxsize=8)
 def starburst_texture(aperture: Aperture, settings: Starburst) -> Pixels:
     """Return the starburst's texture (TEXTURE_SIZE, TEXTURE_SIZE, 3), which spans -extent..extent about its centre."""
-    stop = transmission(aperture, TEXTURE_SIZE, 0.25)
+    stop = transmission(aperture, TEXTURE_SIZE, 0.25)  # the empty margin samples the pattern finely
     power = np.abs(np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(stop)))) ** 2
     power = (power / stop.sum() ** 2).astype(np.float32)
     texture = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE, 3), np.float32)
@@ -95,18 +95,19 @@ def starburst_texture(aperture: Aperture, settings: Starburst) -> Pixels:
     rows, columns = np.mgrid[:TEXTURE_SIZE, :TEXTURE_SIZE].astype(np.float32) - centre
     for wavelength, share in zip(wavelengths(BANDS), responses(BANDS), strict=True):
         scale = np.float32(REFERENCE_WAVELENGTH / wavelength)
+        # A pattern that is wider by 1 / scale is fainter by scale^2: its light stays the same.
         wide = cv2.remap(power, columns * scale + centre, rows * scale + centre, cv2.INTER_LINEAR)
         texture += (wide * scale**2)[..., None] * share.astype(np.float32)
     sigma = settings.core / settings.extent * centre
     texture = cv2.GaussianBlur(texture, (0, 0), sigma).astype(np.float32)
     reach = np.hypot(rows, columns) / centre
-    fade = np.clip((1 - reach) / 0.25, 0, 1)
+    fade = np.clip((1 - reach) / 0.25, 0, 1)  # over the outer quarter, so that no edge shows
     texture *= (settings.gain * fade * fade * (3 - 2 * fade))[..., None]
     return texture / (1 + texture.max(axis=2, keepdims=True) / settings.peak)
 
 
 def draw_starburst(aperture: Aperture, settings: Starburst, x: Pixels, y: Pixels) -> Pixels:
-    """Return the pattern at offsets (x, y) from the light (tan), each (height, width)."""
+    """Return the pattern (height, width, 3) at offsets (x, y) from the light (tan), each (height, width)."""
     texture = starburst_texture(aperture, settings)
     half = TEXTURE_SIZE // 2
     scale = half / settings.extent
@@ -128,7 +129,7 @@ def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) 
     u, v = x - settings.follow * light[0], y - settings.follow * light[1]
     distance = np.hypot(u, v)
     field = math.hypot(*light)
-    # The cosine to the direction away from the principal point; it fades to 0 for a light on the axis.
+    # Cosine of the angle to the light's direction; it fades for a light near the principal point, which has none.
     side = (u * light[0] + v * light[1]) / np.maximum(distance, 1e-6) / math.sqrt(field**2 + 0.05)
     bright = settings.gain * np.maximum(1 - settings.lean * side, 0)
     ring = np.zeros((*x.shape, 3), np.float32)
@@ -141,7 +142,8 @@ def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) 
 
 
 def draw_streak(settings: Streak, light: tuple[float, float], x: Pixels, y: Pixels) -> Pixels:
-    """Return a streak through the light, and its fainter mirror image, (height, width, 3)."""
+    """Return a streak through the light, and its fainter mirror image, (height, width, 3); coordinates as in
+    `draw_ring`."""
     cosine, sine = math.cos(math.radians(settings.turn)), math.sin(math.radians(settings.turn))
     total = np.zeros(x.shape, np.float32)
     for side, share in ((1.0, 1.0), (-0.7, settings.mirror)):

@@ -31,9 +31,10 @@ FIELDS = 10
 
 @compile_cached
 def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating: float) -> float:
-    """Return the unpolarised reflectance between n0 and n2 at an angle of incidence; 1 for total reflection.
+    """Return the unpolarised reflectance of light that comes from n0 and meets n2; 1 for total reflection.
 
-    coating: wavelength (micrometres) for which a layer of magnesium fluoride is a quarter wave thick; 0 for bare glass.
+    cosine: of the angle of incidence. coating: wavelength (micrometres) for which the layer is a quarter wave thick; 0
+    for bare glass. The layer has the index that reflects least, but no lower one than magnesium fluoride's.
     One thin film: R = |(r01 + r12 e^{i d}) / (1 + r01 r12 e^{i d})|^2 for each polarisation.
     """
     sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
@@ -82,7 +83,7 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
     at, step, turns = 0, 1, 0
     while at < count:
         c, z0 = curvature[at], vertices[at]
-        # Meet the sphere (or plane): the root nearest to the vertex.
+        # Meet the sphere (or plane, c = 0): a t^2 - 2 b t + k = 0, the root nearest to the vertex.
         oz = pz - z0
         a = c
         b = dz - c * (px * dx + py * dy + oz * dz)

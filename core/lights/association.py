@@ -25,7 +25,7 @@ FAINT_FIRST_GATE = 0.03
 MIN_ACCELERATION, MAX_ACCELERATION = 0.003, 0.03
 """Bounds of a track's acceleration, diagonals per frame²."""
 UNLIKELY_GATE = 0.4
-"""Factor on the tolerance for a source that hardly looks like a lamp, of a track that does."""
+"""Factor on the tolerance where one of track and source looks like a lamp and the other hardly does."""
 MAX_WAIT, MAX_GAP = 2, 24
 """Frames to the next source of a track, first without and then with knowledge of what comes later."""
 SIZE_COST, COLOUR_COST, EVIDENCE_COST, GAP_COST = 0.4, 0.3, 0.5, 0.06
@@ -81,7 +81,10 @@ class Chain:
         return np.asarray(self.places[-1 if at_end else 0] + (frame - start) * self.velocity(at_end))
 
     def acceleration(self, diagonal: float) -> float:
-        """Return the acceleration, pixels per frame², within bounds."""
+        """Return the acceleration, pixels per frame²: a high one, from the 80th percentile of the changes of velocity.
+
+        It is kept within MIN_ACCELERATION and MAX_ACCELERATION. diagonal: of the frames, pixels.
+        """
         places, frames = self.places, np.array(self.frames)
         least, most = MIN_ACCELERATION * diagonal, MAX_ACCELERATION * diagonal
         if len(frames) < 3:
@@ -131,6 +134,7 @@ def _cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | 
     else:
         speed = float(np.linalg.norm(chain.velocity(at_end=True)))
         before = chain.frames[-1] - chain.frames[-2]
+        # Acceleration adds to the gate where frames are missing, in this gap or in the one that gave the velocity.
         gate = (BASE_GATE * diagonal + SPEED_GATE * speed
                 + 0.5 * chain.acceleration(diagonal) * (gap * gap - 1 + (before - 1) * gap))
     if chain.evidence >= LIKELY > source.evidence:
@@ -143,6 +147,7 @@ def _cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | 
     difference = _difference(last, source)
     if distance > gate or difference > MAX_DIFFERENCE:
         return None
+    # A chain of one source predicts its place without a velocity, so longer chains come first.
     return distance / gate + difference + GAP_COST * (gap - 1) + 0.2 * (len(chain.frames) < 2)
 
 
@@ -156,12 +161,15 @@ def _difference(first: Source, second: Source) -> float:
 
 
 def _join(chains: list[Chain], diagonal: float) -> list[Chain]:
-    """Join chains where one ends before another begins and both extrapolations meet, the best pair first."""
+    """Join chains where one ends before another begins and both extrapolations meet, the best pair first.
+
+    Only chains that look like lamps are joined. Returns all chains, the longest first.
+    """
     likely = {number: chain for number, chain in enumerate(chains) if chain.evidence >= LIKELY}
     others = [chain for number, chain in enumerate(chains) if number not in likely]
     costs = {(i, j): cost for i, first in likely.items() for j, second in likely.items()
              if i != j and (cost := _join_cost(first, second, diagonal)) is not None}
-    following = len(chains)
+    following = len(chains)  # number of the next joined chain
     while costs:
         i, j = min(costs, key=lambda pair: (costs[pair], pair))
         first, second = likely.pop(i), likely.pop(j)
@@ -182,9 +190,11 @@ def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
     if not 0 < gap <= MAX_GAP:
         return None
     is_single = 1 in (len(first.frames), len(second.frames))
+    # A single frame joins only a chain of three or more, which has a velocity and an acceleration.
     if is_single and (gap > MAX_SINGLE_GAP or len(first.frames) + len(second.frames) < 4):
         return None
     acceleration = max(first.acceleration(diagonal), second.acceleration(diagonal))
+    # Each half of the gap may miss acceleration * gap² / 8; a third leaves some room.
     gate = BASE_GATE * diagonal + acceleration * gap * gap / 3
     speeds = [float(np.linalg.norm(chain.velocity(at_end))) for chain, at_end in ((first, True), (second, False))]
     if is_single:  # a single frame has no velocity; it may have the other's

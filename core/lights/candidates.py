@@ -52,14 +52,17 @@ class Candidates:
             batch = np.argsort(-self._bounds, kind="stable")[:size]
             self._bounds[batch] = self._observations.scores(self._places[batch], index)
             top = int(np.argmax(self._bounds))
-            if top in batch:
+            if top in batch:  # its score is new, and no other's upper bound is higher
                 return self._places[top] if self._bounds[top] > 0 else None
         return None
 
 
 def _intersections(observations: Observations, index: NDArray[np.int64], rng: np.random.Generator,
                    max_candidates: int) -> Floats:
-    """Return (n, 4), at most `max_candidates`: places where the rays of two of the detections `index` meet."""
+    """Return (n, 4), at most `max_candidates`: places where the rays of two of the detections `index` meet.
+
+    Rays meet at a place, finite or at infinity, that projects within tolerance of both detections.
+    """
     first, second = _choose_pairs(observations, index, rng)
     places = np.concatenate([_triangulate(observations, first, second), _at_infinity(observations, first, second)])
     first, second = np.tile(first, 2), np.tile(second, 2)
@@ -96,6 +99,7 @@ def _draw_pairs(observations: Observations, index: NDArray[np.int64],
     for _ in range(MAX_DRAWS):
         drawn = np.sort(index[rng.choice(len(index), (2 * MAX_PAIRS, 2), p=weight)], axis=1)
         drawn = drawn[observations.view[drawn[:, 0]] != observations.view[drawn[:, 1]]]
+        # One number for each pair, which np.divmod below takes apart.
         keys = np.concatenate([keys, drawn[:, 0] * len(observations.view) + drawn[:, 1]])
         keys = keys[np.sort(np.unique(keys, return_index=True)[1])]  # in the order of drawing
         if len(keys) >= MAX_PAIRS:
@@ -105,7 +109,10 @@ def _draw_pairs(observations: Observations, index: NDArray[np.int64],
 
 
 def _triangulate(observations: Observations, first: NDArray[np.int64], second: NDArray[np.int64]) -> Floats:
-    """Return (n, 4), the midpoints of the shortest segments between two detections' rays; zeros for parallel rays."""
+    """Return (n, 4), the midpoints of the shortest segments between two detections' rays.
+
+    Zeros for rays that are parallel, or that are nearest behind one of the cameras.
+    """
     a, b = observations.position[observations.view[first]], observations.position[observations.view[second]]
     d, e = observations.ray[first], observations.ray[second]
     cosine, base = (d * e).sum(axis=1), b - a

@@ -52,6 +52,7 @@ class ExposureDetector:
             mask = _main_body(region, MAX_AREA_SHARE * clipped.size)
             if mask is None:
                 continue
+            # Clipped pixels of the region's group beside it, relative to its own.
             group_excess = float(group_areas[top:top + height, left:left + width][mask].max()) / float(mask.sum()) - 1
             score = (shape_score(mask, (left, top), display) * smoothstep(_attached_share(mask, region), 0.4, 0.1)
                      * smoothstep(group_excess, 5.0, 1.5))
@@ -120,7 +121,8 @@ def open_by_disc(mask: NDArray[np.uint8], reach: int) -> NDArray[np.uint8]:
 def _attached_share(core: NDArray[np.bool_], region: NDArray[np.bool_]) -> float:
     """Return the share of a ring half the core's radius outside it where the clipped region continues.
 
-    High for a patch cut out of a surface, low past the short spikes of a star or beside a bracket.
+    core, region: masks (h, w) of the region without thin parts and with them. High for a patch cut out of a surface,
+    low past the short spikes of a star or beside a bracket.
     """
     import cv2
 
@@ -139,7 +141,12 @@ def smoothstep(value: float, low: float, high: float) -> float:
 
 
 def shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:
-    """Return the score of a mask's shape, size, whiteness and surroundings."""
+    """Return the score, 0..1, of a mask's shape, size, whiteness and surroundings.
+
+    mask: (h, w) at `corner` (x, y) of a picture with these display values (height, width, 3). A score of 1 takes a
+    solid region (its share of its convex hull), not long (the ratio of its sides), small (its share of the frame),
+    white (its mean least channel), and darker surroundings.
+    """
     import cv2
 
     height, width = display.shape[:2]

@@ -42,10 +42,12 @@ def check_replaceable(path: Path) -> None:
     places, paths = _read_earlier_places(data, path), _read_earlier_paths(data, path)
 
     def is_unchanged(entry: dict[str, Any]) -> bool:
+        """True if an earlier run wrote the entry's place or path."""
         if "xyz" in entry:
             return any(np.allclose(entry["xyz"], place, rtol=1e-3, atol=1e-5) for place in places)
         return any(_places_by_frame(entry) == earlier for earlier in paths)
 
+    # An entry that a search wrote has a support, and the name of its number.
     by_hand = [str(entry["name"]) for number, entry in enumerate(data["lights"], 1)
                if not ("support" in entry and entry["name"] == f"light{number}" and is_unchanged(entry))]
     if by_hand:
@@ -55,8 +57,9 @@ def check_replaceable(path: Path) -> None:
 
 def write_lights(path: Path, lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
                  keep: bool = False, tracked: Sequence[TrackedLight] = ()) -> list[dict[str, Any]]:
-    """Write lights.json and return its entries. keep: see the module's head. tracked: lights on paths.
+    """Write lights.json and return its entries.
 
+    keep: see the module's head. views: names and cameras, by which lights count as the same. tracked: lights on paths.
     Raises CaptureError where an existing file is to be kept and cannot be read.
     """
     entries: list[dict[str, Any]] = []
@@ -97,7 +100,10 @@ def _places_by_frame(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_same_path(path: dict[str, Any], other: dict[str, Any], camera: Camera) -> bool:
-    """True if two paths on the picture are close to each other in most frames that they share."""
+    """True if two paths on the picture are close to each other in most frames that they share.
+
+    They must share half the frames of the shorter one. camera: its size is that of the frames.
+    """
     shared = [name for name in path if name in other and len(path[name]) == len(other[name]) == 2]
     if len(shared) < 0.5 * min(len(path), len(other)) or not shared:
         return False

@@ -76,6 +76,7 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
         if lights:
             messages.append("A single view gives directions only; distances are those of nearby points, or guesses.")
     else:
+        # Everything that two views agree on; what lacks support is reported as doubtful.
         permissive = replace(settings, min_views=2, max_nfa=np.inf, min_share=0.0)
         candidates = triangulate_lights(views, detections, capture.extent, permissive)
         supported = [light for light in candidates if _is_well_supported(light, min_views, settings)]
@@ -127,8 +128,9 @@ def _stands(capture: Capture, light: TrackedLight, standing: Sequence[FoundLight
 
 def write_findings(capture: Capture, findings: Findings, keep: bool = False, tracked: TrackFindings | None = None
                    ) -> dict[str, Any]:
-    """Write lights.json, overlay sheets and a report into the capture; returns the report. tracked: lights on paths.
+    """Write lights.json, overlay sheets and a report into the capture; returns the report.
 
+    keep: leave the entries of an existing lights.json as they are (see `file.py`). tracked: lights on paths.
     lights/sheetN.png shows every view; lights/report.json lists support, residuals, and doubtful lights.
     """
     from .overlay import write_overlay_sheets
@@ -163,6 +165,7 @@ def write_findings(capture: Capture, findings: Findings, keep: bool = False, tra
 def write_tracks(capture: Capture, findings: TrackFindings, keep: bool = False) -> dict[str, Any]:
     """Write lights.json, sheets and a report of lights that were followed into the capture; return the report.
 
+    keep: leave the entries of an existing lights.json as they are (see `file.py`).
     lights/sheetN.png shows every frame; lights/report.json lists evidence, doubtful frames, and doubtful lights.
     """
     from .track_sheet import write_track_sheets
@@ -201,7 +204,11 @@ def _light_of_entry(entry: dict[str, Any], lights: Sequence[FoundLight]) -> Foun
 
 
 def _from_one_view(capture: Capture, detections: Sequence[Detection]) -> list[FoundLight]:
-    """Place the detections of a single view at the depth of the nearest points in the picture, or far away."""
+    """Place each detection of a single view at the median depth of the points around it in the picture.
+
+    Without a point within 5 % of the diagonal it is placed far away. The uncertainty is
+    as large as the guessed distance, and 0 where the light is far.
+    """
     view = capture.views[0]
     pixels, depth = view.camera.project(capture.points.xyz)
     in_frame = view.camera.contains(pixels, depth)
@@ -211,6 +218,7 @@ def _from_one_view(capture: Capture, detections: Sequence[Detection]) -> list[Fo
         near = in_frame & (np.linalg.norm(pixels - detection.xy, axis=1) < reach)
         ray = view.camera.rays(detection.xy)[0]
         far = not near.any()
+        # A depth is measured along the camera's axis, a distance along the ray.
         distance = FAR * capture.extent if far else float(np.median(depth[near])) / float(ray @ view.camera.forward)
         uncertainty = 0.0 if far else distance
         lights.append(FoundLight(view.camera.position + distance * ray, far, (view.name,), 1, 0.0, uncertainty,
@@ -232,6 +240,8 @@ def detector_for(method: str, threshold: float | None = None, boxes: str | Path 
                  masks: str | Path | None = None) -> Detector:
     """Make the detector "exposure" or "grounded".
 
+    threshold: least score of a detection, 0..1; None for the method's own. boxes, masks: weights of "grounded", folders
+    or names on the hub; None for the usual ones.
     Raises SettingsError for other names; EngineError where its weights or libraries are missing.
     """
     if threshold is not None and not 0 <= threshold <= 1:

@@ -36,7 +36,10 @@ MAX_BLOBS = 20
 
 @dataclass(frozen=True, eq=False)
 class Blob:
-    """A bright spot at `xy` (2,) pixels, of `radius` pixels, `strength` over its surroundings in linear light."""
+    """A bright spot at `xy` (2,) pixels, of `radius` pixels.
+
+    strength: how much it exceeds its surroundings, in square roots of linear light.
+    """
 
     xy: NDArray[np.float64]
     radius: float
@@ -46,7 +49,8 @@ class Blob:
 def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
     """Find bright spots of 0.7 to 6 % of the diagonal, strongest first, by difference of Gaussians over scales.
 
-    On the square root of linear light; with the clean frame, of the difference alone.
+    They are found in the square root of linear light. With `clean`, the clean frame, they are found in the light that
+    the frame has beyond it.
     """
     import cv2
 
@@ -62,6 +66,7 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
     for radius in np.exp(np.linspace(np.log(0.007), np.log(0.06), 6)) * diagonal:
         sigma = radius / 1.6
         inner = cv2.GaussianBlur(small, (0, 0), sigma)
+        # At a ratio of 1.6 the difference is close to a Laplacian of Gaussian (Marr and Hildreth 1980).
         stands_out = np.asarray(inner - cv2.GaussianBlur(small, (0, 0), 1.6 * sigma))
         window = 2 * max(1, round(radius)) + 1
         peak = (stands_out == cv2.dilate(stands_out, np.ones((window, window), np.uint8))) & (stands_out > 0.004)
@@ -99,6 +104,7 @@ def locate_by_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequen
             light = _light_at_ratio(views, blobs, extent, ratio, seed)
             if light is not None and _rank(light, ratio) > _rank(best, best_ratio):
                 best, best_ratio = light, ratio
+    # The residual in pixels of the ghost: at the light it is 1 / ratio times as large.
     return [replace(best, residual=best.residual * abs(best_ratio), how=f"from a ghost at {best_ratio:.2f} of the way")]
 
 
@@ -113,7 +119,8 @@ def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequenc
     claims = []
     for (_, camera), in_view in zip(views, blobs, strict=True):
         centre = np.array([camera.cx, camera.cy])
-        # The radius carries the tolerance: an error at the ghost is 1 / ratio times as large at the light.
+        # The tolerance is half the radius (`Observations.of`): 1 % of the diagonal at the ghost, and 1 / ratio times as
+        # much at the light.
         diagonal = float(np.hypot(*camera.size))
         claims.append([Detection(centre + (blob.xy - centre) / ratio, 0.02 * diagonal / abs(ratio), 1.0,
                                  np.ones(3), np.ones((1, 1), bool), (0, 0), False) for blob in in_view
@@ -123,6 +130,7 @@ def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequenc
                                      seed=seed)
     diagonal = float(np.hypot(*views[0][1].size))
     for light in triangulate_lights(views, claims, extent, settings):
+        # A light that many views would show themselves is not out of frame.
         moved = np.ptp([detection.xy * ratio for _, detection in light.detections], axis=0).max()
         visible = sum(_is_well_inside(camera, light.xyz) for _, camera in views)
         if visible < 0.2 * len(views) and moved > MIN_MOTION * diagonal:

@@ -71,6 +71,7 @@ class GroundedDetector:
         height, width = image.shape[:2]
         with torch.inference_mode():
             inputs = self._box_processor(images=image, text=PROMPT, return_tensors="pt").to(self._device)
+            # A text threshold of 0: the words that a box matches are not used.
             answer = self._box_processor.post_process_grounded_object_detection(
                 self._box_model(**inputs), inputs["input_ids"], threshold=self.threshold, text_threshold=0.0,
                 target_sizes=[(height, width)])[0]

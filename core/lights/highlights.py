@@ -47,15 +47,18 @@ def find_highlights(linear: NDArray[np.float32], threshold: float = 0.95, gain: 
     rows, columns = np.nonzero(np.isfinite(luminance) & (luminance > threshold))
     if not len(rows):
         return Highlights(np.zeros((0, 2)), np.zeros((0, 3)))
+    # Smoothstep of the part above the threshold, so that no pixel appears at once.
     t = np.clip((luminance[rows, columns].astype(np.float64) / threshold - 1) / SOFTNESS, 0, 1)
     colours = np.maximum(linear[rows, columns], 0).astype(np.float64) * (t * t * (3 - 2 * t))[:, None]
     xy = np.stack([columns + 0.5, rows + 0.5], -1)
     spacing = max(width, height) / (NODES - 1)
+    # Nodes across and down, numbered by row. `low` is the node above and left of each pixel.
     shape = np.array([int(width / spacing) + 2, int(height / spacing) + 2])
     at = xy / spacing
     low = np.floor(at).astype(int)
     light, places, strengths = (np.zeros((int(shape.prod()), size)) for size in (3, 2, 1))
     for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        # Bilinear: 1 at the node, 0 at its neighbours.
         share = np.prod(np.where(corner, at - low, 1 - (at - low)), axis=1)
         node = (low[:, 1] + corner[1]) * shape[0] + low[:, 0] + corner[0]
         lit = colours * share[:, None]
@@ -65,6 +68,7 @@ def find_highlights(linear: NDArray[np.float32], threshold: float = 0.95, gain: 
         for column in range(2):
             places[:, column] += np.bincount(node, strength * xy[:, column], len(light))
         strengths[:, 0] += np.bincount(node, strength, len(light))
+    # Faint nodes fade out in the same way.
     part = strengths[:, 0] / strengths.sum() if strengths.any() else strengths[:, 0]
     t = np.clip((part - FAINTEST[0]) / (FAINTEST[1] - FAINTEST[0]), 0, 1)
     chosen = np.flatnonzero(t > 0)

@@ -35,7 +35,8 @@ def lift_to_gaussians(views: Sequence[tuple[str, Camera]], detections: Sequence[
                       opacities: ArrayLike, extent: float, min_views: int = 3, share: float = 0.3) -> list[FoundLight]:
     """Find lights from detections of each view and scene Gaussians: means (n, 3), opacities (n,) in 0..1.
 
-    `share` of the views that see a Gaussian must have it inside a detection.
+    At least `share` of the views that see a Gaussian, and `min_views`, must have it inside a detection. extent: of the
+    cameras' path (`Capture.extent`), world units.
     """
     xyz, opacity = np.asarray(means, np.float64), np.asarray(opacities, np.float64)
     xyz, opacity = xyz[opacity > MIN_OPACITY], opacity[opacity > MIN_OPACITY]
@@ -62,7 +63,10 @@ def lift_to_gaussians(views: Sequence[tuple[str, Camera]], detections: Sequence[
 
 
 def _visible_points(camera: Camera, pixels: Floats, depth: Floats) -> NDArray[np.int64]:
-    """Return the indices of the points that are in frame and not hidden."""
+    """Return the indices of the points that are in frame and not hidden: near the front of their cell.
+
+    pixels (n, 2), depth (n,): of the points.
+    """
     index = np.flatnonzero(camera.contains(pixels, depth))
     size = max(camera.size) / DEPTH_CELLS
     column, row = (pixels[index] / size).astype(int).T
@@ -96,7 +100,10 @@ def _cluster(xyz: Floats, reach: float) -> list[NDArray[np.int64]]:
 
 def _to_light(centre: Floats, spread: float, views: Sequence[tuple[str, Camera]],
               detections: Sequence[Sequence[Detection]]) -> FoundLight:
-    """Return the light at a cluster's centroid, with the nearest detection of each view that shows it."""
+    """Return the light at a cluster's centroid, with the nearest detection of each view that shows it.
+
+    spread: standard distance of the cluster's Gaussians from the centroid, the light's uncertainty.
+    """
     residuals: list[float] = []
     matched: list[tuple[str, Detection]] = []
     visible = 0

@@ -49,7 +49,7 @@ def _by_support(lights: Sequence[FoundLight]) -> list[FoundLight]:
 
 
 def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) -> bool:
-    """True if the detections of `light` are a ghost of `other`."""
+    """True if the detections of `light` are a ghost of `other`, see `remove_ghosts`. cameras: by the views' names."""
     ghost, source, tolerance = [], [], []
     for name, detection in light.detections:
         camera = cameras[name]
@@ -65,12 +65,14 @@ def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) 
     ratio = float((g * s).sum() / (s * s).sum())
     distance = np.linalg.norm(g - ratio * s, axis=1) / tolerance
     motion = float(np.linalg.norm(np.ptp(g, axis=0))) / float(np.median(tolerance))
+    # A spot that hardly moves could lie at any ratio; one at a ratio of 1 is the light itself.
     return bool(np.median(distance) < 1 and motion > 8 and abs(ratio - 1) > 0.05)
 
 
 def _is_same_light(light: FoundLight, other: FoundLight, views: Sequence[tuple[str, Camera]], extent: float) -> bool:
-    """True if two lights fall on one spot: nearer than their radii in most frames that show both, or nearer in space
-    than their uncertainties."""
+    """True if two lights fall on one spot: nearer than the sum of their radii in more than two thirds of the frames
+    that show either, or nearer in space than twice the sum of their uncertainties. Small tolerances are added to both.
+    """
     max_distance = 0.02 * extent + 2 * (light.uncertainty + other.uncertainty)
     if not light.far and not other.far and np.linalg.norm(light.xyz - other.xyz) < min(max_distance, 0.3 * extent):
         return True

@@ -91,8 +91,7 @@ class Observations:
     def scores(self, places: Floats, index: NDArray[np.int64]) -> Floats:
         """Return (n,), the score of each place (n, 4): the summed weights of the detections near its projections.
 
-        index: of the detections that count.
-        The best detection of each view counts, more the nearer it is.
+        index: of the detections that count, ascending. Of each view the best one counts, the more the nearer it is.
         """
         pixels, front = self.project(places)
         view = self.view[index]
@@ -100,5 +99,6 @@ class Observations:
         for axis in range(2):
             squared += ((pixels[:, view, axis] - self.pixel[index, axis]) / self.tolerance[index]) ** 2
         gain = np.where(front[:, view] & (squared < 1), self.weight[index] * (1 - squared), 0.0)
+        # Detections are in the order of their views: those of a view are side by side.
         starts = np.flatnonzero(np.diff(view, prepend=-1))
         return np.asarray(np.maximum.reduceat(gain, starts, axis=1).sum(axis=1))

@@ -20,7 +20,7 @@ MAX_ROUNDS = 5
 HUBER = 1.5
 """Residual, in standard deviations, from which Huber's weight falls."""
 PRIOR = 0.01
-"""Weight of the pull towards infinity, in extents."""
+"""Weight of the pull towards infinity: the inverse distance is 0 with a standard deviation of 1 / (PRIOR extent)."""
 
 
 class InverseDistance(NamedTuple):
@@ -60,8 +60,12 @@ def refine_until_stable(observations: Observations, place: Floats, remaining: ND
 
 def _refine(observations: Observations, place: Floats, inliers: NDArray[np.int64],
             extent: float) -> tuple[Floats, Floats]:
-    """Run Gauss-Newton with Huber weights; returns the place (4,) and its covariance (3, 3)."""
+    """Run Gauss-Newton with Huber weights; returns the place (4,) and its covariance (3, 3).
+
+    The covariance is that of two angles of the direction, radians, and the inverse distance.
+    """
     origin, direction, inverse = parametrise(observations, place, inliers)
+    # Standard deviation of each detection, pixels: a third of its tolerance, more for a low score.
     sigma = (np.maximum(observations.tolerance[inliers] / 3, 0.5)
              / np.sqrt(np.maximum(observations.weight[inliers], 0.05)))
     basis = _tangent_basis(direction)
@@ -76,6 +80,7 @@ def _refine(observations: Observations, place: Floats, inliers: NDArray[np.int64
         gradient = np.einsum("nij,ni,n->j", jacobian, residual, weight)
         gradient[2] += (PRIOR * extent) ** 2 * inverse
         step = np.linalg.solve(information + 1e-12 * np.trace(information) * np.eye(3), -gradient)
+        # The projection is far from linear in the inverse distance, so that a long step would miss.
         step[2] = np.clip(step[2], -0.5 * abs(inverse) - 0.05 / extent, 0.5 * abs(inverse) + 0.05 / extent)
         direction = direction + basis @ step[:2]
         direction /= np.linalg.norm(direction)
@@ -84,6 +89,7 @@ def _refine(observations: Observations, place: Floats, inliers: NDArray[np.int64
         if np.abs(step * (1, 1, extent)).max() < 1e-9:
             break
     residual, _ = _residuals(observations, inliers, InverseDistance(origin, direction, inverse), basis)
+    # Scaled by the residuals, which are nearly zero for two or three detections whatever their errors.
     variance = max(float(np.mean((residual / sigma[:, None]) ** 2)), 0.1)
     covariance = np.linalg.inv(information) * variance
     return np.array([*(direction + inverse * origin), inverse]), covariance
@@ -91,7 +97,10 @@ def _refine(observations: Observations, place: Floats, inliers: NDArray[np.int64
 
 def _residuals(observations: Observations, inliers: NDArray[np.int64], place: InverseDistance,
                basis: Floats) -> tuple[Floats, Floats]:
-    """Return residuals (n, 2) in pixels, and their derivatives (n, 2, 3) by two angles and inverse distance."""
+    """Return residuals (n, 2) in pixels, and their derivatives (n, 2, 3) by two angles and inverse distance.
+
+    basis: (3, 2), the axes of the angles, see `_tangent_basis`.
+    """
     view = observations.view[inliers]
     rotation, shift = observations.rotation[view], place.origin - observations.position[view]
     local = np.einsum("nij,nj->ni", rotation, place.direction + place.inverse * shift)

@@ -95,7 +95,7 @@ def snap_lights(views: Sequence[FlareView], lights: ArrayLike) -> Floats:
     peak."""
     initial = np.array(lights, np.float64).reshape(-1, 3)
     positions, is_on_peak = initial.copy(), _are_on_peaks(views, initial) | _are_unobserved(views, initial)
-    for first in reversed(range(len(WINDOWS) - 2)):
+    for first in reversed(range(len(WINDOWS) - 2)):  # from the narrowest three windows alone to all
         if is_on_peak.all():
             break
         moved = _mean_shift(views, positions, ~is_on_peak, WINDOWS[first:])
@@ -122,7 +122,7 @@ def _mean_shift(views: Sequence[FlareView], positions: Floats, free: NDArray[np.
                 positions[light] += step
                 motions = (float(np.linalg.norm(observation.jacobian @ step)) for observation in observations)
                 farthest = max(farthest, *motions)
-            if farthest < 0.05:
+            if farthest < 0.05:  # pixels
                 break
     return positions
 
@@ -197,7 +197,7 @@ def _observe(views: Sequence[FlareView], positions: Floats, window: float) -> li
         windows = {light: row * column[:, None] for light, (row, column) in profiles.items()}
         total_window = sum(windows.values(), np.full((height, width), 1e-12))
         for light, window_pixels in windows.items():
-            support = window_pixels * window_pixels / total_window
+            support = window_pixels * window_pixels / total_window  # the window times its share of each pixel
             if observed is not None:
                 support = support * observed
             weights = support * flare

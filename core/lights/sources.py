@@ -76,6 +76,7 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
     clipped = (value >= clipped_from).astype(np.uint8)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(clipped, connectivity=8)
     min_area = max(3.0, np.pi * (MIN_RADIUS * diagonal) ** 2)
+    # Scores expect clipped pixels near 1, also in a shot that never reaches white.
     scaled = display if clipped_from >= CLIPPED else np.minimum(display / np.float32(clipped_from), 1)
     sources = []
     for label in range(1, count):
@@ -95,7 +96,10 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
 
 
 def _parts(region: Mask, largest: float) -> Iterator[tuple[Mask, tuple[int, int]]]:
-    """Yield the thick parts of a spot with their corners (x, y) in it; none where a disc of `largest` px fits in."""
+    """Yield the thick parts of a spot, without spikes, with their corners (x, y) in it.
+
+    region: mask (h, w) of the spot. It has no parts where a disc with an area of more than `largest` px² fits in.
+    """
     import cv2
 
     padded = np.pad(region, 1).astype(np.uint8)
@@ -105,12 +109,14 @@ def _parts(region: Mask, largest: float) -> Iterator[tuple[Mask, tuple[int, int]
     thickest = float(thickness.max())
     if np.pi * thickest ** 2 > largest:
         return
-    for ratio in (MIN_THICKNESS, OPENING_RATIO):  # part with a small disc, then trim each part by its own thickness
+    # A small disc separates the parts. Several are trimmed below, each by its own thickness. A single one is opened by
+    # the larger disc of the second pass.
+    for ratio in (MIN_THICKNESS, OPENING_RATIO):
         reach = int(ratio * thickest)
         opened = open_by_disc(padded, reach) if reach >= 1 else padded
         if ratio == MIN_THICKNESS:
             count, labels = cv2.connectedComponents(opened, connectivity=4)
-            if count > 2:
+            if count > 2:  # several parts: label 0 is the background
                 break
     else:
         yield _trimmed(opened, (1, 1))
@@ -135,7 +141,10 @@ def _trimmed(mask: NDArray[np.uint8], padding: tuple[int, int]) -> tuple[Mask, t
 
 
 def _at_flux(found: Detection, linear: NDArray[np.float32]) -> Detection:
-    """Return a detection at the flux centroid of the part above half its peak, where frames hold light above white."""
+    """Return a detection at the flux centroid of its pixels above half its peak.
+
+    linear: the frame, (height, width, 3). A detection whose peak is at most twice white is returned unchanged.
+    """
     from dataclasses import replace
 
     left, top, right, bottom = found.box
@@ -149,7 +158,12 @@ def _at_flux(found: Detection, linear: NDArray[np.float32]) -> Detection:
 
 
 def _softness(mask: Mask, corner: tuple[int, int], luminance: NDArray[np.float32], scale: float) -> float:
-    """Return how softly a spot ends: the light just outside its edge, above that farther out, relative to the spot."""
+    """Return how softly a spot ends: the light in the ring NEAR outside its edge minus that in the ring FAR.
+
+    It is relative to the same difference for the spot itself, which is at 1: 1 for a glow as bright as the spot, about
+    0 for a hard edge. Of the values of all sectors the SIDE_QUANTILE counts; 0 where none can be measured. luminance:
+    (height, width), clipped at 1. scale: pixels of this frame to one of a frame with a diagonal of REFERENCE.
+    """
     import cv2
 
     height, width = luminance.shape

@@ -45,7 +45,8 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
                     maps: Mapping[str, NDArray[np.bool_]]) -> float | None:
     """Return the share, 0..1, of the tests in which the far surrounding is bright where a light was detected.
 
-    cameras, maps: of each view, by name. None if too few views decide: the light itself is far, or nearly in the same
+    A test looks from another view in the direction of a detection, as if its light came from far away. cameras, maps:
+    of each view, by name. None if too few views decide: the light itself is far, or nearly in the same
     direction from all.
     """
     if light.far:
@@ -62,6 +63,7 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
             place, depth = camera.project(light.xyz[None])
             clearance = max(SEPARATION * light.radius * camera.width / cameras[name].width,
                             MIN_SEPARATION * camera.width)
+            # Both fall on one spot, so that a bright one does not tell a lamp from a far surrounding.
             if depth[0] > 0 and np.linalg.norm(place[0] - at) < clearance:
                 continue
             height, width = maps[other].shape

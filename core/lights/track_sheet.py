@@ -46,6 +46,7 @@ def write_track_sheets(folder: Path, capture: Capture, sources: Sequence[Sequenc
 
 def _draw_tile(capture: Capture, index: int, sources: Sequence[Source], states: Sequence[Sequence[LightState]]
                ) -> NDArray[np.float32]:
+    """Draw the frame of view `index` small, with its sources and the lights. states: of each light, by view."""
     import cv2
 
     view = capture.views[index]
@@ -68,6 +69,10 @@ def _draw_tile(capture: Capture, index: int, sources: Sequence[Source], states: 
 
 def _draw_light(tile: NDArray[np.float32], state: LightState, path: Sequence[tuple[int, int]],
                 colour: tuple[float, float, float], scale: float, margin: int) -> None:
+    """Draw a light on a tile, in place: its path, pixels of the tile, and a cross or dashed circle at its place.
+
+    scale: size of the tile's frame relative to the frame. margin: border round it, pixels.
+    """
     import cv2
 
     if len(path) > 1:

@@ -97,6 +97,7 @@ def track_lights(capture: Capture, progress: Progress | None = None) -> TrackFin
     diagonal = float(np.hypot(*camera.size))
     chains = follow(sources, diagonal)
     recover(chains, sources, np.array(camera.size, np.float64), diagonal)
+    # A shot shorter than MIN_FRAMES cannot show a light in so many.
     enough = max(MIN_FRAMES, len(views) // 10) if len(views) >= MIN_FRAMES else 1
     long = [chain for chain in chains if len(chain.frames) >= enough]
     lamps = [chain for chain in long if chain.evidence >= MIN_EVIDENCE]
@@ -113,9 +114,10 @@ def track_lights(capture: Capture, progress: Progress | None = None) -> TrackFin
 
 
 def clip_level(capture: Capture) -> float:
-    """Return the display value from which pixels of a shot are clipped, a little below its largest one.
+    """Return the display value from which pixels of a shot are clipped: a little below the largest, CLIPPED at most.
 
-    Footage with a limited range or a soft shoulder never reaches white.
+    The largest value of a frame is that of its 12th brightest pixel, so that single hot pixels do not count. Footage
+    with a limited range or a soft shoulder never reaches white.
     """
     peaks = []
     for view in capture.views[::max(len(capture.views) // 12, 1)]:
@@ -144,7 +146,11 @@ def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], 
 
 
 def _is_ghost(chain: Chain, lamps: Sequence[Chain], centre: Floats, diagonal: float) -> bool:
-    """True if a chain keeps to a fixed ratio of the way from the picture's middle to a larger light that moves."""
+    """True if a chain is a ghost of one of the others among `lamps`: a larger one, which moves.
+
+    A ghost keeps to one ratio of the way from the principal point to its light. centre: principal point (2,), pixels.
+    diagonal: of the frame, pixels.
+    """
     for light in lamps:
         shared = sorted(set(chain.frames) & set(light.frames))
         if light is chain or len(shared) < max(3, 0.7 * len(chain.frames)):
@@ -161,6 +167,7 @@ def _is_ghost(chain: Chain, lamps: Sequence[Chain], centre: Floats, diagonal: fl
         ratios = np.linalg.lstsq(terms, ghost.ravel(), rcond=None)[0]
         left = (ghost.ravel() - terms @ ratios).reshape(-1, 2)
         error = float(np.median(np.linalg.norm(left, axis=1)))
+        # What lies at a ratio of 1 is part of the light itself.
         if error < GHOST_ERROR * diagonal and abs(ratios[0] - 1) > 0.05:
             return True
     return False
@@ -201,7 +208,10 @@ def _to_light(chain: Chain, capture: Capture, diagonal: float) -> TrackedLight:
 
 
 def recover(chains: Sequence[Chain], sources: Sequence[Sequence[Source]], size: Floats, diagonal: float) -> None:
-    """Add to chains of lamps the unused sources that lie on their paths, such as half hidden lamps."""
+    """Add to chains of lamps, in place, the unused sources that lie on their paths, such as half hidden lamps.
+
+    sources: of each frame of the shot. size (2,), diagonal: of the frames, pixels.
+    """
     lamps = [chain for chain in chains if chain.evidence >= MIN_EVIDENCE and len(chain.frames) >= MIN_FRAMES]
     used = {id(source) for chain in lamps for source in chain.sources}
     for chain in lamps:
@@ -230,7 +240,8 @@ def recover(chains: Sequence[Chain], sources: Sequence[Sequence[Source]], size: 
 def _fill(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple[list[int], Floats, Floats]:
     """Return the frames of a chain's path, places (n, 2) and expected errors (n,) in pixels.
 
-    count: number of frames of the shot. Sources that the frame's edge cuts count as missing where their path is known.
+    count: number of frames of the shot. size (2,), diagonal: of the frames, pixels. Sources that the frame's edge cuts
+    count as missing where their path is known.
     """
     whole = _without_cut(chain)
     acceleration = chain.acceleration(diagonal)
@@ -247,14 +258,14 @@ def _fill(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple[list
             low, high = after - 1, after
             span = float(knots[high] - knots[low])
             place = _hermite((frame - knots[low]) / span, span, points[low], rates[low], points[high], rates[high])
-            error = acceleration * span * span / 16
+            error = acceleration * span * span / 16  # half of what a straight line would miss in the middle
         else:
             end = -1 if after else 0
             step = float(frame - knots[end])
             place, error = points[end] + step * rates[end], 0.5 * acceleration * step * step
         source = measured.get(frame)
         if source is not None and source.detection.is_cut:
-            # The part within the frame bounds the place: no farther out than its radius.
+            # The part within the frame bounds the place: more than three of its radii away, the path is wrong.
             place = source.xy if np.linalg.norm(place - source.xy) > 3 * source.detection.radius else place
             error = max(error, 0.5 * source.detection.radius)
         outside = float(np.maximum(np.maximum(-place, place - size), 0).max())
@@ -276,7 +287,11 @@ def _without_cut(chain: Chain) -> Chain:
 
 
 def _velocities(frames: Floats, places: Floats) -> Floats:
-    """Return the velocity (n, 2) at each place: of the parabola through it and its two nearest neighbours in time."""
+    """Return the velocity (n, 2), pixels per frame, at each place (n, 2), in the frames of these numbers (n,).
+
+    It is that of the parabola through the place and its two neighbours in time. Where the three span more than 6
+    frames, it is that of the straight line to the neighbour nearer in time.
+    """
     if len(frames) < 2:
         return np.zeros_like(places)
     rates = []
@@ -291,19 +306,27 @@ def _velocities(frames: Floats, places: Floats) -> Floats:
             low, high = min(sides, key=lambda pair: frames[pair[1]] - frames[pair[0]])
             rates.append((places[high] - places[low]) / (frames[high] - frames[low]))
             continue
-        rates.append(np.polyfit(times, places[near], degree)[-2])
+        rates.append(np.polyfit(times, places[near], degree)[-2])  # the linear term: the derivative at time 0
     return np.array(rates)
 
 
 def _hermite(part: float, span: float, start: Floats, out: Floats, end: Floats, into: Floats) -> Floats:
-    """Return the cubic between two places with their velocities per frame, at 0..1 of the span."""
+    """Return the place (2,) on the cubic between two places with given velocities.
+
+    part: 0..1, the part of the time between them that has passed. span: that time, frames. out, into: velocities (2,)
+    at `start` and at `end`, pixels per frame.
+    """
     square, cube = part * part, part ** 3
     return np.asarray((2 * cube - 3 * square + 1) * start + (cube - 2 * square + part) * span * out
                       + (3 * square - 2 * cube) * end + (cube - square) * span * into)
 
 
 def _outlier(chain: Chain, index: int, acceleration: float) -> float:
-    """Return the expected error of a measured place: how far it is from its neighbours' path, beyond acceleration."""
+    """Return the expected error, pixels, of the measured place `index` of a chain.
+
+    It is 0.5, plus how much farther the place is from the straight line between its neighbours than acceleration can
+    bend a path. Without near neighbours on both sides it is 0.5.
+    """
     frames, places = chain.frames, chain.places
     if not 0 < index < len(frames) - 1 or frames[index + 1] - frames[index - 1] > 4:
         return 0.5
@@ -316,8 +339,10 @@ def _outlier(chain: Chain, index: int, acceleration: float) -> float:
 def fit_brightness(profiles: Floats, shown: NDArray[np.bool_]) -> Floats:
     """Return the brightness (n,) of a light from its profiles (n, rings): 0..1, NaN where no ring is usable.
 
-    shown: (n,) frames in which the light is seen; only they shape the common profile. The background is the median of
-    the outer rings. Where the glow hardly stands out of it, the brightness is drawn to that of the other frames.
+    shown: (n,) frames in which the light is seen; only they shape the common profile, and the 90th percentile of their
+    brightness is 1. The background is the median of the outer rings. Where the glow hardly stands out of it, the
+    brightness is drawn to the median of the shown frames, or to 0 in a frame that does not show the light. If no shown
+    frame has a usable ring, the brightness is 1 wherever a ring is usable.
     """
     outer = profiles[:, -BACKGROUND_RINGS:]
     seen = np.isfinite(outer).any(axis=1)
@@ -329,6 +354,7 @@ def fit_brightness(profiles: Floats, shown: NDArray[np.bool_]) -> Floats:
     if not (usable & shown[:, None]).any():
         return brightness
     filled = np.where(usable, light, 0.0)
+    # Inverse variance of each ring, and in the loop `precision`: that of each frame's brightness.
     weight = usable / (BACKGROUND_NOISE ** 2 + (GLOW_NOISE * filled) ** 2)
     shaping = weight * shown[:, None]
     shape = np.full(light.shape[1], 0.1)

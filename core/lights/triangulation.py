@@ -73,6 +73,7 @@ def triangulate_lights(views: Sequence[tuple[str, Camera]], detections: Sequence
             break
         place, inliers, covariance = refine_until_stable(observations, place, remaining, extent)
         if len(np.unique(observations.view[inliers])) < settings.min_views:
+            # Rejected candidates have taken detections since the list was made: then a new list may have better places.
             if not candidates.rejected:
                 # Removed from the candidates, or the search would find it again without end.
                 remaining[observations.inliers(place, remaining)] = False
@@ -104,6 +105,7 @@ def _to_light(observations: Observations, place: Floats, inliers: NDArray[np.int
         xyz, uncertainty = origin + FAR * extent * direction, float(np.degrees(angle))
     else:
         xyz = origin + direction / inverse
+        # Errors of the inverse distance (d(1/x) = dx / x²) along the ray, and of the angle across it.
         uncertainty = max(spread / inverse ** 2, angle / inverse)
     homogeneous = np.array([[*(direction if far else xyz), 0.0 if far else 1.0]])
     pixels, front = observations.project(homogeneous)
@@ -122,8 +124,9 @@ def _to_light(observations: Observations, place: Floats, inliers: NDArray[np.int
 def _nfa(observations: Observations, support: int, visible: int) -> float:
     """Return the number of false alarms: how many places chance would give that `support` of `visible` views agree on.
 
-    Every pair of detections claims a place, and each other view has a detection within tolerance of it with a small
-    probability.
+    Every pair of detections claims a place, on which its two views agree by construction. Each other view has a
+    detection within tolerance of it with a small probability: the part of its frame that the tolerances of its
+    detections cover, here the mean over the views.
     """
     area = observations.size.prod(axis=1)
     cover = np.pi * observations.tolerance ** 2 / area[observations.view]

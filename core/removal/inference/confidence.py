@@ -87,7 +87,7 @@ def extract_features(display: Pixels, mean_prediction: Pixels, deviation: Pixels
 
     mean = max(float(mean_prediction.mean()), 1e-9)
     coarse = downsample(mean_prediction.mean(-1))
-    patch = max(coarse.shape) // PATCHES_PER_SIDE | 1
+    patch = max(coarse.shape) // PATCHES_PER_SIDE | 1  # odd, so that it has a centre
     broad = cv2.morphologyEx(coarse, cv2.MORPH_OPEN, np.ones((patch, patch), np.uint8))
     return FlareFeatures(
         regraded_ratio=float(np.log(regraded_prediction.mean() / mean + REGRADED_FLOOR)),
@@ -100,6 +100,7 @@ def extract_features(display: Pixels, mean_prediction: Pixels, deviation: Pixels
 def stretch_black_point(display: Pixels) -> Pixels:
     """Stretch display values 0..1 (h, w, 3) so that the black of each channel is 0."""
     black = np.quantile(display.reshape(-1, 3), BLACK_QUANTILE, axis=0).astype(np.float32)
+    # The bound of 0.1 keeps frames that are nearly white from being amplified without limit.
     return np.asarray(np.clip((display - black) / np.maximum(1 - black, 0.1), 0, 1), np.float32)
 
 

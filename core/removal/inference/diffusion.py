@@ -109,11 +109,12 @@ class DiffusionRemoval(nn.Module):
         return layers
 
     def forward(self, display: Tensor) -> Tensor:
-        """Return the frames without flare, not clipped."""
+        """Return the frames (n, 3, h, w) without flare, not clipped."""
         latents, features = self._encode(display * 2 - 1)
         prompt = self.prompt.expand(len(display), -1, -1)
         step = torch.full((len(display),), NOISE_STEP, dtype=torch.long, device=display.device)
         noise = self.unet(latents, step, encoder_hidden_states=prompt).sample
+        # Latents are sqrt(alpha) * clean + sqrt(1 - alpha) * noise (Ho et al. 2020), solved for the clean ones.
         clean = (latents - (1 - self.alpha_cumprod).sqrt() * noise) / self.alpha_cumprod.sqrt()
         return (self._decode(clean, features) + 1) / 2
 
@@ -127,6 +128,7 @@ class DiffusionRemoval(nn.Module):
         x = encoder.conv_out(encoder.conv_act(encoder.conv_norm_out(encoder.mid_block(x))))
         if self.vae.quant_conv is not None:
             x = self.vae.quant_conv(x)
+        # The first half of the channels is the mean of the latents, the second their variance.
         return x.chunk(2, 1)[0] * self.vae.config.scaling_factor, features
 
     def _decode(self, latents: Tensor, features: list[Tensor]) -> Tensor:
@@ -177,7 +179,10 @@ def _embed_prompt(tokenizer: Any, text: Any) -> Tensor:
 
 
 class DiffusionTrainer:
-    """Trains the model by L2 + LPIPS with batches of 1 and AdamW, on the same pairs as the removal network."""
+    """Trains the model by L2 + LPIPS with batches of 1 and AdamW, on the same pairs as the removal network.
+
+    perceptual: returns the LPIPS of two batches of pictures; None for L2 alone.
+    """
 
     def __init__(self, model: DiffusionRemoval, *, learning_rate: float = LEARNING_RATE,
                  perceptual: Callable[[Tensor, Tensor], Tensor] | None = None) -> None:
@@ -205,7 +210,9 @@ class DiffusionRemover(Remover):
     min_mean_flare = 0.0
 
     def __init__(self, base: Path | str, lora: Path | str, *, working_size: int = WORKING_SIZE) -> None:
-        """lora: the file that `DiffusionRemoval.save` wrote. Raises EngineError, RunError."""
+        """base: as for `DiffusionRemoval`. lora: the file that `DiffusionRemoval.save` wrote. Raises EngineError,
+        RunError."""
+        # Remover.__init__ would load the network. The model does not separate the glow, so all of it is removed.
         self.working_size, self.glow = working_size, "remove"
         self.model = DiffusionRemoval(base, read_rank(lora))
         self.model.load(lora)
@@ -231,8 +238,8 @@ def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[
     """Train the model and return the path of its weights, lora.safetensors in `folder`, which is saved every SAVE_EVERY
     iterations.
 
-    draw: returns the frame and the scene of an iteration. resume: continue the training in the folder; the moments of
-    the optimiser start at zero. Raises RunError, SettingsError, Cancelled.
+    draw: returns the frame and the scene of an iteration. perceptual: as for `DiffusionTrainer`. resume: continue the
+    training in the folder; the moments of the optimiser start at zero. Raises RunError, SettingsError, Cancelled.
     """
     if iterations < 1:
         raise SettingsError("A training needs at least one iteration.")

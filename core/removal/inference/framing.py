@@ -32,9 +32,9 @@ WRAP_SHARE = 8
 
 
 def fill_hidden(plate: Plate) -> Plate:
-    """Return an opaque plate whose hidden parts continue the colours beside them, where the codes are not multiplied
-    with an alpha below 1; else the plate itself.
+    """Return the plate opaque, its hidden parts filled with a continuation of the colours beside them.
 
+    A plate without straight alpha below 1 is returned as it is: premultiplied codes hold no hidden colours.
     The colours that a file stores under alpha 0 are arbitrary, and black there would look like a vignette.
     """
     import cv2
@@ -48,6 +48,7 @@ def fill_hidden(plate: Plate) -> Plate:
     light = plate.space.to_linear(plate.values) * alpha[..., None]
     filling = _diffuse(*(np.asarray(cv2.resize(part, small, interpolation=cv2.INTER_AREA), np.float32)
                          for part in (light, alpha)))
+    # Where alpha is partial, the filling shows through.
     light += (1 - alpha)[..., None] * np.asarray(cv2.resize(filling, (width, height)), np.float32)
     values = plate.space.from_linear(light)
     if plate.encoding == "srgb":
@@ -70,7 +71,10 @@ def _diffuse(light: Pixels, alpha: Pixels) -> Pixels:
 
 
 def wrap_margin(plate: Plate) -> int:
-    """Return the columns that a panorama gets from its other side at each edge; 0 for other pictures."""
+    """Return how many columns a panorama gets from its other side at each edge; 0 for other pictures.
+
+    A picture counts as a panorama by its name or header, or where it is twice as wide as high and its sides meet.
+    """
     width = plate.codes.shape[1]
     is_panorama = wraps_around(plate.path, plate.extras.get("header")) or (
         width == 2 * plate.codes.shape[0] >= 4 and do_sides_meet(_side_columns(plate)))
@@ -95,8 +99,11 @@ def wrap_columns(pixels: NDArray[Any], margin: int) -> NDArray[Any]:
 
 
 def merge_columns(light: Pixels, margin: int) -> Pixels:
-    """Return light (height, width, 3) from that of a wrapped plate: the two predictions of each edge meet half and half
-    at the seam, and the one with more picture around it counts more, up to all, away from it."""
+    """Return light (height, width, 3) from that of a wrapped plate, (height, width + 2 margin, 3).
+
+    Each margin is a second prediction of the columns at the other edge. It counts half at the seam and falls linearly
+    to nothing within `margin` columns, where the first prediction has more picture around it.
+    """
     if not margin:
         return light
     width = light.shape[1] - 2 * margin
@@ -114,6 +121,7 @@ def input_size(width: int, height: int, working_size: int) -> tuple[int, int]:
     scale = working_size / long
     if long > MAX_ASPECT * short:
         scale = min(working_size / (PART_ASPECT * short), MAX_LONG_SIDE * working_size / long)
+    # Rounding a side up must not exceed the long side.
     largest = max(int(max(long * scale, working_size)) // SIZE_MULTIPLE, 2)
     columns, rows = (int(np.clip(round(side * scale / SIZE_MULTIPLE), 2, largest)) for side in (width, height))
     return columns * SIZE_MULTIPLE, rows * SIZE_MULTIPLE
@@ -131,6 +139,7 @@ def predict_in_parts(display: Pixels, predict: Callable[[Pixels], Pixels]) -> Pi
         return predict_in_parts(display.swapaxes(0, 1), lambda part: predict(part.swapaxes(0, 1)).swapaxes(0, 1)
                                 ).swapaxes(0, 1)
     part = PART_ASPECT * height
+    # Parts begin half a part apart at most. Their weight falls to 0 at their ends, so no seam shows.
     starts = np.linspace(0, width - part, -(-2 * (width - part) // part) + 1).round().astype(int)
     place = np.arange(part, dtype=np.float32) + np.float32(0.5)
     weight = np.minimum(place, part - place)[None, :, None]

@@ -56,6 +56,7 @@ def fit_guided_filter(display: Pixels, flare: Pixels) -> GuidedFilterMaps:
         return np.asarray(cv2.blur(values, window, borderType=cv2.BORDER_REFLECT), np.float32)
 
     reach = (4 * RADIUS + 1, 4 * RADIUS + 1)  # as far as a clipped pixel affects the two means
+    # guidance: share of the guided filter in the result, 0..1; it falls off smoothly around clipped pixels.
     clipped = cv2.dilate((display.max(-1) > CLIPPING_LEVEL).astype(np.uint8), np.ones(reach, np.uint8))
     guidance = mean(clipped.astype(np.float32))[..., None]
     mean_display, mean_flare = mean(display), mean(flare)
@@ -75,7 +76,10 @@ def fit_guided_filter(display: Pixels, flare: Pixels) -> GuidedFilterMaps:
 
 def upsample_flare(maps: GuidedFilterMaps, codes: NDArray[Any], encoding: Encoding,
                    max_code: float) -> Iterator[tuple[slice, Pixels]]:
-    """Yield (rows, linear flare of those rows (n, width, 3)) for a plate's codes (height, width, 3), top to bottom."""
+    """Yield (rows, linear flare of those rows (n, width, 3)) for a plate's codes (height, width, 3), top to bottom.
+
+    The flare is 0 or more, and no more than the plate's light.
+    """
     import cv2
 
     height, width = codes.shape[:2]
@@ -84,7 +88,7 @@ def upsample_flare(maps: GuidedFilterMaps, codes: NDArray[Any], encoding: Encodi
     for first in range(0, height, STRIP_ROWS):
         rows = slice(first, min(first + STRIP_ROWS, height))
         y = ((np.arange(first, rows.stop, dtype=np.float32) + 0.5) * (map_height / height) - 0.5)[:, None]
-        low = max(int(y[0, 0]) - 2, 0)
+        low = max(int(y[0, 0]) - 2, 0)  # rows of the maps that the strip needs, with some to spare
         high = min(int(y[-1, 0]) + 4, map_height)
         map_x, map_y = np.broadcast_to(x, (len(y), width)), np.broadcast_to(y - low, (len(y), width))
         gain, offset = (np.concatenate([

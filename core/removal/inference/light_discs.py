@@ -85,7 +85,10 @@ def retained_fraction(display: Pixels, flare: Pixels, glow_fraction: Pixels, *, 
 
 
 def _retained_discs(discs: _LightDiscs, observed: Pixels, clean: Pixels) -> NDArray[Any]:
-    """Return the fraction of the flare that is kept on the light discs themselves, 0..1, (h, w)."""
+    """Return the fraction of the flare that is kept on the light discs themselves and their rims, 0..1, (h, w).
+
+    observed, clean: brightness (h, w) as filmed and without the flare.
+    """
     with_rim = _dilate_labels(discs.labels, RIM_SIZE)
     by_contrast = (discs.by_contrast[with_rim]
                    * np.clip(clean / discs.peak_clean[with_rim], 0, 1) ** BRIGHTNESS_EXPONENT)
@@ -94,13 +97,18 @@ def _retained_discs(discs: _LightDiscs, observed: Pixels, clean: Pixels) -> NDAr
 
 
 def _retained_glow(discs: _LightDiscs, clean: Pixels) -> NDArray[Any]:
-    """Return the fraction of the glow that is kept, (h, w): greatest at the light discs, falling off with distance."""
+    """Return the fraction of the glow that is kept, (h, w): greatest at the light discs, falling off with distance.
+
+    clean: brightness (h, w) without the flare.
+    """
     import cv2
 
     certainty = np.maximum(discs.by_contrast, discs.by_glow) * np.interp(discs.peak_observed, DISC_PEAK_RAMP, (0, 1))
     certainty = certainty[discs.labels]
     falloff = np.float32(GLOW_FALLOFF * max(certainty.shape))
     proximity = np.zeros(certainty.shape, np.float32)
+    # At each of some levels: the falloff from the nearest disc of greater certainty. Their mean weights the glow about
+    # a disc by its certainty.
     for level in range(DISTANCE_LEVELS):
         outside = (certainty <= (level + 0.5) / DISTANCE_LEVELS).astype(np.uint8)
         if not outside.all():
@@ -120,6 +128,7 @@ def _find_light_discs(observed: Pixels, clean: Pixels, flare: Pixels, glow: Pixe
     count, components = cv2.connectedComponents((observed > MIN_DISC_BRIGHTNESS).astype(np.uint8))
     labels = np.asarray(components, np.int32)
     surround = np.where(_dilate_labels(labels, RIM_SIZE) > 0, 0, _dilate_labels(labels, SURROUND_SIZE))
+    # The core is the brighter part of a region, without the pixels that it shares with its surroundings.
     core = np.where(observed >= _label_means(observed, labels, count)[labels], labels, 0)
     contrast, observed_contrast = (_label_means(brightness, core, count) - _label_means(brightness, surround, count)
                                    for brightness in (clean, observed))
@@ -136,7 +145,8 @@ def _find_light_discs(observed: Pixels, clean: Pixels, flare: Pixels, glow: Pixe
 
 
 def _centre_weight(labels: NDArray[np.int32]) -> Pixels:
-    """Return each pixel's distance from its region's edge, relative to half of the region's greatest, 0..1, (h, w)."""
+    """Return how central each pixel is in its region, (h, w): 0 at the edge, 1 from half of the greatest distance to
+    the edge on."""
     import cv2
 
     depth = cv2.distanceTransform((labels > 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)

@@ -34,6 +34,7 @@ class ShotPredictor:
     """
 
     def __init__(self, remover: Remover, paths: Iterable[Path]) -> None:
+        """paths: every picture that may be a neighbour. A plate that is not among them is predicted by itself."""
         self._remover = remover
         self._before: dict[Path, Sequence[Path]] = {}
         self._after: dict[Path, Sequence[Path]] = {}
@@ -67,6 +68,7 @@ class ShotPredictor:
         plate = read_plate(path, self._remover.plate_space)
         features = self._features[path] = self._features.get(path) or self._compute_features(plate)
         frame = self._predict_frame(path, features)
+        # Each neighbour is predicted before its flows, which need that prediction's features.
         return plate, filter_in_time(frame, [
             Neighbour(self._predict_frame(neighbour, theirs), weight, self._flow(path, neighbour),
                       self._flow(neighbour, path))
@@ -76,6 +78,9 @@ class ShotPredictor:
     def _follow_shot(self, features: FrameFeatures,
                      side: Sequence[Path]) -> Iterator[tuple[Path, FrameFeatures, np.float32]]:
         """Yield (frame, its features, its weight) at NEIGHBOUR_OFFSETS to one side of a frame, nearest first.
+
+        features: of the frame. side: the frames on that side, nearest first. A weight is the least similarity on the
+        way there.
 
         A moving camera soon shows something else, so the shot is followed from each of its frames to the next. Frames
         that differ, as by a flash, are skipped.
@@ -116,8 +121,11 @@ class ShotPredictor:
         return self._flows[source, target]
 
     def _evict(self, in_reach: Container[Path], before: Container[Path]) -> None:
-        """Drop what belongs to frames out of reach, and the flows between two frames of `before`: plates are predicted
-        in order, so both are done."""
+        """Drop what belongs to frames out of reach, and the flows between two frames of `before`.
+
+        in_reach: a plate and its neighbours. before: its earlier neighbours. Plates are predicted in order, so two
+        earlier ones need no flow between them any more.
+        """
         self._features = {path: value for path, value in self._features.items() if path in in_reach}
         self._predictions = {path: value for path, value in self._predictions.items() if path in in_reach}
         self._flows = {(source, target): value for (source, target), value in self._flows.items()

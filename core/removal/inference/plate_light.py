@@ -56,15 +56,15 @@ def usual_exposure(plate: Plate) -> np.float32:
 
 
 def to_network_plate(plate: Plate) -> tuple[Plate, np.float32]:
-    """Return a plate as the network sees it, and the gain of its light: sRGB codes, or Rec. 709 light of a usual
-    exposure."""
+    """Return a plate as the network sees it, sRGB codes or Rec. 709 light of a usual exposure, and the gain that its
+    light was multiplied by for that; the plate itself if nothing had to change."""
     rec709 = plate.in_rec709
     gain = usual_exposure(rec709)
     return (rec709 if gain == 1 else replace(rec709, codes=finite_light(rec709.codes) * gain, extras={})), gain
 
 
 def to_linear(codes: NDArray[Any], encoding: Encoding, max_code: float) -> Pixels:
-    """Convert codes to linear light."""
+    """Convert codes to linear light, float32. max_code: the code of white, of "srgb" codes."""
     if encoding == "srgb":
         if codes.dtype == np.uint8:
             return _LINEAR_FROM_UINT8[codes]
@@ -80,7 +80,8 @@ def to_display(light: Pixels) -> Pixels:
 def downscale_linear(codes: NDArray[Any], encoding: Encoding, max_code: float, width: int, height: int) -> Pixels:
     """Downscale a plate by area in linear light clipped to 0..1, as a lens would, (height, width, 3).
 
-    Works in strips of whole result rows: the floats of the whole plate might not fit into memory.
+    Works in strips of whole result rows, whose borders are rounded to whole rows of the plate: the floats of the whole
+    plate might not fit into memory.
     """
     import cv2
 
@@ -108,8 +109,11 @@ def subtract_flare(codes: NDArray[Any], flare: Pixels, encoding: Encoding, max_c
 
 def removed_light(codes: NDArray[Any], clean: NDArray[Any], flare: Pixels, encoding: Encoding,
                   max_code: float) -> Pixels:
-    """Return the flare to write, in scene-linear light: the difference of codes and clean codes, of display codes by
-    the sRGB curve."""
+    """Return the flare to write, in scene-linear light, at most MAX_FLOAT16.
+
+    For linear codes it is `flare`, the linear flare that was subtracted; for display codes the difference of codes and
+    clean codes by the sRGB curve, since `flare` is by `image_formation.GAMMA`.
+    """
     if encoding == "linear":
         return np.minimum(flare, MAX_FLOAT16)
     before, after = (linear_from_srgb(part.astype(np.float32) / np.float32(max_code)) for part in (codes, clean))

@@ -130,7 +130,11 @@ class Remover:
         """Return the codes without flare, in the plate's own type, and the flare in linear light (height, width, 3).
 
         matte: (height, width), 0..1, where an artist has marked a flare: that share of the predicted flare is removed
-        there, whatever its confidence. prediction: for the plate, where it is known (`neighbours.ShotPredictor`).
+        there, whatever its confidence. prediction: for the plate, where it is known (`neighbours.ShotPredictor`); None
+        to predict it here.
+
+        Where the network takes the plate's own codes, the flare is subtracted from them. Where they had to be
+        converted, exposed, filled or wrapped for it, the flare's light is subtracted from the plate.
         """
         opaque, margin = fill_hidden(plate), wrap_margin(plate)
         network_plate, gain = to_network_plate(opaque)
@@ -154,10 +158,10 @@ class Remover:
         light = merge_columns(flare.astype(np.float32), margin) / gain
         alpha = plate.straight_alpha
         if alpha is not None:
-            light = np.where(alpha[..., None] > 0, light, 0)
+            light = np.where(alpha[..., None] > 0, light, 0)  # codes under alpha 0 are arbitrary, and stay
         written = np.minimum(plate.light_in_plate_primaries(light), MAX_FLOAT16)
         if alpha is not None:
-            written = written * alpha[..., None]
+            written = written * alpha[..., None]  # as much as a composite of the plate shows
         return plate.without_light(light), written.astype(np.float16)
 
     def clean_display(self, display: Pixels) -> Pixels:
@@ -198,8 +202,8 @@ class Remover:
 
     @torch.inference_mode()
     def _forward(self, display: Pixels) -> Pixels:
-        """Run the network once (`test_time_augmentation.PredictFn`), in half precision on a GPU; glow that is kept is
-        left out."""
+        """Run the network once, in half precision on a GPU: display values (h, w, 3) to (h, w, 6), the flare and what
+        of it is glow (`test_time_augmentation.PredictFn`). If all glow is kept, both are without it."""
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None].to(self.device)
         with torch.autocast(self.device.type, torch.float16, enabled=self.device.type != "cpu"):
             output = self.network(frame)

@@ -91,6 +91,7 @@ def shot_similarity(first: FrameFeatures, second: FrameFeatures) -> np.float32:
     if first.display.shape != second.display.shape:
         return np.float32(0)
     a, b = first.detail, second.detail
+    # MIN_DETAIL_POWER on both sides of the fraction makes two frames without detail alike.
     correlation = (((a * b).mean() + MIN_DETAIL_POWER)
                    / (np.sqrt(np.square(a).mean() * np.square(b).mean()) + MIN_DETAIL_POWER))
     low, high = SIMILARITY_RAMP
@@ -128,6 +129,7 @@ class _CleanEstimate(NamedTuple):
 
 
 def _clean_estimate(frame: FramePrediction) -> _CleanEstimate:
+    """Return a frame's own estimate, by the prediction for it alone; the confidence is 1."""
     flare = downsample(merge_flare(frame.prediction))
     scene = blur(downsample(frame.features.display) - flare, SCENE_SIGMA)
     greatest: Pixels = flare.max(-1)
@@ -144,8 +146,8 @@ def _warped_neighbour(reference: _CleanEstimate, neighbour: Neighbour) -> _Clean
 
 
 def _exposure_ratio(reference: _CleanEstimate, other: _CleanEstimate) -> np.float32:
-    """Return the exposure of a frame relative to another: the median over pixels that both show without flare, neither
-    black nor clipped.
+    """Return the factor that brings the scene of `other` to the exposure of the reference: the median of their ratio
+    over pixels that both show without flare, neither black nor clipped.
 
     Without it a camera that changes its exposure, or a fade, would pass for a flare. 1 where there are too few pixels.
     """
@@ -160,13 +162,14 @@ def _exposure_ratio(reference: _CleanEstimate, other: _CleanEstimate) -> np.floa
 
 
 def _residual_flare(reference: _CleanEstimate, others: Sequence[_CleanEstimate]) -> Pixels:
-    """Return the flare that the prediction for a frame misses, (h, w, 3), by the warped neighbours; below 0 where it
-    is too great."""
+    """Return the flare that the prediction for a frame misses, display values (h, w, 3) at the size of the flow, by the
+    warped neighbours; below 0 where the prediction is too great."""
     estimates = [reference, *others]
     scene = _weighted_median(np.stack([estimate.scene for estimate in estimates]),
                              np.stack([estimate.weights for estimate in estimates])[..., None])
     support = np.minimum(np.sum([other.flow_confidence for other in others], 0) / np.float32(FULL_SUPPORT), 1)
     smooth = blur((reference.scene - scene) * support[..., None], RESIDUAL_SIGMA)
+    # A mean over the supported places; SUPPORT_FLOOR lets it fade out where there are few.
     smooth /= (blur(support, RESIDUAL_SIGMA) + np.float32(SUPPORT_FLOOR))[..., None]
     greatest = np.max([reference.flare, *(other.flow_confidence * other.flare for other in others)], 0)
     bound = blur(greatest, BOUND_SIGMA)[..., None]
@@ -174,7 +177,8 @@ def _residual_flare(reference: _CleanEstimate, others: Sequence[_CleanEstimate])
 
 
 def _weighted_median(values: Pixels, weights: Pixels) -> Pixels:
-    """Return the weighted median over the first axis; weights broadcast to the values."""
+    """Return the weighted median over the first axis, the lower of two middle values; weights broadcast to the values.
+    """
     order = np.argsort(values, 0)
     sums = np.cumsum(np.take_along_axis(np.broadcast_to(weights, values.shape), order, 0), 0)
     middle = (sums >= sums[-1:] / 2).argmax(0)[None]

@@ -44,7 +44,11 @@ MIN_MEAN_PER_CHANNEL = 0.004
 
 
 def predict_with_tta(display: Pixels, predict: PredictFn) -> TtaPrediction:
-    """Predict the flare of display values 0..1 (h, w, 3), h and w multiples of SIZE_MULTIPLE."""
+    """Predict the flare of display values 0..1 (h, w, 3), h and w multiples of SIZE_MULTIPLE.
+
+    predict: one pass of the network. Channels are predicted one by one in dark frames only, and features computed only
+    where the mean exceeds MIN_MEAN.
+    """
     flares, glows = map(np.concatenate, zip(*(_predict_rotated(predict, display, scale) for scale in SCALES),
                                             strict=True))
     weights = np.repeat(np.square(SCALES), len(QUARTER_TURNS)).astype(np.float32)
@@ -105,13 +109,16 @@ def _single_colour_weight(light: Pixels) -> np.float32:
 
 
 def _predict_rotated(predict: PredictFn, display: Pixels, scale: float) -> tuple[Pixels, Pixels]:
-    """Predict the flare, and its glow, at one scale in every rotation, (rotations, h, w, 3) each."""
+    """Return the flare predicted at one scale in every rotation, and its glow, (rotations, h, w, 3) each."""
     predictions = np.stack([_predict_augmented(predict, display, scale, turns) for turns in QUARTER_TURNS])
     return predictions[..., :3], predictions[..., 3:]
 
 
 def _predict_augmented(predict: PredictFn, display: Pixels, scale: float, turns: int) -> Pixels:
-    """Predict for one scale and rotation, (h, w, 6), transformed back to the frame."""
+    """Return what is predicted at one scale and rotation, (h, w, 6), transformed back to the frame.
+
+    turns: number of rotations by 90 degrees. The frame is scaled in linear light.
+    """
     import cv2
 
     height, width = display.shape[:2]

@@ -29,7 +29,8 @@ MAX_CAUSTIC = 6.0
 
 class Aberrations(NamedTuple):
     """The map from the stop (1 at its edge) to the sensor, relative to the ghost's radius; the first axis points away
-    from the middle of the frame. scale, third: of red, green and blue (3,). third, fifth: spherical aberration."""
+    from the middle of the frame. scale: of the ghost by channel, (3,). third: spherical aberration of third order by
+    channel, (3,). fifth: that of fifth order."""
 
     scale: Array
     third: Array
@@ -38,7 +39,8 @@ class Aberrations(NamedTuple):
     astigmatism: float
 
     def to_sensor(self, channel: int, u: Array, v: Array) -> tuple[Array, Array]:
-        """Return where the stop's points (u, v) lie on the sensor."""
+        """Return (x, y) on the sensor, in radii of the ghost, of the stop's points (u, v), for red (0), green or blue.
+        """
         r2 = u * u + v * v
         even = self.scale[channel] * (1 + self.third[channel] * r2 + self.fifth * r2 * r2)
         return (u * (even + self.astigmatism) + self.coma * (3 * u * u + v * v),
@@ -59,6 +61,7 @@ def draw_light_ghosts(random: Random, light: Point, size: int) -> Array:
     texture = _draw_texture(random)
     contrast = log_uniform(random, 0.1, 1.0)  # of the texture, about
     for _ in range(int(random.integers(1, 6))):
+        # Place on the line through the light (1) and the middle (0): most ghosts lie opposite to the light.
         along = -random.uniform(0.1, 1.4) if random.random() < 0.75 else random.uniform(0.2, 1.2)
         centre = np.array(light) * along + random.normal(0, 0.02, 2)
         radius = log_uniform(random, 0.015, 0.5)
@@ -70,7 +73,10 @@ def draw_light_ghosts(random: Random, light: Point, size: int) -> Array:
 
 
 def _draw_ghost(random: Random, centre: Array, radius: float, texture: Array, size: int) -> Array:
-    """Return (size, size, 3), one ghost of a stop with that texture, 1 where it is evenly lit."""
+    """Return (size, size, 3), one ghost of a stop with that texture, 1 where it is evenly lit.
+
+    centre, radius: of the ghost, in canvas coordinates.
+    """
     import cv2
 
     aberrations = _draw_aberrations(random)
@@ -84,13 +90,14 @@ def _draw_ghost(random: Random, centre: Array, radius: float, texture: Array, si
         rotated = np.stack([x * math.cos(azimuth) - y * math.sin(azimuth),
                             x * math.sin(azimuth) + y * math.cos(azimuth)])
         positions = (rotated * radius + centre[:, None, None] + 1) * size / 2 - 0.5
+        # times the pixels that one sample covers without aberrations, so that an evenly lit ghost is 1
         light[..., channel] = _splat(positions, pupil, size) * (radius * size / count) ** 2
     blur = max(0.6, radius * size * log_uniform(random, 0.003, 0.06))
     return np.asarray(np.minimum(cv2.GaussianBlur(light, (0, 0), blur), MAX_CAUSTIC), np.float32)
 
 
 def _draw_aberrations(random: Random) -> Aberrations:
-    """Draw a ghost's aberrations; many ghosts have nearly none."""
+    """Draw a ghost's aberrations."""
     strength = random.random() ** 2 * 1.2  # many ghosts are nearly free of aberrations
     spread, spread_of_rim = random.normal(0, 0.04), random.normal(0, 0.1)
     return Aberrations(1 + spread * CHANNEL_OFFSETS, strength * random.normal(0, 0.5) + spread_of_rim * CHANNEL_OFFSETS,
@@ -99,11 +106,12 @@ def _draw_aberrations(random: Random) -> Aberrations:
 
 
 def _draw_pupil(random: Random, u: Array, v: Array) -> Array:
-    """Return the transmission at (u, v): a circle, in a third of the ghosts cut by the rim of another lens, in a fifth
-    with a hole."""
-    edge = 60.0 if random.random() < 0.7 else log_uniform(random, 4, 40)
+    """Return the transmission at (u, v), in radii of the stop: a circle, in a third of the ghosts cut by the rim of
+    another lens, in a fifth with a darker middle."""
+    edge = 60.0 if random.random() < 0.7 else log_uniform(random, 4, 40)  # steepness: sharp, or soft in three of ten
 
     def within(distance: Array, limit: float) -> Array:
+        """Return 1 where a distance is below the limit, 0 beyond it, with a soft edge."""
         return np.asarray(1 / (1 + np.exp(np.clip((distance - limit) * edge, -60, 60))), np.float32)
 
     pupil = within(np.hypot(u, v), 0.97)

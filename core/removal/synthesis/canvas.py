@@ -22,9 +22,12 @@ def canvas_grid(size: int) -> tuple[Array, Array]:
 
 
 def spectral_colour(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (n, 3) linear RGB of spectral light of 0.4..0.7 micrometres, smooth and never negative: Gaussian lobes
-    instead of the eye's curves, red with its second lobe in the violet."""
+    """Return (n, 3), about linear RGB of spectral light of wavelengths (n,) of 0.4..0.7 micrometres.
+
+    Gaussian lobes stand in for the eye's curves: smooth and never negative. Red has a second lobe in the violet.
+    """
     def bell(centre: float, below: float, above: float) -> NDArray[np.float64]:
+        """Return a bell whose standard deviation differs below and above its centre."""
         width = np.where(wavelength < centre, below, above)
         return np.exp(-0.5 * ((wavelength - centre) / width) ** 2)
 
@@ -33,7 +36,10 @@ def spectral_colour(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def random_tint(random: Random, strength: float = 0.5) -> Array:
-    """Return (3,), a random colour of mean 1: warm, cool, or any; farther from white for a greater `strength`."""
+    """Return (3,), a random colour of mean 1: in half of the cases warm or cool, else any.
+
+    strength: standard deviation of the channels' logarithms; 0 for white.
+    """
     colour = np.exp(random.normal(0, strength, 3))
     if random.random() < 0.5:  # along the axis of colour temperature, where lamps are
         warm = random.normal(0, strength)
@@ -50,16 +56,17 @@ def log_uniform(random: Random, low: float, high: float) -> float:
 def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, clip_radius: Array,
                second_centre: Array, second_radius: Array, weight: Array, blades: int, turn: float, roundness: float,
                soft: float, rim: float, rim_width: float, hollow: float, slope: float) -> None:
-    """Add a ghost to `layer` (n, n, 3), channel by channel, in canvas coordinates.
+    """Add a ghost to `layer` (n, n, 3), channel by channel, in canvas coordinates: the part that three images share.
 
-    centre, clip_centre, second_centre: (3, 2), of the images of the stop, of the entrance, and of the stop at the
-    light's last passage; the radii (3,). weight: (3,). blades: of the stop, turned by `turn` radians, from straight
-    (roundness 0) to a circle (1). soft: width of the edge. rim: brightness added within rim_width of the edge. hollow:
-    share removed from the middle. slope: one side brighter than the other.
+    centre, clip_centre, second_centre: (3, 2) by channel, of the images of the stop, of the entrance, and of the stop
+    at the light's last passage. radius, clip_radius, second_radius: of the same, (3,). weight: brightness by channel,
+    (3,). blades: number of the stop's blades, turned by `turn` radians, from straight (roundness 0) to a circle (1).
+    soft: width of the edge. rim: brightness added within rim_width (relative to the radius) of the edge. hollow: share
+    removed from the middle. slope: by how much the side away from the canvas' middle is brighter.
     """
     n = layer.shape[0]
     sector = 2 * math.pi / blades
-    flat = math.cos(sector / 2)
+    flat = math.cos(sector / 2)  # distance of a straight blade from the centre, where the corners are at 1
     for channel in range(3):
         r = radius[channel]
         cx, cy = centre[channel, 0], centre[channel, 1]
@@ -68,9 +75,9 @@ def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, c
         x1 = min(int((cx + reach + 1) * n / 2) + 2, n)
         y0 = max(int((cy - reach + 1) * n / 2), 0)
         y1 = min(int((cy + reach + 1) * n / 2) + 2, n)
-        edge = max(soft / r, 2.5 / (n * r))
+        edge = max(soft / r, 2.5 / (n * r))  # relative to the radius; 1.25 pixels or more, so that it is anti-aliased
         distance = math.sqrt(cx * cx + cy * cy) + 1e-6
-        ux, uy = cx / distance, cy / distance
+        ux, uy = cx / distance, cy / distance  # direction away from the canvas' middle
         for row in range(y0, y1):
             y = (row + 0.5) * 2 / n - 1
             for column in range(x0, x1):
@@ -79,10 +86,10 @@ def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, c
                 d = math.sqrt(dx * dx + dy * dy)
                 if d > 1 + edge:
                     continue
-                far = d
+                far = d  # distance from the centre, 1 at the edge
                 if roundness < 1:
                     angle = math.atan2(dy, dx) - turn
-                    angle -= sector * math.floor(angle / sector + 0.5)
+                    angle -= sector * math.floor(angle / sector + 0.5)  # from the middle of the nearest blade
                     far = roundness * d + (1 - roundness) * d * math.cos(angle) / flat
                 qx, qy = (x - second_centre[channel, 0]) / second_radius[channel], \
                     (y - second_centre[channel, 1]) / second_radius[channel]

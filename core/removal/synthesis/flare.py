@@ -52,7 +52,7 @@ def synthesise_flare(seed: int | Sequence[int], size: int, lenses: Sequence[Pres
     count = 1 if random.random() < 0.7 else int(random.integers(2, 4))
     positions = []
     lens_seed = int(random.integers(1 << 31))  # all lights of a picture have one lens
-    for number in range(count):
+    for number in range(count):  # the first light is the main one, the others are fainter
         position = _draw_light_position(random, kind)
         positions.append(position)
         strength = 1.0 if number == 0 else log_uniform(random, 0.2, 1)
@@ -60,6 +60,7 @@ def synthesise_flare(seed: int | Sequence[int], size: int, lenses: Sequence[Pres
         part, light_glow = _draw_light_flare(random, lens_seed, kind, position, size, x, y, lenses)
         rest += part * colour * strength
         glow += light_glow * colour * strength
+        # A light within the canvas or just off it shows; rings have no place relative to a light, so few get one.
         if max(abs(position[0]), abs(position[1])) < 1.05 and (kind != "rings" or random.random() < 0.3) \
                 and random.random() < 0.85:
             source = shapes.light_shape(random, position, x, y)
@@ -70,13 +71,15 @@ def synthesise_flare(seed: int | Sequence[int], size: int, lenses: Sequence[Pres
 
 
 def add_aspheric_ghosts(flare: SynthesisedFlare, seed: Sequence[int]) -> SynthesisedFlare:
-    """Return the flare with the ghosts of a lens of moulded aspheres, that of a seed, added."""
+    """Return the flare with the ghosts that its lights make in a lens of moulded aspheres added; the seed makes the
+    lens."""
     return replace(flare, rest=flare.rest + aspheric.draw_ghosts(seed, flare.lights, flare.rest.shape[0]))
 
 
 def _draw_light_position(random: Random, kind: str) -> Point:
-    """Draw a light's position: anywhere on the frame, in a fifth off it. The disc of radius 1 contains every frame's
-    corners."""
+    """Draw a light's position on the canvas: uniform over the disc of radius 0.85, or in 12 % of the flares (30 % of
+    ghosts, glow, mixed and halo) between the radii 0.75 and 1.6. The frame's corners lie at 0.67 to 1.18
+    (`random_cameras.draw_placement`)."""
     angle = random.uniform(0, 2 * math.pi)
     off_frame_share = 0.3 if kind in ("ghosts", "glow", "mixed", "halo") else 0.12
     radius = random.uniform(0.75, 1.6) if random.random() < off_frame_share else math.sqrt(random.random()) * 0.85
@@ -85,9 +88,11 @@ def _draw_light_position(random: Random, kind: str) -> Point:
 
 def _draw_light_flare(random: Random, lens_seed: int, kind: str, position: Point, size: int, x: Array, y: Array,
                       lenses: Sequence[Prescription]) -> tuple[Array, Array]:
-    """Return (rest, glow) of one light: the parts of its class, each at a brightness of its own. lens_seed: the same
-    for all lights of a picture."""
-    lens_random = np.random.default_rng(lens_seed)  # the same for every light of the picture
+    """Return (rest, glow) of one light, each (size, size, 3): the parts of its class, each at a random brightness.
+
+    random: for what differs between the lights of a picture. lens_seed: for what they share. x, y: `canvas_grid`.
+    """
+    lens_random = np.random.default_rng(lens_seed)
     rest, glow = (np.zeros((size, size, 3), np.float32) for _ in range(2))
     parts = {kind}
     if kind == "mixed":
@@ -99,6 +104,7 @@ def _draw_light_flare(random: Random, lens_seed: int, kind: str, position: Point
         parts.add("veil")
     for part in sorted(parts):
         if part == "scatter":
+            # Only the core, a few pixels, is 1: at 3e4 the spikes, decades below it, show too.
             rest += scatter.starburst(lens_random, position, size) * log_uniform(random, 3, 3e4)
         elif part == "ghosts":
             rest += _normalise_exposure(random, _draw_ghosts(lens_random, position, size, x, y, lenses), 0.02, 1.0)
@@ -112,6 +118,7 @@ def _draw_light_flare(random: Random, lens_seed: int, kind: str, position: Point
         elif part == "shimmer":
             rest += _normalise_exposure(random, scatter.shimmer(lens_random, position, x, y), 0.05, 1.5)
         elif part == "rings":
+            # The paper draws rings in display values; the power takes them to linear light.
             rest += shapes.rings(random, x, y) ** np.float32(random.uniform(1, 2.2))
         elif part == "glow":
             glow += scatter.glow(random, position, x, y) * log_uniform(random, 0.1, 6)
@@ -122,8 +129,9 @@ def _draw_light_flare(random: Random, lens_seed: int, kind: str, position: Point
 
 def _draw_ghosts(random: Random, position: Point, size: int, x: Array, y: Array,
                  lenses: Sequence[Prescription]) -> Array:
-    """Draw traced or freehand ghosts, again if a lens shows nothing of the light."""
-    for _ in range(6):  # some lenses show nothing of some lights
+    """Return (size, size, 3), traced or freehand ghosts of one light. Some lenses show nothing of some lights, so up to
+    six are tried."""
+    for _ in range(6):
         if random.random() < 0.7:
             layer = ghosts.draw_traced(random, ghosts.choose_lens(random, lenses), position, size)
         else:
@@ -136,7 +144,10 @@ def _draw_ghosts(random: Random, position: Point, size: int, x: Array, y: Array,
 
 
 def _normalise_exposure(random: Random, layer: Array, low: float, high: float) -> Array:
-    """Scale a layer to a brightness between low and high, by its bright area rather than by its peak."""
+    """Return a layer scaled to a random brightness between low and high.
+
+    Brightness is the 80th percentile of the lit pixels: it follows the bright area, not a peak of few pixels.
+    """
     values = layer.max(-1)
     lit = values[values > 1e-3 * max(float(values.max()), 1e-9)]
     if not lit.size:

@@ -29,6 +29,7 @@ def _ghost_paths(lens: Prescription) -> list[GhostPath]:
 def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> Array:
     """Return the ghosts of one light through a lens: (size, size, 3), the brightest parts around 1.
 
+    light: on the canvas, where radius 1 is the corner of the sensor.
     Random are the stop's blades and opening, the coatings' colours, how many weak ghosts are visible and how bright
     they are. The lens determines where ghosts lie, how large they are, how they are clipped and how their colours
     separate.
@@ -45,9 +46,10 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
     coating_wavelengths = _draw_coatings(random, lens)
     soft = log_uniform(random, 0.002, 0.03)
     rim, rim_width = (log_uniform(random, 0.1, 2.0), random.uniform(0.02, 0.12)) if random.random() < 0.6 else (0, 0.1)
-    candidates = []
+    candidates = []  # (greatest channel, light by channel, path)
     for ghost in _ghost_paths(lens):
         weight, radius = _brightness(ghost, coating_wavelengths, stop, entrance)
+        # Smaller ghosts are points, and larger ones an even veil.
         if 0.004 < radius / (HALF_DIAGONAL * crop) < 6 and np.isfinite(weight).all():
             candidates.append((float(weight.max()), weight, ghost))
     candidates.sort(key=lambda candidate: -candidate[0])
@@ -59,6 +61,8 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
     saturation = random.uniform(0, 0.8) if random.random() < 0.6 else 0.0  # real coatings have many layers
     unit = HALF_DIAGONAL * crop
     for strength, weight, ghost in strongest:
+        # A ray of height h and slope u meets the stop at a h + b u, and the sensor at s h + t u. The one through the
+        # stop's centre has h = -b u / a, which gives the ghost's centre; its radius is the stop's times |s / a|.
         a, b = ghost.stop[:, 0], ghost.stop[:, 1]
         s, t = ghost.sensor[:, 0], ghost.sensor[:, 1]
         a = np.where(np.abs(a) < 1e-4, 1e-4, a)
@@ -66,8 +70,8 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
         centre = np.outer(t - scale * b, slopes) / unit
         radius = np.maximum(np.abs(scale) * stop / unit, 0.004)
         last_scale = np.where(np.abs(ghost.last_stop[:, 0]) < 1e-4, 1e-4, ghost.last_stop[:, 0])
-        magnification = s / last_scale
-        if np.hypot(*centre[1]) - radius[1] > 1.5:
+        magnification = s / last_scale  # from the stop at the last passage to the sensor
+        if np.hypot(*centre[1]) - radius[1] > 1.5:  # beyond the canvas
             continue
         gain = (strength / reference) ** power / strength
         level = np.minimum(weight * gain, 4.0) * random_tint(random, saturation)
@@ -81,9 +85,9 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
 
 
 def _draw_coatings(random: Random, lens: Prescription) -> NDArray[np.float64]:
-    """Return the wavelength that each surface is coated for; 0 for bare glass. Old lenses have no coatings."""
+    """Return the wavelength in micrometres that each surface is coated for; 0 for bare glass."""
     count = len(lens.index)
-    era = random.random()
+    era = random.random()  # old lenses have no coatings, others one for each surface, or the same for all
     if era < 0.15:
         return np.zeros(count)
     coating_wavelengths = random.uniform(0.42, 0.66, count) if era < 0.7 else np.full(count, random.uniform(0.45, 0.6))
@@ -93,7 +97,11 @@ def _draw_coatings(random: Random, lens: Prescription) -> NDArray[np.float64]:
 
 def _brightness(ghost: GhostPath, coating_wavelengths: NDArray[np.float64], stop: float,
                 entrance: float) -> tuple[NDArray[np.float64], float]:
-    """Return the light (3,) of a ghost by channel, before any exposure, and its radius on the sensor, mm."""
+    """Return the light (3,) of a ghost by channel, before any exposure, and its radius on the sensor, mm.
+
+    stop, entrance: radii of the stop and of the front surface, mm. Light is what both surfaces reflect, spread over the
+    area that a bundle of rays has on the sensor.
+    """
     i, j = ghost.surfaces
     wavelengths = np.array(CHANNEL_WAVELENGTHS)
     indices = ghost.contrast
@@ -115,6 +123,7 @@ def draw_freehand(random: Random, light: Point, size: int) -> Array:
     roundness = random.choice([0.0, 0.5, 1.0])
     base = log_uniform(random, 0.02, 0.25)
     for _ in range(int(random.integers(1, 14))):
+        # 0 at the middle, 1 at the light; in three of ten about -1, where the light's mirror image is
         line_position = random.normal(0, 0.8) if random.random() < 0.7 else -1 + random.normal(0, 0.1)
         offset = random.normal(0, 0.01, 2) if random.random() < 0.2 else np.zeros(2)
         spread = random.normal(0, 0.02) if random.random() < 0.4 else 0.0
@@ -125,6 +134,7 @@ def draw_freehand(random: Random, light: Point, size: int) -> Array:
             roundness = random.choice([0.0, 0.5, 1.0, 1.0])
         hollow = random.uniform(0, 1) if random.random() < 0.5 else 0.0
         rim = log_uniform(random, 0.1, 3) if random.random() < 0.5 else 0.0
+        # A circle beside the ghost cuts some of them, as the rim of another lens does.
         clip = centre + random.normal(0, 0.3, 2) * radius[1] if random.random() < 0.3 else centre
         level = log_uniform(random, 0.03, 1) * random_tint(random, 0.6)
         draw_ghost(layer, _to_float32(centre), _to_float32(np.abs(radius)), _to_float32(clip),
@@ -145,11 +155,12 @@ def draw_mirrored_light(random: Random, source: Array, light: Point) -> Array:
     import cv2
 
     size = source.shape[0]
-    shape = np.minimum(source, 4.0)
+    shape = np.minimum(source, 4.0)  # the image is faint, whatever the light's own level
     bright = shape.sum(-1)
     shape = shape * (bright > 0.25 * bright.max())[..., None]
     layer = np.zeros_like(source)
     for _ in range(int(random.integers(1, 4))):
+        # place: on the line through the light (1) and the middle (0). zoom: below 0 if rotated by 180 degrees.
         place, zoom = -random.uniform(0.8, 1.2) if random.random() < 0.7 else random.normal(0, 0.9), \
             log_uniform(random, 0.5, 2.0) * (-1 if random.random() < 0.8 else 1)
         half = size / 2
@@ -164,7 +175,8 @@ def draw_mirrored_light(random: Random, source: Array, light: Point) -> Array:
 
 
 def draw_arc(random: Random, light: Point, size: int, x: Array, y: Array) -> Array:
-    """Return a caustic at the frame's edge opposite to the light: a rainbow arc about the middle."""
+    """Return a caustic near the frame's edge, linear light (size, size, 3): a rainbow arc about the middle, opposite to
+    the light, in three of ten on its side. x, y: `canvas_grid`."""
     light_radius = math.hypot(*light)
     radius, width = random.uniform(0.5, 1.3), log_uniform(random, 0.01, 0.12)
     direction = math.atan2(-light[1], -light[0]) + (math.pi if random.random() < 0.3 else 0)
@@ -175,7 +187,7 @@ def draw_arc(random: Random, light: Point, size: int, x: Array, y: Array) -> Arr
     waves = np.linspace(0.42, 0.68, 9)
     colours = spectral_colour(waves)
     layer = np.zeros((size, size, 3), np.float32)
-    spread = random.uniform(-0.6, 0.6)
+    spread = random.uniform(-0.6, 0.6)  # of the colours: change of the radius per micrometre from green
     for wave, colour in zip(waves, colours / colours.sum(0), strict=True):
         radius_of_wave = radius * (1 + spread * (wave - 0.55))
         layer += np.exp(-((r - radius_of_wave) / width) ** 2)[..., None] * colour.astype(np.float32)

@@ -18,23 +18,26 @@ STOP_SAMPLES = 256
 
 
 def starburst(random: Random, light: Point, size: int) -> Array:
-    """Return (size, size, 3), the light's diffraction image: 1 near the core, falling over several decades."""
+    """Return (size, size, 3), the light's diffraction image: greatest value 1, in the core, falling over several
+    decades."""
     import cv2
 
     stop = _draw_stop(random, dirt=random.random() ** 2)
     phase = _draw_phase(random)
+    # Padded to twice the size, which samples the image twice as finely.
     plane = np.fft.fftshift(np.fft.fft2(stop * np.exp(1j * phase), (2 * STOP_SAMPLES, 2 * STOP_SAMPLES)))
     raw = (np.abs(plane) ** 2).astype(np.float32)
     blur = log_uniform(random, 0.5, 2.0)  # lights have an extent, and no camera resolves the fringes
     power = np.asarray(cv2.GaussianBlur(raw / raw.max(), (0, 0), blur), np.float32)
     power /= power.max()
-    reach = log_uniform(random, 0.5, 4.0)
+    reach = log_uniform(random, 0.5, 4.0)  # side of the whole image relative to the canvas
     layer = np.zeros((size, size, 3), np.float32)
     waves = np.linspace(0.41, 0.69, 10)
     colours = spectral_colour(waves)
     colours /= colours.sum(0)
     spread = random.uniform(0.3, 1.0)  # of the colours; sensors mix wavelengths
     for wave, colour in zip(waves, colours.astype(np.float32), strict=True):
+        # An image grows with its wavelength, and its light spreads over zoom^2 as many pixels.
         zoom = reach * (1 + spread * (wave / 0.55 - 1)) * size / (2 * STOP_SAMPLES)
         x, y = (light[0] + 1) * size / 2, (light[1] + 1) * size / 2
         matrix = np.array([[zoom, 0, x - zoom * STOP_SAMPLES], [0, zoom, y - zoom * STOP_SAMPLES]])
@@ -51,19 +54,19 @@ def _draw_stop(random: Random, dirt: float) -> Array:
     x, y = np.meshgrid(axis, axis)
     blades = int(random.integers(5, 10))
     if random.random() < 0.2:
-        blades = 18
+        blades = 18  # nearly round
     rotation = random.uniform(0, 2 * math.pi)
     shape = np.ones((STOP_SAMPLES, STOP_SAMPLES))
-    soft = 90.0
+    soft = 90.0  # steepness of the edges
     for k in range(blades):
         angle = rotation + 2 * math.pi * (k + random.normal(0, 0.03)) / blades
-        edge = 0.5 * (1 + random.normal(0, 0.02))
+        edge = 0.5 * (1 + random.normal(0, 0.02))  # distance from the centre; blades are never quite even
         bend = random.uniform(0, 0.25)  # blades are curved, which fans the spikes out
         across = x * -math.sin(angle) + y * math.cos(angle)
         shape *= 1 / (1 + np.exp(np.clip((x * math.cos(angle) + y * math.sin(angle) + bend * across**2 - edge) * soft,
                                          -60, 60)))
     mask = shape.astype(np.float32)
-    for _ in range(int(random.poisson(60 * dirt))):
+    for _ in range(int(random.poisson(60 * dirt))):  # dust
         middle = (random.uniform(0.25, 0.75, 2) * STOP_SAMPLES).astype(int)
         spot = np.ones_like(mask)
         cv2.circle(spot, tuple(int(v) for v in middle), int(log_uniform(random, 1, 6)), (random.uniform(0, 0.9),), -1,
@@ -83,7 +86,7 @@ def _draw_stop(random: Random, dirt: float) -> Array:
 
 
 def _draw_phase(random: Random) -> Array:
-    """Return the phase, radians, of defocus and of smooth grease."""
+    """Return the phase (STOP_SAMPLES, STOP_SAMPLES), radians, of defocus and of smooth grease; 0 without either."""
     import cv2
 
     axis = np.linspace(-1, 1, STOP_SAMPLES)
@@ -98,10 +101,11 @@ def _draw_phase(random: Random) -> Array:
 
 
 def shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return many fine rays round the light, of uneven strength and length."""
+    """Return (size, size, 3), many fine rays round the light, of uneven strength and length; `_normalise_exposure` in
+    `flare` sets their brightness. x, y: `canvas_grid`."""
     dx, dy = x - light[0], y - light[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
-    count = 2048
+    count = 2048  # directions, over the whole circle
     strength = np.zeros(count)
     kind = random.random()
     if kind < 0.4:  # a few long ones
@@ -114,13 +118,14 @@ def shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
         gap = np.abs(positions - centre)
         strength += random.exponential(1) * np.exp(-(np.minimum(gap, 1 - gap) / (width * random.uniform(0.5, 2))) ** 2)
     strength = strength / strength.max() + random.uniform(0, 0.3)
+    # Strong rays are long too; the small random turn loosens that.
     reach = log_uniform(random, 0.08, 0.8) * (0.5 + 0.5 * np.roll(strength, int(random.integers(20))))
     position = ((angle / (2 * math.pi)) % 1) * count
-    low = position.astype(int) % count
+    low = position.astype(int) % count  # each pixel lies between directions low and low + 1
     part = (position - np.floor(position)).astype(np.float32)
     near = strength[low] * (1 - part) + strength[(low + 1) % count] * part
     far = reach[low] * (1 - part) + reach[(low + 1) % count] * part
-    inner = random.uniform(0, 0.15)
+    inner = random.uniform(0, 0.15)  # radius of the middle, even or without rays
     layer = near * (np.exp(-np.maximum(r - inner, 0) / far) if random.random() < 0.5
                     else 1 / (1 + (r / far * 2) ** 2.5))
     if random.random() < 0.5:
@@ -130,14 +135,15 @@ def shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def _radial_tint(random: Random, r: Array) -> Array:
-    """Return (..., 3), a colour that changes with the distance from the light, mean about 1."""
+    """Return (..., 3), a colour of mean about 1 that changes from one to another with the distance r from the light."""
     turns = random.normal(0, 0.35, (2, 3))
     share = np.clip(r / log_uniform(random, 0.2, 1.5), 0, 1)[..., None]
     return np.exp(turns[0] * (1 - share) + turns[1] * share).astype(np.float32)
 
 
 def glow(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return the glow round a light: lobes that fall off as a power, coloured farther out."""
+    """Return (size, size, 3), maximum 1, the glow round a light: one to three lobes that fall off as a power or a
+    Gaussian, each of a colour that changes outwards. x, y: `canvas_grid`."""
     dx, dy = x - light[0], y - light[1]
     if random.random() < 0.25:  # stretched, as a smear is
         angle, ratio = random.uniform(0, math.pi), log_uniform(random, 1.1, 4)
@@ -147,6 +153,7 @@ def glow(random: Random, light: Point, x: Array, y: Array) -> Array:
     for _ in range(int(random.integers(1, 4))):
         width, power = log_uniform(random, 0.015, 0.5), random.uniform(1.6, 4)
         lobe: Array = 1 / (1 + (r / width) ** power) if random.random() < 0.7 else np.exp(-((r / width) ** 2))
+        # Narrow lobes are brighter.
         layer += (lobe * log_uniform(random, 0.05, 1) * (0.05 / width) ** 0.5)[..., None] * _radial_tint(random, r)
     if random.random() < 0.3:  # uneven round the circle
         about = np.arctan2(dy, dx)
@@ -156,7 +163,8 @@ def glow(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def veil(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return veiling glare: light over the whole frame, more on the light's side, without any edge."""
+    """Return veiling glare, (size, size, 3), at most about 1: light over the whole frame, more on the light's side,
+    without any edge. x, y: `canvas_grid`."""
     distance = np.hypot(x - light[0], y - light[1])
     layer = 1 / (1 + (distance / log_uniform(random, 0.3, 2.5)) ** random.uniform(1, 3)) + random.uniform(0, 0.6)
     return (layer / layer.max())[..., None].astype(np.float32) * _radial_tint(random, distance)

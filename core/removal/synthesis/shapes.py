@@ -11,7 +11,10 @@ from .canvas import Array, Point, Random, log_uniform, random_tint, spectral_col
 
 
 def streak(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return the long horizontal line of an anamorphic lens, or a few close to each other."""
+    """Return (size, size, 3), maximum 1: the long horizontal line of an anamorphic lens, or a few close to each other.
+
+    x, y: `canvas_grid`.
+    """
     layer = np.zeros((*x.shape, 3), np.float32)
     blue = np.array([0.25, 0.6, 1.6], np.float32)
     for number in range(1 if random.random() < 0.6 else int(random.integers(2, 5))):
@@ -25,7 +28,7 @@ def streak(random: Random, light: Point, x: Array, y: Array) -> Array:
         if random.random() < 0.3:  # uneven along its length
             falloff *= 1 + 0.4 * np.sin(along * random.uniform(4, 60) + random.uniform(0, 7))
         colour = blue * random_tint(random, 0.2) if random.random() < 0.6 else random_tint(random, 0.6)
-        core = np.exp(-np.abs(along) / (0.3 * length))[..., None]
+        core = np.exp(-np.abs(along) / (0.3 * length))[..., None]  # whiter than the rest
         layer += (profile * falloff * width ** -0.2 * random.uniform(0.3, 1))[..., None] * (
             colour * (1 - 0.6 * core) + 0.6 * core).astype(np.float32)
     return layer / max(float(layer.max()), 1e-9)
@@ -33,7 +36,10 @@ def streak(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 def smear(random: Random, light: Point, x: Array, y: Array) -> Array:
     """Return what wiped grease on the front glass shows, as on most telephones at night: beams across the wiping marks,
-    which widen outwards, of fine rays or even, on one or both sides of the light; 1 at a quarter of the canvas's half.
+    which widen outwards, of fine rays or even, on one or both sides of the light.
+
+    The first beam has a brightness of about 1 at a distance of 0.25 from the light, so the layer (size, size, 3)
+    exceeds 1 nearer to it. x, y: `canvas_grid`.
     """
     dx, dy = x - light[0], y - light[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
@@ -44,7 +50,11 @@ def smear(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Array:
-    """Return one beam of a smear, in polar coordinates about the light."""
+    """Return (size, size, 3), one beam of a smear.
+
+    r, angle: each pixel's polar coordinates about the light. fainter: a beam beside the first, of a tenth of its
+    brightness or more.
+    """
     direction = random.uniform(-math.pi, math.pi)
     bend = random.normal(0, 0.12) if random.random() < 0.3 else 0.0
     width, opening = log_uniform(random, 0.002, 0.04), log_uniform(random, 0.003, 0.15)
@@ -53,8 +63,9 @@ def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Arra
     profile_draw, level = random.random(), log_uniform(random, 0.1, 1) if fainter else 1.0
     rays = _draw_ray_profile(random) if random.random() < 0.5 else None
     colour = random_tint(random, 0.15) + (random_tint(random, 0.5) - 1) * np.clip(r / end, 0, 1)[..., None]
+    # The first factor is 1 at r = 0.25; the last ends the beam.
     falloff = (1 + (0.25 / reach) ** power) / (1 + (r / reach) ** power) * np.exp(-((r / end) ** 2))
-    spread = np.sqrt(width**2 + (opening * r) ** 2)
+    spread = np.sqrt(width**2 + (opening * r) ** 2)  # half width of the beam at r
     light = np.zeros_like(r)
     for rotation, strength in ((0.0, level), (math.pi, level * other_side)):
         deviation = angle - direction - rotation - bend * r
@@ -69,7 +80,8 @@ def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Arra
 
 
 def _draw_ray_profile(random: Random) -> Callable[[Array], Array]:
-    """Return a function of direction: random brightness of rays, mean about 1, one opening's width to either side."""
+    """Return a function that gives the brightness of random rays, mean about 1, by their direction from the beam's
+    axis in units of its opening, -2.5..2.5; beyond, it is constant."""
     count = int(random.integers(6, 60))
     angles, values = np.linspace(-2.5, 2.5, count), random.exponential(1, count) + random.uniform(0, 1)
     values /= values.mean()
@@ -77,7 +89,11 @@ def _draw_ray_profile(random: Random) -> Callable[[Array], Array]:
 
 
 def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return rings about the light (or about the middle), white or in the colours of diffraction, whole or partial."""
+    """Return (size, size, 3), maximum 1: one or two rings, white or in the colours of diffraction, whole or partial.
+
+    They lie about the light; in three of ten flares about another point on the line through the light and the middle.
+    x, y: `canvas_grid`.
+    """
     centre = np.array(light) * (random.uniform(-0.5, 1) if random.random() < 0.3 else 1)
     dx, dy = x - centre[0], y - centre[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
@@ -91,14 +107,14 @@ def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
         spread = random.uniform(-1, 1) if random.random() < 0.7 else 0.0
         ring = np.zeros_like(layer)
         for wave, colour in zip(waves, colours.astype(np.float32), strict=True):
-            radius_of_wave = radius * (1 + spread * (wave - 0.55))
+            radius_of_wave = radius * (1 + spread * (wave - 0.55))  # about green, micrometres
             side = np.where(r < radius_of_wave, random.uniform(0.7, 1.3), 1.0)
             ring += np.exp(-((r - radius_of_wave) / (width * side)) ** 2)[..., None] * colour
-        if random.random() < 0.4:
+        if random.random() < 0.4:  # partial
             direction, opening_angle = random.uniform(-math.pi, math.pi), random.uniform(0.3, 2)
             angle_offset = np.arctan2(np.sin(angle - direction), np.cos(angle - direction))
             ring *= np.exp(-((angle_offset / opening_angle) ** 2))[..., None]
-        if random.random() < 0.3:
+        if random.random() < 0.3:  # of fine rays
             fine = sum(random.normal(0, 0.3) * np.cos(k * angle + random.uniform(0, 7))
                        for k in random.integers(8, 120, 6))
             ring *= np.exp(np.asarray(fine, np.float32))[..., None]
@@ -107,8 +123,8 @@ def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def rings(random: Random, x: Array, y: Array) -> Array:
-    """Return the paper's procedural rings: any centre, radius and colour, opacity below 0.7, times a mask that is 0 at
-    the middle of the frame."""
+    """Return the paper's procedural rings, display values (size, size, 3): one to three of any centre, radius and
+    colour, opacity below 0.7, times a mask that is 0 at the middle of the frame. x, y: `canvas_grid`."""
     layer = np.zeros((*x.shape, 3), np.float32)
     for _ in range(int(random.integers(1, 4))):
         centre, radius = random.uniform(-1, 1, 2), random.uniform(0.1, 1.2)
@@ -121,11 +137,15 @@ def rings(random: Random, x: Array, y: Array) -> Array:
 
 
 def light_shape(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return the light itself, which belongs to the scene: a disc, tube, window or cluster, brighter than white."""
+    """Return the light itself, which belongs to the scene: a disc, tube, window or cluster, brighter than white.
+
+    Linear light (size, size, 3), 0 elsewhere. x, y: `canvas_grid`.
+    """
     layer = np.zeros((*x.shape, 3), np.float32)
+    # kind: below 0.65 discs about one centre; then rectangles, from tubes to windows; above 0.85 scattered ones.
     kind, colour = random.random(), random_tint(random, 0.15)
     level = log_uniform(random, 1.2, 12)
-    edge = 2.0 / x.shape[0]
+    edge = 2.0 / x.shape[0]  # one pixel
     for _ in range(1 if random.random() < 0.85 else int(random.integers(2, 6))):
         dx, dy = x - light[0], y - light[1]
         if kind > 0.85:

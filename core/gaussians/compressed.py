@@ -53,7 +53,7 @@ def read_compressed(path: Path) -> SceneGaussians:
         means = _dequantise(chunks, chunk_of, _unpack(position, 11, 10, 11), "{}_x", "{}_y", "{}_z")
         log_scales = _dequantise(chunks, chunk_of, _unpack(scale, 11, 10, 11), "{}_scale_x", "{}_scale_y", "{}_scale_z")
         rgba = _unpack(colour, 8, 8, 8, 8)
-        rgb = rgba[:, :3]
+        rgb = rgba[:, :3]  # older files have no range of colours: 0..1
         if "min_r" in (chunks.dtype.names or ()):
             rgb = _dequantise(chunks, chunk_of, rgb, "{}_r", "{}_g", "{}_b")
         opacity = np.clip(rgba[:, 3], 0.5 / 255, 254.5 / 255)  # the ends have no finite logit
@@ -101,13 +101,15 @@ def _unpack(packed: NDArray[np.uint32], *bits: int) -> Floats:
 
 
 def _dequantise(chunks: NDArray[Any], chunk_of: NDArray[np.int64], fraction: Floats, *names: str) -> Floats:
-    """Map fractions 0..1 (n, 3) to the ranges of their chunks."""
+    """Map fractions 0..1 (n, 3) to the ranges of their chunks.
+
+    names: of the three columns in `chunks`, with {} for "min" or "max"."""
     low, high = (np.stack([chunks[name.format(end)] for name in names], -1)[chunk_of] for end in ("min", "max"))
     return np.asarray(low + fraction * (high - low), np.float32)
 
 
 def _quaternions(packed: NDArray[np.uint32]) -> Floats:
-    """Unpack (n,) to unit quaternions (n, 4), w x y z."""
+    """Unpack (n,) to unit quaternions (n, 4), w x y z: the components but the largest lie within ±1 / sqrt(2)."""
     largest = (packed >> np.uint32(30)).astype(np.int64)
     stored = (_unpack(packed & np.uint32((1 << 30) - 1), 2, 10, 10, 10)[:, 1:] - np.float32(0.5)) * np.float32(
         math.sqrt(2))

@@ -91,6 +91,7 @@ class Classic:
     def observe(self, rendering: Rendering) -> None:
         """Accumulate the gradients by the centres of the visible Gaussians."""
         height, width = rendering.alpha.shape
+        # From px^-1 to normalised device coordinates, in which the picture is 2 wide and 2 high.
         norms = torch.hypot(*(rendering.centre_gradients * rendering.alpha.new_tensor([width / 2, height / 2])).T)
         is_visible = rendering.radii > 0
         self.gradients += norms * is_visible
@@ -108,7 +109,8 @@ class Classic:
             self._refine(prune_large=iteration > s.reset_every)
             self._reset_statistics()
             changed = True
-        if iteration % s.reset_every == 0 and iteration < s.stop:  # later iterations restore the needed ones
+        # Not at `stop`: later iterations have to restore the opacities that are needed.
+        if iteration % s.reset_every == 0 and iteration < s.stop:
             self.scene.opacity_logits.clamp_(max=math.log(s.reset_to / (1 - s.reset_to)))
             self.optimiser.reset_moments("opacity_logits")
         return changed
@@ -184,7 +186,7 @@ class Mcmc:
 
     NOISE_STEEPNESS = 100.0  # steepness of the sigmoid by which noise falls with opacity, about `faint`
     MAX_NOISE_OPACITY = 0.15  # above this opacity the noise is below 1e-6 of its full strength and omitted
-    MAX_COPIES = 51
+    MAX_COPIES = 51  # of one Gaussian in one relocation, as in gsplat
 
     def __init__(
         self, scene: SceneGaussians, optimiser: Adam, generator: torch.Generator,
@@ -247,8 +249,8 @@ class Mcmc:
         return drawn.to(weights.device)
 
     def _split_opacity(self, sources: Tensor) -> None:
-        """Reduce opacity and scale of the Gaussians of these rows, each with one copy for every time it is drawn, so
-        that a Gaussian and its copies render as it did alone."""
+        """Reduce opacity and scale of Gaussians that are about to be copied, so that each and its copies together
+        render as it did alone. sources: their row numbers, each as often as it is copied."""
         rows, drawn = torch.unique(sources, return_counts=True)
         copies = (drawn + 1).clamp(max=self.MAX_COPIES)
         opacity, shrink = relocated_opacity_and_scale(self.scene.opacities[rows], copies)
@@ -257,7 +259,8 @@ class Mcmc:
         self.scene.log_scales[rows] += shrink.log()[:, None]
 
     def _inject_noise(self) -> None:
-        """Add noise of each Gaussian's covariance to the means of nearly transparent ones (the paper's eq. 9)."""
+        """Add noise, multiplied by each Gaussian's covariance, to the means of nearly transparent ones (the paper's eq.
+        9)."""
         rate = self.optimiser.rates["means"]
         opacities = self.scene.opacities
         rows = torch.nonzero(opacities < self.MAX_NOISE_OPACITY)[:, 0]
@@ -267,7 +270,7 @@ class Mcmc:
         noise = _randn((len(rows), 3), self.generator, opacities) * strength[:, None] * rate
         units = self.scene.units(self.extent)
         if isinstance(units, Tensor):
-            noise = noise / units[rows][:, None]
+            noise = noise / units[rows][:, None]  # the covariance grows as units², but steps are to grow as units
         axes = rotation_matrices(self.scene.quaternions[rows]) * self.scene.scales[rows][:, None, :]
         self.scene.means[rows] += (axes @ (axes.transpose(1, 2) @ noise[..., None]))[..., 0]
 
@@ -298,6 +301,7 @@ def relocated_opacity_and_scale(opacity: Tensor, copies: Tensor) -> tuple[Tensor
         - torch.lgamma(j + 1)
         - torch.lgamma((count[:, None] - j + 1).clamp(min=1))
     )
+    # The last factor is (-1)^(j-1).
     terms = torch.exp(log_binomial + j * new.log()[:, None]) / j.sqrt() * (1 - 2 * ((j - 1) % 2))
     total = torch.where(j <= count[:, None], terms, 0).sum(-1)
     return new.to(opacity), (o / total).to(opacity)

@@ -122,7 +122,7 @@ def _fastest(like: Tensor) -> str:
     """Return the name of the fastest kernel set that can be used for such tensors."""
     preferred = {"cuda": "cuda", "cpu": "cpu"}.get(like.device.type, "tiles")
     if like.dtype != torch.float32:
-        return "tiles"
+        return "tiles"  # the faster ones compute in float32 alone
     reason = _load(preferred)
     if isinstance(reason, ImportError):
         _warn_once(f"The {preferred} kernels cannot be used here ({reason}); slower torch ones take their place.")

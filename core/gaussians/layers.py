@@ -58,7 +58,7 @@ class _UpsampleRows(torch.autograd.Function):
         parts = gradient.contiguous().view(-1, ctx.factor, size)
         shares = _interpolation_weights(ctx.factor, gradient).T @ parts
         total = gradient.new_zeros(len(parts) + 2, size)
-        for position, share in enumerate(shares.unbind(1)):
+        for position, share in enumerate(shares.unbind(1)):  # 0, 1, 2: the row before, the row itself, the row after
             total[position : position + len(parts)] += share
         return total.view(-1, *ctx.row), None
 

@@ -42,7 +42,7 @@ def error_bounds(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None)
     slope = torch.zeros_like(minor)
     if rings is not None:
         r0, w = rings.unbind(-1)
-        curvature = curvature / (w * w).clamp(max=1)
+        curvature = curvature / (w * w).clamp(max=1)  # for a wide ring, w > 1, not below that of a plain Gaussian
         peak_radius = r0 if arcs is None else r0 + w * w * arc_strengths(covariances, arcs).to(r0.dtype)
         slope = r0.abs() / (w * w) * torch.exp(-((peak_radius / w) ** 2) / 2) * minor.rsqrt()
     return torch.stack([factor**2 / 8 * curvature + factor / 2**0.5 * slope for factor in REDUCTIONS])
@@ -70,6 +70,7 @@ def splat_mixed(
         if len(index) == 0:
             continue
         border = 0 if factor == 1 else 1  # so that interpolation has neighbours on all sides
+        # In reduced pixels lengths are divided by the factor, so b, px^-1, is multiplied by it; m has no unit.
         layer = kernels.splat(
             _rows(centres, index) / factor + border, _rows(covariances, index) / factor**2,
             _rows(opacities, index), _rows(colours, index),
@@ -80,7 +81,7 @@ def splat_mixed(
         if factor > 1:
             layer = upsample_layer(layer, factor, width, height)
         picture = layer if picture is None else _merge_layers(picture, layer, blend)
-    if picture is None:
+    if picture is None:  # there are no Gaussians
         return kernels.splat(
             centres, covariances, opacities, colours, width, height, rings=rings, arcs=arcs, blend=blend
         )

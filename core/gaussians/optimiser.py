@@ -117,7 +117,8 @@ class Adam:
 
     @torch.no_grad()
     def last_step(self, name: str, rows: Tensor) -> Tensor:
-        """Return the last step (m, ...) of rows (m,) of a parameter, with full precision where the values are large."""
+        """Return the last step (m, ...) of rows (m,) of a parameter, computed from the moments, since a difference of
+        large values loses digits."""
         first, second = (moment[rows] for moment in self.moments[name])
         count = max(self.steps[name], 1)
         root = (second.sqrt() / math.sqrt(1 - BETA2**count)).add_(self.epsilon)

@@ -62,7 +62,9 @@ def project(
     width: int, height: int, near: float, dilation: float,
 ) -> Projected:  # fmt: skip
     """Project (n, 3) means, (n, 4) quaternions, (n, 3) scales; differentiable by all of them and by the
-    camera's (4, 4) world_to_camera and (3, 3) intrinsics (no skew)."""
+    camera's (4, 4) world_to_camera and (3, 3) intrinsics (no skew).
+
+    near: camera depth up to which Gaussians are culled, world units; dilation: low-pass filter, px²."""
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     positions = means @ rotation.T + translation
     index = torch.nonzero(positions[:, 2] > near)[:, 0]

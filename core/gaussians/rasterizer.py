@@ -39,7 +39,7 @@ def rasterization(
     background       (3,)   shows where the Gaussians leave transmittance; black by default
     sh_degree        how much of sh is used: 0 to 3, all of it by default
     kernels          see `kernels.py`
-    near             camera depth at which Gaussians are culled, world units
+    near             camera depth up to which Gaussians are culled, world units
     dilation         px², added to both diagonal elements of the projected covariances
     depth            False leaves depth and median_depth empty, (0, 0), which saves time
     raw              True: scales are given as logarithms and opacities as logits, as they are optimised, which
@@ -84,7 +84,7 @@ def splat(
     rings        (n, 2) r0 and w > 0, Mahalanobis distance: the profile is a ring, not a disc
     arcs         (n, 2) b, px^-1: the profile is times exp(b·d) and one at its peak, so that one side is brighter
     blend        "over": front to back in the order given; "add": a sum, for scene-linear light
-    resolution   "mixed": those large against the pixel are drawn at 1/4 or 1/2 size and enlarged
+    resolution   "mixed": Gaussians much larger than a pixel are drawn at 1/4 or 1/2 size and enlarged
                  (behind the small ones, if "over"); see `mixed.py` for the error
     kernels      see `kernels.py`
 

@@ -54,7 +54,9 @@ def pixel_centres(width: int, height: int, like: Tensor) -> Tensor:
 def profiles(
     pixels: Tensor, centres: Tensor, covariances: Tensor, rings: Tensor | None, arcs: Tensor | None
 ) -> Tensor:
-    """Return G of n Gaussians at p pixels: (n, p), 0..1. arcs: (n, 3) b and m."""
+    """Return G of n Gaussians at p pixels: (n, p), 0..1.
+
+    pixels: (p, 2) x, y; rings: (n, 2) r0 and w; arcs: (n, 3) b and m; None if there are none."""
     dx, dy = (pixels[None] - centres[:, None]).unbind(-1)
     xx, xy, yy = covariances[:, :, None].unbind(1)
     q = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinants(covariances)[:, None]
@@ -70,7 +72,7 @@ def profiles(
 
 
 def alphas_over(g: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-    """Return alphas and the transmittances in front of them, both (n, p), from profiles (n, p), front to back."""
+    """Return alphas and the transmittances in front of them, both (n, p), from profiles g (n, p), front to back."""
     alpha = opacities.clamp(max=OPACITY_MAX)[:, None] * g
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
     return alpha, torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)[:-1]])
@@ -88,7 +90,9 @@ def weights_add(g: Tensor, opacities: Tensor) -> Tensor:
 
 
 def _map_chunks(pixels: Tensor, count: int, shade: Callable[[Tensor], Tensor]) -> Tensor:
-    """Return shade(pixels), computed in chunks of bounded size, whose intermediates are recomputed in backward."""
+    """Return shade(pixels), computed in chunks of pixels, whose intermediates are recomputed in backward.
+
+    count: number of Gaussians, by which the size of a chunk is bounded."""
     parts = pixels.split(max(1, CHUNK // max(count, 1)))
     if len(parts) == 1 or not torch.is_grad_enabled():
         return torch.cat([shade(part) for part in parts])
@@ -117,6 +121,7 @@ def rasterize_scene(
 
     def median(pixels: Tensor) -> Tensor:
         alpha, before = alphas_over(profiles(pixels, centres, covariances, None, None), opacities)
+        # Gaussians behind which at least half the light passes; the next one is the median, or the appended 0.
         passed = (before * (1 - alpha) >= 0.5).sum(0)
         return torch.cat([depths, depths.new_zeros(1)])[passed]
 

@@ -91,8 +91,8 @@ def extent(
 ) -> Tensor:
     """Return (n,) the Mahalanobis radius beyond which a Gaussian is not drawn; 0 if it is not drawn at all.
 
-    peaks: (n,) clamped opacities; rings: (n, 2); strengths: (n,) of arcs. Solves peak * exp(-r²/2) = threshold for r;
-    for arcs see `normalise_arcs`.
+    peaks: (n,) clamped opacities; rings: (n, 2); strengths: (n,) beta of arcs, see `arc_strengths`. Solves
+    peak * exp(-r²/2) = ALPHA_MIN for r, or exp(-r²/2) = PROFILE_MIN with "add"; for arcs see `normalise_arcs`.
     """
     if blend == "add":
         reach = torch.full_like(peaks, math.sqrt(-2 * math.log(PROFILE_MIN)))

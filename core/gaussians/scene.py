@@ -74,6 +74,7 @@ class SceneGaussians(nn.Module):
         colours = torch.tensor(np.asarray(points.rgb), dtype=torch.float32) / 255
         n = len(means)
         distances = nearest_distances(means)
+        # A single point has no neighbours; duplicates may have a median of 0.
         size = distances.square().mean(-1).sqrt() if distances.shape[1] else torch.ones(n)
         min_size = min(MIN_SIZE, MIN_SIZE_RATIO * float(size.median()) or MIN_SIZE)
         sh = torch.zeros(n, COEFFICIENTS, 3)
@@ -104,10 +105,11 @@ class SceneGaussians(nn.Module):
         return torch.nonzero(self.far.contains(self.means))[:, 0]
 
     def units(self, extent: float) -> Tensor | float:
-        """Return (n,) by how much larger the world units of a Gaussian are than those at `extent`: 1 for near ones.
+        """Return (n,) factors by which Gaussians are larger than near ones that cover the same angle; 1.0 without a far
+        layer.
 
-        Scales and steps divided by it are angles, as near ones appear; densification measures far Gaussians so. 1
-        without a far layer.
+        extent: of the near scene, world units. The factor is 1 for near Gaussians, and for far ones the radius of the
+        far sphere over `extent`. Densification divides scales and steps by it, and so measures far ones as near ones.
         """
         if self.far is None:
             return 1.0

@@ -86,6 +86,7 @@ def _tile_span(
     centres: Tensor, half: Tensor, radii: Tensor, columns: int, rows: int, size: int
 ) -> tuple[Tensor, Tensor]:
     """Return the first tile x, y (n, 2) of boxes of half size `half` (n, 2), px, and their size in tiles (n, 2)."""
+    # Bounded before the conversion, since large floats overflow int64.
     low = ((centres - half) / size).floor().clamp(min=-1, max=2**30).long().clamp(min=0)
     high = ((centres + half) / size).floor().clamp(min=-1, max=2**30).long()
     high = torch.minimum(high, torch.tensor([columns - 1, rows - 1], device=centres.device))
@@ -103,6 +104,7 @@ def bin_tiles(
     counts = span.prod(-1)
 
     # One entry for each tile of each box, then drop those that the ellipse inside the box misses.
+    # number: of the tile within its box, row by row.
     entries = torch.repeat_interleave(counts)
     number = torch.arange(len(entries), device=centres.device) - (counts.cumsum(0) - counts)[entries]
     across = span[entries, 0]
@@ -117,10 +119,11 @@ def bin_tiles(
 
 
 def _min_squared_distance(centres: Tensor, whitening: Tensor, corners: Tensor, size: int) -> Tensor:
-    """Return (m,) the smallest squared Mahalanobis distance to tiles with these upper left corners: 0 if the centre is
-    inside, else attained on one of the two edges that face it."""
+    """Return (m,) the smallest squared Mahalanobis distance from centres (m, 2) to tiles with these upper left corners
+    (m, 2): 0 if the centre is inside, else attained on one of the two edges that face it. size: of a tile, px."""
     low = corners - centres
     high = low + size
+    # The coordinates of the tile's point nearest to the centre: on the lines of the two edges.
     bx, by = torch.zeros_like(low).clamp(low, high).unbind(-1)
     w_xx, w_yx, w_yy = whitening.unbind(-1)
     slope = w_yx / w_yy  # v = w_yy (dy + slope dx)
@@ -146,7 +149,7 @@ def draw_tiles(
     columns, rows = -(-width // size), -(-height // size)
     entries = int(_tile_span(centres, half, radii, columns, rows, size)[1].prod(-1).sum())
     if entries > MAX_ENTRIES and rows > 1:  # too many at a time: the upper half of the picture, then the lower
-        middle = rows // 2 * size
+        middle = rows // 2 * size  # px, at a tile's edge
         shifted = gaussians._replace(places=gaussians.places - gaussians.places.new_tensor([0, middle, 0, 0, 0]))
         halves = [
             draw_tiles(draw, size, part, radii, half, width, part_height, blend=blend, median=median)
@@ -175,7 +178,7 @@ def rasterize_scene(
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
-    """Render as `rasterization` does, by a drawing of tiles; size: of a tile, px."""
+    """Render as `rasterization` of the package does. draw: draws the tiles; size: of a tile, px."""
     scales, opacities = activate(scales, opacities, raw)
     dtype = means.dtype
     projected = project(
@@ -211,7 +214,7 @@ def rasterize_scene(
         colour = colour + (1 - alpha)[..., None] * background
     if depth:
         mean_depth = picture[..., 3] / alpha.clamp(min=ALPHA_MIN / 2)
-        median_depth = torch.cat([depths, depths.new_zeros(1)]).detach()[rows]
+        median_depth = torch.cat([depths, depths.new_zeros(1)]).detach()[rows]  # row -1 is the appended 0
     else:
         mean_depth = median_depth = means.new_empty(0, 0)
     return Rendering(colour, alpha, mean_depth, median_depth, all_centres, radii, gradients)
@@ -222,9 +225,9 @@ def splat(
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
     *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """Rasterize as `splat` of the package does at full resolution, by a drawing of tiles; size: of a tile, px."""
+    """Rasterize as `splat` of the package does at full resolution. draw: draws the tiles; size: of a tile, px."""
     centres, covariances = _to_double(centres), _to_double(covariances)
-    index = torch.nonzero(determinants(covariances) > 0)[:, 0]
+    index = torch.nonzero(determinants(covariances) > 0)[:, 0]  # a degenerate ellipse covers nothing
     centres, covariances, opacities, colours = (
         part[index] for part in (centres, covariances, opacities, colours)
     )

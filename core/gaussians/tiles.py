@@ -37,15 +37,15 @@ def _pixels(like: Tensor) -> Tensor:
 
 
 def _groups(lists: TileLists, filler: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield groups of tiles that are processed together: (b,) tile numbers and (b, longest) entries, padded with
-    `filler`."""
+    """Yield groups of tiles that are processed together, longest lists first: (b,) tile numbers and (b, longest)
+    entries, padded with `filler`, the row of an invisible Gaussian. Tiles without entries are omitted."""
     lengths = lists.starts.diff()
     order = torch.argsort(lengths, descending=True, stable=True)
     busy = int((lengths > 0).sum())
     for first in range(0, busy, TILES_PER_GROUP):
         tiles = order[first : min(first + TILES_PER_GROUP, busy)]
         place = torch.arange(int(lengths[tiles[0]]), device=tiles.device)
-        inside = place < lengths[tiles, None]
+        inside = place < lengths[tiles, None]  # beyond the end of a list: index 0, to be replaced
         entries = lists.entries[(lists.starts[tiles, None] + place) * inside]
         yield tiles, torch.where(inside, entries, filler)
 
@@ -83,7 +83,8 @@ class _Chunk:
         return self.pixels @ torch.stack([along_x, along_y, offset], 1)
 
     def backward(self, h: Tensor) -> list[Tensor]:
-        """Return the gradients (b, k) from h = dL/dlog g: five of the places, then those of ring and arc."""
+        """Return the gradients, (b, k) each, from h = dL/dlog g (b, pixels, k): five of the places, then those of ring
+        and arc."""
         extras = []
         scaled = h  # -2 dL/dq
         if self.gaussians.rings is not None:
@@ -108,7 +109,7 @@ def _tile_centres(tiles: Tensor, columns: int) -> Tensor:
 
 
 def _append_empty(gaussians: WhitenedGaussians) -> WhitenedGaussians:
-    """Append an invisible Gaussian, which pads the lists."""
+    """Append an invisible Gaussian, which pads the lists: all zeros, but rings of 1, since they are divided by w."""
     return WhitenedGaussians(*(  # type: ignore[arg-type]
         None if part is None else torch.cat([part, part.new_full((1, part.shape[1]), fill)])
         for part, fill in zip(gaussians, (0.0, 0.0, 1.0, 0.0), strict=True)
@@ -150,6 +151,7 @@ class _DrawTiles(torch.autograd.Function):
         picture, *parts = ctx.saved_tensors
         lists: TileLists = ctx.lists
         gaussians = _append_empty(WhitenedGaussians(*parts))
+        # Widths of values, places, rings and arcs in the rows of `sums`.
         columns = [0 if part is None else part.shape[1] for part in (gaussians.values, *gaussians[:1], *gaussians[2:])]
         sums = gaussians.values.new_zeros(len(gaussians.values), sum(columns))
         pixels = _pixels(gaussians.values)
@@ -164,7 +166,7 @@ class _DrawTiles(torch.autograd.Function):
                 h *= weights
                 if ctx.blend == "over":
                     behind = remaining - h.cumsum(-1)
-                    # alpha / (1 - alpha), or 0 if the entry did not count
+                    # weights / after: alpha / (1 - alpha), or 0 if the entry did not count
                     h.addcmul_(weights / after.clamp(min=MIN_TRANSMITTANCE), behind, value=-1)
                     remaining, before = behind[..., -1:], after[..., -1:]
                 d_peaks = h.sum(1) / chunk.peaks[:, 0].clamp(min=ALPHA_MIN)
@@ -182,7 +184,7 @@ class _DrawTiles(torch.autograd.Function):
 
 def _blend_weights(chunk: _Chunk, blend: Blend, before: Tensor) -> tuple[Tensor, Tensor]:
     """Return weights (b, pixels, k) of the entries and the transmittances behind them; before (b, pixels, 1): the
-    transmittance in front of the chunk."""
+    transmittance in front of the chunk, which "add" returns unchanged."""
     if blend == "add":
         return threshold(chunk.g, PROFILE_MIN, 0.0), before
     alpha = threshold(chunk.peaks * chunk.g, ALPHA_MIN, 0.0)
@@ -192,7 +194,9 @@ def _blend_weights(chunk: _Chunk, blend: Blend, before: Tensor) -> tuple[Tensor,
 
 
 def _median_rows(transmittance: Tensor, next_transmittance: Tensor, index: Tensor) -> Tensor:
-    """Return (b, pixels) the row at which the transmittance falls below 1/2, -1 if at none of `index`."""
+    """Return (b, pixels) the row at which the transmittance falls below 1/2, -1 if at none of `index` (b, k).
+
+    transmittance (b, pixels, 1): in front of the chunk; next_transmittance (b, pixels, k): behind each entry."""
     limit = torch.full_like(transmittance, -0.5)
     # Negated, since searchsorted needs ascending order.
     place = torch.searchsorted(next_transmittance.neg(), limit, right=True)[..., 0]

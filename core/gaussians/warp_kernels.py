@@ -42,7 +42,9 @@ _CHECK_INTERVAL = wp.constant(32)
 
 @wp.func
 def _profile(dx: float, dy: float, place: _Place, shape: _Shape, rings: bool, arcs: bool) -> float:
-    """Return G of `reference.py` at the offset dx, dy."""
+    """Return G of `reference.py` at the offset dx, dy from the centre.
+
+    place: centre x, y and whitening xx, yx, yy; shape: r0, w, and an arc's a_u, a_v, m; see `WhitenedGaussians`."""
     u = place[2] * dx
     v = place[3] * dx + place[4] * dy
     q = u * u + v * v
@@ -62,6 +64,7 @@ def _kernels(channels: int) -> tuple[Any, Any]:
     Gradients = wp.types.vector(length=1 + channels + PLACES + SHAPES, dtype=wp.float32)
     VALUES, PLACE, SHAPE = 1, 1 + channels, 1 + channels + PLACES  # offsets in Gradients
 
+    # Each thread draws one pixel. entries, starts, columns: see `TileLists`; add: the blend is "add", else "over".
     @wp.kernel(enable_backward=False, module="unique")
     def forward(
         entries: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int32), columns: int,
@@ -95,6 +98,8 @@ def _kernels(channels: int) -> tuple[Any, Any]:
         picture[i] = total
         median_rows[i] = median_row
 
+    # Adds the gradients of each Gaussian to its row of `sums`, whose columns are: peak, values, place, shape.
+    # upstream: gradient of the picture.
     @wp.kernel(enable_backward=False, module="unique")
     def backward(
         entries: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int32), columns: int,

@@ -46,7 +46,7 @@ def channel_names(path: Path | str) -> list[str]:
 
 
 def exr_colour_space(path: Path | str) -> str:
-    """Return the name of the linear space of an EXR by its chromaticities; "" for one without a name here.
+    """Return the name of the built-in linear space of an EXR by its chromaticities; "" if they are those of none.
 
     Without chromaticities it is "linear", Rec. 709, as the format defines. Raises OSError where the file is missing.
     """
@@ -92,9 +92,11 @@ def foreign_strings(path: Path | str) -> dict[str, bytes]:
 
 
 def foreign_names(path: Path | str) -> dict[bytes, bytes]:
-    """Return the names of attributes and channels of an EXR that are not UTF-8, by the names under which this program
-    has them: with the character DEL for each byte above 127, which keeps the order of channels. Raises OSError, and
-    FrameError where two names would be one, or channels would be in another order.
+    """Return the names of attributes and channels of an EXR that are not UTF-8, by the ASCII names under which this
+    program has them: each byte above 127 is replaced by DEL, the last character of ASCII.
+
+    An EXR stores channels in the order of their names, so DEL must not change that order. Raises FrameError where it
+    does, or where two names become one; raises OSError.
     """
     with open_regular(path) as stream:
         if stream.read(4) != exr_header.MAGIC:
@@ -114,6 +116,7 @@ def foreign_names(path: Path | str) -> dict[bytes, bytes]:
 
 
 def _in_ascii(name: bytes) -> bytes:
+    """Return a name with DEL in place of each byte above 127, of the same length."""
     return bytes(byte if byte < 128 else 0x7F for byte in name)
 
 
@@ -127,8 +130,11 @@ def is_utf8(text: bytes) -> bool:
 
 @contextlib.contextmanager
 def _readable_copy(path: Path | str) -> Iterator[str]:
-    """Yield the path of an EXR that the library can read: the file itself, or a copy without what is not UTF-8, for
-    which the library refuses the whole file: "?" in its text attributes, and the names of `foreign_names`."""
+    """Yield the path of an EXR that the library can read: the file itself, or a copy without what is not UTF-8, since
+    the library would refuse the whole file.
+
+    In the copy, text attributes have "?" for each byte above 127, and names are those of `foreign_names`.
+    """
     check_regular(path)
     names = foreign_names(path)
     if not names and not foreign_strings(path):
@@ -169,7 +175,7 @@ def read_exr_headers(path: Path | str) -> list[dict[str, Any]]:
 
 
 def _usable_header(header: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a header without those attributes that this program reads but whose type is not the standard's."""
+    """Return a header without the attributes of _IS_USABLE whose type is not the standard's."""
     return {name: value for name, value in header.items() if name not in _IS_USABLE or _IS_USABLE[name](value)}
 
 
@@ -210,9 +216,10 @@ _Part = TypeVar("_Part")
 
 
 def main_part(parts: Sequence[tuple[_Part, Container[str]]]) -> _Part:
-    """Return the first part of an EXR, given with its channel names, that holds a picture; else the first of all.
+    """Return the first part of an EXR with R, G and B; else the first with Y; else the first of all.
 
-    Other parts hold depth or a render pass, with windows of their own.
+    parts: of each part, what stands for it (its number or header, say) and the names of its channels. Other parts hold
+    depth or a render pass, with windows of their own.
     """
     for channels in ("RGB", "Y"):
         for part, names in parts:
@@ -267,7 +274,7 @@ def _check_finite(path: Path, name: str, channel: NDArray[Any]) -> Pixels:
 def rgb_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> Pixels:
     """Stack R, G and B, or Y three times, to (height, width, 3); luminance and chroma are converted to R, G, B.
 
-    Raises FrameError where neither exists.
+    path: for messages, and to read chroma. Raises FrameError where neither exists, or for NaN and infinity.
     """
     if has_chroma(channels):
         return read_luminance_chroma(path)
@@ -304,7 +311,8 @@ def missing_rgb(path: Path, channels: Iterable[str]) -> FrameError:
 
 
 def rec709_pixels(path: Path, pixels: Pixels, header: Mapping[str, Any]) -> Pixels:
-    """Convert an EXR's pixels to linear Rec. 709 by its chromaticities; unchanged where it has none."""
+    """Convert an EXR's pixels to linear Rec. 709 by its chromaticities; unchanged where it has none. Raises FrameError
+    where they span no space."""
     chromaticities = header.get("chromaticities")
     if chromaticities is None:
         return pixels

@@ -18,6 +18,7 @@ from ..errors import FrameError
 from .exr import main_part, read_exr_headers
 
 _EYES = ("left", "right")
+"""Names by which a view is recognised where no attribute lists the views."""
 _WINDOWS = ("dataWindow", "displayWindow")
 
 
@@ -63,19 +64,24 @@ def _view_of_part(header: Mapping[str, Any]) -> str:
 
 
 def stereo_views(header: Mapping[str, Any], names: Collection[str]) -> list[View]:
-    """Return the views in one part of an EXR, the one at the root first; empty for a picture of one view."""
+    """Return the views in one part of an EXR, the one at the root first; empty for a picture of one view.
+
+    names: of the channels. Without the attribute multiView, views are the channel prefixes "left" and "right"; the
+    picture at the root is then the eye that is not among them, or "root" if both are.
+    """
     listed = [str(name) for name in header.get("multiView", ())]
     prefixed = dict.fromkeys(name.rpartition(".")[0] for name in names if name.count(".") == 1)
     eyes = listed[1:] or [name for name in prefixed if name.lower() in _EYES]
     root = listed[0] if listed else next(name for name in (*_EYES, "root") if name not in [eye.lower() for eye in eyes])
     views = [View(root, colours)] if (colours := _colours(names, "")) else []
     if not views and listed:
-        eyes = listed
+        eyes = listed  # the first one is behind its name too
     views += [View(eye, colours) for eye in eyes if (colours := _colours(names, f"{eye}."))]
     return views if len(views) > 1 else []
 
 
 def _colours(names: Collection[str], prefix: str) -> tuple[str, str, str] | None:
+    """Return the names of R, G, B, or three times that of Y, behind a prefix; None where neither is among `names`."""
     for each in ("RGB", "YYY"):
         channels = tuple(f"{prefix}{name}" for name in each)
         if all(name in names for name in channels):

@@ -24,11 +24,12 @@ def _parts_of_plate(plate: Plate) -> list[tuple[Mapping[str, Any], Mapping[str, 
 
 
 def _views_of_plate(plate: Plate) -> list[View]:
+    """Return the views of a plate, that of its codes first; empty for a picture of one view."""
     return views_of_parts(_parts_of_plate(plate))
 
 
 def split_views(plate: Plate) -> list[tuple[str, Plate]]:
-    """Return (name, plate) of each view of a plate; the plate itself, with the name "", where it has one."""
+    """Return (name, plate) of each view of a plate; the plate itself, with the name "", where it has only one."""
     parts, views = _parts_of_plate(plate), _views_of_plate(plate)
     if not views:
         return [("", plate)]
@@ -36,14 +37,16 @@ def split_views(plate: Plate) -> list[tuple[str, Plate]]:
 
 
 def _view_plate(plate: Plate, view: View, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]]) -> Plate:
+    """Return the plate of one view. header, channels: of the part that holds it."""
     return replace(plate, codes=np.stack([np.asarray(channels[name]) for name in view.channels], -1),
                    grey=len(set(view.channels)) == 1, extras={"header": header, "channels": channels})
 
 
 def join_views(plate: Plate, codes: Sequence[NDArray[Any]]) -> tuple[Plate, NDArray[Any]]:
-    """Return the plate with the codes of all its views but the first, and those of the first, for `write_plate`.
+    """Return the plate and the codes to give to `write_plate`: the plate with the new codes of all views but the first
+    in its channels, and the codes of the first.
 
-    codes: of each view of `split_views`.
+    codes: of each view of `split_views`, in its order.
     """
     views = _views_of_plate(plate)
     if not views:
@@ -66,7 +69,8 @@ def write_view_results(results: Sequence[Path], plate: Plate,
                        cleaned: Sequence[tuple[NDArray[Any], NDArray[Any]]]) -> None:
     """Write the clean plate with all its views, and the flares of all if `results` has a second path.
 
-    cleaned: codes and flare of each view of `split_views`.
+    cleaned: codes and flare of each view of `split_views`. The first view's flare is at the root ("R"), the others'
+    behind their names ("right.R").
     """
     views = _views_of_plate(plate)
     if not views:

@@ -24,8 +24,8 @@ def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: b
               header: Mapping[str, Any] | None = None, commit_lock: AbstractContextManager[None] | None = None) -> None:
     """Write one part, scanlines, ZIP; each channel (height, width), under its full name ("scene.R").
 
-    half: store 16 bit floats; channels that end in ".Z" stay 32 bit, since depth needs the range. commit_lock: see
-    `atomic_path`.
+    half: store 16 bit floats, clipped to their range; depth ("Z" and "*.Z") stays 32 bit, since it needs more. header:
+    more attributes. commit_lock: see `atomic_path`.
     """
     def stored(name: str, pixels: NDArray[Any]) -> NDArray[Any]:
         if half and not name.endswith(".Z") and name != "Z":
@@ -51,8 +51,9 @@ def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str,
 
 def save_exr_parts(path: Path | str, parts: Sequence[tuple[Mapping[str, Any], Mapping[str, NDArray[Any]]]],
                    commit_lock: AbstractContextManager[None] | None = None, source: Path | None = None) -> None:
-    """Write parts, each with its header and channels. commit_lock: see `atomic_path`. source: the EXR whose texts and
-    names that are not UTF-8 are written byte for byte; headers and channels hold others of their lengths.
+    """Write parts, each with its header and channels. commit_lock: see `atomic_path`. source: the EXR that they were
+    read from. Its texts and names that are not UTF-8 are written byte for byte in place of those that `exr.py` read
+    for them, which have the same lengths.
 
     Raises OSError where the system refuses, for instance for a full disk, and FrameError for a path that is not UTF-8.
     """
@@ -78,7 +79,11 @@ def save_exr_parts(path: Path | str, parts: Sequence[tuple[Mapping[str, Any], Ma
 
 
 def _restore_bytes(path: Path, strings: Mapping[str, bytes], names: Mapping[bytes, bytes]) -> None:
-    """Write text attributes, and names of attributes and channels, byte for byte over those that have their lengths."""
+    """Overwrite parts of an EXR's headers with others of the same lengths.
+
+    strings: by the names of `exr_header.string_places`; a text that was changed to another length stays. names: of
+    attributes and channels, by the names in the file.
+    """
     with open(path, "r+b") as stream:
         places = [(at, strings[name]) for name, (at, text) in exr_header.string_places(stream).items()
                   if len(strings.get(name, b"")) == len(text)]

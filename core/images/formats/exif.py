@@ -37,6 +37,7 @@ def read_exif(path: Path) -> tuple[int, float | None]:
         first = tiff.integer_values(tiff.read_tags(block, (tiff.ORIENTATION, EXIF)))
         second = tiff.integer_values(tiff.read_tags(block, (FOCAL_35MM,), first[EXIF])) if EXIF in first else {}
     orientation, focal = first.get(tiff.ORIENTATION, 1), second.get(FOCAL_35MM, 0)
+    # A focal length beyond 5 to 2000 mm is damaged; 0 stands for an unknown one.
     return orientation if 1 <= orientation <= 8 else 1, focal / WIDTH_35MM if 5 <= focal <= 2000 else None
 
 
@@ -65,7 +66,7 @@ def upright_block(block: bytes) -> bytes:
     if block[:4] not in (b"II*\0", b"MM\0*") or first + 2 > len(block):
         return b""
     changed = bytearray(block)
-    for number in range(int.from_bytes(block[first:first + 2], order)):
+    for number in range(int.from_bytes(block[first:first + 2], order)):  # entries of 12 bytes: tag, type, count, value
         at = first + 2 + 12 * number
         if at + 12 <= len(block) and int.from_bytes(block[at:at + 2], order) == tiff.ORIENTATION:
             changed[at + 8:at + 10] = (1).to_bytes(2, order)
@@ -74,10 +75,13 @@ def upright_block(block: bytes) -> bytes:
 
 def without_thumbnail(block: bytes) -> bytes:
     """Return an Exif block without its second directory, which holds a small copy of the picture; damaged ones
-    unchanged. No other offset changes."""
+    unchanged.
+
+    The copy is cut off at the end of the block, and overwritten with zeros elsewhere, so that no offset changes.
+    """
     order: Literal["little", "big"] = "little" if block[:2] == b"II" else "big"
     first = int.from_bytes(block[4:8], order)
-    link = first + 2 + 12 * int.from_bytes(block[first:first + 2], order)
+    link = first + 2 + 12 * int.from_bytes(block[first:first + 2], order)  # offset of the second directory's offset
     second = int.from_bytes(block[link:link + 4], order)
     if block[:4] not in (b"II*\0", b"MM\0*") or not second or link + 4 > len(block):
         return block
@@ -86,7 +90,7 @@ def without_thumbnail(block: bytes) -> bytes:
     tags = tiff.integer_values(tiff.read_tags(io.BytesIO(block), (_THUMBNAIL, _THUMBNAIL_LENGTH), second))
     start = tags.get(_THUMBNAIL, 0)
     end = start + tags.get(_THUMBNAIL_LENGTH, 0)
-    if start >= link + 4 and end <= len(block):
+    if start >= link + 4 and end <= len(block):  # else a damaged tag would have the first directory overwritten
         changed[start:end] = b"" if end == len(block) else bytes(end - start)
     return bytes(changed)
 

@@ -79,6 +79,7 @@ def is_truncated(stream: BinaryIO) -> bool:
     if compression[0] >= len(_LINES_PER_CHUNK):
         return False
     _, top, _, bottom = np.frombuffer(window, "<i4").tolist()
+    # The header is followed by the offsets of the chunks, 8 bytes each. A chunk is its line, its length, and its data.
     start, end = stream.tell(), stream.seek(0, os.SEEK_END)
     chunks = -(-(bottom + 1 - top) // _LINES_PER_CHUNK[compression[0]])
     if chunks <= 0 or start + 8 * chunks > end:
@@ -93,8 +94,11 @@ def is_truncated(stream: BinaryIO) -> bool:
 
 
 def string_places(stream: BinaryIO) -> dict[str, tuple[int, bytes]]:
-    """Return the offset and the bytes of each text attribute, by name; of each text of a list by its name and number,
-    such as "tags[1]"; of parts behind the first by the part's number too, such as "owner, part 1"."""
+    """Return the offset and the bytes of each text of all headers, by the name of its attribute.
+
+    Texts of a list have their number in the name, such as "tags[1]"; those of parts behind the first the part's number,
+    such as "owner, part 1".
+    """
     places = {}
     for part, _, name, kind, length in _iterate_attributes(stream):
         at = stream.tell()
@@ -131,14 +135,14 @@ def _channels(value: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _iterate_attributes(stream: BinaryIO) -> Iterator[tuple[int, int, bytes, bytes, int]]:
-    """Yield part, offset, name, type and length of each attribute of all headers, with the stream at its value; up to
-    the first damaged one."""
+    """Yield the part, the offset of the name, name, type and length of value of each attribute of all headers, up to
+    the first damaged one. The stream is then at the value."""
     stream.seek(len(MAGIC))
     has_parts = int.from_bytes(stream.read(4), "little") & _PARTS
     part, is_empty, at = 0, True, stream.tell()
     while True:
         if not (name := _read_name(stream)):
-            if is_empty or not has_parts:
+            if is_empty or not has_parts:  # after the last of several headers comes an empty one
                 return
             part, is_empty, at = part + 1, True, stream.tell()
             continue

@@ -55,10 +55,12 @@ def write_scanlines(path: Path | str, channels: Mapping[str, NDArray[Any]], head
 
 def _header(names: list[str], pixels: list[NDArray[Any]], attributes: Mapping[str, Any]) -> bytes:
     """Return magic number, version and attributes."""
+    # Of each channel: name, type, whether it is perceptually linear, and sampling of columns and lines.
     listed = b"".join(name.encode() + b"\0" + struct.pack("<iB3xii", _PIXEL_TYPES[one.dtype.name], 0, 1, 1)
                       for name, one in zip(names, pixels, strict=True)) + b"\0"
     flags = _LONG_NAMES if max(len(name.encode()) for name in (*names, *attributes)) > 31 else 0
-    parts = [MAGIC, struct.pack("<i", 2 | flags), _attribute("channels", "chlist", listed),
+    parts = [MAGIC, struct.pack("<i", 2 | flags),  # version 2 of the format
+             _attribute("channels", "chlist", listed),
              _attribute("compression", "compression", bytes([_ZIP])), _attribute("lineOrder", "lineOrder", b"\0"),
              _attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0, 0)),
              _attribute("screenWindowWidth", "float", struct.pack("<f", 1))]
@@ -82,7 +84,7 @@ def _attribute(name: str, kind: str, value: bytes) -> bytes:
 
 
 def _chunks(pixels: list[NDArray[Any]], height: int) -> Iterator[tuple[int, bytes]]:
-    """Yield the first line and the stored bytes of each chunk."""
+    """Yield the first line and the stored bytes of each chunk; uncompressed where ZIP does not make it smaller."""
     for start in range(0, height, _LINES):
         lines = range(start, min(start + _LINES, height))
         raw = b"".join(one[line].tobytes() for line in lines for one in pixels)
@@ -91,7 +93,8 @@ def _chunks(pixels: list[NDArray[Any]], height: int) -> Iterator[tuple[int, byte
 
 
 def _compress(raw: bytes) -> bytes:
-    """Compress as OpenEXR's ZIP: bytes of even and odd places apart, then differences, then zlib."""
+    """Compress as OpenEXR's ZIP: bytes of even places before those of odd ones, then differences plus 128, then zlib.
+    """
     data = np.frombuffer(raw, np.uint8)
     sorted_bytes = np.concatenate([data[::2], data[1::2]])
     differences = sorted_bytes.copy()

@@ -4,6 +4,7 @@ and TIFF hold, to leave out the thumbnails: they show the picture as it was."""
 from __future__ import annotations
 
 _SIGNATURES = (b"8BIM", b"MeSa", b"PHUT", b"AgHg", b"DCSR")
+"""First bytes of a resource; then follow its number, its name, the length of its data, and the data."""
 _THUMBNAILS = (1033, 1036)
 """Numbers of the resources that hold a thumbnail: Photoshop 4's and later ones'."""
 

@@ -51,19 +51,20 @@ _MAX_PAGES = 1000
 
 
 class _Layout(NamedTuple):
-    """Byte order, and the formats of a directory's length, of an entry's count, and of an offset."""
+    """Byte order, and struct's formats of numbers. length: of a directory's number of entries. offset: of an offset,
+    and of an entry's number of values."""
 
     order: _Order
     length: str
     offset: str
 
     def number(self, raw: bytes, kind: str = "") -> int:
-        """Return the offset, or number of this format, at the start of some bytes."""
+        """Return the number at the start of some bytes. kind: its format; "" for an offset's."""
         return int(struct.unpack_from(self.order + (kind or self.offset), raw)[0])
 
     @property
     def place(self) -> int:
-        """Where the value or its offset begins in an entry, which ends with it."""
+        """Where in an entry its last field begins: the values, or their offset if they are longer than the field."""
         return 4 + struct.calcsize(self.offset)
 
     @property
@@ -114,7 +115,7 @@ def read_tags(stream: BinaryIO, numbers: Container[int], at: int | None = None) 
         found = np.frombuffer(raw, values).astype(values.newbyteorder("="))
         if kind not in _BIG_TYPES:
             tags[number] = Tag(kind, found)
-        elif kind != 17 and found.max() < 1 << 32:
+        elif kind != 17 and found.max() < 1 << 32:  # 17 is signed
             tags[number] = Tag(4, found.astype(np.uint32))
     return tags
 
@@ -129,13 +130,17 @@ def page_count(stream: BinaryIO) -> int:
     count = 0
     for layout, entries in _directories(stream):
         kinds = [layout.number(entry[layout.place:], "I") for entry in entries if layout.number(entry, "H") == SUBFILE]
-        count += not any(kind & 1 for kind in kinds)
+        count += not any(kind & 1 for kind in kinds)  # bit 0: a reduced copy of another page
     return count
 
 
 def has_corrupt_data(stream: BinaryIO) -> bool:
     """True if strips or tiles of ZIP compression do not match their checksums, which the library of the format does not
-    compare."""
+    compare.
+
+    Checks at most as many bytes as the pixels can have (8 each channel), and some more, since hostile data
+    uncompress to any length.
+    """
     tags = read_tags(stream, (WIDTH, HEIGHT, BITS, SAMPLES, COMPRESSION, *_STRIPS, *_TILES))
     numbers = integer_values(tags)
     if numbers.get(COMPRESSION) not in _ZIP:
@@ -165,7 +170,10 @@ def _inflated_size(data: bytes, limit: int) -> int:
 
 def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
     """Return a TIFF with these tags in its first page, instead of its own of the same numbers; a BigTIFF and other data
-    unchanged."""
+    unchanged.
+
+    The values and a new directory are appended; the old directory stays in the file, but nothing points to it.
+    """
     (order, _, _), entries = next(_directories(io.BytesIO(data)), _NO_DIRECTORY)
     if not entries or not tags or data[:4] in BIG_TIFF:
         return data
@@ -183,7 +191,7 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
         new_entries.append(struct.pack(order + "HHI", number, kind, count) + place)
     result += b"\0" * (len(result) % 2)
     at = struct.unpack(order + "I", data[4:8])[0]
-    following = data[at + 2 + 12 * len(entries):][:4].ljust(4, b"\0")
+    following = data[at + 2 + 12 * len(entries):][:4].ljust(4, b"\0")  # offset of the next page
     new_entries.sort(key=lambda entry: struct.unpack(order + "H", entry[:2])[0])
     result[4:8] = struct.pack(order + "I", len(result))
     result += struct.pack(order + "H", len(new_entries)) + b"".join(new_entries) + following
@@ -191,7 +199,8 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
 
 
 def with_directory(data: bytes, number: int, tags: Mapping[int, Tag]) -> bytes:
-    """Return a TIFF with another directory, such as Exif's, to which the tag `number` of its first page points."""
+    """Return a TIFF with another directory of these tags, such as Exif's, at its end; the tag `number` of its first
+    page points there. A BigTIFF and other data are unchanged."""
     (order, _, _), entries = next(_directories(io.BytesIO(data)), _NO_DIRECTORY)
     if not entries or not tags or data[:4] in BIG_TIFF:
         return data
@@ -216,8 +225,8 @@ def is_premultiplied(path: Path) -> bool:
 
 
 def without_reader_changes(data: bytes) -> bytes:
-    """Return a TIFF whose pixels a reader neither rotates nor multiplies with alpha, by changing the tags that say so.
-    """
+    """Return a TIFF whose pixels a reader neither rotates nor multiplies with alpha: its tags say that they are upright
+    and, where there is alpha, multiplied already."""
     tags = read_tags(io.BytesIO(data), (ORIENTATION, EXTRA_SAMPLES))
     changed = {ORIENTATION: short(UPRIGHT)} if ORIENTATION in tags else {}
     if EXTRA_SAMPLES in tags and tags[EXTRA_SAMPLES].values[0] == UNASSOCIATED:

@@ -69,7 +69,7 @@ class Child:
             self._process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
 
     def wait_or_kill(self) -> None:
-        """Wait for the process to end, and kill it after `KILL_AFTER_S`."""
+        """Wait for the process to end, and kill it after `KILL_AFTER_S`; then keep the end of its log in `log_tail`."""
         deadline = time.monotonic() + KILL_AFTER_S
         while self.status is None:
             if time.monotonic() > deadline:
@@ -83,7 +83,7 @@ class Child:
             self._stderr.close()
 
     def to_error(self) -> FitFlareError:
-        """Return the error that its exit status stands for, with its message."""
+        """Return the error that the exit status stands for, with the message of the error event."""
         return {STOPPED: Cancelled, USAGE_ERROR: SettingsError}.get(self.status or 0, FitFlareError)(self.error_text)
 
     def _read_events(self) -> None:
@@ -124,8 +124,9 @@ def _parse_event(line: str) -> Event:
 def combined_error(failed: Sequence[Child], count: int, step: str) -> FitFlareError:
     """Return one error for the processes that failed, out of `count` of a step, with the message of each.
 
-    Its type is the one that all have in common. It is an EngineError where a process ended without a message; the end
-    of that process's log goes to standard error.
+    step: the step's name. The error has the type that all errors share, else it is a FitFlareError. Where processes
+    ended without a message it is an EngineError that counts them, and the end of the first one's log goes to standard
+    error.
     """
     problems = [child.to_error() for child in failed if child.error_text]
     messages = list(dict.fromkeys(map(str, problems)))

@@ -155,6 +155,7 @@ def _exit_status(argv: Sequence[str], progress: Progress) -> int:
         return USAGE_ERROR
     except (Cancelled, KeyboardInterrupt) as stop:
         command = COMMANDS.get(getattr(arguments, "command", ""))
+        # Other programs, which read JSON, run the command again in a way of their own.
         hint = f" {_RESUME_HINTS[command.resume_rule]}" if command and isinstance(progress, TerminalProgress) else ""
         progress.error(f"{str(stop) or 'Stopped.'}{hint}")
         return STOPPED
@@ -192,9 +193,10 @@ def _open_progress(argv: Sequence[str]) -> Iterator[Progress]:
 
     So invalid arguments are reported in the same format.
     """
+    # As in argparse, the last --progress counts.
     values = " ".join(argv).replace("--progress=", "--progress ").split("--progress ")[1:]
     kind = values[-1].split(" ")[0] if values else ""
-    if kind != "json" or "--help" in argv:
+    if kind != "json" or "--help" in argv:  # the help is text on standard output
         if kind == "openjd" and isinstance(sys.stdout, io.TextIOWrapper):  # farms read UTF-8 on every system
             sys.stdout.reconfigure(encoding="utf-8", errors="replace")
         progress: Progress = OpenJdProgress() if kind == "openjd" else TerminalProgress()
@@ -241,6 +243,7 @@ def _report_torch_load_errors() -> Iterator[None]:
     try:
         yield
     except OSError as problem:
+        # Only an error from within the import of torch, which runs its module's own code, is meant.
         if not any(frame.f_code.co_name == "<module>" and frame.f_globals.get("__name__") == "torch"
                    for frame, _ in traceback.walk_tb(problem.__traceback__)):
             raise
@@ -251,7 +254,10 @@ def _report_torch_load_errors() -> Iterator[None]:
 
 def _run_steps(command: Command, arguments: argparse.Namespace, argv: Sequence[str],
                progress: Progress) -> dict[str, Any]:
-    """Run the steps of a command that these arguments need; return their results together."""
+    """Run the steps of a command that these arguments need; return their results in one dictionary.
+
+    `arguments.step`: name of the one step to run, in a child process; None for all.
+    """
     result: dict[str, Any] = {}
     for step in command.steps:
         if arguments.step in (None, step.name) and step.is_needed(arguments):
@@ -260,7 +266,11 @@ def _run_steps(command: Command, arguments: argparse.Namespace, argv: Sequence[s
 
 
 def _run_step(step: Step, arguments: argparse.Namespace, argv: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """Run a step here, or in a child process where this one lacks its side; return its result."""
+    """Run a step here, or in a child process where this one lacks its side; return its result.
+
+    `arguments.step` is set in such a child, which has to run the step itself. An optional step whose side this machine
+    lacks is skipped, with result {}.
+    """
     if arguments.step and step.side == "blender" and "bpy" not in sys.modules:
         try:
             __import__("bpy")  # this process was started for the step, in a Python that has Blender as a module
@@ -268,6 +278,7 @@ def _run_step(step: Step, arguments: argparse.Namespace, argv: Sequence[str], pr
             raise EngineError(f"Blender's module cannot be loaded here ({problem}). On Linux it needs libraries of "
                               "X11, on a server too: install the one that is missing (see README.md), or name a "
                               "Blender with --blender.") from problem
+    # An engine that --engine names is used even where this Python has torch.
     elsewhere = step.side == "engine" and arguments.engine is not None and not arguments.step
     if step.side == "any" or (hand_off.current_side() == step.side and not elsewhere):
         with _silence_stdout() if step.side == "blender" else _report_torch_load_errors():

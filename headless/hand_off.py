@@ -188,7 +188,10 @@ def _relay_events(child: Child, progress: Progress) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _forward_signals(child: Child) -> Iterator[None]:
-    """Forward stop signals of this process to the child within the block; the child has its own process group."""
+    """Forward stop signals of this process to the child within the block; its own handlers run too.
+
+    The child has its own process group, so the terminal does not send it any.
+    """
     before = {number: signal.getsignal(number) for number in stop_signals()}
     received: list[int] = []
 

@@ -54,7 +54,7 @@ def _page(text: str, titles: dict[str, str]) -> str:
 
 
 def _blocks(lines: list[str]) -> Iterator[str]:
-    """Yield the HTML of each block of a document."""
+    """Yield the HTML of each block of a document; the line breaks of a paragraph are kept."""
     at = 0
     while at < len(lines):
         line = lines[at]
@@ -113,7 +113,7 @@ def _anchor(heading: str) -> str:
 
 def _inline(text: str) -> str:
     """Return the HTML of text within a block; code stays as it is."""
-    parts = text.split("`")
+    parts = text.split("`")  # every second part is code
     return "".join(f"<code>{html.escape(part)}</code>" if number % 2 else _emphasis(part)
                    for number, part in enumerate(parts))
 

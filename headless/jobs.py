@@ -53,7 +53,8 @@ def run_jobs(args: argparse.Namespace, step: str, numbers: Sequence[int], progre
              extra: Sequence[str] = (), *, continue_on_failure: bool = False) -> None:
     """Run a step of the command in `args.jobs` processes at once, each with a part of the frames.
 
-    extra: more arguments for each process. continue_on_failure, and what is raised: see `run_parts`.
+    extra: more arguments for each process. continue_on_failure, and what is raised: see `run_parts`. The results of the
+    processes are dropped: a caller that needs one runs the step itself afterwards, which keeps the finished frames.
     """
     parts = [[*extra, "--jobs", "1", "--frames", frames] for frames in split_frames(numbers, args.jobs)]
     run_parts(args, step, parts, args.jobs, len(numbers), progress, continue_on_failure=continue_on_failure)
@@ -78,7 +79,10 @@ def run_parts(args: argparse.Namespace, step: str, parts: Sequence[Sequence[str]
 
 
 class _JointProgress:
-    """Sums the progress of all processes: finished processes (`by_part`), or the steps that each one counts."""
+    """Sums the progress of all processes: finished processes (`by_part`), or the steps that each one counts.
+
+    _counted: steps that each process has reported as done.
+    """
 
     def __init__(self, progress: Progress, by_part: bool) -> None:
         self.progress, self._by_part = progress, by_part
@@ -98,7 +102,10 @@ class _JointProgress:
 
 def _run_all(commands: Sequence[Sequence[str]], jobs: int, counter: _JointProgress,
              continue_on_failure: bool) -> list[Child]:
-    """Run the processes, return those that failed; any that still run on an early exit are stopped."""
+    """Run the processes, `jobs` at once; return those that failed.
+
+    Any that still run on an early exit are stopped. Raises Cancelled and EngineError.
+    """
     event_queue: EventQueue = queue.Queue()
     variables = _child_environment(min(jobs, len(commands)))
     waiting, running, failed = deque(commands), list[Child](), list[Child]()

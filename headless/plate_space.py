@@ -11,7 +11,7 @@ from ..core.errors import SettingsError
 from ..core.system.progress import Progress
 
 _MAX_FOLDERS = 4
-"""Folders above a plate that may be its capture: CAPTURE/images/camera/plate.dpx."""
+"""Paths that may be the capture of a plate, from itself upwards: CAPTURE/images/camera/plate.dpx."""
 
 
 def add_option(parser: argparse.ArgumentParser | argparse._ArgumentGroup, *, ocio: bool = True) -> None:

@@ -87,7 +87,7 @@ def exit_process(status: int) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     bpy = sys.modules.get("bpy")
-    if bpy is not None and not bpy.app.binary_path:
+    if bpy is not None and not bpy.app.binary_path:  # Blender as a module, which has no program
         os._exit(status)
     sys.exit(status)
 

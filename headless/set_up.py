@@ -70,7 +70,8 @@ def environment_python(folder: Path) -> Path:
 def run_logged(command: list[str]) -> str:
     """Run a command; return "" on success, else the reason of the failure.
 
-    Its output goes to the log, and the lines that name a download also to the events.
+    Its output goes to the log, and the lines that name a download also to the events. The reason is its first line that
+    begins with "ERROR:", as pip and `--fetch` write one, else its last line.
     """
     last, unreached = "", False
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -135,9 +136,9 @@ def unsupported_reason() -> str:
 
 
 def find_base_python() -> str | None:
-    """Return the Python that makes the environment: this one, else one on the PATH that has `ensurepip`; None without.
+    """Return the Python that makes the environment: the first that has `ensurepip`, of this one and those on the PATH.
 
-    The Blender of a Linux distribution often lacks it.
+    None where none has it. The Blender of a Linux distribution often lacks `ensurepip`.
     """
     check = "import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))"
     candidates = [sys.executable, *(shutil.which(f"python3.{minor}") for minor in (13, 12, 11)),
@@ -263,6 +264,7 @@ def main(argv: list[str]) -> int:
         try:
             fetch(args.fetch[0], Path(args.fetch[1]), args.fetch[2])
         except (OSError, ValueError) as problem:
+            # `run_logged` in the parent process takes the reason from this line.
             print(f"ERROR: {getattr(problem, 'reason', None) or problem}", flush=True)
             return 1
         return 0
@@ -275,8 +277,10 @@ def main(argv: list[str]) -> int:
 
 
 def set_up_engine(folder: Path, packages: list[str], weights: list[str] | None = None) -> int:
-    """Set the engine up in a folder, with these packages or all, and with weights (URL, FILE, SHA256); return the exit
-    status."""
+    """Set the engine up in a folder, and with weights (URL, FILE, SHA256); return the exit status.
+
+    packages: to install in place of the engine's, and without the test of the engine; [] for the engine's.
+    """
     names = packages or engine_packages()
     if not packages and unsupported_reason():
         emit(type="error", text=unsupported_reason())

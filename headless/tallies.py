@@ -22,7 +22,7 @@ def report_capture(capture: Capture, progress: Progress) -> None:
 
 
 def tally_capture(capture: Capture, verb: str = "used", used: int | None = None) -> Tally:
-    """Return the tally of a capture's frames. used: their number (default: all views)."""
+    """Return the tally of a capture's frames. verb: what was done with them. used: how many (default: all views)."""
     tally = Tally("frame", verb)
     tally.use(len(capture.views) if used is None else used)
     tally.merge(capture.left_out.items())
@@ -36,6 +36,7 @@ def tally_solve(report: Mapping[str, Any], source: Path) -> Tally:
     tally.skip("no place in the model", *report["unregistered"])
     names = [path.name for path in pictures_in(source)] if source.is_dir() else []
     for sentence in report["left_out"]:  # "PATH is damaged or truncated; export it again."
+        # Each sentence becomes the name of a file and a reason without the advice.
         name = next((name for name in names if sentence.startswith(f"{source / name} ")), "")
         problem = sentence.removeprefix(f"{source / name} ").partition(";")[0].partition(" (")[0].rstrip(".")
         tally.skip(problem, name or source.name)

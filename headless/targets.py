@@ -105,12 +105,16 @@ def check_options(options: TargetOptions, kind: str) -> None:
     """Raise SettingsError for an option that has no effect on this kind of target."""
     for name in dict.fromkeys(name for names in TARGET_OPTIONS.values() for name in names):
         value = getattr(options, name)
+        # 0 is a value that was given for fall_off (by itself: as far as in the first frame), else a default.
         if (value or (value == 0.0 and name == "fall_off")) and name not in TARGET_OPTIONS[kind]:
             raise SettingsError(f"--{name.replace('_', '-')} does not apply to a {kind} as the target; leave it out.")
 
 
 def find_flare(args: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
-    """Return the .flare, and the poses (4, 4) of its training views, None where they are unknown."""
+    """Return the .flare of --flare, a file or a run, and the poses (4, 4), world to camera, of its training views.
+
+    The views are those of --capture, else of the run's capture; None where there is neither.
+    """
     from ..core.capture import Capture
     from ..core.conventions.run_files import FLARE
     from ..core.fit.run import Run
@@ -165,6 +169,7 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
         distances = {light.name: _median_distance(light, views.get(light.name)) for light in look.lights}
         if options.highlights is not None and options.light:
             raise SettingsError("--highlights takes the lights from the plates; leave --light out.")
+        # The transfer moves this one light to the highlights of each plate; its pixel here has no meaning.
         named = {NAME: (0.5, 0.5)} if options.highlights is not None else _parse_lights(options.light)
         detector: Detector | None = None if named else ExposureDetector()
         centre = _parse_point(options.centre) if options.centre else None
@@ -195,7 +200,7 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
 
 
 def left_out(options: TargetOptions, target: Target) -> list[tuple[str, list[str]]]:
-    """Return what is in the folder of pictures that --to names and gets no flare, by reason."""
+    """Return the names of the pictures and files in the target that get no flare, by reason."""
     from ..core.images.listing import unlisted_entries
 
     folder = options.to[0]
@@ -211,7 +216,10 @@ def _is_plate_folder(folder: Path) -> bool:
 
 
 def _median_distance(light: LightLook, views: TrainingViews | None) -> float:
-    """Return the median distance of the training cameras to a light; the middle of its range where that is unknown."""
+    """Return the median distance of the training cameras to a light, in world units.
+
+    views: None where they are unknown; then it is the distance from the middle of the training cameras' range.
+    """
     import numpy as np
 
     if views is not None:

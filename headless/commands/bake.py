@@ -77,6 +77,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         return layers.report_nothing(args.out)
     if args.jobs != 1:
         jobs.run_jobs(args, "bake", [frame.number for frame in selected], progress)
+    # After jobs, this keeps their finished frames and returns the record of all.
     settings = layers.bake_settings(args, *layers.parse_size(args.size))
     record = bake(run_, selected, cameras, args.out, settings, progress, overwrite=args.overwrite)
     return layers.report_layers(selected, args.out, len(record["frames"]), progress)
@@ -143,6 +144,7 @@ def _bake_frames(args: argparse.Namespace, progress: Progress, step: str,
         return layers.report_nothing(args.out)
     if args.jobs != 1:
         jobs.run_jobs(args, step, [frame.number for frame in selected], progress)
+    # After jobs, this keeps their finished frames and returns the record of all.
     record = bake_shot_frames(renderer(shot), args.out, half=not args.float, overwrite=args.overwrite,
                               progress=progress, frame_numbers={frame.number for frame in selected}, space=args.space,
                               config=args.ocio)

@@ -57,7 +57,8 @@ def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, number
                    intensity: float = 1.0, tint: str = "1,1,1") -> dict[str, Any]:
     """Build the compositor for the layers, save it as a .blend in `out`, and render the frames `numbers` there.
 
-    numbers: None for all.
+    numbers: None for all, [] for none. intensity: factor on the flare. tint: its colour, as text. Returns the command's
+    result.
     """
     import bpy
 

@@ -121,7 +121,10 @@ def _describe_supervision(capture: Capture, mode: Mode) -> str:
 
 
 def write_sheet(capture: Capture, holdout: str | int | None, out: Path) -> None:
-    """Write the contact sheet of up to SHEET_ROWS held-out views (of all views where none is held out)."""
+    """Write the contact sheet of up to SHEET_ROWS held-out views (of all views where none is held out).
+
+    The layers are those in `out`/layers. holdout: as in the settings of a fit.
+    """
     from ...core.bake.bake import read_manifest
     from ...core.bake.exr import read_layers
     from ...core.bake.sheet import contact_sheet

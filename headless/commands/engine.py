@@ -27,6 +27,7 @@ def run(_args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.gaussians import splat
 
     version = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))["version"]
+    # Two equal Gaussians of light 1 in the middle of a picture of 16 pixels.
     centres = torch.full((2, 2), 8.0)
     covariances = torch.tensor([[4.0, 0.0, 4.0]]).repeat(2, 1)
     light = splat(centres, covariances, torch.ones(2), torch.ones(2, 3), 16, 16, blend="add").colour

@@ -74,7 +74,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 def _load_cases(args: argparse.Namespace, progress: Progress) -> list[Case]:
-    """Return the pairs, or the synthetic cases, that the arguments select. Raises SettingsError."""
+    """Return the pairs of PAIRS, or the cases of --synthetic, that the arguments select. Raises SettingsError."""
     from ...core.optics.prescription import read_lenses
     from ...core.removal import evaluation
     from ...core.removal.training.backgrounds import describe_unusable, read_backgrounds

@@ -35,7 +35,10 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def score_run(folder: Path, progress: Progress, *, view_set: str = "held-out",
               capture_folder: Path | None = None, lpips_folder: Path | None = None) -> dict[str, Any]:
-    """Score the views of a run, write its eval.json and report the table; return both. Raises RunError."""
+    """Score the views of a run, write its eval.json and report the table; return the file and the scores.
+
+    view_set: one of VIEWS. capture_folder: None for the run's. lpips_folder: None to leave LPIPS out. Raises RunError.
+    """
     from ...core.conventions.run_files import EVALUATION
     from ...core.fit.frames import Frames
     from ...core.fit.run import Run

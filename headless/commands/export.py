@@ -32,7 +32,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Write the preset or the PLY files. Raises SettingsError and RunError."""
+    """Write the preset of one frame, or a PLY for each frame. Raises SettingsError and RunError."""
     from ...core.capture import Capture
     from ...core.conventions.frame_numbers import number_views
     from ...core.conventions.run_files import FLARE

@@ -72,7 +72,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Fit the capture, or every capture of the list in processes of their own."""
+    """Fit the capture, or every capture of the list in processes of their own.
+
+    Raises SettingsError, CaptureError and RunError.
+    """
     from ...core.capture import Capture
     from ...core.conventions.run_files import CONFIG
     from ...core.fit import Run, fit
@@ -145,6 +148,7 @@ def scene_kind(scene: Path | None, capture: Capture, progress: Progress) -> str:
 
 def with_supervision(capture: Capture, settings: FitSettings, progress: Progress) -> Capture:
     """Return the capture with the clean frames that a fit with these settings needs; they are made where missing."""
+    # The exact scene of a rendered capture serves as its clean frames; a frozen scene needs none.
     exact = settings.supervised and capture.has_truth
     needed = settings.needs_clean_frames and not settings.scene.frozen and not exact
     return with_removed(capture, progress, is_flared=settings.uses_plates) if needed else capture
@@ -166,7 +170,10 @@ def default_mode(capture: Capture, frozen: bool, progress: Progress) -> Mode:
 
 
 def resolve_folders(args: argparse.Namespace) -> tuple[Path, Path]:
-    """Return the folders of the capture and of the run. Raises SettingsError."""
+    """Return the folders of the capture and of the run. Raises SettingsError.
+
+    With --list the run is called after its capture, with the number of its entry before where names are equal.
+    """
     if args.list_file is None:
         if args.capture is None:
             raise SettingsError("fit needs a capture: name its folder, or a list of them with --list and --entry.")

@@ -100,7 +100,10 @@ def _follow(capture: Capture, args: argparse.Namespace, progress: Progress) -> d
 
 
 def _follow_and_record(capture: Capture, progress: Progress, keep: bool = False) -> dict[str, Any]:
-    """Follow the lights of a shot, write lights.json and the sheets, and report them; return the report."""
+    """Follow the lights of a shot, write lights.json and the sheets, and report them; return the report.
+
+    keep: keep the entries of lights.json. Raises CaptureError where the folder cannot be written.
+    """
     from ...core.lights.find import write_tracks
     from ...core.lights.tracks import track_lights
 
@@ -134,7 +137,8 @@ def _find_and_record(capture: Capture, detector: Detector, progress: Progress,
                      keep: bool = False, follow: bool = False) -> dict[str, Any]:
     """Find the lights, write lights.json and the sheets, and report them; return the report.
 
-    follow: follow lights that move from frame to frame as well.
+    gaussians: means (n, 3) and opacities (n,) of a scene on which to place the detections. keep: keep the entries of
+    lights.json. follow: follow lights that move from frame to frame as well.
 
     Raises CaptureError, before the search, where the folder cannot be written.
     """

@@ -96,7 +96,10 @@ def _clean_video(args: argparse.Namespace, progress: Progress) -> dict[str, Any]
 
 
 def _clean_plates(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Clean plates into a folder. Raises FrameError for plates that failed, after the others are done."""
+    """Clean plates into a folder, in `--jobs` processes; return the command's result.
+
+    Raises FrameError for plates that failed, after the others are done.
+    """
     from ...core.conventions.frame_numbers import NumberedFrame, number_sequences
     from ...core.removal.jobs.batch import collect_plates, remove_all
     from ...core.removal.jobs.mattes import Mattes
@@ -106,7 +109,7 @@ def _clean_plates(args: argparse.Namespace, progress: Progress) -> dict[str, Any
     inputs, left_out = expand_videos(args.plates, args.out, progress, None if named is None else named.name)
     for sentence in left_out:
         progress.say(f"Left out: {sentence}")
-    failed = left_out if args.frames is None else []  # a video without frames fails the whole command only
+    failed = left_out if args.frames is None else []  # reported by the whole command, not by each part
     selected_paths = None
     if args.frames is not None or args.jobs != 1:
         plates = dict(collect_plates(inputs, [args.out, args.flare, args.matte]))

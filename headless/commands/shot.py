@@ -77,7 +77,10 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 def _open_capture(args: argparse.Namespace, progress: Progress) -> tuple[Capture, str]:
-    """Return the capture with its lights, and the kind of its scene; says what was chosen and why."""
+    """Return the capture with its lights, and the kind of its scene, "gaussians" or "plates"; report the choice.
+
+    Raises CaptureError where --scene gaussians is asked for and the camera cannot be solved.
+    """
     from ...core.capture import Capture
 
     source: Path = args.source
@@ -103,7 +106,7 @@ def _open_capture(args: argparse.Namespace, progress: Progress) -> tuple[Capture
 
 
 def _solved(args: argparse.Namespace, progress: Progress) -> tuple[Capture | None, str]:
-    """Return the source as a capture with cameras, or None and the reason."""
+    """Return the source as a capture with cameras, and ""; or None, and the reason as a sentence."""
     from ...core.capture import Capture
     from ...core.capture.solve import SolveSettings, solve
 
@@ -147,7 +150,7 @@ def _frames_folder(args: argparse.Namespace, progress: Progress) -> Path:
 
 
 def _settings(args: argparse.Namespace, kind: str, capture: Capture, progress: Progress) -> Any:
-    """Return the settings of the fit: those of an existing run, else new ones."""
+    """Return the settings of the fit: those of an existing run, which is resumed, else new ones. kind: of the scene."""
     from ...core.conventions.run_files import CONFIG
     from ...core.fit import Run, preset
     from ...core.fit.settings import over_plates, override_settings

@@ -141,6 +141,7 @@ def _train_diffusion(args: argparse.Namespace, recipe: Recipe, backgrounds: Back
     batches = Batches(recipe, backgrounds, lenses, user_flares)
 
     def draw(number: int) -> tuple[Pixels, Pixels]:
+        # SD-Turbo was trained with pictures of 512 pixels.
         pair = batches.draw_pair(number, 0, 512, 512)
         return pair.frame, pair.scene_with_glow if args.keep_glow else pair.scene
 

@@ -94,7 +94,8 @@ def read_blend(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, progress: Progress) -> dict[str, Any]:
     """Write the cameras, the lights and their visibility of the target, a .blend, as a shot.
 
-    args: of the command, with --size and --jobs. flare: a .flare, or the folder of a run."""
+    args: of the command, with --size and --jobs. flare: a .flare, or the folder of a run. Raises SettingsError.
+    """
     from ...core.conventions.frame_numbers import NumberedFrame, select_task_frames
     from ...core.conventions.run_files import FLARE
     from ...core.look import read
@@ -111,14 +112,15 @@ def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, pr
     read(flare)
     scene = open_blend(options.to[0])
     every = range(scene.frame_start, scene.frame_end + 1)
-    # Neighbours too: visibility is smoothed over them, and a chunk of frames must give the result of the whole range.
     selected = {frame.number for frame in select_task_frames([NumberedFrame("", number, "") for number in every],
                                                              options.frames, options.job_frames)}
+    # Neighbours too: visibility is smoothed over them (`smooth_visibility`), and a part of the frames must give the
+    # result of the whole range.
     around = range(-2 * options.smooth, 2 * options.smooth + 1)
     numbers = [number for number in every if any(number + step in selected for step in around)]
     if options.query == "source" or options.fall_off == 0 or not selected:
-        # The middle one selects the training view, the first one the fall-off's distance; without any selected, the
-        # engine step reports it.
+        # The middle frame selects the training view of --query source, and the first one the distance of --fall-off 0.
+        # Where no frame is selected, the engine step reports it.
         numbers = list(every)
     names = [name.strip() for name in (options.lights or "").split(",") if name.strip()]
     progress.stage("read the .blend", len(numbers))
@@ -156,8 +158,9 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
                 training: list[Floats] | None, progress: Progress) -> dict[str, Any]:
     """Render the layers of a flare for a target, as a step of `transfer` or `bake`.
 
-    args: of the command, with the options of layers, --frames, --size and --jobs. training: see
-    `targets.open_target`."""
+    args: of the command, with the options of layers, --frames, --size and --jobs. step: its name, for --jobs. flare:
+    the .flare. training: see `targets.open_target`. Returns the command's result.
+    """
     from ...core.transfer.target import resized
     from ...core.transfer.transfer import Transfer, TransferSettings
 
@@ -178,6 +181,7 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     if args.jobs != 1:
         extra = ["--shot", str(targets.shot_path(options))] if targets.is_blend(options) else []
         jobs.run_jobs(args, step, [frame.number for frame in selected], progress, extra)
+    # After jobs, this keeps their finished frames and returns the record of all.
     bake_settings = layers.bake_settings(args)
     sources = {light.name: light.source for frame in target.frames for light in frame.shot.lights}
     stored = () if targets.is_shot_file(options) else transfer.look.edits.placed(sources).texts()

@@ -76,6 +76,7 @@ def write() -> int:
     Raises FlareFileError where no look can be read.
     """
     library.items()  # writes the missing thumbnails
+    # In reverse, so that of two looks with one name the user's replaces the extension's.
     paths = {path.stem: path for path in reversed(library.files()) if _is_usable(path)}
     if not paths:
         raise FlareFileError("The library has no look that can be read; save one to it first.")
@@ -100,7 +101,7 @@ def _is_usable(path: Path) -> bool:
 
 
 def _make_asset(path: Path) -> Any:
-    """Return a new object that is the asset of a look."""
+    """Return a new empty that is the asset of a look, with the look's thumbnail as its preview."""
     item = bpy.data.objects.new(path.stem, None)
     item.empty_display_type, item.empty_display_size = "SPHERE", EMPTY_SIZE
     item.fit_flare.asset_look = path.stem

@@ -74,7 +74,7 @@ def highlighted(edits: LookEdits, chosen: Touched, elements: Mapping[str, list[s
 
 
 def alone(chosen: Touched, edits: LookEdits) -> LookEdits:
-    """Return edits that show the touched element alone, as large and where it is shown."""
+    """Return edits that show the touched element alone, at its size and place, at full intensity."""
     key = chosen.flare, chosen.element
     part = replace(edits.elements.get(key, Edit()), mute=False, solo=True, intensity=1.0)
     whole = replace(edits.lights.get(chosen.flare, Edit()), mute=False, solo=True, intensity=1.0)
@@ -85,12 +85,13 @@ def alone(chosen: Touched, edits: LookEdits) -> LookEdits:
 def outline(gaussians: PlaneGaussians, centres: Any, covariances: Any) -> tuple[float, float, float, float] | None:
     """Return the box (left, top, right, bottom) around the brighter Gaussians, pixels; None where there are none.
 
-    centres (n, 2), covariances (n, 3): pixels.
+    centres: (n, 2) px. covariances: (n, 3) xx, xy, yy, px².
     """
     light = gaussians.opacities * np.abs(gaussians.colours).max(-1)
     chosen = np.isfinite(centres).all(-1) & (light >= OUTLINED * light.max(initial=0.0)) & (light > 0)
     if not chosen.any():
         return None
+    # Outer radius of a ring: r0 + w, Mahalanobis; 1 for a plain Gaussian.
     radii = np.ones(len(light)) if gaussians.rings is None else gaussians.rings.sum(-1)
     reach = REACH * radii[:, None] * np.sqrt(np.maximum(covariances[:, [0, 2]], 0))
     low, high = (centres - reach)[chosen].min(0), (centres + reach)[chosen].max(0)

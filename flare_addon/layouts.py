@@ -29,10 +29,14 @@ def _time_left(job: jobs.Job) -> str:
 
 
 def label_lines(layout: Any, text: str, icon: str = "NONE", width: int = 44) -> None:
-    """Draw a sentence as several labels, since Blender cuts a label off at the edge of the panel."""
+    """Draw a sentence as several labels, since Blender cuts a label off at the edge of the panel.
+
+    width: characters in a line where the width of the panel is not known.
+    """
     region = bpy.context.region
     if region is not None and region.width > 1:
         scale = bpy.context.preferences.system.ui_scale
+        # A character is about 6.4 px wide; icon and margins take 50 px.
         width = max(int((region.width - 50 * scale) / (6.4 * scale)), 16)
     column = layout.column(align=True)
     column.scale_y = 0.85

@@ -19,12 +19,14 @@ from .objects import world_matrix
 DISC_RADIUS_FRACTION = 2 * LIGHT_RADIUS
 """Default radius of the light's disc as a part of its distance: two standard deviations, as in a fit."""
 RAYS = 25
+"""Sample points of the disc."""
 
 
 def _disc_samples() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return sample points (n, 2) in the unit disc, in a sunflower pattern, and their Gaussian weights (n,)."""
     index = np.arange(RAYS) + 0.5
     radius, angle = np.sqrt(index / RAYS), index * math.pi * (3 - math.sqrt(5))
+    # The rim of the unit disc is two standard deviations from its centre: exp(-(2 r)² / 2).
     weights = np.exp(-2.0 * radius**2)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1), weights / weights.sum()
 
@@ -61,8 +63,9 @@ def disc_visibility(scene: Any, depsgraph: Any, eye: Any, light: Any, ignored: s
                     instances: Collection[tuple[str, Any]] = ()) -> float:
     """Return the part of a disc about the point `light` that is visible from `eye`, 0..1.
 
-    ignored, instances: objects by name, and instances by name and matrix_world, that hide nothing. disc_radius: radius
-    in world units, 0 for the default part of the distance.
+    The disc faces the eye. Its middle counts more than its rim. ignored, instances: objects by name, and instances by
+    name and matrix_world, that hide nothing. disc_radius: radius in world units, 0 for the default part of the
+    distance.
     """
     offset = light - eye
     distance = offset.length
@@ -80,7 +83,10 @@ def disc_visibility(scene: Any, depsgraph: Any, eye: Any, light: Any, ignored: s
 
 
 def visible_points(scene: Any, depsgraph: Any, eye: Any, item: Any, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which points (n, 3) of a flare's light no object hides from `eye`; the lamp itself hides nothing."""
+    """Return (n,) which points of a flare's light no object hides from `eye`; the lamp itself hides nothing.
+
+    item: the flare. points: (n, 3) in the world.
+    """
     from mathutils import Vector
 
     ignored, instances = _lamp_parts(item, depsgraph)
@@ -98,13 +104,14 @@ def _is_clear(scene: Any, depsgraph: Any, eye: Any, direction: Any, distance: fl
     from mathutils import Vector
 
     start, remaining = Vector(eye), (1 - LIGHT_MARGIN) * distance
-    for _ in range(4):  # past the lamp's own meshes
+    for _ in range(4):  # past the lamp's own meshes; after four of them the light counts as visible
         hit, hit_point, _normal, _index, obj, matrix = scene.ray_cast(depsgraph, start, direction, distance=remaining)
         if not hit:
             return True
         if obj is None or not (obj.original.name in ignored or _is_invisible_to_camera(obj)
                                or any(obj.original.name == name and matrix == place for name, place in instances)):
             return False
+        # Go on just behind the surface.
         step = (hit_point - start).length + 1e-4 * distance
         start, remaining = start + direction * step, remaining - step
         if remaining <= 0:

@@ -215,6 +215,7 @@ def _draw_preview(layout: Any, icon: int) -> None:
     """Draw a preview (composite above flare) as wide as the panel."""
     region, scale = bpy.context.region, bpy.context.preferences.system.ui_scale
     width = region.width / scale if region is not None else 260
+    # The scale of an icon is in units of 20 px; the margins of the panel take 60 px.
     layout.template_icon(icon_value=icon, scale=max(min((width - 60) / 20, 16), 6))
 
 

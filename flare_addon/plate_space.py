@@ -40,8 +40,11 @@ def configuration() -> Path | None:
 
 
 def command_args(scene: Any) -> list[object]:
-    """Return the options of a command that reads the capture's frames; none where the field is empty, which leaves it
-    to the capture and the files."""
+    """Return the options of a command that reads the capture's frames: the name in the field, and the configuration
+    that knows it unless Fit Flare does.
+
+    [] where the field is empty, which leaves the colour space to the capture and the files.
+    """
     name = scene.fit_flare.plate_space.strip()
     if not name:
         return []

@@ -60,7 +60,7 @@ def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str
     path_of: the file for a frame's number and a suffix (".exr", ".png"). The EXR is scene-linear, the PNG is as the
     scene's view transform shows it (see `set_plain_view`). done: called after each frame. Raises FrameError.
     """
-    if hasattr(scene.render, "compositor_device"):
+    if hasattr(scene.render, "compositor_device"):  # there may be no GPU
         scene.render.compositor_device = "CPU"
     for frame in frames:
         scene.frame_set(frame)
@@ -119,6 +119,7 @@ def save_blend(path: Path) -> None:
     try:
         with atomic_path(path) as temporary:
             try:
+                # The first save gives the file a place, to which paths can be relative; the second stores these paths.
                 bpy.ops.wm.save_as_mainfile(filepath=os.fspath(temporary))
                 for image in bpy.data.images:
                     if image.source == "SEQUENCE":

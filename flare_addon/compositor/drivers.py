@@ -27,6 +27,7 @@ _LIGHT_PATH = re.compile(r'fit_flare\.lights\[(?:(\d+)|"(.*)")\]\.intensity')
 def connect(scene: Any, gains: dict[str, int]) -> None:
     """Drive the node's inputs by the panel's sliders. gains: the index of the flare for each layer.
 
+    In the expressions, i is an intensity, t a channel of a tint, m a mute, s a solo, and n the number of solo flares.
     The layers must be baked without Intensity, Tint, Mute and Solo. A layer without a flare is shown as baked.
     """
     node = find_node(scene)
@@ -55,6 +56,7 @@ def connected_flares(scene: Any) -> dict[str, int]:
         layer = layer_of_gain(socket.name) if socket is not None else ""
         if match is None or not layer:
             continue
+        # Drivers of an earlier version have the name of the flare in place of the index.
         name = bpy.utils.unescape_identifier(match[2] or "")
         if match[1] or name in names:
             index_by_layer[layer] = int(match[1]) if match[1] else names.index(name)
@@ -167,7 +169,10 @@ def _count_solos(scene: Any, node: Any, numbers: Sequence[int]) -> tuple[Any, st
 
 
 def _drive(node: Any, name: str, index: int, expression: str, variables: dict[str, tuple[Any, str]]) -> None:
-    """Drive an input of the node, or a channel of it, by an expression of these variables."""
+    """Drive an input of the node by an expression.
+
+    index: channel of a colour, -1 for a number. variables: data block and path of the property that each one reads.
+    """
     if name not in node.inputs:  # it was renamed
         return
     driver = node.inputs[name].driver_add("default_value", index).driver

@@ -72,7 +72,7 @@ def _add_sockets(group: Any, inputs: Iterable[str]) -> None:
 
 
 def _add_nodes(group: Any, layers: Sequence[str]) -> None:
-    """Add the nodes that compute Flare and Image."""
+    """Add the nodes that compute Flare and Image: one row for each layer, the sums in row -1 to the right of them."""
     entry = new_node(group, "NodeGroupInput", 0, 0)
     sized = [scale_to_render_size(group, entry.outputs[name], 1, -row) for row, name in enumerate(layers, 1)]
     gained = [_mix(group, "MULTIPLY", scaled_layer.outputs[0], entry.outputs[gain_input(name)], 2, -row)
@@ -90,7 +90,10 @@ def _add_nodes(group: Any, layers: Sequence[str]) -> None:
 
 
 def _add_matte(group: Any, colour: Any, column: int) -> Any:
-    """Return a colour with alpha = max(R, G, B) clamped to 0..1, as in the baked layers (core/bake/layers.py)."""
+    """Add nodes that give a colour alpha = max(R, G, B), clamped to 0..1, as in the baked layers (core/bake/layers.py).
+
+    colour: output socket. Returns the output socket of the result.
+    """
     split = new_node(group, "CompositorNodeSeparateColor", column, -2)
     group.links.new(colour, split.inputs[0])
     red, green, blue = split.outputs[:3]
@@ -102,7 +105,7 @@ def _add_matte(group: Any, colour: Any, column: int) -> Any:
 
 
 def new_node(tree: Any, kind: str, column: float, row: float) -> Any:
-    """Add a node of that type at a position on a grid; return it."""
+    """Add a node of that type at a position on a grid; return it. Rows count upwards, as Blender's y does."""
     node = tree.nodes.new(kind)
     node.location = (220 * column, 220 * row)
     return node
@@ -132,6 +135,7 @@ def crop_to_frame(tree: Any, socket: Any, window: DataWindow, column: float, row
             node.inputs[name].default_value = value
     else:  # until 4.4
         node.use_crop_size = True
+        # Blender calls min_y Up and max_y Down.
         node.min_x, node.max_x, node.min_y, node.max_y = -left, width - left, bottom + height, bottom
     tree.links.new(socket, node.inputs["Image"])
     return node

@@ -50,15 +50,15 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     """Build the nodes that combine `layers`, or make existing ones show them; return the "Fit Flare" node.
 
     The flare goes over the baked scene by default. keep_image: it goes over the present input of the output (a render
-    or a plate). plate: it goes over footage, given as (image, frame_start, frame_offset, frame_duration). Other nodes
-    are not changed. Raises FrameError where the files hold no flare layers, and for a scene that renders a cropped
-    region.
+    or a plate). plate: it goes over footage, given as (image, frame_start, frame_offset, frame_duration). Inputs of an
+    existing node keep values, links and animation. Other nodes are not changed. Raises FrameError where the files hold
+    no flare layers, and for a scene that renders a cropped region.
     """
     if scene.render.use_border and scene.render.use_crop_to_border:
         raise FrameError(f"The scene {scene.name!r} renders a cropped region, which layers of whole frames do not fit; "
                          "switch Crop to Render Region off in its output properties.")
     original = tree_of(scene)
-    own_tree = _own_tree(scene)
+    own_tree = _own_tree(scene)  # the same one, or a copy of it
     if STATE_PROPERTY in scene and (own_tree is None or not any(map(_is_ours, own_tree.nodes))):
         del scene[STATE_PROPERTY]  # our nodes were deleted by hand, so the stored state is of another compositor
     state = _scene_state(scene)
@@ -88,6 +88,7 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
                if name in ("Intensity", "Tint") or layer_of_gain(name)}
     node.node_tree = node_group(names)
     new_indices = {socket.name: index for index, socket in enumerate(node.inputs)}
+    # Animated inputs keep their keys, whatever their index is now; keys on inputs that are gone are removed.
     fcurves.renumber(tree, f'nodes["{GROUP}"].inputs',
                      lambda old: new_indices.get(old_names[old]) if old < len(old_names) else old)
     for link in [link for socket in node.inputs for link in socket.links if socket.name != "Scene"]:
@@ -99,12 +100,13 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
                 tree.links.new(feeder, node.inputs[name])
     _remove_crops(tree)
     window = layers.window()
-    if not window.is_frame:
+    if not window.is_frame:  # the layers have overscan
         for row, name in enumerate(names if plate is not None or keep_image else ("scene", *names)):
             cropped = _set_name(crop_to_frame(tree, sockets[name], window, -3.2, -0.7 * row), f"{CROP} {name}")
             sockets[name] = cropped.outputs[0]
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
+    # before: the output socket of the artist's picture under the flare, to which `remove` connects the output again.
     end = _output_input(tree)
     before = _feeding_socket(end)
     is_set_up = before is not None and _depends_on(before.node, node)  # set up earlier, perhaps with nodes after it
@@ -166,7 +168,10 @@ def footage_nodes(scene: Any) -> list[Any]:
 
 
 def footage_behind_camera(scene: Any) -> tuple[Any, int, int, int]:
-    """Return the footage behind the scene's camera for `set_up`. Raises FrameError where there is none."""
+    """Return the footage behind the scene's camera: image, frame_start, frame_offset, frame_duration.
+
+    Raises FrameError where there is none.
+    """
     camera = scene.camera
     for background in camera.data.background_images if camera is not None and camera.type == "CAMERA" else ():
         if background.source == "IMAGE" and background.image is not None:
@@ -182,6 +187,7 @@ def show_plate(scene: Any) -> bool:
     """
     plate = footage_behind_camera(scene)
     tree, state = tree_of(scene), _scene_state(scene)
+    # The artist's nodes: a tree that is switched off (None, but stored), or one without any node of ours.
     if state["tree"] if tree is None else not any(map(_is_ours, tree.nodes)):
         return False
     if tree is None:
@@ -265,7 +271,7 @@ def _render_picture(tree: Any) -> Any:
 
 
 def _footage_node(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
-    """Return the node that shows the footage `plate`."""
+    """Return the node that shows footage. plate: image, frame_start, frame_offset, frame_duration."""
     node = tree.nodes.get(PLATE) or _set_name(new_node(tree, "CompositorNodeImage", -4, 2.5), PLATE)
     image, start, offset, duration = plate
     node.image = image
@@ -279,13 +285,21 @@ def _footage_node(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
 
 
 def _scene_state(scene: Any) -> dict[str, Any]:
-    """Return the compositor state of the scene and the file before the set-up."""
+    """Return the compositor state of the scene and the file before the set-up.
+
+    tree: whether there is a tree, also one that is switched off. use_nodes: whether it is on. viewer: whether the file
+    has the image of a Viewer node.
+    """
     viewer = any(image.type == "COMPOSITING" for image in bpy.data.images)  # Blender makes one for a Viewer node
     return {"tree": trees.has_tree(scene), "use_nodes": GROUPS_ARE_TREES or bool(scene.use_nodes), "viewer": viewer}
 
 
 def _tree_state(tree: Any) -> dict[str, Any]:
-    """Return the names of the nodes in a tree, and the socket that feeds its output."""
+    """Return what `remove` needs to know of a tree before the set-up.
+
+    nodes: names of the nodes, one a line. drivers: whether it has animation data. inputs: number of its inputs. from,
+    socket: node and socket that feed its output; "" for none.
+    """
     end = _output_input(tree, make=False)
     feeder = _feeding_socket(end)
     return {"nodes": "\n".join(node.name for node in tree.nodes if node.name not in (GROUP, LAYERS)),
@@ -310,6 +324,7 @@ def remove(scene: Any) -> None:
     state = dict(scene[STATE_PROPERTY]) if STATE_PROPERTY in scene else {**_scene_state(scene), **_tree_state(tree),
                                                                          "nodes": None}
     group, images = node.node_tree, [tree.nodes[name].image for name in (LAYERS, PLATE) if tree.nodes.get(name)]
+    # below: the output socket that takes the place of our node's.
     below = _image_under_flare(tree, node, state)
     if below is None and not state["tree"]:
         below = _render_picture(tree)
@@ -325,6 +340,7 @@ def remove(scene: Any) -> None:
         ours = tree.nodes.get(name)
         if ours is not None and not (name == RENDER and any(socket.is_linked for socket in ours.outputs)):
             tree.nodes.remove(ours)
+    # A tree that we made is discarded unless the artist added nodes; one of the artist loses the output that we added.
     if not state["tree"] and all(node.bl_idname in _ENDS or node.name == RENDER
                                  for node in tree.nodes):
         trees.discard_tree(scene, tree, bool(state["use_nodes"]))
@@ -377,7 +393,7 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
 
 
 def _output_input(tree: Any, make: bool = True) -> Any:
-    """Return the input socket of the final picture; without `make` None where there is none, else it is added."""
+    """Return the input socket of the final picture. Where there is none, add it, or with make=False return None."""
     outputs = sorted((node for node in tree.nodes if node.bl_idname == _OUTPUT_TYPE),
                      key=lambda node: not _is_active_output(tree, node))
     if not make:
@@ -431,7 +447,7 @@ def colour_space_warning(scene: Any) -> str:
 
 
 def _configured_space(image: Any) -> str:
-    """Return the name of an EXR's colour space in the colour configuration; "" where it has none."""
+    """Return the name of an EXR's colour space in the colour configuration; "" where it has none of the known names."""
     known = {item.identifier for item in image.colorspace_settings.bl_rna.properties["name"].enum_items}
     names = CONFIGURED_NAMES.get(exr_colour_space(absolute(image.filepath)), ())
     return next((name for name in names if name in known), "")

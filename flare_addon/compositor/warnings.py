@@ -60,5 +60,5 @@ def _active_strips(scene: Any) -> Any:
 
 
 def _loses_light(settings: Any) -> bool:
-    """Return whether the file format has alpha and no light where it is 0."""
+    """Return whether files of these settings have alpha, and cannot store light where it is 0, as an EXR can."""
     return settings.color_mode == "RGBA" and settings.file_format not in ("OPEN_EXR", "OPEN_EXR_MULTILAYER")

@@ -94,6 +94,7 @@ def _add_camera(context: Any) -> Any:
     if region is not None:
         camera.matrix_world = region.view_matrix.inverted()
     else:
+        # It looks at the origin along the world's +Y.
         camera.location, camera.rotation_euler = (0.0, -NEW_LIGHT_DISTANCE, 0.0), (1.5707963, 0.0, 0.0)
     scene.camera = camera
     return camera
@@ -142,7 +143,7 @@ def _add_light(scene: Any, camera: Any) -> Any:
     light.location = evaluated.matrix_world.translation + ray * distance
     light.fit_flare.is_placeholder = True
     scene.collection.objects.link(light)
-    depsgraph_of(scene)
+    depsgraph_of(scene)  # updates its matrix_world
     return light
 
 

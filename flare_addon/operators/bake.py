@@ -88,10 +88,11 @@ class FITFLARE_OT_cancel_bake(bpy.types.Operator):
 
 
 def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: bool, match: bool = False) -> None:
-    """Set the compositor up for the layers in a folder.
+    """Set the compositor up for the layers in a folder, and report warnings to the operator.
 
-    The flare goes over the baked scene, the compositor's present output (`keep_image`), or the footage behind the
-    camera (`plate`). match: set the frames and the size of the scene to the layers'. Raises FrameError.
+    folder: that of a bake or of one camera's layers, as the .blend stores it. The flare goes over the baked scene, the
+    compositor's present output (`keep_image`), or the footage behind the camera (`plate`). match: set the frames and
+    the size of the scene to the layers'. Raises FrameError.
     """
     layers = LayerFolder.open(shots.camera_folder(absolute(folder), scene.camera))
     setup.set_up(scene, layers, keep_image=keep_image, plate=setup.footage_behind_camera(scene) if plate else None)

@@ -159,7 +159,10 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         return self.execute(context)
 
     def _pick(self, context: bpy.types.Context, area: Any, event: Any) -> bool:
-        """Store the position of the mouse in the picture; return whether it is over the picture."""
+        """Store the position of the mouse in the picture; return whether it is over the picture.
+
+        area: the 3D view, as `invoke` turned it to the camera.
+        """
         under = [region for region in area.regions if 0 <= event.mouse_x - region.x < region.width
                  and 0 <= event.mouse_y - region.y < region.height]
         space = area.spaces.active
@@ -257,7 +260,7 @@ def _add_camera(scene: Any, name: str, image: Any, lens: float | None) -> Any:
     data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", SENSOR, lens or SENSOR
     camera = bpy.data.objects.new(name, data)
     scene.collection.objects.link(camera)
-    camera.rotation_euler = (1.5707963, 0, 0)
+    camera.rotation_euler = (1.5707963, 0, 0)  # looks along the world's +Y, with +Z up
     data.show_background_images = True
     background = data.background_images.new()
     background.image, background.alpha, background.frame_method = image, 1.0, "STRETCH"

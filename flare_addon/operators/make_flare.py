@@ -35,7 +35,7 @@ def _lens_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
 
 
 def _on_made(job: jobs.Job) -> None:
-    """Choose the new look in the panel Library."""
+    """Choose the new look in the panel Library, and offer it as an asset."""
     target = job.args[job.args.index("--out") + 1] if "--out" in job.args else ""
     number = next((item[-1] for item in library.items() if item[0] == target), None)
     if job.state == "done" and number is not None:

@@ -88,6 +88,7 @@ def _names_below(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
         shared += 1
     if not shared or not root.is_dir():
         return frames
+    # Names stay as they are where one of them leads to a picture, by its own name or another form of it.
     is_below = parts[0][0] not in ("/", "..")
     if is_below and any(root.joinpath(*each).exists() for each in parts):
         return frames
@@ -190,6 +191,7 @@ def _check_points(solve: CameraSolve) -> list[str]:
         local = points @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]
         before = local[:, 2] > 0
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            # Twice the field of view: room for distortion and for a principal point off centre.
             plane = np.abs(local[:, :2] / local[:, 2:])
             reach = np.array([frame.lens.width, frame.lens.height]) / np.array(frame.lens.focal)
         is_seen |= before & (plane <= reach).all(axis=1)

@@ -149,7 +149,7 @@ class Capture:
                 yield
             path = matched.files.get(frame.name)
             if path is None and need_frames and matched.files:
-                continue
+                continue  # left out; if no pose has a picture, the check of the first size says so
             path = path or safe_join(root, frame.name, CaptureError)
             size_of = checked_size if need_frames else size_or_model_size
             size = size_of(path, frame.lens, turned_by_name.get(frame.name))
@@ -447,8 +447,8 @@ class Capture:
         return {view.name for view in views.values() if view is not None}
 
     def _check_layer_sizes(self) -> Steps[None]:
-        """Check the sizes of removed/ and truth/, and that removed/ is complete: an incomplete one is an interrupted
-        run."""
+        """Check the sizes of removed/, truth/ and masks/, and that removed/ is complete: an incomplete one is an
+        interrupted run."""
         if self._removed and len(self._removed) < len(self.views):
             lacking = [view.name for view in self.views if view.name not in self._removed]
             raise CaptureError(f"{self.folder / 'removed'} lacks {len(lacking)} of {len(self.views)} frames, "
@@ -486,6 +486,7 @@ def _to_turned(posed: PosedFrame, path: Path | None) -> TurnedFrame | None:
 
 
 def _to_view(name: str, frame: PosedFrame, size: tuple[int, int], upright: bool) -> View:
+    """Return the view of a frame whose picture has this size; a lens without distortion becomes None."""
     lens = frame.lens
     fx, fy, cx, cy = lens.pinhole
     camera = Camera(lens.width, lens.height, fx, fy, cx, cy, frame.world_to_camera)

@@ -105,7 +105,7 @@ def read_model_in_steps(folder: Path) -> Steps[tuple[list[PosedFrame], PointClou
 def _indices(observed: NDArray[np.int64], known: NDArray[np.int64], order: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the indices of the ids `observed` among `known`, which `order` sorts; unknown ids are dropped."""
     if not len(known):
-        return order
+        return order  # empty as well
     places = order[np.searchsorted(known, observed, sorter=order).clip(max=len(known) - 1)]
     return np.unique(places[known[places] == observed])
 
@@ -166,7 +166,10 @@ def _file_path(folder: Path, name: str) -> Path:
 
 
 def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Steps[Any]:
-    """Read a part of a model by its binary or text reader, in steps; None without points3D. Raises CaptureError."""
+    """Read a part of a model by its binary or text reader, in steps; None without points3D. Raises CaptureError.
+
+    binary: takes a _ByteReader. text: takes the path and the lines.
+    """
     yield
     path = _file_path(folder, name)
     if not path.is_file():
@@ -228,7 +231,7 @@ class _ByteReader:
 def _read_cameras_bin(file: _ByteReader) -> dict[int, Lens]:
     """Return the lenses of a cameras.bin by camera number. Raises CaptureError."""
     lenses: dict[int, Lens] = {}
-    for _ in range(file.count(24)):
+    for _ in range(file.count(24)):  # bytes of a camera without its parameters
         camera, number, width, height = file.take("iiQQ")
         if number not in MODEL_NAMES:
             raise CaptureError(f"{file.path} has a camera of model {number}, which this program does not know; solve "
@@ -277,7 +280,7 @@ _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 def _read_images_bin(file: _ByteReader) -> list[Image]:
     """Read an images.bin. Raises CaptureError."""
     images: list[Image] = []
-    for _ in range(file.count(73)):
+    for _ in range(file.count(73)):  # bytes of an image without its name and observations
         values = file.take("idddddddi")
         name = file.name()
         count = file.count(_POINT2D.itemsize)
@@ -364,7 +367,11 @@ _TRACK_LENGTH = struct.Struct("<Q")
 
 
 def _read_points_bin(file: _ByteReader) -> Steps[Points]:
-    """Read a points3D.bin, in steps. Raises CaptureError."""
+    """Read a points3D.bin, in steps. Raises CaptureError.
+
+    Tracks make the points of different length, so the first pass finds where each starts. The second reads them in
+    blocks.
+    """
     number = file.count(_POINT.itemsize)
     data, at, last = file.data, file.at, len(file.data) - _POINT.itemsize
     starts = np.empty(number, np.int64)
@@ -400,7 +407,7 @@ def _read_points_txt(path: Path, lines: list[str]) -> Points:
                                "again.")
         values.append((x, y, z, error))
         rgb.append(colour)
-        numbers.append(point_id if abs(point_id) < 2**63 else 0)
+        numbers.append(point_id if abs(point_id) < 2**63 else 0)  # one beyond int64 loses its observations
     cloud = _to_cloud(path, np.array(values, np.float64).reshape(-1, 4), np.array(rgb, np.uint8).reshape(-1, 3))
     return cloud, np.array(numbers, np.int64)
 

@@ -14,8 +14,11 @@ from .orientation import TurnedFrame
 
 
 def checked_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:
-    """Return the size (width, height) of a frame's picture. Raises FrameError for another shape than the camera's, and
-    for a file of a kind that is not read."""
+    """Return the size (width, height) of a frame's picture, as it was solved. Raises FrameError for another shape than
+    the camera's, and for a file of a kind that is not read.
+
+    turned: the frame, if it was solved as its Exif orientation shows it; None for its stored pixels.
+    """
     size = turned.upright_size if turned else picture_size(path)
     if not same_aspect(size, (lens.width, lens.height)):
         raise FrameError(f"{path} is {size[0]} x {size[1]} pixels and its camera {lens.width} x {lens.height}, "

@@ -101,7 +101,7 @@ class Lens:
         target = np.asarray(pixels, np.float64).reshape(-1, 2)
         plane = (target - self.centre) / self.focal
         if self.model in _FISHEYES or self.model == "EQUIRECTANGULAR":  # the radius is an angle here
-            angle = np.minimum(np.linalg.norm(plane, axis=1, keepdims=True), 1.5)
+            angle = np.minimum(np.linalg.norm(plane, axis=1, keepdims=True), 1.5)  # below 90 degrees, for the tangent
             plane = plane * np.tan(angle) / np.maximum(angle, 1e-12)
         for _ in range(40):
             error = self.distort(plane) - target
@@ -136,6 +136,7 @@ class Lens:
         if self.model in PINHOLES:
             return fx, fy, cx, cy
         border = self.border - (cx, cy)
+        # A zoom is a factor on the focal length: the smallest whose view the frame covers is sought.
         zoom_cap = float(np.linalg.norm(border / (fx, fy), axis=1).max()) / MAX_TAN_HALF_ANGLE
         widest, narrowest = max(zoom_cap, 0.05), 20.0
         if not (fx > 0 and fy > 0) or not self._is_covered(border / (fx, fy) / narrowest):
@@ -144,7 +145,7 @@ class Lens:
         if self._is_covered(border / (fx, fy) / widest):
             zoom = widest
         elif self._is_covered(border / (fx, fy)) and not self._is_covered(border / (fx, fy) / 0.9999):
-            zoom = 1.0
+            zoom = 1.0  # exactly, where bisection would end beside it: the lens's own focal length
         else:
             low, high = widest, narrowest
             while high / low > 1 + 1e-7:
@@ -160,6 +161,7 @@ class Lens:
         """
         u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         plane = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
+        # OpenCV's pixel centres are whole numbers, this project's at +0.5.
         source = self.distort(plane) * (camera.width / self.width, camera.height / self.height) - 0.5
         source = source.reshape(camera.height, camera.width, 2).astype(np.float32)
         return np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
@@ -204,7 +206,11 @@ def undistort_picture(picture: Picture, maps: tuple[NDArray[np.float32], NDArray
 
 
 def _brown(x: Floats, y: Floats, p: Parameters, numerator: str, denominator: str = "") -> tuple[Floats, Floats]:
-    """Radial polynomial (coefficients `numerator` over `denominator`), tangential p1 p2, thin prism sx sy."""
+    """Distort coordinates by Brown and Conrady's terms: radial, tangential (p1, p2) and thin prism (sx, sy).
+
+    numerator, denominator: names of the coefficients of the radial quotient of polynomials; "" for no denominator. A
+    coefficient that the lens does not have is 0.
+    """
     r2 = x * x + y * y
     radial = _series(r2, [p.get(name, 0.0) for name in numerator.split()])
     if denominator:

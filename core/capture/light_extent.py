@@ -146,7 +146,10 @@ class LightExtent:
         return min(CELLS, len(self.points)) if self.factors is None else len(self.points)
 
     def transformed(self, matrix: ArrayLike) -> LightExtent:
-        """Return the extent under a linear map (3, 3), such as the rotation and scale of another world."""
+        """Return the extent under a linear map (3, 3), such as the rotation and scale of another world.
+
+        A sphere stays one: its radius grows by the map's mean scale.
+        """
         linear = np.asarray(matrix, np.float64)
         scale = abs(float(np.linalg.det(linear))) ** (1 / 3)
         return LightExtent(self.shape, self.axes @ linear.T, self.radius * scale, self.points @ linear.T,
@@ -157,7 +160,7 @@ class LightExtent:
         centre, pose = np.asarray(xyz, np.float64), np.asarray(world_to_camera, np.float64)
         eye = -pose[:3, :3].T @ pose[:3, 3]
         if self.shape == "points":
-            numbers = np.arange(len(self.points))
+            numbers = np.arange(len(self.points))  # neighbours are beside each other: cells are runs of points
             return SampledExtent(centre + self.points, numbers * self.cell_count // len(numbers), 1.0, self.factors)
         axes, emission = self.axes, 1.0
         if self.shape == "sphere":
@@ -207,11 +210,12 @@ def sample_surface(vertices: ArrayLike, triangles: ArrayLike, count: int = SAMPL
         raise ValueError("the surface of the light has no area")
     order = _spatial_order((a + b + c) / 3)
     edges = np.cumsum(areas[order])
+    # Equal steps of area choose the triangles, in an order in which neighbours are near each other.
     numbers = np.arange(count)
     rows = np.searchsorted(edges, (numbers + 0.5) / count * edges[-1], side="right")
     chosen = order[np.minimum(rows, len(order) - 1)]
     u, v = _radical_inverse(numbers + 1, 2), _radical_inverse(numbers + 1, 3)
-    root = np.sqrt(u)
+    root = np.sqrt(u)  # uniform over a triangle (Osada et al. 2002)
     barycentric = np.stack([1 - root, root * (1 - v), root * v], -1)[:, :, None]
     at_rest = (barycentric * rest[indices[chosen]]).sum(1)
     return np.asarray((barycentric * places[indices[chosen]]).sum(1)[_spatial_order(at_rest)], np.float64)
@@ -241,7 +245,10 @@ def _spatial_order(places: Floats) -> NDArray[np.int64]:
 
 
 def _columns(aspect: float) -> int:
-    """Return the number of cells along the first axis, so that cells are about as wide as high."""
+    """Return the number of cells along the first axis, so that cells are about as wide as high.
+
+    It is the power of two next to sqrt(CELLS aspect), from 1 to CELLS. aspect: width of the extent over its height.
+    """
     bits = round(math.log2(CELLS))
     return int(2 ** min(max(round((bits + math.log2(max(aspect, 1e-12))) / 2), 0), bits))
 

@@ -240,6 +240,7 @@ class LightPath:
             return constant, 1.0 if key is None else key.confidence, False
         if key is not None and key.place is not None:
             return key.place, key.confidence, False
+        # Between the entries before and after; beyond the ends both are the nearest entry.
         times = np.array([time for time, _ in self._places])
         after = int(np.searchsorted(times, self._times[name]))
         ends = [self._keys[self._places[min(max(index, 0), len(times) - 1)][1]] for index in (after - 1, after)]

@@ -133,6 +133,7 @@ def _read_chan(path: Path, text: str) -> NukeCamera:
 
 
 def _read_script(path: Path, text: str) -> NukeCamera:
+    """Return the one camera in the text of a script, or its one animated camera. Raises CaptureError."""
     nodes = [_Node(path, words[1]) for words in _commands(text)
              if len(words) > 1 and _CAMERA_NODE.fullmatch(words[0])]
     nodes = [node for node in nodes if node.is_animated] or nodes
@@ -190,6 +191,7 @@ class _Node:
                                    [_at(curve, number) for curve in rotation], order) for number in numbers}
         if not poses:
             raise self._problem("its curves have no frame in common")
+        # An aperture of 0 gives NaN, which `read_nuke_camera` refuses.
         return NukeCamera(poses, {number: _at(focal, number) / (_at(aperture, number) or math.nan) for number in poses})
 
     def _one(self, name: str, default: float) -> Curve:
@@ -234,7 +236,7 @@ class _Node:
 def _pose(translation: Sequence[float], degrees: Sequence[float], order: str) -> Floats:
     """Return camera to world (4, 4); the rotations are about the axes of `order`, the first one first."""
     pose = np.eye(4)
-    for axis in order:
+    for axis in order:  # each turns from the axis after it to the next one: y to z about x
         index = "XYZ".index(axis)
         first, second = (index + 1) % 3, (index + 2) % 3
         angle = math.radians(degrees[index])

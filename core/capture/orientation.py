@@ -97,7 +97,11 @@ def _compare_colours(frames: Sequence[TurnedFrame], points: PointCloud) -> bool 
 
 
 def _colour_error(picture: Pixels, posed: PosedFrame, points: PointCloud) -> float | None:
-    """Return the median difference between the points' colours and the picture at their images; None for few points."""
+    """Return the median difference between the points' colours and the picture at their images; None for few points.
+
+    picture: (height, width, 3), display values 0..1, of any size. Points that the frame observed are compared; without
+    enough of them all points.
+    """
     chosen = posed.points if len(posed.points) >= MIN_POINTS else np.arange(len(points))
     chosen = chosen[::max(len(chosen) // SAMPLED_POINTS, 1)]
     local = points.xyz[chosen] @ posed.world_to_camera[:3, :3].T + posed.world_to_camera[:3, 3]

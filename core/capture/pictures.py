@@ -35,7 +35,7 @@ def read_mask(path: Path) -> Picture:
 
 
 class PictureCache:
-    """Decoded, undistorted, resized pictures; evicts the least recently used above its capacity."""
+    """Decoded, undistorted, resized pictures; evicts the least recently used above its capacity, `room` bytes."""
 
     def __init__(self, room: int) -> None:
         self._capacity = room
@@ -75,7 +75,10 @@ class PictureCache:
                 self._used -= old.pixels.nbytes
 
     def undistorted(self, picture: Picture, view: View, path: Path) -> Picture:
-        """Undistort a picture of a view's file, whose lens is distorted. Raises FrameError."""
+        """Undistort a picture of a view's file, whose lens is distorted. Raises FrameError.
+
+        The maps of the last four lenses and sizes are kept: the frames of a capture share few.
+        """
         assert view.lens is not None
         if not same_aspect(picture.size, view.camera.size):
             raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "

@@ -293,6 +293,7 @@ def _similarity(model: Sequence[PosedFrame], frames: Sequence[PosedFrame]) -> Fl
              if (name := PurePosixPath(canonical_name(frame.name)).name) in model_frames]
     if len(pairs) < 3:
         return None
+    # Each pair gives the rotation between the worlds; the nearest rotation to their mean is taken.
     rotations = np.array([in_file.world_to_camera[:3, :3].T @ in_model.world_to_camera[:3, :3]
                           for in_model, in_file in pairs])
     left, _, right = np.linalg.svd(rotations.mean(axis=0))
@@ -302,6 +303,7 @@ def _similarity(model: Sequence[PosedFrame], frames: Sequence[PosedFrame]) -> Fl
         for side in zip(*pairs, strict=True))
     model_mean, file_mean = model_centres.mean(axis=0), file_centres.mean(axis=0)
     centred, target_centred = (model_centres - model_mean) @ rotation.T, file_centres - file_mean
+    # Sums of squares: the scale is that of least squares, and the mismatch is compared as a square.
     extent, size = float(np.square(centred).sum()), float(np.square(target_centred).sum())
     scale = float((centred * target_centred).sum()) / extent if extent > 0 else 0.0
     if scale <= 0 or np.square(scale * centred - target_centred).sum() > MAX_MISMATCH**2 * size:

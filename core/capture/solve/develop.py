@@ -49,6 +49,7 @@ def write_capture(sources: Sequence[SourceFrame], solved: Solved, out: Path, wor
         written.append(ObservedFrame(names[frame.index], lens, frame.world_to_camera, pixels[valid],
                                      frame.points[valid]))
         progress.advance()
+    # Errors are in pixels of the small pictures; the model has them in pixels of the frames.
     scale = sum(frame.lens.width for frame in written) / sum(frame.lens.width for frame in solved.frames)
     model = solved.model
     cloud = PointCloud(model.xyz.astype(np.float32), model.rgb, (model.error * scale).astype(np.float32))
@@ -84,6 +85,7 @@ def _write_frame(source: SourceFrame, frame: SolvedFrame, camera: Camera, target
         return
     file = Path(source.file)
     is_distorted = frame.lens.max_distortion_px >= MIN_DISTORTION_PX
+    # A frame that needs no change is copied, not encoded again.
     if (not is_distorted and camera.size == (source.width, source.height) and source.orientation == 1
             and not source.space
             and file.suffix.lower() == target.suffix):

@@ -125,7 +125,10 @@ def _solve(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, settings: 
 
 @contextlib.contextmanager
 def _report_library_errors(work: Path, progress: Progress) -> Iterator[None]:
-    """Raise CaptureError in place of what pycolmap raises, which is RuntimeError or ValueError with a line of C++."""
+    """Raise CaptureError in place of what pycolmap raises, which is RuntimeError or ValueError with a line of C++.
+
+    Errors of Python code and lack of memory pass unchanged.
+    """
     try:
         yield
     except (RuntimeError, ValueError) as problem:
@@ -176,7 +179,7 @@ def load_pycolmap() -> Any:
 
 
 def _check_frames_differ(sources: Sequence[SourceFrame], work: Path) -> None:
-    """Raise CaptureError where every frame shows the same."""
+    """Raise CaptureError where every frame shows the same: no pixel of a thumbnail differs by more than 3 of 255."""
     import cv2
 
     first: Any = None
@@ -220,7 +223,7 @@ def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path,
         reader.existing_camera_id = camera_id
         # Walls and skies: weak features are better than none.
         options.sift.peak_threshold = 0.4 * default_threshold if has_little_texture else default_threshold
-        for start in range(0, len(names), 8):
+        for start in range(0, len(names), 8):  # in batches: a stop waits for one of them
             pycolmap.extract_features(database, work / "small", image_names=names[start:start + 8],
                                       camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
                                       extraction_options=options, device=pycolmap.Device.cpu)
@@ -267,7 +270,7 @@ def _match_frames(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, dat
     verification.ransac.random_seed = settings.seed
     listing = pycolmap.ImportedPairingOptions()
     listing.match_list_path = str(work / "pairs.txt")
-    for at in range(0, len(missing_pairs), 100):
+    for at in range(0, len(missing_pairs), 100):  # in batches: a stop waits for one of them
         batch = missing_pairs[at:at + 100]
         write_text(work / "pairs.txt", "".join(f"{sources[i].name} {sources[j].name}\n" for i, j in batch))
         pycolmap.match_image_pairs(database, matching_options=options, pairing_options=listing,
@@ -278,7 +281,7 @@ def _match_frames(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, dat
 
 def _run_mapper(pycolmap: Any, work: Path, database: Path, frames: int, settings: SolveSettings,
                 progress: Progress) -> list[Any]:
-    """Run incremental mapping; returns all models, of this run or an earlier one."""
+    """Run incremental mapping; returns all models, of this run or an earlier one. frames: number of frames."""
     finished = _model_folders(work)
     if finished is not None:
         return [pycolmap.Reconstruction(str(model)) for model in finished]
@@ -365,7 +368,8 @@ def _refine_principal_point(pycolmap: Any, model: Any) -> Any:
 def _check_parallax(pycolmap: Any, database: Path, size: int) -> None:
     """Raise CaptureError where matched features show that depth cannot be measured.
 
-    Mapping would take long and might return a wrong model.
+    Mapping would take long and might return a wrong model. At least 2 % of the pairs of frames must have parallax.
+    size: long side of the small pictures, for the message.
     """
     configuration = pycolmap.TwoViewGeometryConfiguration
     without_parallax = (configuration.PLANAR_OR_PANORAMIC, configuration.PANORAMIC)
@@ -391,7 +395,7 @@ def _check_parallax(pycolmap: Any, database: Path, size: int) -> None:
 
 
 def _to_model(reconstruction: Any, names: dict[str, int]) -> Model:
-    """Convert pycolmap's reconstruction to plain arrays."""
+    """Convert pycolmap's reconstruction to plain arrays. names: index of each source frame by its name."""
     ids = sorted(reconstruction.points3D)
     index = {point: i for i, point in enumerate(ids)}
     points = [reconstruction.points3D[i] for i in ids]

@@ -36,12 +36,14 @@ def choose_pairs(matching: Matching, frames: int, descriptors: Callable[[int], N
                  seed: int = 0) -> list[tuple[int, int]]:
     """Return pairs (i, j), i < j, of frame indices.
 
-    `descriptors(i)` gives the SIFT descriptors (n, 128) of a frame; called only where needed.
+    "sequential" pairs each frame with its neighbours and, to close loops, with the 5 most similar frames farther away.
+    "similar" pairs it with the 24 most similar frames, and with the next two, as many folders are in the order of
+    filming. `descriptors(i)` gives the SIFT descriptors (n, 128) of a frame; called only where needed.
     """
     if matching == "exhaustive":
         pairs = {(i, j) for i in range(frames) for j in range(i + 1, frames)}
     else:
-        neighbours = {*range(1, SEQUENCE_OVERLAP + 1), *(2 ** k for k in range(4, 7))}
+        neighbours = {*range(1, SEQUENCE_OVERLAP + 1), *(2 ** k for k in range(4, 7))}  # 1 to 8, 16, 32, 64
         steps = neighbours if matching == "sequential" else {1, 2}
         pairs = {(i, i + step) for i in range(frames) for step in steps if i + step < frames}
         if frames > 2 * SEQUENCE_OVERLAP:
@@ -60,7 +62,11 @@ def most_similar(similarity: NDArray[Any], number: int, min_distance: int) -> se
 
 
 def similarity(descriptors: Callable[[int], NDArray[np.uint8]], frames: int, seed: int = 0) -> NDArray[np.float32]:
-    """(frames, frames) cosine of the frames' VLAD vectors."""
+    """(frames, frames) cosine of the frames' VLAD vectors.
+
+    The vocabulary is learned from a sample of all descriptors. A frame without descriptors is similar to none. With too
+    few descriptors for a vocabulary, each frame is similar to itself alone.
+    """
     rng = np.random.default_rng(seed)
     sample = np.concatenate([_random_rows(descriptors(i), 200, rng) for i in range(frames)]).astype(np.float32)
     if len(sample) < VOCABULARY_SIZE:
@@ -73,6 +79,7 @@ def similarity(descriptors: Callable[[int], NDArray[np.uint8]], frames: int, see
             continue
         nearest = _nearest_centre(rows, vocabulary)
         summed = _sum_by_group(rows - vocabulary[nearest], nearest, VOCABULARY_SIZE)
+        # Each word counts alike, so that a repeated texture does not outweigh the rest.
         summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-9)
         vectors[i] = summed.ravel() / max(float(np.linalg.norm(summed)), 1e-9)
     return np.asarray(vectors @ vectors.T)
@@ -83,6 +90,7 @@ def _random_rows(rows: NDArray[Any], number: int, rng: np.random.Generator) -> N
 
 
 def _nearest_centre(rows: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Return (n,), the index of the centre nearest to each row: |r - c|² without |r|², times -1/2."""
     return np.argmax(rows @ centres.T - 0.5 * (centres ** 2).sum(axis=1), axis=1)
 
 
@@ -92,6 +100,7 @@ def _sum_by_group(rows: NDArray[np.float32], group: NDArray[np.intp], groups: in
 
 
 def _k_means(rows: NDArray[np.float32], words: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return centres (words, d) of rows (n, d) by 12 rounds of Lloyd's algorithm; one without rows stays in place."""
     centres = _random_rows(rows, words, rng).copy()
     for _ in range(12):
         nearest = _nearest_centre(rows, centres)

@@ -20,7 +20,11 @@ INK, PATH, PAPER = (0.15, 0.15, 0.15), (0.85, 0.2, 0.1), 1.0
 
 def make_report(sources: Sequence[SourceFrame], solved: Solved, left_out: list[str], request: dict[str, Any],
                 seconds: float) -> dict[str, Any]:
-    """Return the report, JSON-able. Errors are in pixels of the small pictures."""
+    """Return the report, JSON-able. Errors are in pixels of the small pictures.
+
+    left_out: sentences about frames that were not used. request: source and settings of the solve, by which a later run
+    recognises it.
+    """
     registered = {frame.index for frame in solved.frames}
     model = solved.model
     lenses = list(dict.fromkeys(frame.lens for frame in solved.frames))
@@ -38,14 +42,19 @@ def make_report(sources: Sequence[SourceFrame], solved: Solved, left_out: list[s
 
 
 def draw_model(solved: Solved, path: Path) -> None:
-    """Draw points in their colours, cameras as wedges, and their path, from above and from the front."""
+    """Draw points in their colours, cameras as dots with a line ahead, and their path, from above and from the front.
+
+    The world is aligned: x to the right, y ahead, z up.
+    """
     import cv2
 
     model = solved.model
     positions = np.array([-frame.world_to_camera[:3, :3].T @ frame.world_to_camera[:3, 3] for frame in solved.frames])
     ahead = np.array([frame.world_to_camera[2, :3] for frame in solved.frames])
+    # Points in two views only are inaccurate; a few points are all drawn.
     good = model.tracks >= 3 if (model.tracks >= 3).sum() > 50 else np.ones(len(model.xyz), bool)
     xyz, rgb = model.xyz[good], model.rgb[good]
+    # The pictures hold all cameras and most points, with a margin of a tenth.
     low, high = np.percentile(xyz, (2, 98), axis=0)
     low, high = np.minimum(low, positions.min(axis=0)), np.maximum(high, positions.max(axis=0))
     middle, reach = (low + high) / 2, 0.55 * float((high - low).max())
@@ -54,6 +63,7 @@ def draw_model(solved: Solved, path: Path) -> None:
         panel = np.full((PANEL, PANEL, 3), PAPER, np.float32)
 
         def place(points: Floats, axes: tuple[int, int] = axes) -> Any:
+            """Return the pixels (n, 2) of points (n, 3) on the panel."""
             flat = (points[:, axes] - middle[list(axes)]) / reach * (1, -1)
             return (0.5 * PANEL * (1 + flat)).round().astype(int)
 

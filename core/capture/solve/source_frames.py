@@ -102,8 +102,9 @@ def prepare_frames(source: Path, work: Path, number: int, size: int,
                    ) -> tuple[list[SourceFrame], list[str]]:
     """Choose frames and write small pictures and masks of them below `work`.
 
-    `number`: how many (0: all of a folder, 150 of a video); `size`: long side of the small pictures. Returns the
-    frames, in order, and sentences about those left out. The record of an earlier run is used as it stands. Raises
+    `number`: how many (0: all of a folder, 150 of a video); `size`: long side of the small pictures; `space`: name of
+    the colour space of the frames, "" for what they declare, and its OpenColorIO configuration. Returns the frames, in
+    order, and sentences about those left out. The record of an earlier run is used as it stands. Raises
     CaptureError where there are too few frames, FrameError for a video that cannot be read.
     """
     earlier = read_record(work)
@@ -165,7 +166,7 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
             try:
                 scores.append(sharpness(read_picture(file, space=named, over_black=True).display().mean(axis=2)))
             except FrameError:
-                scores.append(-1.0)
+                scores.append(-1.0)  # chosen only where its stretch has no other; it is then left out
             progress.advance()
         files = [files[i] for i in choose_sharpest(scores, number)]
     progress.stage("read frames", len(files))
@@ -226,7 +227,8 @@ def _from_video(source: Path, work: Path, number: int, size: int,
 def _write_small(picture: Picture, aspect: float, work: Path, name: str, size: int) -> None:
     """Write the small picture and its mask, with square pixels.
 
-    A solve has one focal length; `develop` stretches its camera to the frame's pixels.
+    aspect: pixel aspect ratio of the picture. size: long side of the small one, which is never enlarged. A solve has
+    one focal length; `develop` stretches its camera to the frame's pixels.
     """
     wide = picture.size[0] * aspect
     scale = min(1.0, size / max(wide, picture.size[1]))

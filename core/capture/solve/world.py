@@ -32,7 +32,10 @@ def up_direction(rotations: Sequence[Floats]) -> Floats:
 
 
 def align(model: Model) -> None:
-    """Rotate, scale and shift the model in place."""
+    """Rotate, scale and shift the model in place: +z is up, and the cameras' mean heading is +y.
+
+    The points' median is then at x = y = 0. Their lowest 2 % are below z = 0: outliers below the floor.
+    """
     up = up_direction([frame.world_to_camera[:3, :3] for frame in model.frames])
     ahead = np.mean([frame.world_to_camera[2, :3] for frame in model.frames], axis=0)
     ahead = ahead - (ahead @ up) * up

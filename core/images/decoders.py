@@ -55,6 +55,7 @@ _PACKAGES = {"OpenImageIO": ("OpenImageIO", "engine"), "pillow_heif": ("pillow-h
 """Package and dependency group of each module."""
 _DPX_TRANSFERS = {"linear": "linear", "printing density": "cineon", "logarithmic": "cineon", "kodaklog": "cineon",
                   "adx": "cineon"}
+"""Names of colour spaces by OpenImageIO's names of the transfer of a DPX."""
 
 
 class Description(NamedTuple):
@@ -84,7 +85,7 @@ def describe(path: Path, kind: Kind) -> Description:
     if kind == "raw":
         with _open_raw(path) as raw:
             sizes = raw.sizes
-            turned = sizes.flip in (5, 6)
+            turned = sizes.flip in (5, 6)  # LibRaw's numbers of the quarter turns, which `_decode_raw` applies
             width, height = (sizes.height, sizes.width) if turned else (sizes.width, sizes.height)
             return Description(width, height, colour_space("linear"))
     with _open_by_pillow(path, kind) as picture:
@@ -96,9 +97,10 @@ def describe(path: Path, kind: Kind) -> Description:
             if _avif_orientation(picture) in SWAPS_SIDES:
                 width, height = height, width
             if not profile and (frame := _av1_frame(path)) is not None:
-                points = int(frame.raw.color_primaries), int(frame.raw.color_trc)
+                points = int(frame.raw.color_primaries), int(frame.raw.color_trc)  # Pillow does not give them
         space = profile_space(path, profile) or (space_of_code_points(*points) if points else None)
         exif, xmp = (bytes(picture.info.get(name) or b"") for name in ("exif", "xmp"))
+        # Orientation 1: `decode_foreign` turns these formats upright.
         return Description(width, height, space, 1, profile, points, exif.removeprefix(b"Exif\0\0"), xmp)
 
 
@@ -121,7 +123,7 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
         orientation = _avif_orientation(picture) if kind == "avif" else 1
         frame = _av1_frame(path) if kind == "avif" and picture.mode == "RGB" else None
         if frame is not None and frame.colour.bits > 8 and (frame.raw.width, frame.raw.height) == picture.size:
-            return _bgr(apply_orientation(frame.stored_codes(), orientation))
+            return _bgr(apply_orientation(frame.stored_codes(), orientation))  # Pillow would round to 8 bits
         is_transparent = picture.has_transparency_data
         mode = "RGBA" if is_transparent else picture.mode if picture.mode in ("L", "RGB") else "RGB"
         try:
@@ -154,20 +156,21 @@ def _avif_orientation(picture: Any) -> int:
 
 
 def profile_space(path: Path, profile: bytes) -> ColourSpace | None:
-    """Return the space of a file's ICC profile, None for none. Raises FrameError for one that cannot be honoured."""
+    """Return the space of a file's ICC profile; None for an empty or damaged one. Raises FrameError for an intact one
+    that cannot be honoured."""
     if not profile:
         return None
     try:
         return space_of_profile(profile)
     except UnreadableProfile as problem:
         if "damaged" in str(problem):
-            return None  # as viewers do
+            return None  # viewers ignore it likewise
         raise FrameError(f"{path} has a colour profile that {problem}; convert it to sRGB, or name its space with "
                          "--plate-space.") from problem
 
 
 def _bgr(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Return R G B (A) as B G R (A), grey as (height, width), grey with alpha as four channels."""
+    """Return R G B (A) as B G R (A), grey as (height, width), grey with alpha as three equal channels and alpha."""
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         return np.ascontiguousarray(pixels[..., 0])
     if pixels.ndim == 2:
@@ -195,7 +198,7 @@ def open_oiio(path: Path) -> Any:
     oiio = _library("OpenImageIO", path)
     check_regular(path)
     _check_stated_size(path)
-    oiio.attribute("limits:imagesize_MB", 8192)
+    oiio.attribute("limits:imagesize_MB", 8192)  # MAX_PIXELS of four floats
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
     opened = oiio.ImageInput.open(str(path), settings)
@@ -246,12 +249,15 @@ def _check_stated_size(path: Path) -> None:
         return
     order: Literal["big", "little"] = "big" if head[:4] in _STATED_SIZES else "little"
     stated, user_data = (int.from_bytes(head[at:at + 4], order) for at in place)
-    if size < stated < 0xFFFFFFFF or size < user_data < 0xFFFFFFFF:
+    if size < stated < 0xFFFFFFFF or size < user_data < 0xFFFFFFFF:  # all bits set: not stated
         raise _damaged(path, f"it has {size} of {max(stated, user_data)} bytes")
 
 
 def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
-    """Raise FrameError for a file that cannot hold the pixels that its header claims: their memory may be gigabytes."""
+    """Raise FrameError for a file that cannot hold the pixels that its header claims: their memory may be gigabytes.
+
+    Only formats without compression, or of runs of equal pixels, have a bound; others pass.
+    """
     size = path.stat().st_size
     bits = spec.get_int_attribute("oiio:BitsPerSample", 0) or 8 * spec.format.size()
     claimed = spec.width * spec.height * spec.nchannels * bits // 8
@@ -266,7 +272,8 @@ def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
 
 
 def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
-    """Decode a file with OpenImageIO; see `decode_foreign`. Raises FrameError."""
+    """Decode a file with OpenImageIO; see `decode_foreign`. Of more than four channels, the colours are kept, and alpha
+    where it is the fourth. Raises FrameError."""
     opened = open_oiio(path)
     try:
         spec = opened.spec()
@@ -274,6 +281,7 @@ def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
         if kind == "psd" and spec.get_string_attribute("psd:ColorMode") in ("CMYK", "Lab", "Multichannel"):
             raise FrameError(f"{path} is in {spec.get_string_attribute('psd:ColorMode')} colours; convert it to RGB.")
         if kind == "tiff" and spec.get_int_attribute("tiff:PhotometricInterpretation", 2) not in (0, 1, 2, 3, 6):
+            # Read are 0 or 1 for white, R G B, palettes, and Y Cb Cr.
             raise FrameError(f"{path} is in colours for print or measurement (CMYK or Lab); convert it to RGB.")
         if channels > 4:
             channels = 4 if spec.alpha_channel == 3 else 3
@@ -359,7 +367,8 @@ def _open_raw(path: Path) -> Any:
 
 
 def _decode_raw(path: Path) -> NDArray[Any]:
-    """Develop a raw file to 16 bit scene-linear Rec. 709, with the camera's white balance, unclipped highlights off."""
+    """Develop a raw file upright to 16 bit scene-linear Rec. 709, B G R, with the camera's white balance and without
+    automatic brightening; highlights are clipped at white."""
     library = _library("rawpy", path)
     with _open_raw(path) as raw:
         try:

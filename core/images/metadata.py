@@ -63,13 +63,16 @@ _EXTENDED_CLAIMS = ("http://ns.google.com/photos/1.0/depthmap/", "http://ns.adob
 
 
 def copy_metadata(encoded: bytes, source: Path, *, has_alpha: bool) -> bytes:
-    """Return an encoded PNG, JPEG or TIFF with the metadata of `source`, if that has the same format."""
+    """Return an encoded PNG, JPEG or TIFF with the metadata of `source`, if that has the same format; else unchanged.
+
+    has_alpha: whether the encoded picture has alpha.
+    """
     data = read_bytes(source)
     if encoded[:2] == b"\xff\xd8" == data[:2]:
         return _copy_to_jpeg(encoded, data)
     if encoded[:8] == png.SIGNATURE == data[:8]:
         was_grey, is_grey = (not header[_COLOUR_TYPE_OFFSET] & 2 for header in (data, encoded))
-        left_out = (b"iCCP",) if was_grey != is_grey else ()
+        left_out = (b"iCCP",) if was_grey != is_grey else ()  # a profile is for grey or for R G B
         chunks = b"".join(png.make_chunk(name, without_thumbnail(content) if name == png.EXIF else content)
                           for name, content in png.chunks(io.BytesIO(data), KEPT_CHUNKS) if name not in left_out)
         return encoded[:_HEADER_END] + chunks + encoded[_HEADER_END:]
@@ -86,9 +89,10 @@ def with_colour_chunks(encoded: bytes, profile: bytes, code_points: tuple[int, i
     """
     is_colour = encoded[_COLOUR_TYPE_OFFSET] & 2 > 0
     if profile and is_colour == (profile[16:20] == b"RGB "):
+        # Its name, the number of the compression, and the compressed profile.
         chunk = png.make_chunk(b"iCCP", b"profile\0\0" + zlib.compress(profile))
     elif code_points and code_points != _SRGB_POINTS and _UNSPECIFIED not in code_points:
-        chunk = png.make_chunk(b"cICP", bytes((*code_points, 0, 1)))
+        chunk = png.make_chunk(b"cICP", bytes((*code_points, 0, 1)))  # matrix R G B, full range
     else:
         return encoded
     return encoded[:_HEADER_END] + chunk + encoded[_HEADER_END:]
@@ -96,9 +100,10 @@ def with_colour_chunks(encoded: bytes, profile: bytes, code_points: tuple[int, i
 
 def with_description(encoded: bytes, exif: bytes, xmp: bytes) -> bytes:
     """Return an encoded PNG with the Exif block and the XMP of the picture of another format that it was made from;
-    without the claims of what the PNG does not hold."""
+    without the claims of what the PNG does not hold. exif, xmp: empty for none."""
     chunks = png.make_chunk(png.EXIF, without_thumbnail(exif)) if exif else b""
     if packet := _without_claims(jpeg.XMP + xmp).removeprefix(jpeg.XMP) if xmp else b"":
+        # The zeros: end of the keyword, not compressed, no method, no language, no translation of the keyword.
         chunks += png.make_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + packet)
     return encoded[:_HEADER_END] + chunks + encoded[_HEADER_END:]
 
@@ -136,7 +141,7 @@ def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
     copied = []
     for marker, content in _without_resource_thumbnails(segments):
         if marker == jpeg.APP0 and content.startswith(b"JFIF\0") and len(content) >= 14:
-            header = jpeg.make_segment(marker, content[:12] + b"\0\0")  # density, without its thumbnail
+            header = jpeg.make_segment(marker, content[:12] + b"\0\0")  # density, and a thumbnail of 0 x 0
         elif has_refocus_original and content.startswith(jpeg.EXTENDED_XMP):
             continue  # it holds that original, which shows the flare
         elif marker in _MARKERS and not content.startswith((_INDEX, _ISO_GAIN_MAP)):
@@ -163,24 +168,28 @@ def _without_resource_thumbnails(segments: list[tuple[int, bytes]]) -> list[tupl
 
 
 def _has_claims(segment: bytes) -> bool:
+    """True if an XMP segment claims that the file holds more than its first picture."""
     return any(name.encode() in segment for name in _CLAIMS) or (
         _CAMERA.encode() in segment and any(name.encode() in segment for name in _CAMERA_CLAIMS))
 
 
 def _without_claims(segment: bytes) -> bytes:
-    """Return an XMP segment without thumbnails, and without the properties by which it claims parts that are not kept;
-    empty where it cannot be parsed."""
+    """Return an XMP segment without thumbnails, and without the properties by which it claims parts that are not kept.
+
+    One without any stays byte for byte; one with some that cannot be parsed is left out (empty).
+    """
     if not _has_claims(segment) and _THUMBNAILS.encode() not in segment:
         return segment
     text = segment[len(jpeg.XMP):].rstrip(b"\0 \n")
     try:
         for _, (prefix, address) in ElementTree.iterparse(io.BytesIO(text), ("start-ns",)):
-            if not prefix.startswith("ns"):
+            if not prefix.startswith("ns"):  # ElementTree writes registered prefixes, and reserves ns0, ns1, ...
                 ElementTree.register_namespace(prefix, address)
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError):
         return b""
     names = (*_CLAIMS, *_EXTENDED_CLAIMS) if _ORIGINAL.encode() in segment else _CLAIMS
+    # ElementTree names a property "{name space}name".
     claims = (*(f"{{{name}" for name in names), *(f"{{{_CAMERA}}}{name}" for name in _CAMERA_CLAIMS),
               "{http://ns.adobe.com/xap/1.0/}Thumbnails")
     for element in root.iter():
@@ -196,7 +205,7 @@ def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
     every = _AllBut(_STRUCTURE_TAGS)
     tags = tiff.read_tags(io.BytesIO(data), every)
     directories = {number: tags.pop(number) for number in (EXIF_DIRECTORY, GPS_DIRECTORY) if number in tags}
-    if not has_alpha:
+    if not has_alpha:  # these tags describe the source's alpha
         tags.pop(tiff.EXTRA_SAMPLES, None)
     if (resources := tags.get(_RESOURCES_TAG)) is not None and resources.values.dtype.itemsize == 1:
         tags.pop(_RESOURCES_TAG)
@@ -205,6 +214,7 @@ def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
     encoded = tiff.with_tags(encoded, tags)
     for number, place in directories.items():
         if len(place.values) == 1:
+            # 0xA005 is the offset of another directory, which is not copied.
             inner = tiff.read_tags(io.BytesIO(data), _AllBut({0xA005}), int(np.uint32(place.values[0])))
             encoded = tiff.with_directory(encoded, number, inner)
     return encoded

@@ -32,8 +32,8 @@ def needs_oiio_writer(path: Path) -> bool:
 
 
 def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[Any] | None, suffix: str) -> None:
-    """Write codes (height, width, 1 or 3), with alpha (height, width), with the header of `source`. suffix: that of the
-    format. Raises FrameError."""
+    """Write codes (height, width, 1 or 3) and alpha (height, width), not multiplied, with the header of `source`.
+    suffix: a key of OIIO_FORMATS, whatever the suffix of `path`. Raises FrameError."""
     if suffix == ".webp":
         _write_webp(path, source, codes, alpha)
         return
@@ -53,13 +53,13 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
     spec.set_format(types.get(codes.dtype.name, oiio.FLOAT))
     spec.channelformats = ()
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    if name == "dpx" and file_kind(source) == "cineon":
+    if name == "dpx" and file_kind(source) == "cineon":  # whose codes are film density in 10 bits
         spec.attribute("dpx:Transfer", "Printing density")
         spec.attribute("oiio:BitsPerSample", 10)
     if name == "tiff":
         spec.attribute("planarconfig", "contig")
         compression = spec.get_string_attribute("compression")
-        if compression in ("jpeg", "webp", "lerc"):
+        if compression in ("jpeg", "webp", "lerc"):  # with loss, or without but not in every build
             spec.attribute("compression", "zip")
     with atomic_path(path) as temporary:
         output = oiio.ImageOutput.create(name)

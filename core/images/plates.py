@@ -41,6 +41,7 @@ from .unsupported import unsupported_file
 from .write import save_exr_parts, write_exr
 
 _PLACEMENT = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
+"""Attributes that give another EXR a plate's windows and colours."""
 _UNWRITTEN = ("heif", "avif", "jxl", "jp2", "gif", "psd")
 """Formats whose clean plates are PNG."""
 _JPEG_QUALITY = 97
@@ -54,9 +55,10 @@ class Plate:
     """A picture file with its code values.
 
     codes: (height, width, 3), the file's type, R G B; a grey file has three equal channels. encoding: "srgb" for
-    integer codes, "linear" for floats. extras: an EXR's header and other channels, written back unchanged, and the
-    names of the channels with the codes; of several parts, those of all, and the number of the main one. declared: the
-    space that the file declares, or that the user names; None for the usual one of its encoding.
+    integer codes, "linear" for floats. alpha: (height, width), codes as stored; None for a file without, and for an
+    EXR, whose alpha is one of its channels. extras: of an EXR, "header" and all "channels" of the main part, and the
+    "names" of those with the codes; of one with several parts, also "parts" and the number of the "main" one. declared:
+    the space that the file declares, or that the user names; None for the usual one of its encoding.
     """
 
     path: Path
@@ -69,12 +71,12 @@ class Plate:
 
     @property
     def max_code(self) -> float:
-        """The code value of white, 1."""
+        """The code of the value 1: the greatest integer of the type, or 1 of floats."""
         return float(np.iinfo(self.codes.dtype).max) if self.codes.dtype.kind == "u" else 1.0
 
     @property
     def values(self) -> NDArray[np.float32]:
-        """(height, width, 3) codes as 0..1, in the plate's colour space."""
+        """(height, width, 3) codes as 0..1, floats as they are, in the plate's colour space."""
         return self.codes.astype(np.float32) / np.float32(self.max_code)
 
     def to_plate_channels(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -86,12 +88,12 @@ class Plate:
         """The area inside its black borders."""
         if self.encoding == "srgb":
             return find_picture_area(self.codes, lambda line: line / self.max_code)
-        return find_picture_area(self.codes, lambda line: srgb_from_linear(
+        return find_picture_area(self.codes, lambda line: srgb_from_linear(  # NaN counts as white
             np.clip(np.nan_to_num(line.astype(np.float32), nan=1.0), 0, 1)))
 
     @property
     def straight_alpha(self) -> NDArray[np.float32] | None:
-        """(height, width), 0..1: alpha that the codes are not multiplied with; None where there is none such."""
+        """(height, width), 0..1: alpha; None for a plate without, or whose codes are multiplied with it."""
         if self.alpha is None or tiff.is_premultiplied(self.path):
             return None
         return self.alpha.astype(np.float32) / np.float32(self.max_code)
@@ -143,7 +145,7 @@ class Plate:
         if codes.dtype.kind == "f":
             changed &= np.isfinite(codes).all(-1)
         values, removed = self.codes[changed].astype(np.float32) / np.float32(self.max_code), light[changed]
-        if self.space.is_linear:
+        if self.space.is_linear:  # light subtracts there, so that the values need no conversion
             values = values - self.space.from_linear(removed)
         else:
             values = self.space.from_linear(self.space.to_linear(values) - removed)
@@ -155,12 +157,14 @@ class Plate:
         return codes
 
     def light_in_plate_primaries(self, light: NDArray[Any]) -> NDArray[Any]:
-        """Return scene-linear Rec. 709 light in the primaries of a linear plate, in which its flare is written."""
+        """Return scene-linear Rec. 709 light in the primaries of a linear plate, in which its flare is written;
+        unchanged for other plates."""
         return self.space.from_linear(light) if self.space.is_linear and self.encoding == "linear" else light
 
     @cached_property
     def description(self) -> Description | None:
-        """Header of the file, for a clean plate that is a PNG; None where the file is one, or an EXR."""
+        """Header of the file, for a clean plate that is a PNG; None where the file is itself a PNG, an EXR, or of an
+        unknown format."""
         kind = file_kind(self.path)
         if kind == "jpeg":
             return _describe_jpeg(self.path)
@@ -168,7 +172,8 @@ class Plate:
 
     @property
     def warning(self) -> str:
-        """Sentences on what a plate with changed codes cannot keep, and on a name of another format; "" for none."""
+        """Sentences on a suffix that is not that of the file's contents, and on what a plate with changed codes cannot
+        keep; "" for none."""
         suffix, kind = self.path.suffix.lower(), file_kind(self.path)
         written, sentence = SUFFIX_KINDS.get(_format_suffix(self.path, self)), ""
         if clean_name(self.path) == self.path and kind not in ("", SUFFIX_KINDS.get(suffix)):
@@ -215,7 +220,7 @@ def is_plate_error(problem: Exception) -> bool:
 
 
 def finite_light(codes: NDArray[Any]) -> NDArray[np.float32]:
-    """Return float codes as finite linear light: NaN is black, infinity the greatest half."""
+    """Return float codes as finite linear light: NaN and negative infinity are black, infinity the greatest half."""
     return np.nan_to_num(codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
 
 
@@ -274,7 +279,7 @@ def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
     OpenCV reads such files without it.
     """
     with open_regular(path) as stream:
-        depth = stream.read(25)[24:]
+        depth = stream.read(25)[24:]  # bits of a code (PNG specification, 11.2.1)
         key = next((content for _, content in png.chunks(stream, (b"tRNS",), before_pixels=True)
                     if len(content) == 2), None)
     if key is None:
@@ -285,7 +290,11 @@ def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
 
 
 def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
-    """Read an EXR plate, with the headers and channels of all its parts. Raises FrameError."""
+    """Read an EXR plate, with the headers and channels of all its parts. Raises FrameError.
+
+    The codes are the colours of the main part; of a stereo picture without colours at the root, those of its first
+    view.
+    """
     parts = read_exr_parts(path)
     check_parts(path, parts)
     main = main_part([(number, channels) for number, (_, channels) in enumerate(parts)])
@@ -314,9 +323,10 @@ def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
 
 
 def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDArray[Any] | None = None) -> None:
-    """Write `codes` in the format and depth of `plate`, with its alpha, channels and tags, to a path of its suffix.
+    """Write `codes` in the format and depth of `plate`, with its alpha, channels and tags, to `path`.
 
-    alpha: as stored, in place of the plate's.
+    The suffix of `path` is the plate's, or that of `clean_name`. A plate that did not change is copied. alpha: as
+    stored, in place of the plate's. Raises FrameError for what the format cannot hold.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -364,8 +374,8 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
 
 
 def _format_suffix(path: Path, plate: Plate) -> str:
-    """Return the usual suffix of the format in which a clean plate is written: that of its file's contents where both
-    have one name, else that of its name."""
+    """Return the suffix of the format in which a plate is written to `path`: that of the plate's contents if `path`
+    has the suffix of the plate, which may be wrong; else the suffix of `path`."""
     suffix, kind = path.suffix.lower(), file_kind(plate.path)
     if suffix != plate.path.suffix.lower() or kind in ("", SUFFIX_KINDS.get(suffix)):
         return suffix
@@ -373,19 +383,21 @@ def _format_suffix(path: Path, plate: Plate) -> str:
 
 
 def _encoder_options(suffix: str, kind: np.dtype[Any]) -> list[int]:
-    """Return OpenCV's options for pixels of this type."""
+    """Return OpenCV's options for a format and a type of pixels: JPEG with chroma at full resolution, floats as they
+    are."""
     import cv2
 
     if suffix in _JPEGS:
         return [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
                 cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    if suffix in _TIFFS and kind.kind == "f":  # else LogLuv, 16 bits for three floats
+    if suffix in _TIFFS and kind.kind == "f":  # OpenCV would write LogLuv, with loss
         return [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE]
     return []
 
 
 def write_flare(path: Path | str, plate: Plate, flare: NDArray[Any]) -> None:
-    """Write the flare removed from a plate, light (height, width, 3) in its colours, as an EXR with its windows."""
+    """Write the flare removed from a plate as an EXR with the plate's windows. flare: (height, width, 3), linear
+    light in the plate's primaries."""
     write_exr(path, {name: flare[..., k] for k, name in enumerate("RGB")}, header=plate.placement)
 
 
@@ -397,7 +409,8 @@ def write_results(results: Sequence[Path], plate: Plate, codes: NDArray[Any], fl
 
 
 def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
-    """Write codes with the headers and the other channels of an EXR plate, as scanlines without loss."""
+    """Write codes with the headers, the other channels and the other parts of an EXR plate, as scanlines without loss.
+    """
     channels = dict(plate.extras["channels"])
     for index, name in enumerate(plate.extras["names"]):
         channels[name] = np.ascontiguousarray(codes[..., index], channels[name].dtype)  # channels may differ in depth

@@ -50,6 +50,7 @@ def read_picture(path: Path | str, *, space: ColourSpace | None = None, over_bla
     if not over_black or stored.ndim == 2 or stored.shape[2] < 4 or tiff.is_premultiplied(path):
         return picture
     alpha = stored[..., 3:].astype(np.float32)
+    # Floats hold alpha at 0..1, integers at 0..their greatest value.
     alpha /= np.float32(1 if stored.dtype.kind == "f" else np.iinfo(stored.dtype).max)
     if alpha.min() >= 1:
         return picture
@@ -58,7 +59,8 @@ def read_picture(path: Path | str, *, space: ColourSpace | None = None, over_bla
 
 
 def _to_picture(path: Path, stored: NDArray[Any], space: ColourSpace | None) -> Picture:
-    """Convert what `read_stored_pixels` returns from its colours, without alpha. Raises FrameError."""
+    """Convert the result of `read_stored_pixels` to Rec. 709 as `read_picture` returns it, without alpha. space: in
+    place of the declared one. Raises FrameError."""
     colour = rgb_codes(stored)
     if stored.dtype.kind == "f":
         pixels = colour.astype(np.float32, copy=False)
@@ -92,7 +94,7 @@ def rgb_codes(stored: NDArray[Any]) -> NDArray[Any]:
     """
     import cv2
 
-    if stored.dtype not in (np.uint8, np.uint16, np.float32):
+    if stored.dtype not in (np.uint8, np.uint16, np.float32):  # OpenCV converts no others, such as half floats
         return np.ascontiguousarray(np.repeat(stored[..., None], 3, axis=2) if stored.ndim == 2 else stored[..., 2::-1])
     if stored.ndim == 2:
         return np.asarray(cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB))
@@ -111,7 +113,8 @@ def has_float_pixels(path: Path, space: ColourSpace | None = None) -> bool:
             formats = tiff.read_tags(stream, (tiff.SAMPLE_FORMAT,)).get(tiff.SAMPLE_FORMAT)
         if formats is not None and formats.values[0] == tiff.FLOATS:
             return True
-        signed = formats is not None and formats.values[0] != tiff.UNSIGNED  # LogLuv among them: stored as integers
+        # Whether these decode to floats shows only afterwards; LogLuv, for one, is stored as integers.
+        signed = formats is not None and formats.values[0] != tiff.UNSIGNED
         if (is_big or signed) and read_stored_pixels(path).dtype.kind == "f":
             return True
     known = space or declared_space(path)
@@ -119,7 +122,7 @@ def has_float_pixels(path: Path, space: ColourSpace | None = None) -> bool:
 
 
 def has_half_pixels(path: Path) -> bool:
-    """True if a picture is stored in 16 bit floats, as some EXRs are. Raises FrameError."""
+    """True for an EXR whose colours are 16 bit floats. Raises FrameError."""
     if not is_exr(path):
         return False
     with open_regular(path) as stream:

@@ -84,7 +84,8 @@ class SweepView:
 
 
 def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) -> FarLayer | None:
-    """Return the far layer of a capture; None where nothing that its views see lies beyond their parallax."""
+    """Return the far layer of a capture; None where nothing that `views` see lies beyond their parallax, or cannot be
+    told: without points, or with all cameras in one place."""
     sampled = subsample(views, SWEEP_VIEWS)
     cameras = [view.camera.scaled(min(SWEEP_WIDTH, view.camera.width)) for view in sampled]
     extent = _spread(cameras)
@@ -123,6 +124,7 @@ class Patches:
 def decide_patches(views: list[SweepView]) -> Patches | None:
     """Decide which patches of directions are far; None where too few are for a far layer."""
     directions, costs, bare, misaligned = sweep_patches(views)
+    # The patches that are certainly far decide whether there is a far layer; `_fill` then decides every patch anew.
     has_contrast = misaligned >= MIN_CONTRAST
     is_far = has_contrast & (costs < DECISIVE_RATIO * misaligned) & (costs <= bare)
     if is_far.sum() < max(MIN_FAR_PATCHES, MIN_FAR_SHARE * has_contrast.sum()):
@@ -146,10 +148,12 @@ def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats, Float
     spheres = (0.0, BARE_PARALLAX_PX, *PARALLAXES_PX)
     costs = np.full((len(spheres), len(patch_directions)), np.nan)
     for row, parallax in zip(costs, spheres, strict=True):
+        # A point at distance r has a parallax of focal * spread / r pixels.
         cost, seen = _disagreement(views, directions, parallax / focal / _spread(cameras))
         sums = np.bincount(patch_of, np.where(seen, cost, 0), len(patch_directions))
         numbers = np.bincount(patch_of, seen, len(patch_directions))
         row[:] = np.where((numbers > 0) & (numbers >= MIN_SEEN_SHARE * members), sums / np.maximum(numbers, 1), np.nan)
+    # Known on the infinite sphere, on that of bare parallax, and on some near one.
     usable = np.isfinite(costs[:2]).all(0) & np.isfinite(costs[2:]).any(0)
     return patch_directions[usable], *costs[:2, usable], np.nanmedian(costs[2:, usable], axis=0)
 
@@ -157,7 +161,8 @@ def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats, Float
 def _fill(directions: Floats, costs: Floats, misaligned: Floats) -> Booleans:
     """Return which patches (n,) are far, each by the nearest patches that are not plain, weighted by their contrast.
 
-    costs: (n,) on the infinite sphere; misaligned: (n,) on near ones.
+    A patch that is not plain is far, too, if its own cost is below MAX_COST. costs, misaligned: shares (n,) of the
+    views that differ on the infinite sphere, and on near ones.
     """
     known = misaligned >= MIN_CONTRAST
     count = min(NEIGHBOURS, int(known.sum()))
@@ -170,7 +175,7 @@ def _fill(directions: Floats, costs: Floats, misaligned: Floats) -> Booleans:
 
 
 def _sweep_view(view: View, frames: Frames) -> SweepView:
-    """Return a view for the sweep: of its clean frame, where the fit has exact ones, else of its frame."""
+    """Return a view for the sweep, at the usual exposure: its clean frame if the fit has one, else its frame."""
     camera, frame, clean = frames.targets(view)
     small = camera.scaled(min(SWEEP_WIDTH, camera.width))
     picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
@@ -179,15 +184,16 @@ def _sweep_view(view: View, frames: Frames) -> SweepView:
     counts = None
     if mask is not None:
         share = Picture(mask.numpy().astype(np.float32), "linear").resized(*small.size).pixels
-        counts = np.asarray(share > 0.99)
+        counts = np.asarray(share > 0.99)  # all that was averaged to the pixel counts
     return SweepView(small, values, counts)
 
 
 def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: float) -> tuple[Floats, Booleans]:
-    """Return the share (n,) of the views that differ from the largest group that agrees, in directions (n, 3) on the
-    sphere of a radius, and which directions (n,) enough views see.
+    """Return the share (n,) of the views that differ from the largest group that agrees, and which (n,) enough views
+    see, for points in directions (n, 3) on a sphere about the cameras.
 
-    Groups are robust: a direction may be hidden by something near in most views.
+    Groups are robust: a direction may be hidden by something near in most views. inverse_radius: of the sphere, 0 for
+    an infinite one. The share is 0 where too few views see a point.
     """
     centre = _centre([view.camera for view in views])
     values = np.full((len(views), len(directions), 3), np.nan, np.float32)
@@ -206,7 +212,7 @@ def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: fl
         difference = (red - r).abs_().maximum((green - g).abs_()).maximum((blue - b).abs_())
         agree = (difference <= MAX_DIFFERENCE).sum(0, dtype=torch.int32)  # comparisons with NaN are false
         best = torch.maximum(best, agree)
-    cost[seen] = 1 - (best.numpy() - 1) / (numbers[seen] - 1)
+    cost[seen] = 1 - (best.numpy() - 1) / (numbers[seen] - 1)  # every view agrees with itself
     return cost, seen
 
 
@@ -226,6 +232,7 @@ def _project(camera: Camera, centre: Floats, directions: Floats, inverse_radius:
     """Return which points (n,) of a sphere about `centre`, in these directions, lie on the camera's frame, and their
     places (m, 2), pixels. inverse_radius: of the sphere, 0 for an infinite one."""
     rotation = camera.world_to_camera[:3, :3]
+    # (centre + radius * direction - position) / radius: the camera sees no difference.
     local = (directions + inverse_radius * (centre - camera.position)) @ rotation.T
     in_front = local[:, 2] > 1e-6
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -235,7 +242,10 @@ def _project(camera: Camera, centre: Floats, directions: Floats, inverse_radius:
 
 
 def _far_points(sphere: FarSphere, patches: Patches, views: Sequence[View], frames: Frames) -> PointCloud:
-    """Return points on the far sphere in the far patches, in the colours of the frames."""
+    """Return at most about MAX_POINTS points on the far sphere in the far patches, in the colours of the frames.
+
+    Colours are those at the usual exposure: medians of clean frames, else a low quantile of the frames.
+    """
     centre = np.array(sphere.centre)
     targets = [frames.targets(view) for view in views]
     focal = float(np.median([target.camera.focal_length for target in targets]))
@@ -249,6 +259,7 @@ def _far_points(sphere: FarSphere, patches: Patches, views: Sequence[View], fram
     colours = np.full((len(views), len(directions), 3), np.nan, np.float32)
     is_exact = all(target.clean is not None for target in targets)
     for row, view, (camera, frame, clean) in zip(colours, views, targets, strict=True):
+        # Points are then PITCH_PX apart, as the directions of the sweep are.
         small = camera.scaled(max(round(camera.width * PITCH_PX / POINT_PITCH_PX), 8))
         picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
         values = Picture(picture, "srgb").resized(*small.size).display()
@@ -281,11 +292,12 @@ def _seen_directions(cameras: list[Camera], pitch: float) -> Floats:
     """
     forwards = np.array([camera.forward for camera in cameras])
     axis = forwards.mean(0)
+    # Where cameras look all around, their mean direction means nothing, and any axis will do.
     axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 0.1 else forwards[0]
     reach = [np.arccos((forward @ axis).clip(-1, 1)) + np.arctan(camera.corner_radius)
              for forward, camera in zip(forwards, cameras, strict=True)]
     lowest = float(np.cos(min(max(reach), np.pi)))
-    count = max(int(2 * np.pi * (1 - lowest) / (pitch * pitch)), 1)
+    count = max(int(2 * np.pi * (1 - lowest) / (pitch * pitch)), 1)  # area of the cap over that of one direction
     helper = np.eye(3)[int(np.abs(axis).argmin())]
     right = np.cross(helper, axis)
     right /= np.linalg.norm(right)

@@ -60,12 +60,11 @@ TV_REWEIGHTINGS, TV_EPSILON = 30, 1e-3
 
 @torch.no_grad()
 def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, render_view: RenderView) -> None:
-    """Set the brightness of the lights in these views, in the order of the shot, by least errors of frame - scene over
-    the present flares, and by the brightness in the lights' file; smooth in time, with steps, where single frames are
-    uncertain (`smooth_with_steps`).
+    """Set the brightness of the lights in these views, which are in the order of the shot.
 
-    The flare stays as it is. In frames that the fit has not seen, only its strength is read off, as `lights` reads the
-    places.
+    The present flares at that brightness explain frame - scene best. Where a frame leaves it uncertain, the brightness
+    in the lights' file and that of the neighbouring frames decide (`smooth_with_steps`). The flare stays as it is:
+    held-out frames give the places and the brightness of lights, and nothing else.
     """
     lights = flare.frame_lights
     if lights is None:
@@ -135,7 +134,11 @@ def _solve_tridiagonal(weights: NDArray[np.float64], springs: NDArray[np.float64
 def _solve(targets: Targets, scene: NDArray[np.float32], flares: Sequence[NDArray[np.float32] | None],
            start: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the strengths (lights,) of flares (height, width, 3), linear light, in a frame over its scene, and their
-    certainty, 1 / variance."""
+    certainty, 1 / variance.
+
+    flares: None for a light behind the camera. start: (lights,) present strengths, which stay, with a certainty of 0,
+    where a light has no flare in the frame.
+    """
     solved, certainty = start.copy(), np.zeros(len(start))
     present = [number for number, flare in enumerate(flares) if flare is not None and flare.max() > 0]
     frame = targets.frame.numpy()
@@ -147,6 +150,8 @@ def _solve(targets: Targets, scene: NDArray[np.float32], flares: Sequence[NDArra
     solved[present] = robust_bounded_fit(columns, light, start[present], 0.0, MAX_BRIGHTNESS, PRIOR_WEIGHT)
     residual = light - columns @ solved[present]
     energies = np.square(columns).sum(0)
+    # The variance of a strength is variances / energies, by the squared errors at each pixel (White 1980), if errors are
+    # independent; `area` pixels count as one. The last term keeps the certainty finite.
     variances = (np.square(columns) * residual[:, None] ** 2).sum(0) / np.maximum(energies, 1e-12)
     area = CORRELATION_SHARE * len(light)
     certainty[present] = energies / (area * variances + 1e-6 * area)
@@ -174,7 +179,10 @@ def normalise_brightness(flare: FlareModel, views: Sequence[View]) -> None:
 
 def _scale_colours(sh: torch.Tensor, head: nn.Linear, names: Sequence[str], widths: Sequence[int],
                    factor: float) -> None:
-    """Multiply the colours 0.5 + C0 (sh + change) + ... of Gaussians, and what the network changes of them."""
+    """Multiply the colours 0.5 + C0 (sh + change) + ... of Gaussians by a factor, `change` the network's offset.
+
+    names, widths: the parts of the output of `head`, the network's last layer.
+    """
     sh *= factor
     sh[:, :3] += (factor - 1) * 0.5 / C0
     first = sum(widths[:names.index("sh")])
@@ -236,7 +244,10 @@ def without_other_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:
 
 
 def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
-    """Write lights.json of a run: the lights of the capture with their fitted brightness, by frame."""
+    """Write lights.json of a run: the lights of the capture with their places and fitted brightness, by frame.
+
+    Lights that are not in `flare` have no brightness. Nothing is written for lights that stand and stay on.
+    """
     lights = flare.frame_lights
     if lights is None:
         return
@@ -260,7 +271,7 @@ def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
 def read_frame_lights(capture: Capture, names: Sequence[str]) -> FrameLights:
     """Return places and brightness of these lights of a capture, in every view.
 
-    An unknown brightness starts at 1, and a doubtful one is a first guess.
+    An unknown brightness starts at 1. A fit starts from a doubtful one, but it has no prior (NaN), as an unknown one.
     """
     by_name = {light.name: light for light in capture.lights}
     states = [[capture.light_state(by_name[name], view) for name in names] for view in capture.views]

@@ -56,7 +56,8 @@ def measure_exposures(capture: Capture, frames: Frames, progress: Progress | Non
     """
     progress = progress or Progress()
     stops = PointObservations.of(capture, subsample(capture.views, SAMPLED_VIEWS), frames, progress).stops()
-    if spread(stops) >= MIN_SPREAD and len(stops) < len(capture.views):  # all only where some differ
+    # All frames are measured only if some of the first differ.
+    if spread(stops) >= MIN_SPREAD and len(stops) < len(capture.views):
         stops = PointObservations.of(capture, capture.views, frames, progress).stops()
     if spread(stops) < MIN_SPREAD:
         return {}
@@ -66,8 +67,8 @@ def measure_exposures(capture: Capture, frames: Frames, progress: Progress | Non
 
 
 def _fill_unmeasured(stops: Floats, folders: Sequence[Path]) -> Floats:
-    """Replace exposures that are not finite by the nearest finite one, of the same folder if possible: often that of
-    one camera."""
+    """Replace exposures (n,) that are not finite by the nearest finite one, of the same folder if possible: a folder
+    often has the frames of one camera. folders: of the n frames."""
     usable = np.flatnonzero(np.isfinite(stops))
 
     def nearest(index: int) -> int:
@@ -78,7 +79,7 @@ def _fill_unmeasured(stops: Floats, folders: Sequence[Path]) -> Floats:
 
 def spread(stops: Floats) -> float:
     """Return the spread, stops, of exposures (n,) without the darkest and the brightest tenth; 0 if fewer than three,
-    or half of all, are finite."""
+    or fewer than half of all, are finite."""
     usable = stops[np.isfinite(stops)]
     if len(usable) < max(3, len(stops) / 2):
         return 0.0
@@ -107,9 +108,9 @@ class PointObservations:
 
     @classmethod
     def of(cls, capture: Capture, views: Sequence[View], frames: Frames, progress: Progress) -> PointObservations:
-        """Sample the frames where the solve found the points, neither too dark nor clipped; clean frames where there
-        are any."""
-        # The same points of all views.
+        """Sample the clean frames of views, else the frames, at points that the solve found there, where they are
+        neither too dark nor clipped. frames: decoded, at the size of the fit."""
+        # Points whose index is a multiple of `step`, so that views have them in common.
         step = max(int(np.median([len(view.points) for view in views])) // SAMPLED_POINTS, 1)
         parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
         progress.stage("look at exposures", len(views))
@@ -130,9 +131,9 @@ class PointObservations:
         return cls(len(views), numbers, points, light)
 
     def stops(self) -> Floats:
-        """Return the exposure of each view (count,), not finite where it cannot be measured.
+        """Return the exposure of each view (count,), stops, not finite where it cannot be measured.
 
-        The points' luminances in a usual view are estimated with it.
+        In turn, the lines of the views are fitted to the points' luminances, and these are estimated by the lines.
         """
         luminances = self._initial_luminances()
         for _ in range(REFINEMENTS):
@@ -142,7 +143,10 @@ class PointObservations:
         return np.log2(self._fit_lines(luminances)[0])
 
     def _initial_luminances(self) -> Floats:
-        """Estimate the luminance of each point in a view of the usual exposure, by index, without veils."""
+        """Estimate the luminance of each point in a view of the usual exposure, by the point's index, without veils.
+
+        Points and exposures are in turn the medians of what the other leaves, in stops. NaN for points not observed.
+        """
         light, stops = np.log2(self.light), np.zeros(self.count)
         count = int(self.points.max(initial=-1)) + 1
         for _ in range(MAX_ROUNDS):
@@ -162,6 +166,7 @@ class PointObservations:
             finite = np.isfinite(known)
             if finite.sum() >= MIN_POINTS:
                 line, error = _fit_line(known[finite], observed[finite])
+                # The relative error of a slope is its error in stops times ln 2.
                 if line[0] > 0 and error / line[0] < MAX_STANDARD_ERROR * np.log(2):
                     lines[:, number] = line
         return lines[0], lines[1]
@@ -189,6 +194,7 @@ def _fit_line(known: Floats, observed: Floats) -> tuple[Floats, float]:
     line = np.array([np.median(observed / known.clip(min=ERROR_FLOOR)), 0.0])
     for _ in range(MAX_ROUNDS):
         errors = (observed - columns @ line) ** 2 * error_weights
+        # The variance of a normal distribution is 2.2 times the median of its squared errors.
         robust_weights = 1 / (1 + errors / (2.2 * np.median(errors) + 1e-12))
         weights = robust_weights * error_weights
         product = columns.T @ (weights[:, None] * columns)
@@ -202,7 +208,8 @@ def _fit_line(known: Floats, observed: Floats) -> tuple[Floats, float]:
 def resolve_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings, tuple[str, ...]]:
     """Return the settings with `white` resolved, and sentences for the user.
 
-    It is 1, the white of most formats, or MAX_WHITE if all frames are float files and one of them holds more than 1.
+    It is 1, the white of most formats, or MAX_WHITE if a training frame holds more than 1 and all files of the fit,
+    clean frames included, are float files.
     """
     if settings.white is not None:
         return settings, ()
@@ -222,4 +229,5 @@ def resolve_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings,
 
 
 def _is_above_white(capture: Capture, view: View) -> bool:
+    """True if a pixel of the frame is above 1; only a frame whose format can hold that is decoded."""
     return capture.holds_light_above_white(view) and bool(capture.frame(view).pixels.max() > 1)

@@ -43,6 +43,7 @@ def scene_loss(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor
     loss = settings.scene_weight * quantile_loss(scene, targets.frame, settings.excess_weight * (1 - share))
     near = torch.from_numpy(light_proximity(targets.camera, lights, settings.light_radius))
     loss = loss + settings.near_scene_penalty * share * (scene * near[..., None]).mean()
+    # In the discs, the scene is fitted to the frame.
     if discs is not None:
         loss = loss + ((scene - targets.frame).abs() * discs[..., None]).mean()
     return loss

@@ -89,12 +89,15 @@ class Alignment:
                                               borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 3), np.float32)
 
     def _camera_travels(self) -> bool:
+        """True if homographies explain too few matches of the probed pairs of frames, or no pair has enough matches;
+        False for a shot that is too short for a pair."""
         pairs = list(zip(self._names, self._names[PROBED_OFFSET:], strict=False))
         probed = [self._match(*pair).inlier_share for pair in pairs[::max(len(pairs) // PROBES, 1)]]
         shares = [share for share in probed if share is not None]
         return bool(pairs) and (not shares or float(np.median(shares)) < TURNING_INLIER_SHARE)
 
     def _flow(self, source: str, target: str) -> Pixels:
+        """Return the flow (height, width, 2) from a frame to another, pixels."""
         if (source, target) not in self._flows:
             for name in (source, target):
                 if name not in self._codes:
@@ -103,6 +106,7 @@ class Alignment:
         return self._flows[source, target]
 
     def _match(self, source: str, target: str) -> _Match:
+        """Return the match from a frame's pixels to another's; that of the reverse is its inverse."""
         if (source, target) not in self._matches:
             match = self._find_match(source, target)
             self._matches[source, target] = match
@@ -111,6 +115,8 @@ class Alignment:
         return self._matches[source, target]
 
     def _find_match(self, source: str, target: str) -> _Match:
+        """Compute the homography from a frame's pixels to another's by matched features; the identity if the camera
+        stands."""
         import cv2
 
         first, second = self._described(source), self._described(target)
@@ -122,7 +128,7 @@ class Alignment:
         if len(pairs) < MIN_INLIERS:
             return _Match(None, None)
         ends = first.points[[pair[0] for pair in pairs]], second.points[[pair[1] for pair in pairs]]
-        cv2.setRNGSeed(0)
+        cv2.setRNGSeed(0)  # RANSAC gives the same result each time
         matrix, inliers = cv2.findHomography(*ends, cv2.RANSAC, MAX_ERROR_PX)
         share = 0.0 if matrix is None else float(inliers.mean())
         if matrix is None or inliers.sum() < max(MIN_INLIERS, MIN_INLIER_SHARE * len(pairs)):
@@ -132,6 +138,7 @@ class Alignment:
         return _Match(np.eye(3) if stands else np.asarray(matrix, np.float64), share)
 
     def _described(self, name: str) -> _Features:
+        """Return the features of a frame: points (n, 2), pixels, and SIFT descriptors."""
         import cv2
 
         if name not in self._features:

@@ -74,10 +74,10 @@ class PlateEstimator:
         self.alignment = Alignment(shot.plates)
 
     def estimate(self, name: str, cleaned: Mapping[str, Pixels] | None = None) -> Pixels:
-        """Return the plate of a frame, display values.
+        """Return the plate of a frame, display values; the network's plate if no neighbour can be aligned.
 
-        cleaned: frames minus the fitted flare, which show the neighbours' background in place of the network's plates.
-        The frame itself stays as filmed: a flare subtracted from its own frame would hide its own errors.
+        cleaned: frames minus the fitted flare, which show the background in place of the network's plates. The frame
+        itself stays as filmed: a flare subtracted from its own frame would hide its own errors.
         """
         shot, alignment = self._shot, self.alignment
         plates = shot.plates if cleaned is None else cleaned
@@ -86,7 +86,7 @@ class PlateEstimator:
         if not aligned:
             return shot.plates[name]
         stack = np.stack([plates[name], *aligned])
-        count = np.isfinite(stack[..., 0]).sum(0) - 1
+        count = np.isfinite(stack[..., 0]).sum(0) - 1  # neighbours only
         background = linear_from_srgb(_median(stack))
         frame, own = linear_from_srgb(shot.frames[name]), linear_from_srgb(shot.plates[name])
         usable = (frame.max(-1, keepdims=True) < USABLE).astype(np.float32)
@@ -94,8 +94,9 @@ class PlateEstimator:
         gain = gain * local_gain(own, gain * background)
         hidden = hidden_share(frame, gain * background, gain)
         confidence = ((1 - hidden) * np.clip(count / MIN_NEIGHBOURS, 0, 1))[..., None]
+        # A flare only adds light, so no plate is brighter than its frame.
         lowest = srgb_from_linear(np.minimum(np.minimum(gain * background, frame), own).clip(0))
-        change = -_small_parts(shot.plates[name] - lowest)
+        change = -_small_parts(shot.plates[name] - lowest)  # 0 or less: the plate only becomes darker
         confidence = confidence / (1 + (change.min(-1, keepdims=True) / MAX_MISSED_FLARE) ** 4)
         return np.asarray(shot.plates[name] + confidence * change, np.float32)
 
@@ -110,8 +111,11 @@ def _median(stack: Pixels) -> Pixels:
 
 
 def _small_parts(excess: Pixels) -> Pixels:
-    """Return an excess (height, width, 3), display values from 0, above its median nearby: the network misses what is
-    small, and a gain that is wrong over a large area has no say."""
+    """Return by how much an excess (height, width, 3), display values of 0 or more, is above its median nearby.
+
+    Only small parts of the excess remain. The network misses what is small, and an excess over a large area comes from
+    a wrong gain as often as from a flare.
+    """
     import cv2
 
     size = 2 * max(int(GHOST_RADIUS * excess.shape[1]), 1) + 1
@@ -127,10 +131,11 @@ def _blur(values: Pixels, sigma: float) -> Pixels:
 
 
 def smooth_gain(plate: Pixels, background: Pixels, usable: Pixels) -> Pixels:
-    """Return the gain (height, width, 3) of a plate over a background that changes smoothly over the picture.
+    """Return the gain (height, width, 3) of a plate over a background, a gain that changes smoothly over the picture.
 
-    Linear light. usable: (height, width, 1) weights of the pixels. Pixels whose gain differs from that around them
-    count less, for they may hold flare.
+    plate, background: (height, width, 3), linear light. usable: (height, width, 1) weights of the pixels. It is a least
+    squares fit of relative errors in a window. Pixels whose gain differs from that around them count less, for they may
+    hold flare.
     """
     sigma = max(GAIN_WINDOW * plate.shape[1], 1.0)
     base = usable / (background + DARK) ** 2
@@ -145,7 +150,9 @@ def smooth_gain(plate: Pixels, background: Pixels, usable: Pixels) -> Pixels:
 def hidden_share(frame: Pixels, expected: Pixels, gain: Pixels) -> NDArray[np.float32]:
     """Return (height, width), 0..1, how likely something hides the background of a frame.
 
-    frame, expected: linear light, the expected frame without flare; gain: that of the background, see `smooth_gain`.
+    Three things show it: a channel darker than expected, the texture of the background absent, or a gain far from 1;
+    the likeliest counts. frame, expected: (height, width, 3), linear light, the expected frame without flare. gain: of
+    the background, `smooth_gain` times `local_gain`.
     """
     import cv2
 
@@ -166,15 +173,16 @@ def hidden_share(frame: Pixels, expected: Pixels, gain: Pixels) -> NDArray[np.fl
 
 
 def _step(values: Pixels, middle: float, steepness: float) -> Pixels:
-    """Return a smooth step from 0 to 1 at `middle`."""
+    """Return the logistic function of values: 0 far below `middle`, 0.5 there, 1 far above it. steepness: 4 times the
+    slope there."""
     return np.asarray(1 / (1 + np.exp(np.clip(-steepness * (values - middle), -50, 50))), np.float32)
 
 
 def local_gain(plate: Pixels, expected: Pixels) -> Pixels:
     """Return the gain (height, width, 1) of the texture of a plate over that of the expected plate, linear light.
 
-    Light on a wall raises its texture too, a flare adds light alone. It is the
-    least that the texture makes likely.
+    Light on a wall raises its texture too, a flare adds light alone. The gain is the estimate less one standard error,
+    and 1 at least: the smallest that the texture makes likely.
     """
     sigma = max(LIGHT_WINDOW * plate.shape[1], 1.0)
     gain, error = _line_gain(plate, expected, sigma)
@@ -193,7 +201,8 @@ def _texture_deviation(frame: Pixels, expected: Pixels, sigma: float) -> Pixels:
 def _line_gain(frame: Pixels, expected: Pixels, sigma: float) -> tuple[Pixels, Pixels]:
     """Return the gain of a local line frame = gain * expected + flare, and its standard error, (height, width) each.
 
-    sigma: standard deviation of the window, pixels. The channels share one gain.
+    frame, expected: (height, width, 3), linear light. sigma: standard deviation of the window, pixels. The channels
+    share one gain. Where the texture is weaker than the noise, the gain tends to 1.
     """
     weight = 1 / (expected.mean(-1, keepdims=True) + DARK) ** 2
     total = _blur(weight, sigma)
@@ -205,7 +214,7 @@ def _line_gain(frame: Pixels, expected: Pixels, sigma: float) -> tuple[Pixels, P
     variance = (mean(expected**2) - mean_expected**2).sum(-1).clip(0)
     covariance = (mean(frame * expected) - mean_frame * mean_expected).sum(-1)
     spread = (mean(frame**2) - mean_frame**2).sum(-1).clip(0)
-    noise = 3 * (NOISE * (mean_expected.mean(-1) + DARK) * DISPLAY_SLOPE) ** 2
+    noise = 3 * (NOISE * (mean_expected.mean(-1) + DARK) * DISPLAY_SLOPE) ** 2  # variance of linear light, 3 channels
     gain = (covariance + noise) / (variance + noise)
     unexplained = (spread - np.clip(gain, 0, 2) * covariance).clip(0)
     return gain, np.sqrt((unexplained + noise) / (WINDOW_SAMPLES * (variance + noise)))

@@ -89,8 +89,11 @@ class FlareTrainer(abc.ABC):
                       self.settings.kernels, visibility=self.settings.flare.active_visibility)
 
     def finish_lights(self, folder: Path) -> Sequence[str]:
-        """Measure the lights' brightness, in held-out views of a shot too, and their shares, leave out those that do
-        not flare, and write the lights by frame, if they change; return sentences for the user."""
+        """Normalise the lights' brightness, leave out lights that do not flare, and write the lights by frame, if they
+        change; return sentences for the user on their shares.
+
+        In a fit over plates, the brightness is solved once more for all views first, held-out ones too.
+        """
         if self.flare is None:
             return ()
         if self.settings.uses_plates:
@@ -109,7 +112,11 @@ class FlareTrainer(abc.ABC):
         return self.views[int(order[done % len(self.views)])]
 
     def _generator(self, number: int, purpose: int) -> torch.Generator:
-        """Return a random generator for one purpose and one number, such as an iteration."""
+        """Return a random generator for one purpose and one number, such as an iteration.
+
+        Purposes: 0 the scene's density, 1 the order of the views, 2 + n the density of the n-th flare.
+        """
+        # A large prime keeps the seeds of different purposes and numbers apart.
         mixed = (self.settings.seed * 1_000_003 + purpose) * 1_000_003 + number
         return torch.Generator().manual_seed(mixed % (1 << 62))
 
@@ -124,7 +131,7 @@ class FlareTrainer(abc.ABC):
             clone_and_prune(light, adam, names, settings, self._generator(self.iteration, 2 + number))
 
     def _flare_penalty(self, pose: Tensor, frame: str) -> Tensor:
-        """Return the penalties on the light's corrections and on the brightness of the lights in a frame."""
+        """Return the penalties on delta_l at a pose (4, 4), and on the brightness of the lights in its frame."""
         assert self.flare is not None
         settings, penalty = self.settings, torch.zeros(())
         if settings.flare.correction_weight:

@@ -52,7 +52,10 @@ def ensure_points(capture: Capture, settings: FitSettings, progress: Progress) -
 
 def _triangulate(capture: Capture,
                  progress: Progress) -> tuple[Floats, NDArray[np.uint8], dict[str, NDArray[np.int64]]]:
-    """Return points (n, 3), colours (n, 3), and the indices of those observed in each view, by its name."""
+    """Return points (n, 3), colours (n, 3), and the indices of those observed in each view, by its name.
+
+    Each frame is matched with the next two; every match gives a point, in the colour of the first frame.
+    """
     import cv2
 
     views = subsample(capture.views, MATCHED_VIEWS)
@@ -108,7 +111,7 @@ def triangulate_pair(first: Camera, second: Camera, pixels: Floats, others: Floa
     """Return points (n, 3) from pixels (n, 2) of two cameras, and which (n,) are sound.
 
     A point is where the two rays are nearest to each other. It is sound if it lies before both cameras, the rays differ
-    by an angle, and it projects onto both pixels.
+    by more than MIN_ANGLE, and it projects to less than MAX_ERROR_PX from both pixels.
     """
     rays, other_rays = first.rays(pixels), second.rays(others)
     baseline = second.position - first.position
@@ -126,7 +129,10 @@ def triangulate_pair(first: Camera, second: Camera, pixels: Floats, others: Floa
 
 
 def _random_points(capture: Capture, known: Floats, seed: int) -> tuple[Floats, NDArray[np.uint8]]:
-    """Return points (n, 3) in the view of the cameras, with the colours (n, 3) of the frames where they were drawn."""
+    """Return points (n, 3) in the view of the cameras, with the colours (n, 3) of the frames where they were drawn.
+
+    Depths are log-uniform about what each camera looks at. known: (m, 3) triangulated points, which tell where that is.
+    """
     generator = np.random.default_rng(seed)
     views = subsample(capture.views, MATCHED_VIEWS)
     focus = None if capture.is_rotation_only else _focus([view.camera for view in views])
@@ -154,8 +160,9 @@ def _focus(cameras: list[Camera]) -> Floats | None:
 
 
 def _distance(camera: Camera, known: Floats, focus: Floats | None, capture: Capture) -> float:
-    """Return the distance, world units, of what a camera looks at: of known points, the common focus, or the extent."""
-    if len(known) >= 20:
+    """Return the distance, world units, of what a camera looks at: of known points (n, 3), the common focus (3,), or
+    the capture's extent."""
+    if len(known) >= 20:  # enough for a median
         depths = camera.project(known)[1]
         if (depths > 0).any():
             return float(np.median(depths[depths > 0]))

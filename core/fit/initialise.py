@@ -37,7 +37,8 @@ SNAP_WIDTH, SNAP_VIEWS = 160, 40
 
 
 def initial_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
-    """Return the scene that a fit starts from: a scene trained elsewhere, or one Gaussian for each point."""
+    """Return the scene that a fit starts from: a scene trained elsewhere, or one Gaussian for each point of the
+    capture, with near plane and white for its frames."""
     scene = _load_scene(capture, settings, views, frames)
     scene.near = min(scene.near, NEAR_PLANE_FACTOR * nearest_depth(capture))
     scene.display_white = settings.display_white
@@ -82,6 +83,7 @@ def _check_in_view(scene: SceneGaussians, views: tuple[View, ...], path: str) ->
     """Raise CaptureError where few views have a Gaussian of the scene on their frames: it is of another world."""
     means = scene.means.detach().numpy()
     seeing = 0
+    # Some Gaussians suffice as a rule; all are projected only if those are on too few frames.
     for points in (means[::max(len(means) // SAMPLED_POINTS, 1)], means):
         seeing = sum(bool(view.camera.contains(*view.camera.project(points)).any()) for view in views)
         if seeing >= MIN_SHARE_OF_SEEING_VIEWS * len(views):
@@ -107,6 +109,7 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
     if frame_lights is None:
         positions = _standing_positions(capture, views, frames, settings, generator)
     else:
+        # Those of the middle frame, for cameras of other frames.
         positions = frame_lights.positions[len(frame_lights.positions) // 2].clone()
     cameras = [view.camera for view in views]
     corner_radius = max(camera.corner_radius for camera in cameras)

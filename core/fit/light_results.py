@@ -150,8 +150,8 @@ def _solve(targets: Targets, scene: NDArray[np.float32], flares: Sequence[NDArra
     solved[present] = robust_bounded_fit(columns, light, start[present], 0.0, MAX_BRIGHTNESS, PRIOR_WEIGHT)
     residual = light - columns @ solved[present]
     energies = np.square(columns).sum(0)
-    # The variance of a strength is variances / energies, by the squared errors at each pixel (White 1980), if errors are
-    # independent; `area` pixels count as one. The last term keeps the certainty finite.
+    # If errors were independent, the variance of a strength would be variances / energies, by the squared errors at
+    # each pixel (White 1980); but `area` pixels count as one. The last term keeps the certainty finite.
     variances = (np.square(columns) * residual[:, None] ** 2).sum(0) / np.maximum(energies, 1e-12)
     area = CORRELATION_SHARE * len(light)
     certainty[present] = energies / (area * variances + 1e-6 * area)

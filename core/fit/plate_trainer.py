@@ -153,8 +153,8 @@ class PlateTrainer(FlareTrainer):
         return figures
 
     def _update(self) -> None:
-        """At a few iterations, solve the brightness of the lights in all frames, and estimate the plates again with the
-        flare subtracted."""
+        """At a few iterations, solve the brightness of the lights in all frames; from `refine_at` on, estimate the
+        plates again, too, with the flare subtracted."""
         every = max(round(self.settings.brightness.solve_every * self.settings.iterations), 1)
         if self.iteration % every == 0 and self.iteration < self.settings.iterations:
             assert self.flare is not None
@@ -163,7 +163,10 @@ class PlateTrainer(FlareTrainer):
                 self._estimate_plates(subtract_flare=True)
 
     def _loss(self, picture: Tensor, frame: Tensor) -> Tensor:
-        """Return the loss of a composite against its frame: squares alone at first, then with L1 and SSIM."""
+        """Return the loss of a composite against its frame: squares alone at first, then with L1 and SSIM.
+
+        Squares count less where the composite is brighter: estimated plates more often contain flare than lack light.
+        """
         settings = self.settings.plates
         error = picture - frame
         weight = torch.where(error > 0, 1 / settings.excess_weight, 1.0)

@@ -48,7 +48,7 @@ def add_sky_points(capture: Capture, views: tuple[View, ...], frames: Frames) ->
 
 def fibonacci_directions(count: int, lowest: float = -1) -> NDArray[np.float64]:
     """Return unit vectors (count, 3), evenly spread over the part z > lowest of the sphere: a Fibonacci lattice
-    (Swinbank and Purser 2006)."""
+    (Swinbank and Purser 2006), with steps of the golden angle."""
     number = np.arange(count) + 0.5
     z, azimuth = 1 - (1 - lowest) * number / count, number * np.pi * (3 - np.sqrt(5))
     flat = np.sqrt(np.maximum(1 - z * z, 0))

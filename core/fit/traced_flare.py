@@ -95,7 +95,9 @@ class TracedResult:
 
 def make_flare(settings: TracedFlareSettings, out: Path, progress: Progress, *, notes: str = "", licence: str = ""
                ) -> TracedResult:
-    """Trace, fit, measure the error on a path that the fit did not see, and write a .flare.
+    """Trace, fit, measure the error on a path that the fit did not see, and write a .flare at `out`.
+
+    notes: stored in the file; empty for those of `describe`. licence: stored, too.
 
     Raises SettingsError, and Cancelled where the progress stops it; then nothing is written.
     """
@@ -124,9 +126,10 @@ def traced_camera(settings: TracedFlareSettings) -> Camera:
 
 
 def exposed_setup(settings: TracedFlareSettings) -> LensSetup:
-    """Return the setup of the tracer with the gain that gives the ghosts their level.
+    """Return the setup of the tracer with the gain that gives the ghosts their level, `settings.ghosts.level`.
 
-    Raises SettingsError where no ghost of the lens reaches the frame.
+    The gain is measured with the light at PROBES, on ghosts drawn more coarsely. Raises SettingsError where no ghost of
+    the lens reaches the frame.
     """
     setup = settings.lens_setup()
     if settings.ghosts.count == 0 or settings.ghosts.level == 0:
@@ -134,6 +137,7 @@ def exposed_setup(settings: TracedFlareSettings) -> LensSetup:
     optics, pairs = build_optics(setup)
     camera = traced_camera(settings)
     drawing = replace(setup.ghosts, bands=3 if settings.ghosts.dispersion else 1, supersample=1, limit=math.inf)
+    # An anamorphic lens is a spherical one that sees x divided by the squeeze, as in `render_flare`.
     pictures = np.stack([draw_ghosts(optics, pairs, drawing, (x / setup.squeeze, y),
                                      (camera.fx * setup.squeeze, camera.fy), (camera.cx, camera.cy), camera.width,
                                      camera.height) for x, y in _in_frame(settings, PROBES)])
@@ -166,7 +170,7 @@ def spread_places(settings: TracedFlareSettings) -> Places:
     They are denser towards the centre, where ghosts lie over each other and change fastest.
     """
     numbers = np.arange(1, settings.tracing.positions + 1)[:, None] * np.array(PLACE_STEPS)
-    even = numbers % 1 * 2 - 1
+    even = numbers % 1 * 2 - 1  # -1..1
     far = np.abs(even).max(1, keepdims=True)
     return _in_frame(settings, even * far ** (CENTRE_POWER - 1) * settings.tracing.field)
 
@@ -178,7 +182,7 @@ def path_places(settings: TracedFlareSettings) -> Places:
 
 def trace(settings: TracedFlareSettings, setup: LensSetup, places: Places, progress: Progress, stage: str
           ) -> TracedPictures:
-    """Trace the flare at each place of the light; `stage` names the stage of the progress."""
+    """Trace the flare at each place (n, 2) of the light, normalised coordinates. stage: its name for the progress."""
     camera = traced_camera(settings)
     progress.stage(stage, len(places))
     pictures = np.zeros((len(places), camera.height, camera.width, 3), np.float32)
@@ -214,7 +218,7 @@ def fit_traced(settings: TracedFlareSettings, setup: LensSetup, traced: TracedPi
     """
     fit = _fit_settings(settings)
     generator = torch.Generator().manual_seed(settings.fit.seed)
-    with torch.random.fork_rng():
+    with torch.random.fork_rng():  # torch's own generator draws the network's weights
         torch.manual_seed(settings.fit.seed)
         model = _new_model(settings, setup, fit, traced, generator)
     flare, camera = model.lights[0], traced_camera(settings)
@@ -232,6 +236,7 @@ def fit_traced(settings: TracedFlareSettings, setup: LensSetup, traced: TracedPi
         number = order.pop()
         optimisers.set_rates(iteration / fit.iterations)
         drawn = _draw(flare, lights[number], intrinsics, camera)
+        # Under the root, 1e-4 bounds the slope where the error vanishes.
         relative = (drawn - pictures[number]).square().sum() / energies[number]
         loss = (_encode(drawn) - encoded[number]).abs().mean() + SQUARED_WEIGHT * (relative + 1e-4).sqrt()
         loss.backward()
@@ -244,7 +249,8 @@ def fit_traced(settings: TracedFlareSettings, setup: LensSetup, traced: TracedPi
 
 def _new_model(settings: TracedFlareSettings, setup: LensSetup, fit: FitSettings, traced: TracedPictures,
                generator: torch.Generator) -> FlareModel:
-    """Return the model before the fit, with the light on the camera's axis."""
+    """Return the model before the fit, with the light on the camera's axis, and its Gaussians at light and ghosts and
+    along the line. setup: the traced lens. fit: settings of the model."""
     cameras = torch.tensor([[-CAMERA_RANGE] * 3, [CAMERA_RANGE] * 3])
     corner = math.hypot(settings.reach, settings.reach * settings.height / settings.tracing.width)
     query_range = QueryRange.of(cameras, torch.tensor(traced.places, dtype=torch.float32), corner)
@@ -260,11 +266,12 @@ def _new_model(settings: TracedFlareSettings, setup: LensSetup, fit: FitSettings
 
 
 def _start_at_light(flare: LightFlare, chosen: Tensor, reach: float, pixel: float, generator: torch.Generator) -> None:
-    """Move the chosen rows of the initial Gaussians to the light, as rays of log-uniform length, and scale all to the
-    frame.
+    """Move the chosen rows of the initial Gaussians to the light, as rays at log-uniform distances, and scale all to
+    the frame.
 
     Starburst and glow have most of a flare's light and stay at the light, where few of the Gaussians along the line
-    would lie. reach: half the frame's width, pixel: width of a pixel of the traced pictures, normalised coordinates.
+    would lie. The first CORE_GAUSSIANS rows lie in the light itself. reach: half the frame's width, pixel: width of a
+    pixel of the traced pictures, normalised coordinates.
     """
     rows = flare.gaussians
     with torch.no_grad():
@@ -276,6 +283,7 @@ def _start_at_light(flare: LightFlare, chosen: Tensor, reach: float, pixel: floa
         rows["positions"][chosen] = 1.0
         rows["offsets"][chosen] = direction * distance[:, None]
         rows["rotations"][chosen] = direction
+        # Deviations along and across the ray: a needle, but the shortest rays are about as wide as long.
         rows["log_scales"][chosen] = torch.log(torch.stack([0.35 * distance.clamp_min(RAY_LENGTHS[0] * reach * 2),
                                                             0.12 * distance.clamp_min(RAY_LENGTHS[0] * reach * 4)], -1))
         rows["rings"][chosen] = 0.0

@@ -25,9 +25,9 @@ Floats = NDArray[np.float64]
 CANVAS_WIDTH, CANVAS_REACH = 192, 3.0
 """Width of the pictures of single ghosts, pixels, and their field relative to the frame's."""
 MIN_LIGHT = 1e-9
-"""Total light of a ghost over the frame below which it counts as absent."""
+"""Root mean square of a ghost's light over the frame up to which it counts as absent."""
 ENERGY_POWER = 0.35
-"""Exponent of a ghost's light over the frame, to which its share of the Gaussians is proportional."""
+"""Exponent of `MeasuredGhost.light`; the ghost's share of the Gaussians is proportional to the power."""
 MIN_SHARE, MAX_SHARE = 0.008, 0.15
 """Range of a ghost's share of the Gaussians."""
 OVERLAP = 0.75
@@ -51,7 +51,11 @@ class MeasuredGhost:
 
 
 def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Sequence[float]) -> list[MeasuredGhost]:
-    """Return the ghosts of a setup that reach the frame, brightest first. lights: (n, 2) normalised coordinates."""
+    """Return the ghosts of a setup that reach the frame, brightest first, by their centroids, variances and levels.
+
+    camera: of the traced pictures. lights: (n, 2) places of the light, normalised coordinates. colour: of the light,
+    linear RGB. Each place counts by the ghost's light over the frame.
+    """
     optics, pairs = build_optics(setup)
     height = round(CANVAS_WIDTH * camera.height / camera.width)
     scale = CANVAS_WIDTH / CANVAS_REACH / camera.width
@@ -64,6 +68,7 @@ def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Seq
     for pair in pairs:
         seen, weights = [], []
         for light in lights:
+            # An anamorphic lens sees x divided by the squeeze.
             picture = draw_ghosts(optics, [pair], drawing, (light[0] / setup.squeeze, light[1]),
                                   (focal[0] * setup.squeeze, focal[1]), centre, CANVAS_WIDTH, height)
             picture = picture.astype(np.float64) * np.asarray(colour)
@@ -80,6 +85,8 @@ def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Seq
         if seen:
             rows, mix = np.array(seen), np.array(weights)
             along, squared, variance, *level = (mix[:, None] * rows).sum(0) / mix.sum()
+            # The place on the line is a least squares fit of centroid = place * light. An even disc of radius r has a
+            # variance of r^2 / 4 along each axis; half a pixel of the canvas is its least deviation.
             pixel = 0.5 / focal[0]
             ghosts.append(MeasuredGhost(float(along / max(squared, 1e-12)), 2 * math.sqrt(max(variance, pixel**2)),
                                         (level[0], level[1], level[2]), float(np.sqrt((mix**2).sum() / len(lights)))))
@@ -88,15 +95,17 @@ def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Seq
 
 def start_at_ghosts(flare: LightFlare, rows: torch.Tensor, ghosts: Sequence[MeasuredGhost],
                     generator: torch.Generator) -> None:
-    """Move the Gaussians of these rows to the ghosts, as even discs; each ghost has a latent code of its own.
+    """Move the Gaussians of these rows to the ghosts, spread evenly over a disc for each; each ghost has a latent code
+    of its own.
 
     The last two numbers of a code are the Gaussian's place in the ghost, so that the network can move, stretch and clip
-    a ghost as one. Rows that remain keep their places.
+    a ghost as one. Ghosts share the rows by their light; rows that remain keep their places.
     """
     if not ghosts or not len(rows):
         return
     shares = np.array([ghost.light for ghost in ghosts]) ** ENERGY_POWER
     shares = np.clip(shares / shares.sum(), MIN_SHARE, MAX_SHARE)
+    # Shares that were raised to MIN_SHARE may add up to more than 1.
     counts = np.floor(shares / max(shares.sum(), 1.0) * len(rows)).astype(int)
     parts = torch.split(rows[:int(counts.sum())], counts.tolist())
     table = flare.gaussians
@@ -105,11 +114,11 @@ def start_at_ghosts(flare: LightFlare, rows: torch.Tensor, ghosts: Sequence[Meas
             count = len(part)
             if not count:
                 continue
-            index = torch.arange(count) + 0.5
+            index = torch.arange(count) + 0.5  # a spiral by the golden angle fills a unit disc evenly
             radius, angle = (index / count).sqrt(), index * (math.pi * (3 - math.sqrt(5)))
             place = radius[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
             size = OVERLAP * ghost.radius * math.sqrt(math.pi / count)
-            inner = max(ghost.radius - size, 0.3 * ghost.radius)
+            inner = max(ghost.radius - size, 0.3 * ghost.radius)  # the outermost Gaussians reach the ghost's edge
             level = np.maximum(ghost.level, 1e-6)
             # A disc of level L: opacity x colour x 2 pi size^2 x count = L pi radius^2, with colours about 0.5.
             brightness = float(level.mean()) * ghost.radius**2 / (2 * size**2 * count)

@@ -115,7 +115,7 @@ class Trainer(FlareTrainer):
         return len(self._scene.means)
 
     def finish(self, folder: Path, pixel_grid: PixelGrid, progress: Progress) -> None:  # noqa: ARG002
-        """Write the scene."""
+        """Write the scene; a frozen one keeps the pixel grid that it was trained at."""
         if not self.settings.scene.frozen:
             self._scene.pixel_grid = pixel_grid
         write_ply(folder / SCENE, self._scene)
@@ -123,8 +123,8 @@ class Trainer(FlareTrainer):
     # ---- one iteration ----------------------------------------------------------------------------
 
     def step(self) -> dict[str, float]:
-        """Run one iteration on the next view; return the loss of the composite, absent while the scene is fitted alone,
-        and that of the scene."""
+        """Run one iteration on the next view; return "loss", of the composite, absent while the scene is fitted alone,
+        and "scene_loss", absent where nothing but the composite supervises the scene."""
         self.iteration += 1
         settings = self.settings
         view = self._view()
@@ -140,6 +140,7 @@ class Trainer(FlareTrainer):
         light_discs = self._light_disc_mask(targets)
         picture = composite(self._flare_background(targets, scene_picture, light_discs), flare, settings.blend,
                             self.frames.display_white)
+        # The losses of composite and scene, and the penalties.
         weight = 1 - settings.ssim_share
         joint_target = self._joint_target(targets, picture.detach(), light_discs)
         loss = (scene_picture.new_zeros(()) if scene_only else
@@ -165,6 +166,7 @@ class Trainer(FlareTrainer):
         occlusion_loss = self._occlusion_loss(targets)
         if occlusion_loss is not None:
             loss = loss + occlusion_loss
+        # Gradients and steps. The step moves far Gaussians, too; `_turn_far_layer` puts them back on their sphere.
         far_rows = self.scene.far_rows()
         far_means = self.scene.means.detach()[far_rows]
         if loss.requires_grad:  # it does not with a frozen scene and no light in front of the camera
@@ -184,7 +186,8 @@ class Trainer(FlareTrainer):
 
     @torch.no_grad()
     def _turn_far_layer(self, rows: Tensor, before: Tensor) -> None:
-        """Turn far Gaussians, which were at `before`, by the angle that a near one would appear to move by a step."""
+        """Turn far Gaussians (rows), which were at `before`, by the angle at which a Gaussian one extent away would
+        appear to move by the optimiser's step."""
         if self.scene.far is not None and self.fits_scene and len(rows):
             steps = self.optimisers.scene.last_step("means", rows) * (self.scene.far.radius / self.extent)
             self.scene.means[rows] = self.scene.far.move(before, steps)
@@ -245,7 +248,8 @@ class Trainer(FlareTrainer):
         return self.settings.supervised and self.fits_scene and targets.clean is not None and not flare_started
 
     def _flare_background(self, targets: Targets, scene: Tensor, light_discs: Tensor | None) -> Tensor:
-        """Return what the flare is composited over: the clean frame until `separate_until`, then the scene.
+        """Return what the flare is composited over: the clean frame until `separate_until`, then the scene; black in
+        the lights' discs.
 
         The faint and small parts of a flare drown in the errors of a scene that has not converged. Later the scene, on
         which all views agree, is better than one clean frame with its residual flare; but not above white, where its
@@ -274,13 +278,15 @@ class Trainer(FlareTrainer):
         return discs if self.frames.display_white == 1 else discs & (targets.frame - clean < MIN_DIFFERENCE).all(-1)
 
     def _joint_target(self, targets: Targets, picture: Tensor, light_discs: Tensor | None) -> Tensor:
-        """Return the target of the composite: the frame. Above white, a light's disc is only a lower bound: at least
-        white."""
+        """Return the target of the composite: the frame. If frames go above white, a light's disc only has to be white
+        or brighter: there the target is the composite itself (`picture`), where that is so."""
         if self.frames.display_white == 1 or light_discs is None:
             return targets.frame
         return torch.where(light_discs[..., None], picture.clamp_min(1), targets.frame)
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
+        """Return what the scene's picture is compared with, display values; None without a clean frame, and in modes
+        without such a target. picture: the composite."""
         if self.settings.supervised:
             return targets.clean
         if self.settings.mode == "in-flare":
@@ -308,6 +314,8 @@ class Trainer(FlareTrainer):
                                         settings.split)
 
     def _sh_degree(self) -> int:
+        """Return the degree of the scene's colours in this iteration: it grows by one every `sh_every`, up to a limit
+        that is lower at first in a fit by parallax."""
         if self.settings.scene.start:
             return MAX_DEGREE  # it was trained before
         split = self.settings.split
@@ -323,6 +331,7 @@ class Trainer(FlareTrainer):
         return Classic(self.scene, adam, self.extent, generator, settings.classic)
 
     def _reorder_scene(self) -> None:
+        """Sort the scene's Gaussians along the Morton curve at intervals, which keeps neighbours together in memory."""
         if self.iteration % self.settings.scene.reorder_every == 0:
             order = morton_order(self.scene.means.detach())
             self.optimisers.scene.keep_rows(order)

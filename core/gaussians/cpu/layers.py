@@ -29,7 +29,7 @@ from .vector import LANES, atomic_increment, deinterleave, fma, interleave, load
 PIXELS_PER_TASK = 1 << 12
 """Pixels that a thread composites at a time."""
 PADDING = 8
-"""Zero pixels on both sides of a scratch row, more than half a tent."""
+"""Zero pixels on both sides of a scratch row: border pixels gather up to 3/4 of a tent there, 6 pixels for factor 4."""
 ZERO = np.float32(0)
 
 
@@ -44,7 +44,8 @@ def _interpolate_rows(plane, length, near, far, share, row):
 
 @inlined
 def _upsample_row(row, channels, factor, width, out, at):
-    """Upsample the pixels of an interpolated row to `width` pixels of `out`, from the flat index `at` on."""
+    """Upsample the pixels of an interpolated row, which has a border of one pixel, to `width` pixels of `out`, from the
+    flat index `at` on."""
     for i in range(width):
         cell, j = i // factor + 1, i % factor
         share = (j + 0.5) / factor - 0.5
@@ -74,7 +75,8 @@ def upsample_kernel(counter, row, colour, t, small_width, factor, width, height,
 
 @inlined
 def _gather_rows(plane, length, r, factor, height, row, pad):
-    """Write the tent-weighted sum of the rows about small row r of a plane to row[pad : pad + length]."""
+    """Write the tent-weighted sum of the rows of a plane about small row r to row[pad : pad + length]; length, height:
+    of the plane."""
     start = (r - 1) * factor - factor // 2
     first, last = max(start, 0), min(start + 2 * factor, height)
     for block in range(0, length, LANES):
@@ -105,7 +107,7 @@ def _gather_pixels(row, pad, channels, factor, small_width, out, at):
 def upsample_backward_kernel(
     counter, row, d_colour, d_t, small_width, small_height, factor, width, height, out_colour, out_t
 ):  # fmt: skip
-    """Write the gradients of the small picture; d_t may be empty."""
+    """Write the gradients of the small picture, border included; d_t may be empty."""
     pad = 3 * PADDING
     row[:] = ZERO
     while True:

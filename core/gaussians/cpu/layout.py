@@ -14,7 +14,9 @@ from .. import rendering
 TILE_SHIFT_X, TILE_SHIFT_Y = 4, 6
 TILE_WIDTH, TILE_HEIGHT = 1 << TILE_SHIFT_X, 1 << TILE_SHIFT_Y
 
-# A record of 16 float32, a cache line, for each Gaussian; `projection` defines its fields.
+# A record of 16 float32, a cache line, for each Gaussian. `projection` defines A, K, D, STEP and RUN. REACH: the
+# exponent A u² + D d_y² at the rim. HALF_X, HALF_Y: half size of the bounding box, px. K_REST: what K loses by
+# rounding, for needles; 0 in scenes.
 X, Y, A, K, D, OPACITY, STEP, RUN, RED, GREEN, BLUE, DEPTH, REACH, HALF_X, HALF_Y, K_REST = range(16)
 RECORD = 16
 

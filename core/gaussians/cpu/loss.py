@@ -76,8 +76,10 @@ def _apply_window(v):
 
 @inlined
 def _window_along_row(row, at):
-    """Apply the window along a row of scratch. Neighbours are shuffled out of three vectors: unaligned loads take twice
-    the time, since nearly all of them cross a cache line."""
+    """Return the window's weighted sums along a row of scratch, for 16 numbers from `at` on, without the padding.
+
+    Neighbours in x are 3 numbers apart: -15, -12 ... 15. They are shuffled out of three vectors: unaligned loads take
+    twice the time, since nearly all of them cross a cache line."""
     at += PAD
     a, b, c = load(row, at - LANES), load(row, at), load(row, at + LANES)
     return _apply_window((
@@ -89,7 +91,9 @@ def _window_along_row(row, at):
 
 @inlined
 def _store_band(v, rows, at):
-    """Apply the window down the columns of a band into scratch; v: the band's rows and 5 more on both sides."""
+    """Apply the window down 16 columns of a band and write them to scratch from `at` on.
+
+    v: the band's 6 rows and 5 more on both sides."""
     store(rows[0], PAD + at, _apply_window(v[:11]))
     store(rows[1], PAD + at, _apply_window(v[1:12]))
     store(rows[2], PAD + at, _apply_window(v[2:13]))
@@ -100,13 +104,13 @@ def _store_band(v, rows, at):
 
 @inlined
 def _is_interior(band, height):
-    """Return whether the windows of a band lie within the picture."""
+    """Return whether the windows of a band lie within the picture; band: its first row."""
     return HALO <= band <= height - BAND - HALO
 
 
 @inlined
 def _column_moments(x, y, row, at, length, height):
-    """Return E[x], E[xx] and E[xy] down the columns."""
+    """Return E[x], E[xx] and E[xy] down the columns, at 16 numbers of a row from `at` on; length: numbers of a row."""
     m, xx, xy = splat(ZERO), splat(ZERO), splat(ZERO)
     for k in range(max(-HALO, -row), min(HALO + 1, height - row)):
         a = load(x, (row + k) * length + at)
@@ -117,7 +121,7 @@ def _column_moments(x, y, row, at, length, height):
 
 @inlined
 def _columns_of_moments(x, y, band, end, length, height, rows):
-    """Write the column moments of the rows of a band to scratch; loads the rows of all windows once."""
+    """Write the column moments of rows band .. end of the picture to scratch; loads the rows of all windows once."""
     for block in range(0, length, LANES):
         at = min(block, length - LANES)
         if _is_interior(band, height):
@@ -155,7 +159,7 @@ def _columns_of_maps(before, here, after, length, rows):
 
 @inlined
 def _ssim_derivatives(mu, xx, xy, mu_y, s_y):
-    """Return S and its derivatives by E[x], E[xx], E[xy]."""
+    """Return S and its derivatives by E[x], E[xx], E[xy], from these means and the target's E[y] and s_y."""
     cross, squares = mu * mu_y, fma(mu, mu, mu_y * mu_y)
     a1, a2 = fma(cross, TWO, splat(C1)), fma(xy - cross, TWO, splat(C2))
     b1, b2 = squares + C1, xx - mu * mu + s_y + C2
@@ -196,7 +200,7 @@ def _compute_maps(x, y, mu_y, s_y, band, length, height, rows, maps, sums):
 
 @inlined
 def _gradient(x, y, before, here, after, band, length, height, by_l1, by_similarity, rows, out):
-    """Write by_l1 sign(x - y) + by_similarity dS/dx of a band, from its maps and those of the bands beside it."""
+    """Write by_l1 sign(x - y) + by_similarity dS/dx of a band, from its maps `here` and those of its neighbours."""
     _columns_of_maps(before, here, after, length, rows)
     for row in range(band, min(band + BAND, height)):
         place = row - band
@@ -215,8 +219,8 @@ def _gradient(x, y, before, here, after, band, length, height, by_l1, by_similar
 def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, parts, done, sums, value, out):
     """Write the loss to value (1,) and its gradient by x to `out`, unless `out` is empty.
 
-    parts: number of parts of the picture, each the work of a thread; done (1,): 0, counts finished parts; sums (h, 2):
-    workspace."""
+    lam: weight of L1; parts: number of parts of the picture, each the work of a thread; done (1,): 0, counts finished
+    parts; sums (h, 2): workspace."""
     length = STEP * width
     maps = scratch[: 9 * BAND * length].reshape(3, 3, BAND, length)
     rows = scratch[9 * BAND * length :][: 3 * BAND * (length + 2 * PAD)].reshape(3, BAND, length + 2 * PAD)
@@ -230,7 +234,7 @@ def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, par
         first, end = bands * part // parts, bands * (part + 1) // parts
         halo_bands = 1 if out.size > 0 else 0  # the gradient needs the maps of the bands beside
         for number in range(first - halo_bands, end + halo_bands):
-            here = maps[(number + 3) % 3]
+            here = maps[(number + 3) % 3]  # a ring of three bands; number may be -1
             if 0 <= number < bands:
                 _compute_maps(x, y, mu_y, s_y, number * BAND, length, height, rows, here, sums)
             else:
@@ -240,7 +244,7 @@ def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, par
                 _gradient(
                     x, y, before, middle, here, (number - 1) * BAND, length, height, by_l1, by_similarity, rows, out
                 )
-        if atomic_add(done, 0, 1) == parts - 1:
+        if atomic_add(done, 0, 1) == parts - 1:  # whoever finishes last adds up the rows, always in the same order
             l1, similarity = 0.0, 0.0
             for row in range(height):
                 l1 += sums[row, 0]
@@ -250,7 +254,7 @@ def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, par
 
 @kernel
 def target_moments_kernel(counter, scratch, y, width, height, mu_y, s_y):
-    """Write the target's window means and variances."""
+    """Write the window means mu_y and variances s_y of the target y, all flat."""
     length = STEP * width
     rows = scratch[: 2 * (length + 2 * PAD)].reshape(2, length + 2 * PAD)
     rows[:, :] = ZERO
@@ -325,7 +329,7 @@ class _L1Ssim(torch.autograd.Function):
 
 
 def l1_ssim(image: Tensor, target: Tensor, lam: float) -> Tensor:
-    """Return the loss of `l1_ssim` of `..loss`."""
+    """Return the loss of `l1_ssim` of `..loss`; a picture whose rows are shorter than a vector is left to torch."""
     if STEP * image.shape[1] < LANES:
         return definition.l1_ssim(image, target, lam, kernels="torch")
     return _L1Ssim.apply(image, target.detach() if target.requires_grad else target, lam)

@@ -98,11 +98,13 @@ class AdamStep(NamedTuple):
 def adam_steps(steps: Sequence[AdamStep], *, beta1: float, beta2: float, epsilon: float) -> None:
     """Make all steps in one parallel call: a thread that finds no more work on one parameter takes the next."""
     calls = [_kernel_arguments(step, beta1, beta2, epsilon) for step in steps]
-    tasks = sum(-(-call[1].size // call[6]) for call in calls)
+    tasks = sum(-(-call[1].size // call[6]) for call in calls)  # parameter and task_size of `adam_kernel`
     parallel(_step_all, calls, limit=tasks if adam_kernel.overloads else 1)  # compiled by one thread
 
 
 def _step_all(counter: Array, calls: Sequence[tuple[Any, ...]]) -> None:
+    """Step all parameters on this thread together with the others. The first call counts by the counter of `parallel`,
+    for which idle threads watch; each other call has its own."""
     for number, call in enumerate(calls):
         adam_kernel(call[0] if number else counter, *call[1:])
 

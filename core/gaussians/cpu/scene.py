@@ -22,7 +22,7 @@ _BLACK, _NO_DEPTH = torch.zeros(3), torch.empty(0, 0)
 
 @dataclass(frozen=True)
 class _RasterOptions(TileGrid):
-    """Inputs and results that are not differentiated."""
+    """Inputs and results that are not differentiated; for the inputs see `rasterization`."""
 
     sh_degree: int
     near: float
@@ -121,10 +121,11 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _camera_gradients(sums: Array, camera: Array) -> tuple[Tensor, Tensor]:
-    """Return the gradients of world_to_camera (4, 4) and intrinsics (3, 3), from the sums of all chunks."""
+    """Return the gradients of world_to_camera (4, 4) and intrinsics (3, 3), from the sums (chunks, CAMERA_SUMS) and the
+    packed camera."""
     total = sums.astype(np.float64).sum(0)
     rotation, translation = camera[:9].reshape(3, 3).astype(np.float64), camera[9:12].astype(np.float64)
-    position = total[projection.POSITION_SUM : projection.POSITION_SUM + 3]  # of -R^T t
+    position = total[projection.POSITION_SUM : projection.POSITION_SUM + 3]  # gradient by the position, -R^T t
     d_rotation = total[:9].reshape(3, 3) - np.outer(translation, position)
     d_translation = total[9:12] - rotation @ position
     pose = np.zeros((4, 4))

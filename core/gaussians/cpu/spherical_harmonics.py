@@ -30,7 +30,7 @@ ZERO, HALF, TWO, THREE, FOUR, EIGHT = (np.float32(number) for number in (0, 0.5,
 
 @inlined
 def gather(sh, first, width, used, transposed):
-    """Transpose `used` of the `width` numbers of 16 Gaussians, from row `first` of sh (n, width) on."""
+    """Transpose the first `used` of the `width` numbers of 16 Gaussians, from row `first` of sh (n, width) on."""
     one = opaque(1)
     column = 0
     while column < used:
@@ -54,7 +54,7 @@ def scatter(transposed, first, width, sh, cached):
     while column < width:
         if column + LANES <= width:
             rows = load_rows(transposed, column * LANES, LANES)
-            if width == ROWS and not cached:
+            if width == ROWS and not cached:  # rows of 48 numbers begin at cache lines, as `stream_rows` requires
                 stream_rows(sh, first * width + column, width, transpose(rows))
             else:
                 store_rows(sh, first * width + column, width, transpose(rows))
@@ -102,7 +102,9 @@ def colours(transposed, degree, x, y, z, b):
 
 @inlined
 def coefficients_backward(degree, x, y, z, v, b, transposed):
-    """Write the transposed gradients of the coefficients from those of the colours."""
+    """Write the transposed gradients of the coefficients from those of the colours, v; zeros above the degree.
+
+    b: workspace of 16 vectors."""
     _basis(degree, x, y, z, b)
     used = (degree + 1) * (degree + 1)
     for k in range(used):
@@ -118,6 +120,7 @@ def slope(transposed, degree, x, y, z, channel):
     rows, stride = transposed[channel * LANES :], 3 * LANES  # coefficient k is at row k * stride
     zero = splat(ZERO)
     dx, dy, dz = zero, zero, zero
+    # h_k: coefficient k times a constant of grad b_k
     if degree >= 1:
         dx, dy, dz = load(rows, 3 * stride) * -C1, load(rows, stride) * -C1, load(rows, 2 * stride) * C1
     if degree >= 2:

@@ -55,7 +55,7 @@ class _Worker:
         self._done = np.zeros(1, np.int64)
         self._error: BaseException | None = None
         self._is_asleep = False
-        self._state = threading.Lock()  # of _call and _asleep
+        self._state = threading.Lock()  # guards _call and _is_asleep
         self._wakeup = threading.Semaphore(0)
         threading.Thread(target=self._run, name="kernels", daemon=True).start()
 
@@ -76,6 +76,7 @@ class _Worker:
         return error
 
     def _run(self) -> None:
+        """Make one call after the other; between them spin for a moment, then sleep."""
         torch.set_flush_denormal(True)  # a register of the thread
         while True:
             number = self._number
@@ -90,7 +91,7 @@ class _Worker:
                 _call(*call)
             except BaseException as error:
                 self._error = error
-            del call
+            del call  # frees its arrays before the thread waits
 
 
 class _ThreadPool:
@@ -102,7 +103,9 @@ class _ThreadPool:
         self._counters = np.zeros((2, buffers.CACHE_LINE // 8), np.int64)
 
     def call(self, function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...], count: int) -> None:
-        """Call on the caller's thread and count - 1 workers."""
+        """Call function(counter, [workspace,] *arguments) on the caller's thread and on count - 1 workers, and wait.
+
+        scratch: see `parallel`."""
         while len(self._workers) < count - 1:
             self._workers.append(_Worker(self._counters))
         self._number += 1
@@ -121,6 +124,7 @@ class _ThreadPool:
 
 
 _idle_pools: list[_ThreadPool] = []
+"""Pools that no call uses at the moment; each of several callers at a time takes one."""
 
 
 def _call(function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...]) -> None:

@@ -35,7 +35,14 @@ class TileGrid:
 
 @dataclass(frozen=True)
 class Bins:
-    """Entries by tile, and the slots of each Gaussian; see `binning`."""
+    """Entries by tile, and the slots of each Gaussian; see `binning`.
+
+    entries   flat, `layout.ENTRY` numbers each, tile by tile
+    starts    (tiles + 1,) number of the first entry of each tile
+    firsts    (n,) first slot of each Gaussian
+    counts    (n,) number of its slots
+    slots     number of all slots, including unused ones
+    """
 
     entries: Array
     starts: Array
@@ -53,8 +60,8 @@ def bin_gaussians(
     records: Array, keys: Array, tiles: Array, rows: Array, bounds: Array, firsts: Array, chunk_bounds: Array,
     grid: TileGrid,
 ) -> Bins:  # fmt: skip
-    """Sort n records into tiles, by key; for the arguments see `binning.list_sorted`, which overwrites bounds and
-    firsts.
+    """Sort n records into tiles, by key; for the arguments see `binning.list_sorted`, which replaces bounds by counts
+    and firsts by first slots.
 
     chunk_bounds: sums of the bounds over chunks."""
     n, parts = len(keys), min(torch.get_num_threads(), MAX_PARTS)  # each part scans all keys
@@ -63,6 +70,7 @@ def bin_gaussians(
         keys, bounds, chunk_bounds, max(1, -(-n // SAMPLE_SIZE)), np.empty(binning.HISTOGRAM_BINS, np.int64),
         starts_of_chunks, cuts,
     )  # fmt: skip
+    # Each part needs one place more than it lists: it may write an entry that it does not count.
     tile_list = buffers.empty((capacity + parts) * binning.LIST_ENTRY, np.int32)
     spans, tile_counts = np.empty((parts, 2), np.int64), np.empty((parts, grid.tiles), np.int32)
     parallel(

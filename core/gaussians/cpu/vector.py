@@ -64,7 +64,7 @@ def _broadcast(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
 
 
 def _as_vector(context: Any, builder: ir.IRBuilder, value: ir.Value, type_: types.Type, kind: str) -> ir.Value:
-    """Convert a number of `type_` to a vector; return vectors unchanged."""
+    """Convert a number of `type_` to a vector of this kind; return vectors unchanged."""
     if isinstance(type_, Vector):
         return value
     scalar = {"float32": types.float32, "int32": types.int32, "bool": types.boolean}[kind]
@@ -84,7 +84,9 @@ def _kind_of(args: Sequence[types.Type]) -> str | None:
 
 
 def _define_operator(symbol: Callable[..., Any], kinds: dict[str, Callable[..., ir.Value]], result: str) -> None:
-    """Define the operator `symbol` for two vectors, or a vector and a number; kinds: emitter by kind of vector."""
+    """Define the operator `symbol` for two vectors, or a vector and a number.
+
+    kinds: emitter by kind of vector; result: kind of the result, "" for that of the arguments."""
 
     class Typing(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:  # noqa: ARG002
@@ -480,7 +482,7 @@ def _interleave_halves(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, step: in
 
 
 def _reduce_eight(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
-    """Sum up to 8 vectors of 16 lanes to 8 lanes: a transposition that adds at each step."""
+    """Return 8 lanes, of which lane i is the sum of vector i of up to 8: a transposition that adds at each step."""
     low, high = range(LANES // 2), range(LANES // 2, LANES)
     level: list[ir.Value | None] = [
         builder.fadd(_shuffle(builder, v, None, low), _shuffle(builder, v, None, high)) for v in vectors
@@ -572,6 +574,7 @@ def _permute(context: Any, builder: ir.IRBuilder, vectors: ir.Value, count: int,
             positions = [divmod(i * count + k, LANES) for i in range(LANES)]  # (vector, lane) of each result lane
         else:
             positions = [divmod(k * LANES + i, count)[::-1] for i in range(LANES)]
+        # Step v takes the lanes that come from vector v. Step 1 also puts those of vector 0 into their places.
         value = parts[0]
         for v in range(1, count):
             source = [LANES + lane if vector == v else (lane if v == 1 else i)
@@ -622,7 +625,7 @@ def exp2_unclamped(x):
     ff = f * f
     p = fma(ff, fma(f, _EXP2[5], _EXP2[4]), fma(f, _EXP2[3], _EXP2[2]))
     p = fma(ff, p, fma(f, _EXP2[1], _EXP2[0]))
-    return as_floats(as_ints(p) + (as_ints(rounded) << 23))
+    return as_floats(as_ints(p) + (as_ints(rounded) << 23))  # adds the integer part to the bits of the exponent
 
 
 @inlined
@@ -637,7 +640,7 @@ _FLOAT_MAX, _INFINITY = np.float32(3.4028235e38), np.float32(np.inf)
 
 @inlined
 def exp(x):
-    """Return e^x, 1.2e-6 relative within -20 .. 20 (half an ulp of x / ln 2); NaN and infinity stay."""
+    """Return e^x, 1.2e-6 relative within -20 .. 20 (half an ulp of x / ln 2); NaN and +infinity stay."""
     return where(x <= _FLOAT_MAX, exp2(x * _LOG2_E), x)
 
 
@@ -672,7 +675,8 @@ _LOG2 = tuple(np.float32(2.8853900817779268 / k) for k in (1, 3, 5, 7, 9))
 
 @inlined
 def log2(x):
-    """Return log2 x for normal x > 0 (2e-7 absolute near 1)."""
+    """Return log2 x for normal x > 0 (2e-7 absolute near 1): the exponent plus log2 of the mantissa m, by the series in
+    s = (m - 1) / (m + 1), with m brought to sqrt(1/2) .. sqrt(2)."""
     bits = as_ints(x)
     exponent = to_floats(((bits >> 23) & 255) - 127)
     m = as_floats((bits & 0x007FFFFF) | 0x3F800000)

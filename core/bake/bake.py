@@ -133,6 +133,8 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
                 progress: Progress | None = None, *, overwrite: bool = False) -> dict[str, Any]:
     """Write the layers of `frames`, each by its own renderer, under `out`; return the content of bake.json.
 
+    cameras: by the view's name, at the size of the frames.
+
     Frames that an earlier bake with the same settings finished are kept, and stay in the manifest. Raises RunError if
     `out` holds layers made with other settings, unless `overwrite`, or another bake starts to write such there;
     SettingsError for invalid edits; Cancelled.
@@ -144,14 +146,14 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
         keyed_edits, frame_edits = keyed.at(frame.number, lights, elements), renderer_of(frame).edit_texts
         return LookEdits.parse([*frame_edits, *keyed_edits.texts()], lights, elements) if frame_edits else keyed_edits
 
-    edits = {frame.view: edits_of(frame) for frame in frames}  # before anything that is there makes way for it
+    edits = {frame.view: edits_of(frame) for frame in frames}  # invalid edits raise before any file is deleted
     space = settings.colour_space()
     cache_key = _cache_key(source.fingerprint, settings, keyed)
     names = layer_names(lights)
     _claim_folder(out, cache_key, names, overwrite)
 
     def header_notes(frame: NumberedFrame) -> dict[str, Any]:
-        """Return the entries of a frame's header."""
+        """Return the entries of a frame's header, by which `_is_up_to_date` knows the frame again."""
         inputs = renderer_of(frame).fingerprint
         frame_edits = {"inputs": inputs} if inputs else {}
         return {"view": frame.view, "frame": frame.number, **frame_edits, **cache_key}
@@ -204,6 +206,7 @@ def _cache_key(fingerprint: str, settings: BakeSettings, keyed: KeyedEdits) -> d
         cache_key["space"] = [settings.space, settings.config, settings.colour_space().fingerprint]
     if keyed.frames:
         cache_key["keyed"] = keyed.to_json()["frames"]
+    # As it is read back from a file: tuples become lists.
     normalised: dict[str, Any] = json.loads(json.dumps(cache_key))
     return normalised
 
@@ -246,8 +249,9 @@ def _claim_folder(out: Path, cache_key: dict[str, Any], names: dict[str, str], o
 
 
 def _is_up_to_date(path: Path, expected: Mapping[str, Any]) -> bool:
-    """True if the file is whole and holds this frame under these settings, by its own header: other farm tasks write
-    here too."""
+    """True if the file is whole and its own header has the `expected` entries: the frame and its settings.
+
+    bake.json does not tell, since other tasks of a farm write here too."""
     try:
         if is_exr_truncated(path):
             return False
@@ -258,6 +262,7 @@ def _is_up_to_date(path: Path, expected: Mapping[str, Any]) -> bool:
 
 
 def _entry(out: Path, frame: NumberedFrame, extra_files: Sequence[Path]) -> dict[str, Any]:
+    """Return the entry of a finished frame in bake.json."""
     with open_regular(out / frame.file) as stream:
         width, height = exr_header.windows(stream)["dataWindow"]
     beside = {"rest": [path.relative_to(out).as_posix() for path in extra_files]} if extra_files else {}
@@ -283,6 +288,7 @@ def _add_to_manifest(out: Path, cache_key: dict[str, Any], names: dict[str, str]
     with file_lock(out / LOCK):
         _check_is_current(out, cache_key, names)
         existing = read_manifest(out) if (out / MANIFEST).exists() else {}
+        # Entries whose files are gone are dropped.
         known = {entry["file"]: entry for entry in existing.get("frames", []) if (out / entry["file"]).is_file()}
         known.update({entry["file"]: entry for entry in entries})
         frames = sorted(known.values(), key=lambda entry: (Path(entry["file"]).parent.as_posix(), entry["frame"]))

@@ -64,7 +64,9 @@ def read_description(path: Path | str) -> dict[str, Any]:
 
 
 def read_layers(path: Path | str) -> FrameLayers:
-    """Read the layers of a file that `write_layers` made. Raises FrameError if it is damaged or not one."""
+    """Read the layers of a file that `write_layers` made, without the alpha of the composite.
+
+    Raises FrameError if it is damaged or not one."""
     import numpy as np
 
     lights = read_description(path)["lights"]

@@ -102,6 +102,7 @@ class LayerFolder:
 
 
 def _read_layer_names(path: Path) -> set[str]:
+    """Return the names of the layers in a file; the composite has none. Raises FrameError if it is truncated."""
     if is_exr_truncated(path):
         raise FrameError(f"{path} ends before its last lines; bake it again.")
     return {name.rpartition(".")[0] for name in channel_names(path)} - {""}

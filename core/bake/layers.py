@@ -81,6 +81,7 @@ class FrameLayers:
 
 
 def _add_channels(channels: dict[str, Pixels], prefix: str, colour: Pixels, alpha: Pixels | None = None) -> None:
+    """Add the channels R, G, B and, if given, A of one layer, with `prefix` before their names."""
     for index, name in enumerate("RGB"):
         channels[prefix + name] = colour[..., index]
     if alpha is not None:
@@ -88,6 +89,7 @@ def _add_channels(channels: dict[str, Pixels], prefix: str, colour: Pixels, alph
 
 
 def _apply_colour(layer: Pixels, matrix: Any) -> Pixels:
+    """Return a layer (h, w, 3) under a colour matrix (3, 3); a pixel that is nowhere negative stays so."""
     matrix = np.asarray(matrix, np.float32)
     factors = matrix.diagonal()
     # What is negative, as differences of layers are where a flare covers what is brighter, stays so.

@@ -31,6 +31,7 @@ class ShotRenderer(ShotSource):
         super().__init__(shot)
         self.run = Run.open(shot.run) if shot.run else None
         model = self.run.flare.model if self.run is not None and self.run.flare is not None else None
+        # Visibility of each unoccluded light through the scene of the fit, by name.
         self._clear = dict(zip(model.names, model.clear.tolist(), strict=True)) if model is not None else {}
 
     @property
@@ -50,6 +51,7 @@ class ShotRenderer(ShotSource):
             scene, white = (None, 1.0) if self.run is None else (render_scene(self.run.gaussians, camera),
                                                                  self.run.gaussians.display_white)
             parts = linear_layers(dark if scene is None else scene.colour, flares, self.look.blend, white)
+        # Over black a flare only adds; what is below 0 there is rounding.
         layers = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()
                   for name, layer in parts.flares.items()}
         depth = dark[..., 0] if scene is None else scene.depth

@@ -71,6 +71,7 @@ class LookRenderer(ShotSource):
         super().__init__(shot)
 
     def render(self, shot_frame: ShotFrame, camera: Camera, edits: LookEdits | None = None) -> RenderedLayers:
+        """Render the layers of a frame; scene and depth are 0, and a light without a flare has a black layer."""
         flares = self.look.evaluate_lights(camera.world_to_camera, shot_frame.lights, edits, self.shot.query)
         exposed = {name: gaussians.with_exposure(camera.exposure, self.look.blend)
                    for name, gaussians in flares.items()}

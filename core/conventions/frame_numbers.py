@@ -92,7 +92,7 @@ def number_sequences(paths: Iterable[Path]) -> dict[Path, int]:
     for path in dict.fromkeys(paths):
         folders.setdefault(path.parent, []).append(path)
     numbers: dict[Path, int] = {}
-    for inside in folders.values():
+    for inside in folders.values():  # one group, unless two plates share a number
         ends = [number for path in inside if (number := _parse_number(path)) is not None]
         groups: dict[tuple[str, str], list[Path]] = {}
         for path in inside:
@@ -161,7 +161,7 @@ def select_task_frames(frames: Sequence[NumberedFrame], text: str | None,
 
 
 def _is_between(numbers: Sequence[int], ranges: Sequence[range]) -> bool:
-    """Return whether a range begins after the first and ends before the last of sorted numbers."""
+    """Return whether any of the ranges begins after the first and ends before the last of sorted numbers."""
     return bool(numbers) and any(numbers[0] < each[0] and each[-1] < numbers[-1] for each in ranges)
 
 
@@ -172,9 +172,10 @@ def _no_frames(frames: Sequence[NumberedFrame], text: str) -> SettingsError:
 
 
 def missing_numbers(frames: Sequence[NumberedFrame], text: str | None) -> str:
-    """Return the numbers in `text` that no frame has, as such a list; "" where there are none."""
+    """Return the numbers in the list `text` that no frame has, as such a list; "" where there are none, or no text."""
     known, gaps = {frame.number for frame in frames}, []
     for numbers in _parse_ranges(text) if text is not None else []:
+        # Places in the range that a frame has; a gap lies between neighbours that are more than 1 apart.
         present = [-1, *sorted(numbers.index(number) for number in known if number in numbers), len(numbers)]
         gaps += [numbers[before + 1:after] for before, after in itertools.pairwise(present) if after > before + 1]
     return ",".join(str(gap[0]) if len(gap) == 1 else f"{gap[0]}-{gap[-1]}" + f":{gap.step}" * (gap.step > 1)

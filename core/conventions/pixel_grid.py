@@ -56,7 +56,7 @@ class PixelGrid:
         return {"least": self.min_focal_length, "most": self.max_focal_length}
 
     def pixel_ratio(self, focal_length: float) -> float:
-        """Number of pixels of a picture of this focal length, px, along one pixel of the fit's frames."""
+        """Number of pixels of a picture of this focal length, px, along one of the fit's frames; 1 inside the range."""
         ratio = focal_length / min(max(focal_length, self.min_focal_length), self.max_focal_length)
         return 1.0 if abs(ratio - 1) < SIZE_TOLERANCE else ratio
 

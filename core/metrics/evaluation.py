@@ -33,6 +33,7 @@ LAYERS = ("composite", "scene", "flare", "flare_linear")
 _COMPARED_TO_EMPTY = ("psnr", "empty_psnr", "relative_l2")
 """Scores of a flare that are read beside those of an empty one."""
 _CLIP_LEVEL = 254.5 / 255
+"""Display value from which a pixel counts as clipped: the last 8-bit code."""
 
 
 def evaluate(renderer: ViewRenderer, capture: Capture, cameras: Mapping[View, Camera],
@@ -54,6 +55,7 @@ def evaluate(renderer: ViewRenderer, capture: Capture, cameras: Mapping[View, Ca
         part = (slice(None), slice(None)) if area is None else area.slices
         clean = {"truth": capture.truth_scene, "removed": capture.removed}.get(reference, _no_picture)
         flare = capture.truth_flare if reference == "truth" else _no_picture
+        # The reference scene, and the exact flare, where the capture has them.
         known, exact = (None if picture is None else replace(picture, pixels=picture.pixels[part])
                         for picture in (clean(view, camera.size), flare(view, camera.size)))
         filmed = capture.frame(view, camera.size)
@@ -148,6 +150,7 @@ def _to_display(linear: Array) -> Array:
 
 
 def _score_picture(image: Array, target: Array, lpips: Perceptual | None, counted: NDArray[np.bool_] | None) -> Scores:
+    """Return the scores of one layer of display values; arguments as of `score_view`."""
     if counted is not None:
         image = np.where(counted[..., None], image, target)
     return {"psnr": psnr(image, target, counted), "ssim": ssim(image, target, mask=counted),
@@ -173,6 +176,7 @@ def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]
 
 
 def _mean(parts: list[Scores]) -> Scores:
+    """Return the mean of each score of one layer over its views, as `summarise` says; None where no view has one."""
     means: Scores = {}
     flared = [part for part in parts if not _has_no_flare(part)]
     for key in parts[0] if parts else ():

@@ -25,6 +25,7 @@ _EDGE_WIDTH = 0.082
 _COLOUR_EXPONENT, _KNEE, _KNEE_VALUE = 0.7, 0.4, 0.95
 """q_c, p_c and p_t of section 4.1.3."""
 _FEATURE_EXPONENT = 0.5
+"""q_f of section 4.2."""
 _XYZ_FROM_RGB = np.array([[10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794],
                           [2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897],
                           [1425312 / 73733382, 8788810 / 73733382, 70074185 / 73733382]])
@@ -60,14 +61,15 @@ def _matrix(planes: Planes, matrix: NDArray[np.float32]) -> Planes:
 def _to_perceived_lab(planes: Planes) -> Planes:
     """Filter Y C_x C_z by the contrast sensitivity, and convert to Hunt-adjusted L*a*b*, sections 4.1.1 and 4.1.2."""
     lab = _lab(np.clip(_matrix(_filter_contrast(planes), _RGB_FROM_OPPONENT), 0, 1))
-    lab[..., 1:] *= 0.01 * lab[..., :1]
+    lab[..., 1:] *= 0.01 * lab[..., :1]  # Hunt: colours look paler where it is dark
     return lab
 
 
 def _filter_contrast(planes: Planes) -> Planes:
+    """Filter each channel of Y C_x C_z by its contrast sensitivity, section 4.1.1."""
     radius = math.ceil(3 * math.sqrt(max(b for part in _CONTRAST for _, b in part) / (2 * math.pi ** 2))
                        * PIXELS_PER_DEGREE)
-    place = np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE
+    place = np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE  # degrees
     filtered = np.empty_like(planes)
     for channel, gaussians in enumerate(_CONTRAST):
         rows = [np.exp(-math.pi ** 2 * place ** 2 / b) for _, b in gaussians]
@@ -125,6 +127,7 @@ def _feature_difference(first: Plane, second: Plane) -> Plane:
     points = (place ** 2 / sigma ** 2 - 1) * bell
     largest = np.zeros(first.shape, np.float32)
     for row in (edges, points):
+        # The weights of either sign sum to 1.
         row = np.where(row > 0, row / row[row > 0].sum(), row / -row[row < 0].sum())
         strengths = [np.hypot(_convolve(plane, row, bell / bell.sum()), _convolve(plane, bell / bell.sum(), row))
                      for plane in map(np.ascontiguousarray, (first, second))]

@@ -22,6 +22,7 @@ from ..system.reading import check_regular
 _LAYERS = ((0, 4, 2, False), (3, 1, 2, True), (6, 1, 1, True), (8, 1, 1, False), (10, 1, 1, False))
 """Index in AlexNet's features, stride, padding, whether a 3x3 maximum of stride 2 comes first."""
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""Mean and standard deviation of red, green and blue, -1 to 1, by which the network's input is normalised."""
 
 
 class Lpips:

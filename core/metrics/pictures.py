@@ -21,6 +21,7 @@ Perceptual = Callable[[NDArray[np.float32], NDArray[np.float32]], float]
 
 WINDOW = 11
 SIGMA = 1.5
+"""Side and standard deviation of the window of SSIM, pixels."""
 
 
 def psnr(image: Array, target: Array, mask: Array | None = None) -> float:
@@ -46,6 +47,7 @@ def relative_l2(image: Array, target: Array, mask: Array | None = None) -> float
 
 
 def _masked_difference(image: Array, target: Array, mask: Array | None) -> NDArray[np.float64]:
+    """Return the differences of the pixels to score, in one row. Raises SettingsError if the sizes differ."""
     _check_same_size(image, target)
     difference = np.asarray(image, np.float64) - np.asarray(target, np.float64)
     return difference.ravel() if mask is None else difference[mask].ravel()
@@ -77,13 +79,14 @@ def ssim(image: Array, target: Array, borders: Borders = "valid", mask: Array | 
     similarity = ((2 * mean_x * mean_y + c1) * (2 * covariance + c2)
                   / ((mean_x ** 2 + mean_y ** 2 + c1) * (variance_x + variance_y + c2)))
     if mask is not None:
+        # Without borders the similarity is smaller than the picture.
         margin = (image.shape[0] - similarity.shape[0]) // 2
         similarity = similarity[mask[margin:mask.shape[0] - margin, margin:mask.shape[1] - margin]]
     return float(similarity.mean()) if similarity.size else math.nan
 
 
 def _blur(picture: NDArray[np.float64], borders: Borders) -> NDArray[np.float64]:
-    """Convolve with the Gaussian window, one axis after the other."""
+    """Convolve with the Gaussian window, one axis after the other; "valid" makes the picture smaller by the window."""
     offsets = np.arange(WINDOW) - WINDOW // 2
     window = np.exp(-offsets ** 2 / (2 * SIGMA ** 2))
     window /= window.sum()

@@ -63,7 +63,10 @@ def run_in_child(function: Callable[..., Any], *args: Any, progress: Progress) -
 
 def _converse(to_child: IO[bytes], from_child: IO[bytes], call: tuple[Callable[..., Any], tuple[Any, ...]],
               progress: Progress) -> Any:
-    """Send a call; answer each message of its progress until it has ended."""
+    """Send a call, pass the calls of its progress on to `progress`, and return or raise what the call does.
+
+    The reply to each message is whether to continue; what `progress` raises is raised when the child has ended its
+    work."""
     _send(to_child, call)
     raised: BaseException | None = None
     while True:
@@ -84,6 +87,7 @@ def _converse(to_child: IO[bytes], from_child: IO[bytes], call: tuple[Callable[.
 
 
 def _send(stream: IO[bytes], message: Any) -> None:
+    """Write one message at once."""
     pickle.dump(message, stream)
     stream.flush()
 
@@ -121,9 +125,10 @@ def serve() -> None:
     for name in ("SIGINT", "SIGHUP", "SIGBREAK"):  # the parent decides
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
+    # The messages keep their own descriptors; what libraries read and print at 0 and 1 goes nowhere.
     from_parent, to_parent = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_RDWR)
-    for number in (0, 1):  # libraries print
+    for number in (0, 1):
         os.dup2(nowhere, number)
     function, args = pickle.load(from_parent)
     replies: queue.Queue[Any] = queue.Queue()

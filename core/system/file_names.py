@@ -27,6 +27,7 @@ def natural_key(name: PurePath | str) -> list[tuple[tuple[int, int, str], ...]]:
 
 @lru_cache(maxsize=1 << 14)
 def _part_key(part: str) -> tuple[tuple[int, int, str], ...]:
+    """Return the key of one part of a path: numbers as (0, value, ""), which come before texts as (1, 0, text)."""
     return tuple((0, int(piece), "") if piece.isascii() and piece.isdigit() and len(piece) < _MAX_DIGITS
                  else (1, 0, piece) for piece in _DIGITS.split(unicodedata.normalize("NFC", part)) if piece)
 
@@ -49,6 +50,7 @@ def name_below(folder: Path, name: str) -> str:
     if not parts or ".." in parts or not (parts[0] == "/" or _DRIVE.fullmatch(parts[0])):
         return name
     for start in range(1, len(parts)):
+        # The file itself may be missing, but not the folder that it lies in.
         inside = find_entry(folder, "/".join(parts[start:-1] or parts[start:]))
         if inside is not None:
             return "/".join(parts[start:])
@@ -63,6 +65,7 @@ def find_entry(folder: Path, name: str) -> Path | None:
     path = folder
     for part in name.split("/"):
         try:
+            # Of names that differ in case alone, the first in order counts.
             entries = {entry.name.casefold(): entry for entry in sorted(path.iterdir(), reverse=True)}
         except OSError:
             return None

@@ -135,9 +135,9 @@ def remove_folder(folder: Path) -> None:
 
 
 def _apply_umask(temporary: Path, mode: int) -> None:
-    """Give a file of mkstemp, which is private, the permissions of any new file, where the disk has permissions.
+    """Give a file or folder of tempfile, which is private, the permissions of any new one, where the disk has them.
 
-    Windows' disks in WSL and some network shares refuse to change them.
+    mode: before the umask. Windows' disks in WSL and some network shares refuse to change permissions.
     """
     with contextlib.suppress(PermissionError):
         temporary.chmod(mode & ~_umask())
@@ -205,7 +205,7 @@ def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
     """
     lock = Path(lock)
     lock.parent.mkdir(parents=True, exist_ok=True)
-    refusals, last_mtime, since = 0, 0, time.monotonic()
+    refusals, last_mtime, since = 0, 0, time.monotonic()  # since: when the lock was first seen with that time
     while True:
         try:
             os.close(os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
@@ -269,6 +269,7 @@ def remove_partials_below(folder: Path | str) -> None:
 
 
 def _umask() -> int:
+    """Return this process's umask, which can only be read by setting it."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

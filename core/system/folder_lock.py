@@ -49,13 +49,14 @@ def _open_locked(lock: Path) -> int | None:
         descriptor = os.open(lock, os.O_CREAT | os.O_RDWR)
         try:
             _lock(descriptor)
+            # The lock counts only while its file still has this name.
             if os.path.samestat(os.fstat(descriptor), lock.stat()):
                 return descriptor
         except FileNotFoundError:  # its holder has removed it meanwhile
             pass
         except OSError as problem:
             if problem.errno not in _ALREADY_LOCKED:
-                return descriptor
+                return descriptor  # a disk without locks
             os.close(descriptor)
             return None
         os.close(descriptor)

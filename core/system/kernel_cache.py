@@ -61,6 +61,7 @@ def _user_folder() -> Path:
 
 
 def _fingerprint(package: str, sources: Path) -> str:
+    """Return a hash of numba's version, the package's name and its sources."""
     # The machine code names the modules it came from, and the tree may be imported under several names.
     digest = hashlib.sha256(f"{numba.__version__} {package}".encode())
     for source in sorted(sources.glob("*.py")):

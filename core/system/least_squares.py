@@ -17,7 +17,8 @@ def robust_bounded_fit(columns: Floats, values: Floats, start: Floats, low: Arra
                        prior_weight: float) -> Floats:
     """Return x (n,) within bounds that brings columns (m, n) @ x nearest to values (m,), by least absolute errors.
 
-    prior_weight: per value, of the squared distance from `start`, which decides where the values do not.
+    low, high: the bounds, (n,) or one for all. prior_weight: per value, of the squared distance from `start`, which
+    decides where the values do not.
     """
     lower, upper = np.broadcast_to(low, start.shape), np.broadcast_to(high, start.shape)
     solution, weights = start.copy(), np.ones(len(values))
@@ -26,12 +27,15 @@ def robust_bounded_fit(columns: Floats, values: Floats, start: Floats, low: Arra
         weighted = columns.T * weights
         solution = bounded_least_squares(weighted @ columns + prior, weighted @ values + prior @ start, solution,
                                          lower, upper)
+        # So weighted, the square of a residual counts as its absolute value.
         weights = 1 / (np.abs(values - columns @ solution) + L1_EPSILON)
     return solution
 
 
 def bounded_least_squares(product: Floats, target: Floats, start: Floats, low: Floats, high: Floats) -> Floats:
-    """Solve product x = target for x (n,) between bounds, by coordinate descent."""
+    """Return x (n,) between bounds (n,) that minimises x^T product x / 2 - target^T x, by coordinate descent.
+
+    product (n, n): of the normal equations product x = target, which x solves where no bound holds. start (n,)."""
     solution = start.copy()
     for _ in range(DESCENT_SWEEPS):
         for index in range(len(solution)):

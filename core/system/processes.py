@@ -137,7 +137,7 @@ def _start_time_windows(pid: int) -> float | None:
 
     kernel = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
     kernel.OpenProcess.restype = ctypes.c_void_p
-    handle = ctypes.c_void_p(kernel.OpenProcess(0x1000, False, pid))
+    handle = ctypes.c_void_p(kernel.OpenProcess(0x1000, False, pid))  # PROCESS_QUERY_LIMITED_INFORMATION
     if not handle:
         return None
     code, times = ctypes.c_ulong(), [ctypes.c_ulonglong() for _ in range(4)]
@@ -155,6 +155,7 @@ def _start_time_proc(pid: int) -> float | None:
     if after_name[0] in "ZX":  # ended, and its parent has not read its status
         return None
     booted = re.search(r"^btime (\d+)", (PROC / "stat").read_text(encoding="utf-8"), re.MULTILINE)
+    # Field 22 of the line, starttime: clock ticks since the system started.
     return int(booted[1]) + int(after_name[19]) / os.sysconf("SC_CLK_TCK") if booted else None
 
 

@@ -108,6 +108,7 @@ class Progress:
         return passed / (self._done - before) * (self._total - self._done)
 
     def _sample_pace(self) -> None:
+        """Note the steps done now, and forget samples older than the window, but for the one at its start."""
         now, samples = time.monotonic(), self._samples
         if not samples or now - samples[-1][0] >= MIN_PACE_WINDOW_S:
             samples.append((now, self._done))
@@ -142,6 +143,7 @@ def flush_or_drop(stream: TextIO) -> None:
     except OSError as problem:
         if problem.errno not in _STREAM_GONE:
             raise
+        # Flush what is left into nowhere, and give the stream its file back.
         number, null = stream.fileno(), os.open(os.devnull, os.O_WRONLY)
         before = os.dup(number)
         os.dup2(null, number)

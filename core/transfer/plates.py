@@ -57,7 +57,9 @@ class ColouredPlate:
 
     @property
     def has_straight_alpha(self) -> bool:
-        """Return whether the colours are straight, not multiplied by the alpha. An EXR's are always premultiplied."""
+        """Return whether the plate is a PNG or TIFF with alpha, by which `linear` multiplies its light.
+
+        An EXR's light is multiplied already."""
         return self.plate.alpha is not None
 
     @property
@@ -87,9 +89,9 @@ class ColouredPlate:
             grown = alpha_with_light(alpha, lit)
             top = np.float32(np.iinfo(stored_alpha.dtype).max if stored_alpha.dtype.kind == "u" else 1)
             if stored_alpha.dtype.kind == "u":  # the colours belong to the alpha as it is stored
-                grown = np.ceil(grown * top - np.float32(1e-3)) / top
+                grown = np.ceil(grown * top - np.float32(1e-3)) / top  # rounding must not cost a code
             values = self.space.from_linear(lit / np.maximum(grown, 1e-6)[..., None])
-            if self.plate.straight_alpha is None:
+            if self.plate.straight_alpha is None:  # the file's colours are multiplied by it
                 values = values * grown[..., None]
             new_alpha = undo_orientation(grown, self.orientation) * top
             new_alpha = np.round(new_alpha) if top > 1 else new_alpha

@@ -129,7 +129,7 @@ def extrapolation_fade(light: LightLook, view: ViewOfLight) -> float:
 
 def _weighted_queries(light: LightLook, view: ViewOfLight, xyz: Floats, query: Follows, training: TrainingViews | None,
                       scale: float, fixed: ViewOfLight | None) -> list[tuple[float, ViewOfLight]]:
-    """Return the views at which the network is evaluated, with weights that sum to 1."""
+    """Return the views at which the network is evaluated, with weights that sum to 1; arguments as of `evaluate`."""
     offset = (view.camera - xyz) / scale
     distance = float(np.linalg.norm(offset))
     is_same_world = scale == 1 and np.linalg.norm(xyz - light.xyz) <= SAME_WORLD_TOLERANCE * distance
@@ -145,6 +145,7 @@ def _weighted_queries(light: LightLook, view: ViewOfLight, xyz: Floats, query: F
     order = np.argsort(dissimilarity)[:NEIGHBOURS + 1]
     # The most dissimilar one has no weight, so that weights change continuously when the neighbours change.
     edge = dissimilarity[order[-1]] if len(order) > NEIGHBOURS else 2 * dissimilarity[order[-1]] + 1e-6
+    # The small term gives a single view, or several equal ones, a weight.
     weights = np.maximum(1 - (dissimilarity[order] / max(edge, 1e-9)) ** 2, 0) ** 2 + 1e-12
     weights /= weights.sum()
     return [(float(weight), replace(view, camera=training.cameras[row].astype(np.float32), light=position))

@@ -120,8 +120,8 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
 
     focal: px (default: the training camera's field of view, turned for a picture of the other orientation); centre:
     principal point, px (default: the middle). distances: distance of each source at which its flare has the brightness
-    of the fit. space: of the pictures, None for what their files declare. training: training views by source; a
-    detected light shows the source with the most similar view.
+    of the fit. requested: source by light. space: of the pictures, for `detector`; None for what their files declare.
+    training: training views by source; a detected light shows the source with the most similar view.
 
     Raises SettingsError if no picture has a light, and for two pictures of one name.
     """
@@ -168,6 +168,7 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
 
 def _detected(path: Path, detector: Detector | None, orientation: int,
               space: ColourSpace | None) -> dict[str, tuple[float, float]]:
+    """Return the position, px, of each light that the detector finds in a picture, by name; {} without a detector."""
     if detector is None:
         return {}
     detections = detector.detect(upright_picture(path, orientation, space))
@@ -182,6 +183,7 @@ def _most_similar_sources(
 
     Uses each source once if there are enough."""
     chosen: dict[str, str] = {}
+    # Every light with every source, the most similar first.
     pairs = sorted((float(np.linalg.norm(views.lights - position, axis=1).min()), name, source)
                    for name, position in positions.items() for source, views in training.items())
     while pairs and len(chosen) < len(positions):
@@ -198,7 +200,7 @@ def _most_similar_sources(
 def capture_target(capture: Capture, look: Look, requested: SourceNames, *, lights: Path | None = None,
                    scene: Path | None = None, scene_is_background: bool = False) -> Target:
     """Return a target of a capture's views. lights: a lights.json instead of the capture's. scene: a 3DGS PLY in its
-    world, which hides lights; shown: the scene is the background instead of the frames.
+    world, which hides lights. scene_is_background: it stands in for the frames. requested: source by light.
 
     Raises CaptureError without lights.
     """
@@ -226,8 +228,7 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
 
 
 def _scene_in_view(path: Path, frames: Sequence[TargetFrame]) -> SceneGaussians:
-    """Read a 3DGS PLY. Raises CaptureError where few cameras have one of its Gaussians on their frames, as a fit does.
-    """
+    """Read a 3DGS PLY. Raises CaptureError where fewer than half of the cameras have any of its Gaussians in view."""
     scene = read_ply(path)
     means, seeing = scene.means.detach().numpy(), 0
     for points in (means[::max(len(means) // _SAMPLED_POINTS, 1)], means):
@@ -239,6 +240,7 @@ def _scene_in_view(path: Path, frames: Sequence[TargetFrame]) -> SceneGaussians:
 
 
 def _undistorted(capture: Capture, view: View) -> Callable[[ColourSpace | None], Picture]:
+    """Return `TargetFrame.undistorted` for a view."""
     return lambda space: capture.frame(view) if space is None else capture.frame_in_space(view, space)
 
 
@@ -259,6 +261,7 @@ def cameras_target(capture: Capture, look: Look, scene: Path | None = None) -> T
 def shot_target(shot: Shot, look: Look, requested: SourceNames, *, plates: Path | None = None,
                 scene: Path | None = None, required_frames: Container[int] | None = None) -> Target:
     """Return a target of a shot's frames. plates: a folder of pictures whose names end with the frames' numbers.
+    requested: source by light. scene: a 3DGS PLY that hides lights.
 
     required_frames: frames that need a plate, None for all: a task of a farm may begin before the last plate exists.
     Raises SettingsError if one of them has no plate.
@@ -357,6 +360,7 @@ def resized(target: Target, width: int | None, height: int | None) -> Target:
     for frame in target.frames:
         camera = frame.shot.camera
         if frame.window is not None:
+            # The camera of the whole frame, from that of the window.
             (left, top), size = frame.window.origin, frame.window.frame
             camera = camera.cropped(-left, -top, *size)
         frames.append(replace(frame, shot=replace(frame.shot, camera=camera.scaled(width, height)), window=None))

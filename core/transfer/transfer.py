@@ -103,7 +103,7 @@ class Transfer:
 
     def fingerprint_of(self, index: int) -> str:
         """Return a hash of a frame and of the neighbours that the visibility of its lights depends on."""
-        radius = 2 * self.settings.smooth
+        radius = 2 * self.settings.smooth  # see `smooth_visibility`
         neighbours = self.target.frames[max(index - radius, 0):index + radius + 1]
         fixed = [(name, view.camera.tolist(), view.light.tolist()) for name, view in self._fixed.items()]
         key_text = "".join(frame.cache_key() for frame in neighbours) + repr(fixed)
@@ -200,7 +200,7 @@ class Transfer:
         return distances
 
     def _fixed_views(self) -> dict[str, ViewOfLight]:
-        """Return the view of each light for the query `source`, by name."""
+        """Return the view of each light for the query `source`, by name; without lights that are never in front."""
         fixed = {}
         for name in self.lights:
             placed: list[tuple[ViewOfLight, float, PlacedLight]] = []
@@ -278,7 +278,7 @@ class Transfer:
 
 
 def _without_margin(visibility: float) -> float:
-    """Return a visibility with 0 and 1 where it is nearer to them than VISIBILITY_MARGIN."""
+    """Return 0 or 1 for a visibility nearer to them than VISIBILITY_MARGIN, and the range between stretched to 0..1."""
     return min(max((visibility - VISIBILITY_MARGIN) / (1 - 2 * VISIBILITY_MARGIN), 0.0), 1.0)
 
 
@@ -331,7 +331,7 @@ class _FrameRenderer:
             plate = self._transfer.plate(frame)
             stored = plate_window(frame.plate, frame.orientation)
             if frame.window is not None and frame.window.size == camera.size:
-                self._plate = plate
+                self._plate = plate  # for `finish`
                 return move_to_window(plate.linear, stored, frame.window), no_depth
             picture = Picture(crop_to_display_window(plate.linear, stored), "linear")
             return np.asarray(picture.resized(*camera.size).pixels, np.float32), no_depth
@@ -353,7 +353,7 @@ class _FrameRenderer:
             if plate.plate.warning:
                 self._progress.say(plate.plate.warning)
         layers = replace(layers, window=frame.window)
-        plate_matrix, matrix = plate.space.matrix, self._space.matrix
+        plate_matrix, matrix = plate.space.matrix, self._space.matrix  # None for a space that is not linear
         if plate_matrix is not None and matrix is not None and np.allclose(plate_matrix, matrix, atol=1e-9)\
                 and not plate.has_straight_alpha:
             layers = replace(layers, scene=move_to_window(plate.values, stored, frame.window))

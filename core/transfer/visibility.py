@@ -50,7 +50,7 @@ def smooth_visibility(frames: Sequence[ShotFrame], index: int, light: str, radiu
         weights = np.convolve(weights, [0.5, 0.5])
     total = value = 0.0
     for offset in range(-radius, radius + 1):
-        if offset in values:
+        if offset in values:  # 0 always is
             window = range(offset - radius, offset + radius + 1)
             lowest = min(values[other] for other in window if other in values)
             value += weights[offset + radius] * lowest

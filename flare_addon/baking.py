@@ -175,7 +175,7 @@ ON_BAKED: list[Callable[[jobs.Job, Any], None]] = []
 
 
 def _on_finished(job: jobs.Job) -> None:
-    """Reload the layers that Blender shows, and call `ON_BAKED` for each scene with these layers."""
+    """Reload the layers that Blender shows; after success, call `ON_BAKED` for each scene with these layers."""
     from .images import reload_images
 
     if reload_images(job.folder):

@@ -71,13 +71,16 @@ class Origin:
 
 
 class Job:
-    """One command of the engine. done, total: steps of `stage`. eta_s: remaining seconds, None where unknown. warnings:
-    of what was done with its result."""
+    """One command of the engine.
+
+    done, total: steps of `stage`. eta_s: remaining seconds, None where unknown. figures: numbers of its last progress
+    by name, such as losses. messages: sentences for the user. result: what its result events say. warnings: of what
+    was done with its result. args: without --overwrite, so that they are equal where the result is.
+    """
 
     def __init__(self, kind: str, folder: Path, origin: Origin, args: Sequence[str] = (),
                  process: subprocess.Popen[bytes] | None = None) -> None:
         self.kind, self.folder, self.origin = kind, folder, origin
-        # Without --overwrite, so that arguments are equal where the result is.
         self.args = [arg for arg in args if arg != "--overwrite"]
         self.state: State = "running"
         self.stage, self.done, self.total = "starting", 0, 0

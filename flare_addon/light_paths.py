@@ -22,7 +22,7 @@ from ..core.system.files import follow_link, read_json, round_for_text, write_js
 from .paths import absolute
 
 STANDING = 1e-4
-"""Motion of a light below which it stands, relative to its distance from the origin, or in scene units."""
+"""Motion of a light below which it stands, relative to its largest coordinate; world units where that is below 1."""
 
 
 def frame_numbers(folder: Path) -> dict[str, int]:
@@ -77,7 +77,10 @@ def world_paths(scene: Any, items: Mapping[str, Any], folder: Path, place: Calla
 
 
 def _power(item: Any) -> float:
-    """Return the power of a lamp at the current frame; 1 for other objects, 0 for one that is not rendered."""
+    """Return the power of a lamp at the current frame, times its strongest colour channel.
+
+    It is 1 for other objects, and 0 for any object that is disabled in renders.
+    """
     if item.hide_render:
         return 0.0
     return float(item.data.energy * max(item.data.color)) if item.type == "LIGHT" else 1.0

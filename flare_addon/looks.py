@@ -173,7 +173,7 @@ def lost_flares(scene: Any) -> list[int]:
 
 
 def remove_flare(scene: Any, number: int) -> None:
-    """Remove a flare from the scene.
+    """Remove the flare with this index from the scene.
 
     The flares after it keep their animation and their drivers in the compositor. The layer of the removed flare stays
     in the compositor as it was baked.

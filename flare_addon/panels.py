@@ -174,6 +174,7 @@ def _draw_clean_frames(layout: Any, state: Any, capture: Any, stage: str) -> Non
     if job is not None and job.error:
         label_lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
     exists = is_folder(capture / REMOVED) and (job is None or job.state == "done")
+    # Clean frames without a job were filmed or made elsewhere; they are not made again by the network.
     by_network = stage != "finished" and (not exists or job is not None)
     if not exists:
         label_lines(layout, "The fit can remove its flare from the frames." if stage == "finished" else

@@ -64,6 +64,7 @@ def _update_relative_paths(blend: str, *_: object) -> None:
     for scene in (scene for scene in bpy.data.scenes if scene.library is None):
         for name in PATH_PROPERTIES:
             text = getattr(scene.fit_flare, name)
+            # On the first save these are the absolute paths, later the relative ones.
             if text and text.startswith("//") != is_first_save:
                 _paths_before_save[scene.name, name] = text
                 setattr(scene.fit_flare, name, _relative(absolute(text), blend))

@@ -58,7 +58,7 @@ def redraw_viewports(_self: Any = None, _context: Any = None) -> None:
 
 
 def _update_target(self: Any, context: Any) -> None:
-    """Measure the power of a flare's new light object, and redraw."""
+    """Measure power and distance of a flare's new light object, set the flare's switches, and redraw."""
     from .lamp_drive import on_target
 
     on_target(self, context)
@@ -182,6 +182,7 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
         "brightness; it is measured when the flare gets its light object", default=0.0, min=0.0, subtype="DISTANCE",
         update=redraw_viewports)
     is_at_artists_light: BoolProperty()  # type: ignore[valid-type]  # not at a light of the capture, nor without one
+    # The lamp's linear RGB light at which the flare has its own brightness, and whether drivers moved it when measured.
     reference_light: FloatVectorProperty(size=3, default=(0.0, 0.0, 0.0))  # type: ignore[valid-type]
     reference_is_driven: BoolProperty()  # type: ignore[valid-type]
     extent: EnumProperty(  # type: ignore[valid-type]
@@ -214,7 +215,7 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
                                  "capture",
         type=bpy.types.Object, update=redraw_viewports)
 
-    known_lights: StringProperty()  # type: ignore[valid-type]
+    known_lights: StringProperty()  # type: ignore[valid-type]  # all lights that it ever had (lights.remember_names)
     footage: EnumProperty(  # type: ignore[valid-type]
         name="Footage", description="Which frames are shown behind the cameras",
         items=(("images", "As Filmed", "The frames as filmed, with their flare"),
@@ -299,9 +300,9 @@ class FITFLARE_PG_object(bpy.types.PropertyGroup):
     light: StringProperty(  # type: ignore[valid-type]
         name="Light Name", description="Name of the light in lights.json and in the .flare", override=OVERRIDABLE)
     asset_look: StringProperty()  # type: ignore[valid-type]  # the look of an asset that was not dropped yet
-    is_points: BoolProperty()  # type: ignore[valid-type]
-    is_root: BoolProperty()  # type: ignore[valid-type]
-    is_made: BoolProperty()  # type: ignore[valid-type]
+    is_points: BoolProperty()  # type: ignore[valid-type]  # the point cloud of a capture
+    is_root: BoolProperty()  # type: ignore[valid-type]  # the root of an imported capture
+    is_made: BoolProperty()  # type: ignore[valid-type]  # an empty that was made for a light; deleted with the light
     is_placeholder: BoolProperty()  # type: ignore[valid-type]  # a new light of Add Flare that Pick Light may move
     view: StringProperty(name="Frame", description="Name of the capture's frame that this camera belongs to")  # type: ignore[valid-type]
     exposure: FloatProperty(  # type: ignore[valid-type]

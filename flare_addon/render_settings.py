@@ -60,7 +60,7 @@ def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str
     path_of: the file for a frame's number and a suffix (".exr", ".png"). The EXR is scene-linear, the PNG is as the
     scene's view transform shows it (see `set_plain_view`). done: called after each frame. Raises FrameError.
     """
-    if hasattr(scene.render, "compositor_device"):  # there may be no GPU
+    if hasattr(scene.render, "compositor_device"):
         scene.render.compositor_device = "CPU"
     for frame in frames:
         scene.frame_set(frame)

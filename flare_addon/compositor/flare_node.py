@@ -37,6 +37,7 @@ def node_group(layers: Sequence[str]) -> Any:
     """
     input_names = ["Scene", *layers, "Intensity", "Tint", *(gain_input(layer) for layer in layers)]
     for group in bpy.data.node_groups:
+        # Blender numbers groups of the same name: "Fit Flare.001".
         if group.bl_idname == "CompositorNodeTree" and group.name.split(".")[0] == GROUP:
             inputs = [item.name for item in group.interface.items_tree if getattr(item, "in_out", "") == "INPUT"]
             if inputs == input_names:

@@ -107,7 +107,7 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
             yield number
 
     def _end(self, context: bpy.types.Context) -> None:
-        """Report what was rendered."""
+        """Report what was rendered, and move the timeline back."""
         path = viewport_render.output_path(context.scene, context.scene.frame_current)
         context.scene.frame_set(self._before)
         what = f"{self._done} frames are" if self.animation else f"{path.name} is"

@@ -56,7 +56,7 @@ class PictureCache:
             self._close()
 
     def get(self, name: str) -> Codes | None:
-        """Return the array stored under a name, or None."""
+        """Return the array stored under a name; None if it was not stored, or the disk fails."""
         place = self._on_disk.get(name)
         if place is None or self._file is None:
             return self._in_memory.get(name)
@@ -77,7 +77,7 @@ class PictureCache:
             try:
                 if shutil.disk_usage(self._folder).free - codes.nbytes < DISK_LEFT:
                     return
-                offset = self._file.seek(0, 2)
+                offset = self._file.seek(0, 2)  # the end
                 if self._file.write(codes.tobytes()) < codes.nbytes:
                     return  # the disk, or what one may have of it, is full
             except OSError:

@@ -25,6 +25,7 @@ from ..system.reading import parse_json
 
 VERSION = 1
 _SPARSE_FROM_ROWS = 100_000
+"""Number of rows above which a table is stored by its rows that are not 0, if those are less than a quarter."""
 _MAX_TABLE = 1 << 32
 """Bound of the numbers in a table that is stored by its rows."""
 LIGHT_TOLERANCE = 1e-5
@@ -33,7 +34,7 @@ State = dict[str, Any]
 
 
 def save(path: Path, state: Mapping[str, Any]) -> None:
-    """Write a state atomically."""
+    """Write a state atomically: nested names as "table/.../name", and large tables by the rows that are not 0."""
     tensors: dict[str, Tensor] = {}
     values: dict[str, Any] = {}
     shapes: dict[str, list[int]] = {}
@@ -103,9 +104,10 @@ def _leaves(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 class FitInputs:
-    """The lights of a capture, and a digest of each view's camera, frame and, with `removed`, clean frame.
+    """The lights of a capture, and a digest of each view's camera, frame, mask and, with `removed`, clean frame.
 
-    A checkpoint holds them; a fit resumes only with the same inputs. lights: False for a fit without flare.
+    A checkpoint holds them; a fit resumes only with the same inputs. removed: True if the fit uses the clean frames in
+    removed/. lights: False for a fit without flare.
     """
 
     def __init__(self, capture: Capture, *, removed: bool, lights: bool) -> None:
@@ -148,14 +150,16 @@ class FitInputs:
         files = [capture.frame_path(view), *([capture.removed_path(view)] if self._removed else []),
                  *([] if mask is None else [mask])]
         rotation, position = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        # Adding 0 makes -0 from rounding 0, which has other text.
         numbers = [*np.round(rotation, 5).ravel() + 0.0, *position, camera.fx, camera.fy, camera.cx, camera.cy]
         inputs = [*map(content_hash, files), *(f"{number:.5g}" for number in numbers), str(view.lens)]
         return hashlib.blake2b(" ".join(inputs).encode(), digest_size=8).hexdigest()
 
 
 def _describe_change(old: list[Any], new: list[Any], tolerance: float) -> str:
-    """Return what differs between two lists of [name, [x, y, z]], or "": the names, else the first position.
+    """Return what differs between two lists of `Light.numbers`, [name, [x, y, z], ...]; "" if nothing does.
 
+    That is the names, else the first light whose position (None if it moves) or other values differ.
     Positions may differ by `tolerance`, and by what Blender's single precision rounds to.
     """
     before, after = ([name for name, *_ in lights] for lights in (old, new))

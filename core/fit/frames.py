@@ -34,7 +34,10 @@ def subsample(items: Sequence[T], number: int) -> Sequence[T]:
 
 
 def sample_colours(xyz: NDArray[Any], camera: Camera, picture: Tensor) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Return which (n,) of the world points (n, 3) lie on the camera's frame, and a picture's colours there, (m, 3)."""
+    """Return which (n,) of the world points (n, 3) lie on the camera's frame, and a picture's pixels there, (m, ...).
+
+    picture: of the camera's size; a mask will do, too.
+    """
     pixels, depth = camera.project(xyz)
     inside = camera.contains(pixels, depth)
     x, y = np.minimum(pixels[inside].astype(int), np.array(camera.size) - 1).T
@@ -157,6 +160,10 @@ class Frames:
 
     def _display(self, view: View, kind: str,
                  decode: Callable[[View, tuple[int, int]], Picture | None]) -> Tensor | None:
+        """Return a picture of a view without borders, display values (height, width, 3); None where there is none.
+
+        kind, decode: see `_stored`.
+        """
         stored = self._stored(view, kind, decode)
         if stored is None:
             return None
@@ -166,7 +173,10 @@ class Frames:
 
     def _stored(self, view: View, kind: str,
                 decode: Callable[[View, tuple[int, int]], Picture | None]) -> NDArray[np.uint16] | None:
-        """Return the whole picture as 16 bit codes, from the cache if possible; None where there is none."""
+        """Return the whole picture as 16 bit codes, from the cache if possible; None where there is none.
+
+        kind: first part of its name in the cache. decode: reads the picture of a view at a size (width, height).
+        """
         name = f"{kind}/{view.name}"
         stored = self.cache.get(name)
         if stored is None:

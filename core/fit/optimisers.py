@@ -14,8 +14,8 @@ from .checkpoint import State
 from .settings import FitSettings, FlareRates
 
 COLOUR_RATE_FACTOR = 3.0
-"""Factor on the learning rate of the scene's colours where frames go above white, which is farther to go. Lamps of 32
-times white end a sixth off instead of three fifths (`desk`, preset draft)."""
+"""Factor on the learning rate of the scene's constant colours where frames go above white, which is farther to go.
+Lamps of 32 times white end a sixth off instead of three fifths (`desk`, preset draft)."""
 
 PLANE_ROWS = ("offsets",)
 """Rows of a flare's Gaussians whose values are lengths in the normalised plane."""
@@ -32,6 +32,7 @@ class Optimisers:
         self._settings, self._extent = settings, extent
         rates = settings.scene.rates
         features = torch.full((COEFFICIENTS, 1), rates.features_rest)
+        # Coefficient 0 is the constant colour; the others change it with direction, and learn more slowly.
         features[0] = rates.features * (COLOUR_RATE_FACTOR if display_white > 1 else 1)
         rate_by_name: dict[str, float | Tensor] = {
             "means": self._means_rate(0.0), "log_scales": rates.scale, "quaternions": rates.rotation,
@@ -52,11 +53,12 @@ class Optimisers:
             self._flare_optimisers.set_rates(progress)
 
     def _means_rate(self, progress: float) -> float:
+        """Return the rate of the scene's positions, world units, at a share of the fit."""
         rates = self._settings.scene.rates
         return _decay(rates.position, rates.position_final, progress) * self._extent
 
     def step(self, *, scene: bool) -> None:
-        """Step by the gradients and clear them; the scene only if `scene`."""
+        """Step all by their gradients and clear these; the scene's optimiser only if `scene` is True."""
         for optimiser in (self.scene if scene else None, self.flare, self.grids, self._brightness):
             if optimiser is not None:
                 optimiser.step()
@@ -120,6 +122,7 @@ class FlareOptimisers:
                 tables.append(parameter)
                 continue
             dense[name] = parameter
+            # Names are "light's number.gaussians.rows" and "light's number.network.…".
             last = name.rsplit(".", 1)[1]
             rate = gaussian_rates[last] if ".gaussians." in name else rates.network
             rate_by_name[name] = rate * (flare.lights[int(name.split(".")[0])].scale if last in PLANE_ROWS else 1)
@@ -133,7 +136,7 @@ class FlareOptimisers:
     def set_rates(self, progress: float) -> None:
         """Set the learning rates at a share of the fit, 0 to 1."""
         rates = self._rates
-        decay = _decay(1.0, rates.final_ratio, 2 * progress - 1)
+        decay = _decay(1.0, rates.final_ratio, 2 * progress - 1)  # 1 until the middle of the fit
         for name, rate in self._first_rates.items():
             position = name.endswith("gaussians.positions")
             new_rate = _decay(rates.position, rates.position_final, progress) if position else rate * decay
@@ -144,7 +147,7 @@ class FlareOptimisers:
             group["lr"] = rates.brightness * decay
 
     def step(self) -> None:
-        """Step by the gradients and clear them."""
+        """Step networks, Gaussians and grids by the gradients and clear these; traced flares have no `brightness`."""
         for optimiser in (self.dense, self.grids):
             optimiser.step()
             optimiser.zero_grad()

@@ -40,7 +40,8 @@ def write_preview(path: Path, rows: Sequence[NDArray[np.float32]]) -> None:
 
 
 def write_small_preview(path: Path, strip: NDArray[np.float32]) -> None:
-    """Write one view's composite above its flare, small enough for a panel that reads it again and again."""
+    """Write one view's composite above its flare, small enough for a panel that reads it again and again. strip: from
+    `preview_row`."""
     width = (strip.shape[1] - 3 * GAP) // 4
     composite, flare = (strip[:, index * (width + GAP):index * (width + GAP) + width] for index in (1, 3))
     both = np.ascontiguousarray(np.concatenate([composite, flare]), np.float32)

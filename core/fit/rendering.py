@@ -68,6 +68,7 @@ def render_flare(flare: FlareModel | None, blend: Blend, camera: Camera, kernels
 
 def _visibilities(flare: FlareModel, camera: Camera, scene: Scene | None, visibility: VisibilitySettings | None,
                   kernels: Kernels) -> dict[str, Tensor] | None:
+    """Return the visibility of each light behind a scene; None where nothing hides lights, as plates do not."""
     if visibility is None or not isinstance(scene, SceneGaussians):
         return None
     pose, _ = pose_and_intrinsics(camera)
@@ -81,7 +82,8 @@ def render(scene: Scene, flare: FlareModel | None, blend: Blend, camera: Camera,
            pixel_grid: PixelGrid | None = None) -> RenderedView:
     """Render scene, flares and composite of a view, without gradients.
 
-    edits: changes of the flare; `look` evaluates them. pixel_grid: the grid at which the flare was fitted.
+    visibility: how the scene hides lights; None if it does not. edits: changes of the flare, which `look` evaluates in
+    place of `flare`; both or neither. pixel_grid: the grid at which the flare was fitted; None in the fit itself.
     """
     rendering = scene.render_frame(camera) if isinstance(scene, PlateScene) else render_scene(scene, camera, kernels)
     flares: dict[str, Splats] = {}
@@ -109,7 +111,7 @@ def render_scene(scene: SceneGaussians, camera: Camera, kernels: Kernels = "auto
 def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels, sh_degree: int | None,
                          depth: bool) -> Rendering:
     """Render at the camera's size. Where that is coarser than the fitted frames, pixels are means, in linear light, of
-    a larger picture."""
+    a larger picture. sh_degree: of the colours; None for all degrees."""
     samples = 1 if scene.pixel_grid is None else scene.pixel_grid.supersampling(camera.focal_length, *camera.size)
     if samples == 1:
         return scene.render(camera, sh_degree, kernels=kernels, depth=depth)
@@ -125,7 +127,7 @@ def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels
                         centres=large.centres / samples, radii=large.radii / samples)
     if not depth:
         return rendering
-    middle = slice(samples // 2, None, samples)
+    middle = slice(samples // 2, None, samples)  # a mean of two surfaces would lie on neither
     return replace(rendering, depth=mean(large.alpha * large.depth) / alpha.clamp_min(MIN_ALPHA),
                    median_depth=large.median_depth[middle, middle])
 

@@ -219,7 +219,8 @@ class Run:
                       edits=edits, pixel_grid=pixel_grid)
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
-        """Render the layers of a view at the camera's size, with the flare under `edits`."""
+        """Render the layers of a view at the camera's size, with the flare under `edits`; lights behind the camera have
+        black layers."""
         view = self.render_view(camera, edits)
         flares = {name: layer.numpy() for name, layer in view.layers.flares.items()}
         dark = np.zeros_like(view.layers.scene.numpy())

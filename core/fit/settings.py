@@ -400,7 +400,7 @@ def over_plates(settings: FitSettings) -> FitSettings:
 
 
 def _scale_schedule(settings: FitSettings, factor: float) -> FitSettings:
-    """Scale every schedule by a factor, so that events keep their share of a fit that is that much longer."""
+    """Scale every schedule by a factor, so that events keep their share of a fit that is longer by that factor."""
     def scaled(iteration: int) -> int:
         return max(round(iteration * factor), 1)
 
@@ -427,7 +427,7 @@ def _shorten_schedule(settings: FitSettings, count: int, max_gaussians: int) -> 
     rates = replace(settings.flare.rates, network=1e-3, grids=5e-3, position=1.6e-3, position_final=1.6e-5,
                     features=1e-2, scale=0.02, rotation=5e-3, ring=2e-2, arc=2e-2, final_ratio=FINAL_RATIO)
     classic = replace(settings.scene.classic, start=round(length * 0.05), stop=round(length * 0.6),
-                      every=max(round(length / 50), 20), reset_every=10 * length, cap=max_gaussians)
+                      every=max(round(length / 50), 20), reset_every=10 * length, cap=max_gaussians)  # never resets
     mcmc = replace(settings.scene.mcmc, start=classic.start, stop=round(length * 0.8), every=classic.every,
                    cap=max_gaussians)
     scene = replace(settings.scene, classic=classic, mcmc=mcmc, sh_every=max(round(length / 6), 1),

@@ -166,7 +166,7 @@ class TracedFlareSettings:
         picture, and for an f-number that it does not reach."""
         scale = self.reach / REFERENCE_REACH
         widest = find_lens(self.lens).widest_f_number()
-        f_number = self.iris.f_number or 2 * widest
+        f_number = self.iris.f_number or 2 * widest  # two stops
         if f_number < F_NUMBER_TOLERANCE * widest:
             raise SettingsError(f"The lens {self.lens} opens to f/{widest:.2g} at most; give an f-number of that or "
                                 "more, or 0.")

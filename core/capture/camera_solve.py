@@ -157,7 +157,10 @@ def _index(root: Path, folders: list[Path]) -> PictureIndex:
 
 def _describe(solve: CameraSolve, files: dict[str, Path], missing: list[str], unposed: list[str],
               renamed: list[str]) -> list[str]:
-    """Return sentences for the user on frames without a pose, poses without a frame, and frames of another name."""
+    """Return sentences for the user on frames without a pose, poses without a frame, and frames of another name.
+
+    files, missing, unposed: as of `MatchedFrames`. renamed: "file for name" of each frame of another name.
+    """
     sentences = []
     if files and (missing or unposed):
         text = f"{len(files)} of {len(files) + len(unposed)} frames in {solve.root} have a pose"

@@ -136,7 +136,8 @@ class Lens:
         if self.model in PINHOLES:
             return fx, fy, cx, cy
         border = self.border - (cx, cy)
-        # A zoom is a factor on the focal length: the smallest whose view the frame covers is sought.
+        # A zoom is a factor on the focal length. The smallest from 0.05 to 20 whose view the frame covers is sought; at
+        # zoom_cap the farthest corner is 60 degrees off the axis.
         zoom_cap = float(np.linalg.norm(border / (fx, fy), axis=1).max()) / MAX_TAN_HALF_ANGLE
         widest, narrowest = max(zoom_cap, 0.05), 20.0
         if not (fx > 0 and fy > 0) or not self._is_covered(border / (fx, fy) / narrowest):

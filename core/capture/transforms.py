@@ -93,7 +93,10 @@ def read_transforms(folder: Path) -> Transforms:
 
 def _read_frame(path: Path, number: int, meta: dict[str, Any], frame: Any, lenses: dict[tuple[object, ...], Lens],
                 result: Transforms) -> str:
-    """Read a frame's lens, pose and mask; return its name."""
+    """Read a frame's lens, pose and mask into `result`; return its name.
+
+    number: of the frame in the file, for messages. meta: the whole file. lenses: the lenses so far, which frames share.
+    """
     name = frame.get("file_path") if isinstance(frame, dict) else None
     if not isinstance(name, str):
         raise CaptureError(f"{path}, frame {number}: file_path is missing; export it again.")
@@ -219,7 +222,10 @@ def _focal_length(angle: float, size: int, where: str) -> float:
 
 
 def _parse_matrix(value: Any, where: str, what: str) -> Floats:
-    """Parse (4, 4) from nested lists of 3 or 4 rows of 4 numbers. Raises CaptureError."""
+    """Parse (4, 4) from nested lists of 3 or 4 rows of 4 numbers.
+
+    Raises CaptureError, whose message begins with `where` and names the value as `what`.
+    """
     try:
         matrix = np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError):

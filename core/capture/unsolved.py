@@ -55,7 +55,10 @@ def cameras_without_solve(folder: Path, focal: float | None = None) -> tuple[Cam
 
 
 def _focal_multiple(folder: Path, first: Path, size: tuple[int, int], focal: float | None) -> tuple[float, str]:
-    """Return the focal length as a multiple of the longer side, and its source."""
+    """Return the focal length as a multiple of the longer side, and its source.
+
+    first, size: file of the first frame and its (width, height). focal: as of `cameras_without_solve`.
+    """
     recorded = find_entry(folder, CAMERA)
     if focal is not None:
         multiple, source = focal / max(size), "as given"

@@ -122,7 +122,10 @@ def _patience(chain: Chain) -> int:
 
 
 def _cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | None:
-    """Return the cost of joining a chain to a source of a later frame; None beyond the gate."""
+    """Return the cost of joining a chain to a source of a later frame; None beyond the gate.
+
+    The gate is the largest distance, pixels, of a source from the predicted place. diagonal: of the frames, pixels.
+    """
     gap = frame - chain.frames[-1]
     last = chain.sources[-1]
     distance = float(np.linalg.norm(chain.predict(frame) - source.xy))
@@ -185,7 +188,10 @@ def _join(chains: list[Chain], diagonal: float) -> list[Chain]:
 
 
 def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
-    """Return the cost of taking two chains for one thing; None where that cannot be."""
+    """Return the cost of taking two chains for one thing; None where that cannot be.
+
+    `first` must end before `second` begins. diagonal: of the frames, pixels.
+    """
     gap = second.frames[0] - first.frames[-1]
     if not 0 < gap <= MAX_GAP:
         return None

@@ -74,7 +74,10 @@ def _intersections(observations: Observations, index: NDArray[np.int64], rng: np
 
 def _choose_pairs(observations: Observations, index: NDArray[np.int64],
                   rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Choose at most MAX_PAIRS pairs of the detections `index`, of different views, at random by their weights."""
+    """Choose at most MAX_PAIRS pairs of the detections `index`, of different views, at random by their weights.
+
+    Returns the first and the second detection of each pair, (n,) each.
+    """
     if math.comb(len(index), 2) > MAX_LISTED_PAIRS:
         return _draw_pairs(observations, index, rng)
     first, second = np.triu_indices(len(index), 1)
@@ -111,7 +114,8 @@ def _draw_pairs(observations: Observations, index: NDArray[np.int64],
 def _triangulate(observations: Observations, first: NDArray[np.int64], second: NDArray[np.int64]) -> Floats:
     """Return (n, 4), the midpoints of the shortest segments between two detections' rays.
 
-    Zeros for rays that are parallel, or that are nearest behind one of the cameras.
+    first, second: the detections of each pair (n,). Zeros for rays that are parallel, or that are nearest behind one of
+    the cameras.
     """
     a, b = observations.position[observations.view[first]], observations.position[observations.view[second]]
     d, e = observations.ray[first], observations.ray[second]

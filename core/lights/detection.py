@@ -89,7 +89,8 @@ def measure_detection(mask: Mask, corner: tuple[int, int], picture: Picture, dis
 def _glow_colour(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.float64]:
     """Return the colour of the glow: the light just round the disc minus the light farther out.
 
-    At most half is subtracted, so that some glow is left beside a bright surface.
+    (3,) linear, the largest channel 1; white where no glow can be measured. At most half is subtracted, so that some
+    glow is left beside a bright surface. mask: (h, w) of the disc at `corner` (x, y).
     """
     import cv2
 

@@ -141,6 +141,7 @@ def _check_writable(entry: dict[str, Any], path: Path) -> None:
 
 
 def _to_entry(light: FoundLight, name: str) -> dict[str, Any]:
+    """Return the entry of a light with one place in the world."""
     return {"name": name, "xyz": [round_for_text(float(x)) for x in light.xyz],
             "colour": [round(float(c), 3) for c in light.colour], "support": len(light.support),
             "views": light.visible, "residual_px": round(light.residual, 3),
@@ -148,6 +149,7 @@ def _to_entry(light: FoundLight, name: str) -> dict[str, Any]:
 
 
 def _to_track_entry(light: TrackedLight, name: str) -> dict[str, Any]:
+    """Return the entry of a light on a path on the picture."""
     frames = {}
     for frame, key in light.keys.items():
         place = key.place

@@ -47,8 +47,9 @@ class Blob:
 
 
 def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
-    """Find bright spots of 0.7 to 6 % of the diagonal, strongest first, by difference of Gaussians over scales.
+    """Find bright spots, strongest first, by difference of Gaussians over scales.
 
+    Their radii are 0.7 to 6 % of the diagonal, and their strength is above 0.004; MAX_BLOBS at most are returned.
     They are found in the square root of linear light. With `clean`, the clean frame, they are found in the light that
     the frame has beyond it.
     """

@@ -43,6 +43,7 @@ def refine_until_stable(observations: Observations, place: Floats, remaining: ND
                         extent: float) -> tuple[Floats, NDArray[np.int64], Floats]:
     """Refine a place (4,) until its inliers no longer change.
 
+    remaining: (d,) which detections may be inliers. extent: of the cameras' path, world units.
     Returns the place, its inliers, and the covariance (3, 3) of direction (two angles) and inverse distance.
     """
     inliers = observations.inliers(place, remaining)
@@ -62,7 +63,8 @@ def _refine(observations: Observations, place: Floats, inliers: NDArray[np.int64
             extent: float) -> tuple[Floats, Floats]:
     """Run Gauss-Newton with Huber weights; returns the place (4,) and its covariance (3, 3).
 
-    The covariance is that of two angles of the direction, radians, and the inverse distance.
+    inliers: the detections (n,) to fit. extent: of the cameras' path, world units. The covariance is that of two angles
+    of the direction, radians, and the inverse distance.
     """
     origin, direction, inverse = parametrise(observations, place, inliers)
     # Standard deviation of each detection, pixels: a third of its tolerance, more for a low score.

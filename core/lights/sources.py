@@ -66,7 +66,10 @@ class Source:
 
 
 def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source]:
-    """Return the sources of a frame, the largest evidence first. clipped_from: display value of clipped pixels."""
+    """Return at most MAX_SOURCES sources of a frame, the largest evidence first.
+
+    clipped_from: display value from which pixels are clipped.
+    """
     import cv2
 
     display, linear = picture.display(), picture.linear()

@@ -128,6 +128,7 @@ def clip_level(capture: Capture) -> float:
 
 def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], ghosts: int,
               sources: Sequence[Sequence[Source]]) -> list[str]:
+    """Return the sentences for the user. ghosts: number of chains that are ghosts of the lights."""
     number = sum(map(len, sources))
     messages = [f"{number} bright spots in {sum(map(bool, sources))} of {len(sources)} frames, of which "
                 f"{len(lights)} {'is a light' if len(lights) == 1 else 'are lights'} that could be followed."]
@@ -254,7 +255,7 @@ def _fill(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple[list
         after = int(np.searchsorted(knots, frame))
         if after < len(knots) and knots[after] == frame:
             place, error = points[after], _outlier(whole, after, acceleration)
-        elif 0 < after < len(knots):
+        elif 0 < after < len(knots):  # between two measured frames; else before the first or after the last
             low, high = after - 1, after
             span = float(knots[high] - knots[low])
             place = _hermite((frame - knots[low]) / span, span, points[low], rates[low], points[high], rates[high])
@@ -289,8 +290,8 @@ def _without_cut(chain: Chain) -> Chain:
 def _velocities(frames: Floats, places: Floats) -> Floats:
     """Return the velocity (n, 2), pixels per frame, at each place (n, 2), in the frames of these numbers (n,).
 
-    It is that of the parabola through the place and its two neighbours in time. Where the three span more than 6
-    frames, it is that of the straight line to the neighbour nearer in time.
+    It is that of the parabola through the place and its two neighbours in time, at either end the two nearest. Where
+    the three span more than 6 frames, it is that of the straight line to the neighbour nearer in time.
     """
     if len(frames) < 2:
         return np.zeros_like(places)

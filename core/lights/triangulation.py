@@ -94,7 +94,10 @@ def triangulate_lights(views: Sequence[tuple[str, Camera]], detections: Sequence
 
 def _to_light(observations: Observations, place: Floats, inliers: NDArray[np.int64], covariance: Floats, extent: float,
               allow_out_of_frame: bool) -> FoundLight:
-    """Return a refined place (4,) with its covariance (3, 3) and inliers as a light."""
+    """Return a refined place (4,) with its covariance (3, 3) and inliers as a light.
+
+    The covariance is that of `refine_until_stable`. allow_out_of_frame: count all views with the place in front.
+    """
     view = observations.view[inliers]
     origin, direction, inverse = parametrise(observations, place, inliers)
     spread = float(np.sqrt(covariance[2, 2]))

@@ -102,7 +102,7 @@ def solve(sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, v
 
 def _solve(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, video: bool,
            progress: Progress) -> Solved:
-    """Carry out `solve`."""
+    """Carry out `solve`. video: the frames are of a video, which decides which of them are matched."""
     database = work / DATABASE
     _check_frames_differ(sources, work)
     _extract_features(pycolmap, sources, work, database, settings, progress)

@@ -59,13 +59,16 @@ MAX_VIDEO_PIXELS = 100_000_000
 MAX_NAMED_FRAMES = 8
 """Number of damaged frames that a sentence names."""
 _LIMITED, _FULL = 1, 2
+"""FFmpeg's numbers of the ranges; 0 is unspecified."""
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
+"""Decoders that keep alpha, by FFmpeg's names of the codecs."""
 
 
 def import_av() -> ModuleType:
     """Import PyAV, which passes on none of FFmpeg's messages. Raises EngineError where it is not installed.
 
-    No level is set: that would install a callback in Python, on which decoding threads wait while a file is closed.
+    No level of messages is set: that would install a callback in Python, on which decoding threads wait while a file is
+    closed.
     """
     try:
         import av
@@ -112,7 +115,8 @@ class VideoFrame:
         return self.colour.to_signal(stack_planes(arrays, planar))
 
     def stored_codes(self) -> NDArray[Any]:
-        """(height, width, 3): R G B codes of the signal as stored, uint8 or uint16, whatever its transfer says."""
+        """(height, width, 3): R G B codes of the signal, uint8 or uint16, without its curve and primaries, not turned
+        upright."""
         arrays, planar = self._planes
         return replace(self.colour, transfer="display", primaries=None).to_signal(stack_planes(arrays, planar))
 
@@ -121,7 +125,8 @@ class VideoFrame:
         return self.orientation.upright(self.colour.to_pixels(self._signal))
 
     def alpha(self) -> NDArray[Any] | None:
-        """(height, width) alpha, of the type of integer `pixels` or float32 0..1; None where the video has none."""
+        """(height, width) alpha: codes of the type of `pixels`, or float32 0..1 beside linear light; None where the
+        video has none."""
         arrays, planar = self._planes
         if not planar.has_alpha:
             return None
@@ -146,7 +151,8 @@ class VideoFrame:
         return Picture(pixels, self.encoding)
 
     def grey(self) -> NDArray[np.float32]:
-        """(height, width) luma, or the green of RGB, at 0..255 for all codes, upright, for measures of detail."""
+        """(height, width) luma, or the green of RGB, upright, for measures of detail. 0..255 spans all codes of the
+        format, also of a limited range."""
         arrays, planar = self._planes
         luma = arrays[1 if planar.is_rgb else 0].astype(np.float32)
         return self.orientation.upright(luma * np.float32(255 / ((1 << planar.bits) - 1)))
@@ -310,7 +316,10 @@ class Video:
                 return
 
     def _frames_from(self, number: int) -> Iterator[Any]:
-        """Yield PyAV's frames from frame `number` on."""
+        """Yield PyAV's frames from frame `number` on.
+
+        By seeking, where the time of that frame is known and decoding arrives at it; else by decoding from the start.
+        """
         first_pass, self._first_pass = self._first_pass, None
         if number == 0 and first_pass is not None:
             yield from first_pass
@@ -345,7 +354,8 @@ class Video:
         return True
 
     def _packet_times(self) -> list[int] | None:
-        """Return the time of every frame in the order of display, from the packets alone; None where it is unknown."""
+        """Return the time of every frame, in ticks, in the order of display, from the packets alone; None where one is
+        unknown. The file is then at its end."""
         av = import_av()
         times = list[int]()
         try:
@@ -400,7 +410,12 @@ def write_frame(stem: Path, frame: VideoFrame) -> Path:
 
 
 def _colour_of(path: Path, raw: Any, stream: Any) -> VideoColour:
-    """Return what a frame's codes mean by its tags. Raises FrameError for colours that cannot be converted."""
+    """Return what a frame's codes mean by its tags, which are code points of ITU-T H.273.
+
+    Without tags, as players assume: limited range of Y Cb Cr, full range of grey and RGB; the matrix of BT.2020 with
+    its primaries, else by the size; the primaries of BT.2020 with its matrix, PQ or HLG. Raises FrameError for colours
+    that cannot be converted.
+    """
     context = stream.codec_context
 
     def tag(of_frame: int, of_container: int) -> int:  # the frame's, unless only the container has one
@@ -415,7 +430,7 @@ def _colour_of(path: Path, raw: Any, stream: Any) -> VideoColour:
     if planar.is_rgb:
         matrix, limited = RGB, False
     elif planar.is_grey:
-        matrix, limited = 1, colour_range == _LIMITED
+        matrix, limited = 1, colour_range == _LIMITED  # any matrix: only the luma is decoded
     else:
         limited = colour_range != _FULL and not planar.is_full_range and not raw.format.name.startswith("yuvj")
         if matrix == 12:  # derived from the primaries

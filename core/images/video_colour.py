@@ -71,9 +71,10 @@ class VideoColour:
         return self.primaries is not None and not self.is_light
 
     def to_signal(self, planes: NDArray[Any]) -> NDArray[Any]:
-        """Return the signal R G B of planes (height, width, 1 or 3), at 0..`signal_top` for all codes of the result.
+        """Return the signal R G B (height, width, 3) of planes (height, width, 1 or 3), as uint8 or uint16 codes.
 
-        8 bit codes stay 8 bit, unless a curve follows; others become 16 bit.
+        Code 0 stands for the signal 0, the greatest code for `signal_top`. 8 bit codes stay 8 bit, unless a curve
+        follows; others become 16 bit.
         """
         import cv2
 
@@ -85,9 +86,9 @@ class VideoColour:
             table = (np.clip(levels / self.signal_top, 0, 1) * top + 0.5).astype(kind)
             return np.asarray(cv2.merge([np.take(table, np.minimum(planes[..., 0], (1 << self.bits) - 1))] * 3))
         if kind == np.uint8 and self.matrix == RGB:
-            return planes.copy()
+            return planes.copy()  # `stack_planes` reuses their memory
         affine = np.concatenate([matrix, offset[:, None]], 1) * (top / self.signal_top)
-        if kind == np.uint16 and planes.dtype == np.uint8:
+        if kind == np.uint16 and planes.dtype == np.uint8:  # cv2.transform returns the type that it is given
             planes = planes.astype(np.uint16)
         return np.asarray(cv2.transform(planes, affine.astype(np.float32)))
 
@@ -98,7 +99,7 @@ class VideoColour:
         if not self.is_light and not self.is_wide:
             return signal
         light = np.take(_light_table(self.transfer), signal)
-        if self.transfer == "HLG":
+        if self.transfer == "HLG":  # its OOTF: scene's light times a power of its luminance gives the display's
             luminance = cv2.transform(light, _REC_2020_LUMINANCE[None])
             light *= np.power(luminance, np.float32(HLG_GAMMA - 1))[..., None]
             light *= np.float32(HLG_PEAK_NITS / REFERENCE_WHITE_NITS)
@@ -110,7 +111,10 @@ class VideoColour:
         return (np.clip(srgb_from_linear(light), 0, 1) * 65535 + 0.5).astype(np.uint16)
 
     def from_pixels(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the signal, 0..1, of display values 0..1 or of linear light: the inverse of `to_pixels`."""
+        """Return the signal, 0..1, of display values 0..1 or of linear light (height, width, 3), float32.
+
+        The inverse of `to_pixels`; light below 0 becomes 0.
+        """
         import cv2
 
         if not self.is_light and not self.is_wide:
@@ -130,20 +134,23 @@ class VideoColour:
         return srgb_from_linear(light)
 
     def to_plane_differences(self, differences: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return how the codes of the planes change, for a change (height, width, 3) of the signal 0..1."""
+        """Return how the codes of the planes, Y Cb Cr or R G B, change for a change of the signal R G B 0..1; both
+        (height, width, 3)."""
         import cv2
 
         return np.asarray(cv2.transform(differences, np.linalg.inv(self._decoding[0]).astype(np.float32)))
 
     @property
     def signal_top(self) -> float:
-        """The signal that the largest code of `to_signal` stands for."""
+        """The signal that the greatest code of `to_signal` stands for: 1, or more for HLG, whose limited range goes
+        beyond."""
         return HLG_HEADROOM if self.transfer == "HLG" else 1.0
 
     @property
     def _decoding(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return matrix (3, 3) and offset (3,): signal R G B = matrix @ codes + offset; codes of RGB planes are R G B.
         """
+        # Codes that luma and colour differences span, and that of black (ITU-T H.273, 8.3).
         step, top = float(1 << (self.bits - 8)), float((1 << self.bits) - 1)
         luma, difference, black = ((219 * step, 224 * step, 16 * step) if self.limited else (top, top, 0.0))
         if self.matrix == RGB:
@@ -151,6 +158,7 @@ class VideoColour:
         if self.matrix == YCGCO:
             matrix = np.array([[1.0, -1, 1], [1, 1, 0], [1, -1, -1]])
         else:
+            # Y = red R + green G + blue B; Cb = (B - Y) / (2 - 2 blue); Cr = (R - Y) / (2 - 2 red).
             red, blue = LUMA_WEIGHTS[self.matrix]
             green = 1 - red - blue
             matrix = np.array([[1, 0, 2 - 2 * red],
@@ -169,7 +177,8 @@ def usual_matrix(width: int, height: int) -> int:
 
 @lru_cache(maxsize=4)
 def _light_table(transfer: Transfer) -> NDArray[np.float32]:
-    """(65536,) light of each code of `to_signal`: reference white is 1 for PQ, the scene's peak is 1 for HLG."""
+    """(65536,) light of each 16 bit code of `to_signal`: reference white is 1 for PQ, the scene's peak is 1 for HLG;
+    display values of wide primaries are decoded as sRGB."""
     signal = np.arange(65536, dtype=np.float64) / 65535
     if transfer == "PQ":
         return (_nits_from_pq(signal) / REFERENCE_WHITE_NITS).astype(np.float32)
@@ -178,6 +187,7 @@ def _light_table(transfer: Transfer) -> NDArray[np.float32]:
     return signal.astype(np.float32) if transfer == "linear" else linear_from_srgb(signal)
 
 
+# Constants of PQ and HLG: ITU-R BT.2100, tables 4 and 5.
 _PQ_M1, _PQ_M2 = 2610 / 16384, 2523 / 4096 * 128
 _PQ_C1, _PQ_C2, _PQ_C3 = 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
 _HLG_A = 0.17883277
@@ -191,6 +201,7 @@ def _nits_from_pq(signal: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _pq_from_nits(nits: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Invert `_nits_from_pq`."""
     power = np.power(np.clip(nits.astype(np.float64) / PQ_PEAK_NITS, 0, 1), _PQ_M1)
     return np.power((_PQ_C1 + _PQ_C2 * power) / (1 + _PQ_C3 * power), _PQ_M2).astype(np.float32)
 
@@ -201,5 +212,6 @@ def _light_from_hlg(signal: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _hlg_from_light(light: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Invert `_light_from_hlg`."""
     curve = _HLG_A * np.log(np.maximum(12 * light - _HLG_B, 1e-6)) + _HLG_C
     return np.where(light <= 1 / 12, np.sqrt(3 * light), curve).astype(np.float32)

@@ -50,20 +50,24 @@ def plane_format(name: str) -> PlaneFormat | None:
 
 
 def nearest_planar_name(frame: Any) -> str:
-    """Return the name of the planar format that holds all components of a PyAV frame."""
+    """Return the name of the planar format, without subsampling, that holds all components of a PyAV frame.
+
+    It is R G B for palettes, and for sensor (Bayer), XYZ and one bit pictures, which swscale converts.
+    """
     components = frame.format.components
     has_alpha = any(component.is_alpha for component in components) or frame.format.has_palette
     bits = max((component.bits for component in components), default=8)
     is_rgb = frame.format.is_rgb or frame.format.has_palette or frame.format.name.startswith(("bayer", "xyz", "mono"))
     depth = next((depth for depth in _DEPTHS if depth >= bits), 16)
-    if has_alpha and depth in (9, 14):
+    if has_alpha and depth in (9, 14):  # depths that FFmpeg has not with alpha
         depth += 1 if depth == 9 else 2
     name = f"gbr{'a' if has_alpha else ''}p" if is_rgb else f"yuv{'a' if has_alpha else ''}444p"
     return name if depth == 8 else f"{name}{depth}le"
 
 
 def to_planar(frame: Any, is_limited: bool) -> tuple[Any, PlaneFormat]:
-    """Return a PyAV frame in a planar format, itself where it has one, and the format."""
+    """Return a PyAV frame in a planar format, itself where it has one, and the format. is_limited: range of its codes.
+    """
     planar = plane_format(frame.format.name)
     if planar is None:
         name = nearest_planar_name(frame)
@@ -119,7 +123,10 @@ _BUFFERS = threading.local()
 
 
 def _scratch(number: int, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-    """Return an array of this thread that the next frame overwrites: fresh memory costs more than the conversion."""
+    """Return an array of this thread that the next frame overwrites: fresh memory costs more than the conversion.
+
+    number: of the array; arrays of different numbers do not overwrite each other.
+    """
     buffers: dict[str, NDArray[Any]] = _BUFFERS.__dict__
     known = buffers.get(str(number))
     if known is None or known.shape != shape or known.dtype != dtype:
@@ -128,7 +135,7 @@ def _scratch(number: int, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
 
 
 def shrink_plane(plane: NDArray[np.float32], planar: PlaneFormat) -> NDArray[np.float32]:
-    """Average a plane of the full size to the size of the chroma planes."""
+    """Average a plane (height, width) of the full size to the size of the chroma planes, rounded up."""
     import cv2
 
     across, down = planar.sampling
@@ -140,7 +147,7 @@ def shrink_plane(plane: NDArray[np.float32], planar: PlaneFormat) -> NDArray[np.
 
 @dataclass(frozen=True)
 class Orientation:
-    """How stored frames are turned to stand upright: columns become lines (`transposed`), then mirrored axes."""
+    """How stored frames are turned to stand upright: columns become lines (`transposed`), then axes are mirrored."""
 
     transposed: bool = False
     mirror_x: bool = False
@@ -186,7 +193,7 @@ def orientation_from_matrix(matrix: list[int] | None) -> Orientation:
     """Return the orientation nearest to a display matrix; turns by other angles than quarters are rounded."""
     if matrix is None:
         return Orientation()
-    a, b, c, d = matrix[0], matrix[1], matrix[3], matrix[4]
+    a, b, c, d = matrix[0], matrix[1], matrix[3], matrix[4]  # shown x = a x + c y, shown y = b x + d y
     if abs(a) + abs(d) >= abs(b) + abs(c):
         return Orientation(False, a < 0, d < 0)
     return Orientation(True, c < 0, b < 0)

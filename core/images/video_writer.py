@@ -99,14 +99,15 @@ def rewrite_video(source: Path, target: Path, codec: str, change: Change, *,
                   on_written: Callable[[Path], None] = lambda _: None) -> list[str]:
     """Write `source` to `target` with changed frames, and return sentences about what was left out.
 
-    on_frame: called after each frame, and may raise to stop. on_written: called with the whole file before it is
-    renamed to `target`. Raises FrameError where the source cannot be decoded or the target not be encoded, OSError
-    where the target cannot be written.
+    codec: a name of CODECS, as `choose_codec` returns it. on_frame: called after each frame, and may raise to stop.
+    on_written: called with the whole file before it is renamed to `target`. Raises FrameError where the source cannot
+    be decoded or the target not be encoded, OSError where the target cannot be written.
     """
     av = import_av()
     encoder = CODECS[codec]
     with Video(source) as video, atomic_path(target) as temporary, av.open(str(source), metadata_errors="replace") as \
             other:
+        # Without this, FFmpeg drops tags of other names than its own, such as "com.apple.quicktime.make".
         options = {"movflags": "use_metadata_tags"} if any("." in name for name in other.metadata) else {}
         container_format = CONTAINERS[target.suffix.lower()]
         if container_format == "matroska":
@@ -152,12 +153,14 @@ def _timecode(container: Any, stream: Any) -> str | None:
 
 
 def _output_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFormat:
-    """Return the planar format that is encoded: the source's, or the nearest that the encoder takes."""
+    """Return the planar format that is encoded: the source's if the encoder keeps it, else the same without alpha if it
+    takes that, else one of the encoder's own for alpha, for more than 8 bits, or for any."""
     av = import_av()
     _, planar = to_planar(first.raw, video.colour.limited)
     accepted = {pixel_format.name for pixel_format in av.codec.Codec(encoder.name, "w").video_formats or ()}
     if encoder.keeps(planar) and planar.name in accepted and not (encoder.limited and not video.colour.limited):
         return planar
+    # yuvj is FFmpeg's older name of yuv in full range.
     name, plain = encoder.fallback, planar.name.replace("yuvj", "yuv")
     if encoder.alpha is None:
         plain = plain.replace("yuva", "yuv")
@@ -173,8 +176,11 @@ def _output_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFo
 
 
 def _add_picture(out: Any, video: Video, source: Any, encoder: Encoder, left_out: list[str]) -> Any:
-    """Add the stream of the frames, with the tags, timing and shape of the source's. left_out: sentences about what is
-    not written, to which others are added."""
+    """Add the stream of the frames to `out`, with the tags, timing and shape of that of `video`, and return it.
+
+    source: the container of the video, opened anew. left_out: sentences about what is not written, to which others are
+    added.
+    """
     first = next(iter(video), None)
     if first is None:
         raise FrameError(f"{video.path} has no frame that can be read; copy it again.")
@@ -198,10 +204,10 @@ def _add_picture(out: Any, video: Video, source: Any, encoder: Encoder, left_out
     if ratio:
         context.sample_aspect_ratio = ratio
     tags = {"colorspace": raw.colorspace, "color_trc": raw.color_trc, "color_primaries": raw.color_primaries}
-    for name, value in tags.items():
+    for name, value in tags.items():  # 0 and 2: the frame names none, but its container may
         setattr(context, name, value if value not in (0, 2) else getattr(original.codec_context, name))
     if not planar.is_rgb and video.colour.matrix == 0:
-        context.colorspace = 1 if min(video.stored_size) > 576 else 6
+        context.colorspace = 1 if min(video.stored_size) > 576 else 6  # from RGB: BT.709, or BT.601 for small frames
     context.color_range = 1 if _is_limited(planar, video, encoder) else 2
     if video.matrix is not None:
         stream.set_display_matrix(video.matrix)
@@ -212,13 +218,19 @@ def _add_picture(out: Any, video: Video, source: Any, encoder: Encoder, left_out
 
 
 def _is_limited(planar: PlaneFormat, video: Video, encoder: Encoder) -> bool:
+    """True if codes are written in limited range: never of RGB, always of RGB that is encoded as Y Cb Cr, else as the
+    encoder demands or the source has it. planar: the format that is encoded."""
     if planar.is_rgb:
         return False
     return encoder.limited or video.colour.limited or video.colour.matrix == 0
 
 
 class _OtherStreams:
-    """Sound and subtitles of the source, copied packet by packet beside the frames."""
+    """Sound and subtitles of the source, copied packet by packet beside the frames; sound that does not fit into the
+    new container is encoded anew.
+
+    left_out: sentences about what is not written or encoded anew, to which others are added.
+    """
 
     def __init__(self, source: Any, out: Any, video: Video, left_out: list[str]) -> None:
         self._out, self._targets, self._encoded = out, dict[int, Any](), dict[int, Any]()
@@ -241,7 +253,7 @@ class _OtherStreams:
             elif stream.type == "subtitle" and codec in out.supported_codecs:
                 target = out.add_stream_from_template(stream)
             else:
-                if codec or "timecode" not in str(stream.metadata).lower():
+                if codec or "timecode" not in str(stream.metadata).lower():  # that of the timecode becomes a tag
                     left_out.append(f"Stream {stream.index} of {video.path} ({stream.type}) is left out.")
                 continue
             _copy_tags(stream.metadata, target.metadata, _STREAM_FACTS)
@@ -265,7 +277,7 @@ class _OtherStreams:
                 self._waiting = packet
                 return
             self._write(packet)
-        if time is None:
+        if time is None:  # what the encoders still hold
             for target in self._encoded.values():
                 self._out.mux(target.encode())
             self._encoded.clear()
@@ -282,7 +294,10 @@ class _OtherStreams:
 
 def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Change, sound: _OtherStreams,
             on_frame: Callable[[], None]) -> None:
-    """Encode every frame with its change, and write the other streams up to LEAD_S ahead of it."""
+    """Encode every frame with its change, and write the other streams up to LEAD_S ahead of it.
+
+    stream: of the frames, by `_add_picture`. sound: the other streams. on_frame: called after each frame.
+    """
     planar = plane_format(stream.pix_fmt)
     assert planar is not None
     context, time_base = stream.codec_context, stream.codec_context.time_base
@@ -293,9 +308,10 @@ def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Chang
         raw = apply_change(frame, *both) if both is not None else frame.raw
         if raw.format.name != planar.name or (not planar.is_rgb and frame.colour.limited != limited):
             raw = _reformat(raw, frame, planar, context, limited=limited)
-        ticks = frame.number if frame.time is None else frame.time[0]
+        ticks = frame.number if frame.time is None else frame.time[0]  # see the time base of `_add_picture`
         if last is not None and ticks <= last:  # a damaged file may repeat a time
             ticks = last + 1
+        # Type 0 of a picture lets the encoder choose its key frames.
         raw.pts, raw.time_base, raw.pict_type, last = ticks, time_base, 0, ticks
         raw.color_range, raw.colorspace = context.color_range, context.colorspace
         sound.write_until(ticks * time_base + LEAD_S)
@@ -306,12 +322,16 @@ def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Chang
 
 
 def _reformat(raw: Any, frame: VideoFrame, planar: PlaneFormat, context: Any, *, limited: bool) -> Any:
-    """Convert a frame to another planar format by swscale, exactly."""
+    """Convert PyAV's frame `raw` to the planar format that `context` encodes, by swscale with its exact flags.
+
+    frame: the video's frame that `raw` is, or was made from, which says what its codes mean. limited: the range to
+    write.
+    """
     from av.video.reformatter import Interpolation
 
     exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | \
         Interpolation.FULL_CHR_H_INP
-    source = _SWSCALE_MATRICES.get(frame.colour.matrix, 5)
+    source = _SWSCALE_MATRICES.get(frame.colour.matrix, 5)  # 5 is BT.601; RGB has none
     target = _SWSCALE_MATRICES.get(int(context.colorspace), source)
     return raw.reformat(format=planar.name, interpolation=exact, src_colorspace=source, dst_colorspace=target,
                         src_color_range=1 if frame.colour.limited else 2,
@@ -319,13 +339,14 @@ def _reformat(raw: Any, frame: VideoFrame, planar: PlaneFormat, context: Any, *,
 
 
 _SWSCALE_MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9}
-"""swscale's numbers of matrix coefficients."""
+"""swscale's numbers of matrix coefficients, by those of ITU-T H.273."""
 
 
 def apply_change(frame: VideoFrame, before: NDArray[np.float32], after: NDArray[np.float32]) -> Any:
     """Return PyAV's frame with the change from `before` to `after` added to its codes, in a planar format.
 
-    Codes of pixels that do not change stay as they are; those of subsampled colour change by the mean of their pixels.
+    before, after: upright pixels (height, width, 3), as of `VideoFrame.picture`. Codes of pixels that do not change
+    stay as they are; those of subsampled colour change by the mean of their pixels.
     """
     colour = frame.colour
     difference = colour.from_pixels(after) - colour.from_pixels(before)

@@ -56,8 +56,8 @@ class Case:
 
 
 def read_cases(folder: Path | str) -> list[Case]:
-    """Return the cases of a folder, see the module's head. Raises SettingsError where it holds none, or a picture has
-    no counterpart."""
+    """Return the cases of a folder in the layout that the module's docstring describes. Raises SettingsError where it
+    holds none, or a picture has no counterpart."""
     folder = Path(folder)
     cases: list[Case] = []
     if not folder.is_dir():
@@ -89,7 +89,8 @@ def _find_folder(root: Path, names: Sequence[str]) -> Path | None:
 
 
 def _index_by_key(folder: Path) -> dict[str, Path]:
-    """Return a folder's pictures by name without prefix, or by the whole name if that is ambiguous."""
+    """Return a folder's pictures by name without prefix, or by the whole name if that is ambiguous. Raises
+    SettingsError where one name has two suffixes."""
     paths = pictures_in(folder)
     duplicates = [stem for stem, count in Counter(path.stem for path in paths).items() if count > 1]
     if duplicates:
@@ -152,8 +153,11 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
 
 def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
             lpips: Perceptual | None) -> Scores:
-    """Return the scores of a picture against the truth; None for one that is infinite or cannot be computed."""
-    small = min(picture.shape[:2]) < 11
+    """Return the scores of a picture against the truth; None for one that is infinite or cannot be computed.
+
+    mask: display values (height, width, 3), white where the flare is; None for no masked score.
+    """
+    small = min(picture.shape[:2]) < 11  # the side of SSIM's window
     scores: Scores = {"psnr": psnr(picture, truth), "ssim": None if small else ssim(picture, truth),
                       "lpips": lpips(picture, truth) if lpips else None, "flip": flip(picture, truth)}
     if mask is not None:
@@ -163,7 +167,10 @@ def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return means over the cases, and the share that became worse by more than 0.5 dB."""
+    """Return means over the cases, and the share that became worse by more than 0.5 dB.
+
+    rows: of `evaluate`, one dictionary per case.
+    """
     gains = [row["gain_db"] for row in rows]
     summary: dict[str, Any] = {"count": len(rows), "gain_db": _mean(gains),
                                "made_worse": round(sum(gain < -0.5 for gain in gains) / max(len(gains), 1), 4)}
@@ -175,7 +182,7 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _psnr_or_identical(scores: Scores) -> float:
-    """Return PSNR in dB; IDENTICAL_PSNR for identical pictures."""
+    """Return PSNR in dB; IDENTICAL_PSNR for identical pictures, whose score is None."""
     return IDENTICAL_PSNR if scores["psnr"] is None else scores["psnr"]
 
 
@@ -198,7 +205,11 @@ def format_table(scores: dict[str, Any]) -> str:
 
 def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores: dict[str, Any],
                 width: int = 400) -> Pixels:
-    """Return the pictures with the lowest gain, worst first: input | result | truth | removed flare, display values."""
+    """Return a sheet (rows, 4 * width, 3) of the pictures with the lowest gain, worst first: input | result | truth |
+    removed flare times 2, display values.
+
+    clean: as for `evaluate`. scores: what `evaluate` returned. width: of one tile, pixels.
+    """
     import cv2
 
     by_name = {(case.category, case.name): case for case in cases}
@@ -224,7 +235,7 @@ def held_out_lenses(lenses: Iterable[Prescription]) -> list[Prescription]:
 def synthetic_cases(seed: int, count: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
                     size: tuple[int, int]) -> list[Case]:
     """Return `count` cases of every flare class, a function of the seed: a test set that needs no data but clean
-    pictures. Frames are 8 bit codes."""
+    pictures. Frames are rounded to 8 bit codes. size: (width, height) of a frame."""
     from .synthesis.flare import FLARE_CLASSES
     from .training.flare_bank import SingleFlareBank
     from .training.pairs import make_pair

@@ -79,8 +79,8 @@ def collect_with_neighbours(inputs: Sequence[Path], exclude: Iterable[Path | Non
 
 
 def _excluded_paths(folder: Path, excluded: Iterable[Path]) -> set[Path]:
-    """Return files and folders in `folder` that hold no plates: those of `excluded` that lie in it, and the results
-    that their manifests list."""
+    """Return files and folders in `folder` that hold no plates: those of `excluded` that lie in it, and all results
+    that manifests in `excluded` list."""
     excluded_paths = {other.resolve() for other in excluded if folder.resolve() in other.resolve().parents}
     return excluded_paths.union(*(Manifest(other).results() for other in excluded))
 
@@ -92,9 +92,10 @@ def _self_and_parents(path: Path) -> list[Path]:
 
 
 def left_out(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) -> dict[str, list[str]]:
-    """Return the names of the files in the item folders that are no plates, by reason.
+    """Return the names of the files in those inputs that are folders, and that are no plates, by reason.
 
-    exclude: as for `collect_plates`; these, manifests and locks are not mentioned.
+    A name is the path below its input. exclude: as for `collect_plates`; these, manifests and hidden entries are not
+    mentioned.
     """
     skipped: dict[str, list[str]] = {}
     for item in inputs:

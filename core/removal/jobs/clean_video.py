@@ -43,10 +43,11 @@ def frames_folder(target: Path) -> Path:
 
 def write_clean_video(source: Path, target: Path, codec: str | None, progress: Progress, *,
                       overwrite: bool = False) -> bool:
-    """Write the clean frames in `frames_folder` as a video; False while some are missing.
+    """Write the clean frames in `frames_folder` as a video; False while some are missing, else True.
 
-    A video that was written of the same frames is kept. Raises SettingsError where the target is another file, unless
-    `overwrite`, and FrameError where it cannot be written.
+    codec: its name, None for one that suits source and target. A video that was written of the same frames is kept.
+    Raises SettingsError where the target is another file, unless `overwrite`, and FrameError where it cannot be
+    written.
     """
     folder = frames_folder(target)
     filmed = {path.stem: path for path in pictures_in(folder / f"{source.name}.frames")}
@@ -68,6 +69,7 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
             return True
 
     def change(frame: VideoFrame) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Return a frame's pixels as extracted and as cleaned; None where they are the same."""
         stem = f"{source.stem}.{frame.number + 1:06d}"
         if stem not in filmed:
             raise FrameError(f"{folder / stem} is missing among the frames of {source}; delete {folder} and clean it "
@@ -76,7 +78,11 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
         return None if np.array_equal(before.pixels, after.pixels) else (before.pixels, after.pixels)
 
     def note(whole: Path) -> None:
-        # Before the video has its name: an end between the two must leave no video that looks like someone's work.
+        """Record the finished video and the one that it replaces.
+
+        It is called before the video has its name: a process that is killed between the two must leave neither of them
+        looking like someone's work.
+        """
         replaced = {"replaced": content_hash(target)} if target.exists() else {}
         write_json(folder / RECORD, {"from": digest, "written": content_hash(whole), **replaced})
 

@@ -105,7 +105,11 @@ def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
 
 def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
                 above_white: bool) -> tuple[Plate, NDArray[Any], Pixels, dict[str, float]]:
-    """Return a view's plate, the codes of its clean frame, the removed flare in linear light, and each light's gain."""
+    """Return a view's plate, the codes of its clean frame, the fitted flare in linear light (height, width, 3), and
+    each light's gain.
+
+    Raises FrameError for a plate that the fit's cameras do not match: turned by Exif, or with several views.
+    """
     if view.upright:
         raise FrameError(f"{capture.frame_path(view)} was solved as viewers show it, and its pixels are stored turned; "
                          "turn the pixels, remove its Exif orientation, and fit again.")
@@ -114,6 +118,7 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
         names = " and ".join(name for name, _ in views)
         raise FrameError(f"{stored.path} holds the views {names}, and the fit has the "
                          "cameras of one; export each view as a file of its own.")
+    # From these codes the flare can be subtracted as it is; others are converted to Rec. 709 to find what is removed.
     is_direct = stored.is_rec709 or (stored.encoding == "linear" and stored.space.is_linear)
     plate = stored if is_direct else stored.in_rec709
     height, width = plate.codes.shape[:2]
@@ -134,7 +139,7 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
         flare[fitted_part] += np.float32(gains[light]) * light_flare[fitted_part]
     light_discs = light_disc_mask(_display_values(plate), camera,
                                   [capture.light_state(light, view).xyz for light in capture.lights])
-    if above_white and plate.encoding == "linear":
+    if above_white and plate.encoding == "linear":  # the scene knows the lights' own brightness
         codes = subtract_fitted_flare(plate, flare, scene, light_discs)
     else:
         codes = subtract_fitted_flare(plate, np.where(light_discs[..., None], 0, flare), scene)
@@ -156,10 +161,12 @@ def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) 
     part = plate.picture_area.slices
     step = max(round(math.sqrt(math.prod(plate.codes.shape[:2]) / MAX_SAMPLES)), 1)
     observed, *layers = (pixels[part][::step, ::step] for pixels in (_linear_light(plate), scene, *flares.values()))
+    # Linear plates do not clip.
     clipped = linear_from_srgb(np.array(CLIPPING_LEVEL)) if plate.encoding == "srgb" else np.inf
     unclipped = (observed < clipped).all(-1)
     light = observed[unclipped].ravel().astype(np.float64)
     columns = np.stack([pixels[unclipped].ravel() for pixels in layers], 1).astype(np.float64)
+    # Bounds of the scene's gain, then of each flare's.
     low, high = np.array([[1 / MAX_SCENE_GAIN, MAX_SCENE_GAIN], *len(flares) * [[0.0, 1.0]]]).T
     # The prior alone decides where the whole plate is clipped.
     gains = robust_bounded_fit(columns, light, np.ones(len(layers)), low, high, PRIOR_WEIGHT)
@@ -187,7 +194,7 @@ def subtract_fitted_flare(plate: Plate, flare: Pixels, scene: Pixels,
     the codes are not finite.
 
     flare, scene: linear light (height, width, 3). The scene replaces the result where the plate is clipped and where
-    `hidden` (height, width) is set, as far as it is brighter than the result.
+    `hidden` (height, width) is set, as far as it is brighter than the result, and no brighter than the plate.
     """
     light = _linear_light(plate)
     clipped = np.zeros((*light.shape[:2], 1), bool)
@@ -197,6 +204,7 @@ def subtract_fitted_flare(plate: Plate, flare: Pixels, scene: Pixels,
         clipped = clipped | hidden[..., None]
     difference = light - flare
     filled = np.maximum(difference, np.minimum(scene, light))
+    # No light becomes negative; what is negative in the plate, as outside a gamut, stays.
     difference = np.maximum(np.where(clipped, filled, difference), np.minimum(light, 0))
     if plate.encoding == "srgb":
         codes = (srgb_from_linear(difference) * np.float32(plate.max_code) + np.float32(0.5)).astype(plate.codes.dtype)

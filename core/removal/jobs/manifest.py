@@ -88,6 +88,7 @@ class Manifest:
             new = {table: {**rows} for table, rows in old.items()}
             for table, value in {**self._entries(digest, results), "sources": content_hash(source)}.items():
                 new[table][key] = value
+            # Of the clean frame and of its flare, in the order of `results`.
             is_listed = (key in old["plates"], old["flares"].get(key) == new["flares"].get(key))
             for path, listed in zip(results, is_listed, strict=False):
                 if not overwrite and not listed and path.exists():
@@ -162,12 +163,13 @@ class Manifest:
         return error.filename is not None and Path(error.filename) in paths
 
     def _is_up_to_date(self, tables: _Tables, name: Path, digest: str, results: Sequence[Path]) -> bool:
+        """Return whether a frame is entered with this digest and no file is missing or empty."""
         entered = all(tables[table].get(name.as_posix()) == value
                       for table, value in self._entries(digest, results).items())
         return entered and all(path.is_file() and path.stat().st_size for path in results)
 
     def _edited(self, tables: _Tables, results: Sequence[Path]) -> list[Path]:
-        """Return those files that hold something else than was written."""
+        """Return those files that hold something else than was written; one without an entry does not count."""
         written = tables["written"]
         return [path for path in results if path.is_file()
                 and written.get(_relative_path(self._folder, path), content_hash(path)) != content_hash(path)]

@@ -47,10 +47,13 @@ class Mattes:
         return matte
 
     def read(self, name: Path, plate: DataWindow, orientation: int = UPRIGHT) -> NDArray[np.float32]:
-        """Return the plate's matte as the plate is stored: (height, width), 0..1, its brightest channel times its
-        alpha.
+        """Return a plate's matte, 0..1, for the pixels that the plate's file stores, (height, width): its brightest
+        channel times its alpha.
 
-        orientation: the plate's Exif orientation. Raises FrameError for a damaged matte, and for one of another aspect.
+        name: of the plate below its folder. plate: window of its stored pixels. orientation: its Exif orientation.
+
+        The matte may have the size of the plate's frame, another size of the same aspect, or that of its stored pixels.
+        Raises FrameError for a damaged matte, and for one of another aspect.
         """
         import cv2
 
@@ -71,6 +74,7 @@ class Mattes:
         if (columns, rows) != (width, height):
             values = np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
         x, y = plate.origin
+        # Crop the frame to the plate's stored pixels, which take the part of the display window here.
         values = crop_to_display_window(values, DataWindow(plate.frame, (-x, -y), plate.size))
         return np.clip(values, 0, 1)
 

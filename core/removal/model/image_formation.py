@@ -37,12 +37,13 @@ def add_under_shoulder(scene: Pixels, flare: Pixels, strength: float) -> Pixels:
 
 def flare_to_linear(display: Pixels, flare: Pixels) -> Pixels:
     """Return the linear flare (by GAMMA) that accounts for what a flare adds to display values: the frame's light minus
-    the clean frame's."""
+    the clean frame's. display: the frame, 0..1. flare: what it adds, of the same shape."""
     return np.asarray(display**GAMMA - np.maximum(display - flare, 0) ** GAMMA, np.float32)
 
 
 def coverage(flare: Pixels, energy_share: float = 0.9) -> float:
-    """Return the smallest fraction of the frame that holds this share of a flare's energy; 0 for an empty layer."""
+    """Return the smallest fraction of the frame, 0..1, that holds this share of the energy of a flare (h, w, 3); 0 for
+    an empty layer."""
     energy = np.sort(np.asarray(flare, np.float64).sum(-1).ravel())[::-1]
     total = float(energy.sum())
     if total <= 0:

@@ -41,11 +41,13 @@ class NetworkOutput(NamedTuple):
 
 
 def pyramid_inputs(display: Tensor) -> list[Tensor]:
-    """Return the input of each level, finest first, (n, INPUT_CHANNELS, h / side, w / side); the finest has the pixels
-    of the frame besides (pixel unshuffle).
+    """Return the input of each level, finest first, (n, INPUT_CHANNELS, h / side, w / side), where `side` is that of a
+    position in pixels: SHUFFLE_FACTOR, doubled from level to level. The finest has the pixels of the frame besides
+    (pixel unshuffle).
 
     display: whole frames (n, 3, h, w), values 0..1, principal point in the centre; h and w multiples of SIZE_MULTIPLE.
     """
+    # 0 where the darkest channel is at 0.9 or less, 1 where it is clipped
     exposure = ((display.amin(1, keepdim=True) - 0.9) * 10).clamp(0, 1)
     mean, minimum, over_exposure = torch.cat([display, exposure], 1), display, exposure
     inputs = []
@@ -62,7 +64,8 @@ def pyramid_inputs(display: Tensor) -> list[Tensor]:
 
 
 def _position_channels(like: Tensor, height: int, width: int) -> Tensor:
-    """Return (3, height, width): x, y and x^2 + y^2, which is 1 at the corners."""
+    """Return (3, height, width): x, y and x^2 + y^2 from the centre, which is 1 at the corners. like: has the dtype
+    and device."""
     half_diagonal = (height**2 + width**2) ** 0.5 / 2
     y = (torch.arange(height, dtype=like.dtype, device=like.device) + 0.5 - height / 2) / half_diagonal
     x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5 - width / 2) / half_diagonal
@@ -112,6 +115,7 @@ class Attention(nn.Module):
         super().__init__()
         self.heads, self.octaves = heads, octaves
         self.norm = ChannelNorm(width)
+        # position 3, direction 2, sine and cosine of x and y for each octave
         self.pos_embed = nn.Conv2d(5 + 4 * octaves, width, 1)
         self.qkv = nn.Conv2d(width, 3 * width, 1)
         self.proj = nn.Conv2d(width, width, 1)
@@ -187,11 +191,12 @@ class RemovalNetwork(nn.Module):
             if level:
                 x = F.interpolate(self.up[level - 1](x), scale_factor=2, mode="nearest") + skips.pop()
         out = F.pixel_shuffle(self.head(x), SHUFFLE_FACTOR).float()
+        # The share without glow is a sigmoid whose slope at 0 is 1, by the factor 4.
         return NetworkOutput(out[:, :3], out[:, :3] * torch.sigmoid(out[:, 3:] * 4))
 
     def _encode_level(self, x: Tensor, level: int) -> Tensor:
         """Apply the encoder's residual blocks of a level, and its attention layers."""
-        coarse = level - (LEVELS - 2)
+        coarse = level - (LEVELS - 2)  # 0 and 1 on the levels with attention, below 0 on the others
         inner = list(cast(nn.ModuleList, self.inner_attention[coarse])) if coarse >= 0 else []
         for number, block in enumerate(cast(nn.Sequential, self.encoder[level])):
             x = block(x)

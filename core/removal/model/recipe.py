@@ -89,7 +89,7 @@ class Recipe:
                                 f"in pixels), of {2 * SIZE_MULTIPLE} pixels or more.")
 
     def learning_rate_at(self, iteration: int) -> float:
-        """Return the learning rate of an iteration."""
+        """Return the learning rate of an iteration: a linear rise over the warm-up times a cosine that falls to 0."""
         fall = 0.5 + 0.5 * math.cos(math.pi * min(iteration / self.iterations, 1.0))
         return self.learning_rate * fall * min((iteration + 1) / self.warmup_iterations, 1.0)
 
@@ -101,7 +101,11 @@ class Recipe:
         return self.size_stages[-1][1:]
 
     def draw_batch_shape(self, random: np.random.Generator, iteration: int) -> tuple[int, int, int]:
-        """Draw (count, width, height) of the frames of an iteration; sides are multiples of SIZE_MULTIPLE."""
+        """Draw (count, width, height) of the frames of an iteration; sides are multiples of SIZE_MULTIPLE.
+
+        The aspect is 1 to 1.9, one frame size in five is upright, and there are as many frames as the pixels of an
+        iteration allow.
+        """
         low, high = map(math.log, self.size_range_at(iteration))
         long_side = max(round(math.exp(random.uniform(low, high)) / SIZE_MULTIPLE), 2) * SIZE_MULTIPLE
         short_side = max(round(long_side / random.uniform(1.0, 1.9) / SIZE_MULTIPLE), 2) * SIZE_MULTIPLE

@@ -90,7 +90,8 @@ def load(path: Path) -> RemovalNetwork:
         raise RunError(f"{path} holds weights that are no finite numbers; get it again, or train it anew.")
     architecture = read_architecture(path, metadata)
     try:
-        with torch.device("meta"):  # before memory is taken for a size that the tensors do not have
+        # Shapes are compared without data first: a damaged header might ask for more memory than there is.
+        with torch.device("meta"):
             described = RemovalNetwork(*architecture).state_dict()
         if {name: value.shape for name, value in described.items()} != {
                 name: value.shape for name, value in tensors.items()}:

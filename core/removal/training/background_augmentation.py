@@ -63,12 +63,13 @@ def _random_pose(random: Random, draw_view: DrawView, width: int, height: int) -
     choice = random.random()
     if choice < 0.6:
         return draw_view(random, width, height)
-    if choice < 0.75:
+    if choice < 0.75:  # on its side
         return np.ascontiguousarray(draw_view(random, height, width).swapaxes(0, 1))
     piece_width, piece_height = math.ceil(width * WARP_MARGIN), math.ceil(height * WARP_MARGIN)
     scene = draw_view(random, piece_width, piece_height)
     roll = math.radians(random.normal(0, 12))
     rotation = np.array([[math.cos(roll), -math.sin(roll)], [math.sin(roll), math.cos(roll)]])
+    # The corners of the frame in the piece: each is moved along its diagonal, which makes the perspective.
     corners = (UNIT_SQUARE * (width, height) / 2) @ rotation.T * np.exp(random.normal(0, 0.1, (4, 1)))
     corners += (piece_width / 2, piece_height / 2)
     target_corners = (UNIT_SQUARE + 1) / 2 * (width, height)
@@ -88,7 +89,7 @@ def _random_defocus(random: Random, scene: Pixels) -> Pixels:
 
 
 def defocus(scene: Pixels, aperture: Pixels) -> Pixels:
-    """Convolve a scene with the image (height, width) of the aperture, in pixels."""
+    """Convolve a scene with the image of the aperture, (height, width) in pixels of the scene, of any sum."""
     import cv2
 
     blurred = cv2.filter2D(scene, -1, aperture / aperture.sum(), borderType=cv2.BORDER_REFLECT)
@@ -96,7 +97,7 @@ def defocus(scene: Pixels, aperture: Pixels) -> Pixels:
 
 
 def _add_dead_leaves(random: Random, scene: Pixels, draw_view: DrawView) -> Pixels:
-    """Cover the scene with pieces of other views, each in its own exposure, some out of focus."""
+    """Cover the scene with one to eight pieces of other views, each in its own exposure, some with soft edges."""
     height, width = scene.shape[:2]
     scene = scene.copy()
     for _ in range(int(random.integers(1, 9))):
@@ -107,6 +108,7 @@ def _add_dead_leaves(random: Random, scene: Pixels, draw_view: DrawView) -> Pixe
         top = int(random.uniform(-piece_height / 2, height - piece_height / 2))
         shape = _draw_leaf(random, piece_width, piece_height)[..., None]
         piece = draw_view(random, piece_width, piece_height) * np.float32(math.exp(random.normal(0, 0.5)))
+        # The part of the piece that lies in the frame, and its place there.
         piece_window = np.s_[max(-top, 0):height - top, max(-left, 0):width - left]
         scene_window = np.s_[max(top, 0):top + piece_height, max(left, 0):left + piece_width]
         scene[scene_window] = _blend(scene[scene_window], piece[piece_window], shape[piece_window])
@@ -114,7 +116,7 @@ def _add_dead_leaves(random: Random, scene: Pixels, draw_view: DrawView) -> Pixe
 
 
 def _blend(first: Pixels, second: Pixels, weight: Pixels) -> Pixels:
-    """Mix two pictures by the weight 0..1 of the other; light that rounding leaves below zero becomes zero."""
+    """Mix two pictures by the weight 0..1 of the second; light that rounding leaves below zero becomes zero."""
     return np.asarray(np.maximum(first + (second - first) * weight, 0), np.float32)
 
 
@@ -142,7 +144,7 @@ def _draw_blob(random: Random, width: int, height: int) -> Pixels:
     import cv2
 
     coarse = random.random((int(random.integers(3, 9)), int(random.integers(3, 9)))).astype(np.float32)
-    coarse[0] = coarse[-1] = coarse[:, 0] = coarse[:, -1] = 0
+    coarse[0] = coarse[-1] = coarse[:, 0] = coarse[:, -1] = 0  # so that the blob ends inside the mask
     hills = np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC), np.float32)
     return np.asarray(np.clip((hills - random.uniform(0.3, 0.5)) * min(width, height) / 4 + 0.5, 0, 1), np.float32)
 
@@ -158,7 +160,7 @@ def _draw_polygon(corners: NDArray[np.float64], width: int, height: int) -> Pixe
 
 def _grade(random: Random, scene: Pixels) -> Pixels:
     """Change contrast, saturation and colour balance; exchange channels in a few."""
-    level = np.float32(max(float(scene.mean()), 1e-4))
+    level = np.float32(max(float(scene.mean()), 1e-4))  # contrast changes about the mean
     if random.random() < 0.5:
         scene = level * (scene / level) ** np.float32(math.exp(random.normal(0, 0.25)))
     if random.random() < 0.5:
@@ -193,10 +195,12 @@ def _add_haze(random: Random, scene: Pixels) -> Pixels:
     """
     height, width = scene.shape[:2]
     across = math.hypot(width, height)
+    # x and y from the sun, which is on the horizon; y is below the horizon too.
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) - random.uniform(-0.3, 1.3) * width,
                        np.arange(height, dtype=np.float32) - random.uniform(0, 0.7) * height)
     opacity = np.float32(1) - np.exp(-_optical_depth(random, scene, y / height))[..., None]
     colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
+    # The light that distance fades to: bright, but as a part of this scene may be.
     air = np.float32(np.quantile(scene.mean(-1), 0.9) * log_uniform(random, 0.5, 1.5)) * colour
     if random.random() < 0.5:
         warm = np.exp(random.normal((0.2, 0, -0.3), 0.2)).astype(np.float32)
@@ -208,8 +212,8 @@ def _add_haze(random: Random, scene: Pixels) -> Pixels:
 def _optical_depth(random: Random, scene: Pixels, below_horizon: Pixels) -> Pixels:
     """Return the optical depth of haze (height, width), 0 where the scene is near.
 
-    Distance is guessed: it grows up to the horizon and with brightness, along the edges of the picture. below_horizon:
-    (height, width) in picture heights.
+    Distance is guessed: it grows with height above the horizon and with brightness, and follows the edges of the
+    picture. below_horizon: (height, width) in picture heights, negative above it.
     """
     import cv2
 
@@ -218,6 +222,7 @@ def _optical_depth(random: Random, scene: Pixels, below_horizon: Pixels) -> Pixe
     up = np.float32(random.uniform(0.5, 4)) * np.minimum(-below_horizon, 0)
     radius = max(round(math.hypot(*scene.shape[:2]) * log_uniform(random, 0.01, 0.05)), 2)
     distance = cv2.ximgproc.guidedFilter(grey, up + grey, radius, 0.02)
+    # The nearest part of the picture, 15 to 50 %, is without haze.
     distance -= np.quantile(distance, random.uniform(0.15, 0.5))
     density = log_uniform(random, 0.4, 4) / max(float(distance.max()), 1e-3)
     return np.asarray(np.maximum(distance, 0) * np.float32(density), np.float32)
@@ -237,7 +242,7 @@ def _add_bright_objects(random: Random, scene: Pixels) -> Pixels:
 
 
 def _draw_reflection(random: Random, height: int, width: int) -> Pixels:
-    """Return the mask (height, width) 0..1 of a lamp's reflection on a floor: long, upright, broken up."""
+    """Return the mask (height, width) 0..1 of a lamp's reflection on a floor: long, upright, broken up by `waves`."""
     import cv2
 
     across = math.hypot(width, height) * log_uniform(random, 0.004, 0.03)

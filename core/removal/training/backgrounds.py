@@ -68,6 +68,8 @@ class Backgrounds:
         return _defocus_by_disc(random, scene) if random.random() < 0.125 else scene
 
     def _draw_view(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
+        """Return a view of a random picture, as for `draw`. A map counts as three photographs: it has views all round.
+        """
         photos = len(self.photos)
         share = len(self.maps) * 3 / (photos + len(self.maps) * 3)
         if random.random() < share:
@@ -153,7 +155,8 @@ def list_pictures(folder: Path, suffixes: Set[str], part: Part) -> list[Path]:
 
 
 def _read_environment_map(path: Path) -> NDArray[np.float16] | None:
-    """Return an environment map, at most 1024 x 512, scaled to a median of 0.18; None if it is unusable."""
+    """Return an environment map, (height, width, 3) linear light, at most 1024 x 512 pixels, scaled to a median of
+    0.18; None if it is unusable."""
     import cv2
 
     if path.suffix.lower() == ".exr":
@@ -176,15 +179,17 @@ def _read_environment_map(path: Path) -> NDArray[np.float16] | None:
         return None
     if light.shape[1] > 1024:
         light = cv2.resize(light, (1024, 512), interpolation=cv2.INTER_AREA)
-    light = np.clip(light / max(float(np.median(light.mean(-1))) / 0.18, 1e-6), 0, 6e4)
+    light = np.clip(light / max(float(np.median(light.mean(-1))) / 0.18, 1e-6), 0, 6e4)  # below float16's greatest
     return light.astype(np.float16)
 
 
 def _crop_photo(random: Random, photo: NDArray[np.uint8], width: int, height: int, gamma: float) -> Pixels:
-    """Return a random crop of a photograph, mirrored in half of the cases, in linear light."""
+    """Return a random crop of a photograph, (height, width, 3) linear light, mirrored in half of the cases. gamma: of
+    the photograph's display values."""
     import cv2
 
     h, w = photo.shape[:2]
+    # scale: pixels of the photograph for each of the result. One that is much too small is not cropped further.
     fit = min(w / width, h / height)
     scale = fit * random.uniform(0.3, 1.0) if fit > 0.7 else fit
     cw, ch = min(int(width * scale), w), min(int(height * scale), h)
@@ -198,9 +203,11 @@ def _crop_photo(random: Random, photo: NDArray[np.uint8], width: int, height: in
 
 
 def _perspective_view(random: Random, light: NDArray[np.float16], width: int, height: int) -> Pixels:
-    """Return a perspective view of 35 to 100 degrees, pitched by some degrees, exposed to a random grey."""
+    """Return a perspective view, (height, width, 3) linear light: 35 to 100 degrees wide, pitched by some degrees,
+    exposed to a random median about 0.18. light: an equirectangular map, (h, w, 3)."""
     import cv2
 
+    # Directions of the pixels: x to the right, y down, at a distance of 1.
     field = math.tan(math.radians(random.uniform(35, 100)) / 2)
     x = (np.arange(width, dtype=np.float32) + 0.5 - width / 2) / (width / 2) * field
     y = (np.arange(height, dtype=np.float32) + 0.5 - height / 2) / (width / 2) * field
@@ -218,7 +225,7 @@ def _perspective_view(random: Random, light: NDArray[np.float16], width: int, he
 
 
 def _defocus_by_disc(random: Random, scene: Pixels) -> Pixels:
-    """Blur by a disc of 1 to 8 % of the width."""
+    """Blur by a disc with a diameter of 1 to 8 % of the width."""
     radius = scene.shape[1] * log_uniform(random, 0.005, 0.04)
     reach = math.ceil(radius)
     y, x = np.mgrid[-reach:reach + 1, -reach:reach + 1]

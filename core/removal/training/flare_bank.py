@@ -65,6 +65,7 @@ class SynthesisBank:
         """Return a random flare of the current part."""
         slots = range(self._part, len(self._entries), self._part_count)
         slot = slots[int(random.integers(len(slots)))]
+        # The greatest serial number below the end that falls into this slot.
         serial = self._end_serial - 1 - (self._end_serial - 1 - slot) % len(self._entries)
         entry = self._entries[slot]
         if entry is None or entry[0] != serial:
@@ -143,6 +144,7 @@ class UserFlares:
         return len(self._files)
 
     def _drop_unreadable(self) -> None:
+        """Try about PROBED_FLARES files, evenly over the list; drop and report those that cannot be read."""
         for file in self._files[:: max(len(self._files) // PROBED_FLARES, 1)]:
             try:
                 self._read(file, np.random.default_rng(0))
@@ -162,7 +164,10 @@ class UserFlares:
         return self._draw_layers(random)
 
     def _draw_layers(self, random: Random) -> FlareLayers:
-        """Return the layers of a random file; its light is placed where the picture of the light is brightest."""
+        """Return the layers of a random file; its light is placed where the picture of the light is brightest.
+
+        All but the light is `rest`: the pictures do not separate the glow.
+        """
         file = self._files[int(random.integers(len(self._files)))]
         flare, light = map(self._fit_to_canvas, self._read(file, random))
         light = np.minimum(light, flare)
@@ -170,6 +175,7 @@ class UserFlares:
         if float(light.max()) > 0.3:
             y, x = np.unravel_index(int(light.sum(-1).argmax()), light.shape[:2])
             lights = (((float(x) + 0.5) / self._size * 2 - 1, (float(y) + 0.5) / self._size * 2 - 1),)
+        # Pictures clip a light at white; in the scene it is brighter.
         return FlareLayers(flare - light, np.zeros_like(flare), light * 4, lights)
 
     @staticmethod
@@ -180,7 +186,8 @@ class UserFlares:
         return flare, np.zeros_like(flare) if light_path is None else _read_linear(light_path)
 
     def _fit_to_canvas(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Scale a picture so that its diagonal is the canvas' side, and centre it."""
+        """Return a picture on the canvas (size, size, 3), black beside it: scaled so that its diagonal is the canvas'
+        side, and centred."""
         import cv2
 
         height, width = pixels.shape[:2]
@@ -194,14 +201,15 @@ class UserFlares:
 
 
 def _read_linear(path: Path) -> NDArray[np.float32]:
-    """Return a picture's linear light, over black where it is transparent."""
+    """Return a picture's linear light (h, w, 3), over black where it is transparent."""
     light = read_picture(path).linear()
+    # An EXR is premultiplied, so it is over black already.
     alpha = None if path.suffix.lower() == ".exr" else read_plate(path).straight_alpha
     return light if alpha is None else np.asarray(light * alpha[..., None], np.float32)
 
 
 def _read_random_frame(path: Path, random: Random) -> NDArray[np.float32]:
-    """Return the linear light of a picture, or of a random frame of a video."""
+    """Return the linear light (h, w, 3) of a picture, or of a random frame of a video. Raises FrameError."""
     if not is_video(path):
         return _read_linear(path)
     with Video(path) as clip:

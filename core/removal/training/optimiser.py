@@ -50,6 +50,7 @@ class MuonAdamW:
         gradients = [_as_matrix(cast(Tensor, self._parameters[name].grad)) for name in matrices_to_step]
         momenta = [self._momenta[name] for name in matrices_to_step]
         torch._foreach_lerp_(momenta, gradients, 1 - MUON_MOMENTUM)
+        # Nesterov momentum: the gradient is counted once more beside the momentum.
         directions = [direction.contiguous() for direction in torch._foreach_lerp(gradients, momenta, MUON_MOMENTUM)]
         for group in _group_same_shapes(directions, filter(worker.is_responsible_for, range(len(directions)))):
             orthogonal = orthogonalise(torch.stack([directions[number] for number in group]))
@@ -58,6 +59,7 @@ class MuonAdamW:
         worker.all_gather(directions)
         rows = list(matrices_to_step.values())
         torch._foreach_mul_(rows, 1 - rate * self._decay)
+        # An orthogonal matrix has a root mean square of 1 / sqrt(longer side).
         torch._foreach_mul_(directions, [rate * MUON_UPDATE_RMS * math.sqrt(max(matrix.shape)) for matrix in rows])
         torch._foreach_sub_(rows, directions)
         for param_group in self._adam.param_groups:
@@ -111,10 +113,12 @@ def orthogonalise(matrices: Tensor) -> Tensor:
     a, b, c = NEWTON_SCHULZ_COEFFICIENTS
     tall = matrices.shape[-2] > matrices.shape[-1]
     wide = matrices.mT if tall else matrices
+    # The Frobenius norm exceeds every singular value, and the iteration needs them at 1 at most.
     wide = wide / torch.linalg.matrix_norm(wide, keepdim=True).clamp(min=1e-7)
     square = torch.bmm(wide, wide.mT)
     factors = torch.eye(square.shape[-1], dtype=square.dtype, device=square.device).expand_as(square)
     for _ in range(NEWTON_SCHULZ_STEPS):
+        # factor: a + b s + c s^2 for the square s; a step takes s to factor s factor
         factor = torch.baddbmm(square, square, square, beta=b, alpha=c)
         factor.diagonal(dim1=-2, dim2=-1).add_(a)
         factors = torch.bmm(factors, factor)

@@ -67,9 +67,10 @@ def make_pair(random: Random, bank: FlareSource, backgrounds: Backgrounds, width
               lifted_black_share: float = 0.0) -> Pair:
     """Return one frame of that size with and without flare.
 
-    Shares of all frames: clean_share has no flare; against_light_share has its lights where the scene is bright, as the
-    sun in its sky, the others anywhere; shoulder_share is of cameras whose curve bends towards white;
-    lifted_black_share is graded so that black is grey, or is as logarithmic footage is.
+    The shares, 0..1, are of all frames. clean_share: without flare. against_light_share: with the lights where the
+    scene is bright, as the sun in its sky; in the others they are anywhere. shoulder_share: of cameras whose curve
+    bends towards white. lifted_black_share: graded so that black is grey and white dimmer, as flat or logarithmic
+    footage looks.
     """
     gamma = float(random.uniform(*GAMMA_RANGE))
     scene: Pixels = backgrounds.draw(random, width, height, gamma) * random_cameras.draw_exposure(random)
@@ -86,7 +87,7 @@ def make_pair(random: Random, bank: FlareSource, backgrounds: Backgrounds, width
                 scene = scene * np.float32(np.clip(aim / max(bright, 1e-3), *random_cameras.EXPOSURE_LIMITS))
         r, g, li = _warp_to_frame(layers, random_cameras.draw_appearance(random, strength), matrix, width, height)
         rest, glow, light = rest + r, glow + g, np.maximum(light, li)
-    if without_flare:
+    if without_flare:  # half of these frames still show the lights
         rest, glow, light = rest * 0, glow * 0, light * float(random.random() < 0.5)
     scene = scene + light
     if graininess := random_cameras.draw_grain(random):  # the same in all pictures, since removal does not denoise
@@ -104,7 +105,7 @@ def make_pair(random: Random, bank: FlareSource, backgrounds: Backgrounds, width
         black, white = random_cameras.draw_fade(random)
         displayed = [black + (white - black) * picture for picture in displayed]
     frame, clean_scene, scene_with_glow = displayed
-    if without_flare:
+    if without_flare:  # not quantised: frame and scene are equal, so that the flare to predict is exactly 0
         return Pair(frame, clean_scene, scene_with_glow)
     return Pair(_quantise(random, frame), clean_scene, scene_with_glow)
 
@@ -122,7 +123,7 @@ def _place_against_bright_scene(random: Random, layers: FlareLayers, matrix: NDA
     import cv2
 
     height, width = scene.shape[:2]
-    columns, rows = max(width // 16, 1), max(height // 16, 1)
+    columns, rows = max(width // 16, 1), max(height // 16, 1)  # mean over about 16 x 16 pixels
     brightness = cv2.resize(scene, (columns, rows), interpolation=cv2.INTER_AREA).mean(-1)
     best = -1.0
     others = (random_cameras.draw_placement(random, layers.size, width, height)
@@ -137,7 +138,7 @@ def _place_against_bright_scene(random: Random, layers: FlareLayers, matrix: NDA
 
 
 def _canvas_to_frame(matrix: NDArray[Any], layers: FlareLayers, place: tuple[float, float]) -> NDArray[Any]:
-    """Return (x, y) in pixels of a position on the canvas."""
+    """Return (x, y) in pixels of the frame of a position on the canvas, -1..1."""
     return matrix[:, :2] @ ((np.array(place) + 1) * layers.size / 2) + matrix[:, 2]
 
 
@@ -173,7 +174,7 @@ def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearan
 
 
 def _develop(development: random_cameras.Development, displayed: Sequence[Pixels]) -> list[Pixels]:
-    """Apply a camera's curve and saturation to all pictures."""
+    """Apply a camera's curve and saturation to all pictures, display values 0..1."""
     contrast, saturation, lift = development
     result = []
     for picture in displayed:
@@ -184,7 +185,7 @@ def _develop(development: random_cameras.Development, displayed: Sequence[Pixels
 
 
 def _quantise(random: Random, frame: Pixels) -> Pixels:
-    """Return the frame as stored: 8 bit codes, through JPEG in some."""
+    """Return the frame as it is read from a file: display values of 8 bit codes, in four of ten through JPEG."""
     import cv2
 
     codes: NDArray[Any] = (frame * 255 + random_cameras.draw_dither(random)).astype(np.uint8)

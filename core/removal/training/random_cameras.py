@@ -28,14 +28,15 @@ EXPOSURE_LIMITS = (0.3, 3.0)
 
 
 def draw_exposure(random: Random) -> Triple:
-    """Draw gain and white balance of the scene alone, by day or night."""
+    """Draw gain times white balance, (3,), of the scene alone: by day 0.5 to 1.2, by night down to 0.03."""
     gain = random.uniform(0.5, 1.2) if random.random() < 0.65 else math.exp(random.uniform(math.log(0.03), 0))
     balance = np.exp(random.normal(0, 0.06, 3))
     return np.asarray(gain * balance, np.float32)
 
 
 def draw_target_light(random: Random) -> float:
-    """Draw the light to which the scene is exposed at the first light; 0 to leave the exposure."""
+    """Draw the linear light (1 is white) that the scene gets by exposure where the first light is; 0 to leave the
+    exposure."""
     return float(random.uniform(0.4, 2)) if random.random() < 0.5 else 0.0
 
 
@@ -50,7 +51,8 @@ def draw_shoulder(random: Random) -> float:
 
 
 class Development(NamedTuple):
-    """A camera's curve and saturation."""
+    """A camera's curve and saturation. contrast: share of an S-shaped curve, 0..1. saturation: a factor, 1 for none.
+    lift: display value of black."""
 
     contrast: float
     saturation: float
@@ -67,7 +69,7 @@ def draw_development(random: Random) -> Development:
 
 
 def draw_fade(random: Random) -> tuple[Triple, Triple]:
-    """Draw the display values that black and white become."""
+    """Draw the display values that black and white become in a faded picture, (3,) each."""
     black = random.uniform(0.02, 0.2) + random.normal(0, 0.015, 3)
     white = random.uniform(0.75, 1) + random.normal(0, 0.01, 3)
     return np.clip(black, 0, 1).astype(np.float32), np.clip(white, 0, 1).astype(np.float32)
@@ -111,8 +113,9 @@ def draw_placement(random: Random, canvas: int, width: int, height: int,
     """Draw affine matrices (*count_shape, 2, 3) from a square canvas with sides of `canvas` pixels to a frame in
     pixels.
 
-    The canvas is rotated, mirrored, sheared a little, and scaled by at least what lets its inner circle pass through
-    the frame's corners; its middle is the frame's in four of five.
+    The canvas is rotated, mirrored, sheared a little, and scaled by 0.85 to 1.5 times what lets its inner circle pass
+    through the frame's corners. Its middle is within about a hundredth of the half diagonal of the frame's in four of
+    five, and within about a quarter in the others.
     """
     half = math.hypot(width, height) / 2
     zoom, roll = random.uniform(0.85, 1.5, count_shape), random.uniform(0, 2 * math.pi, count_shape)

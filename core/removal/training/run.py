@@ -127,7 +127,7 @@ class TrainingSetup(NamedTuple):
         recipe = replace(self.recipe, widths=form.widths, blocks=tuple(map(max, self.recipe.blocks, form.blocks)),
                          attention=tuple(map(max, self.recipe.attention, form.attention)))
         iteration = 0
-        if self.resumes:
+        if self.resumes:  # the state fits a network of exactly its form, and the flares follow from its seed
             recipe = replace(recipe, **form._asdict(), seed=parse_json(metadata["recipe"])["seed"])
             iteration = int(metadata["iteration"])
         trainer = RemovalTrainer(recipe, worker)
@@ -158,8 +158,11 @@ def _run_worker(worker: Worker, setup: TrainingSetup) -> None:
 def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
                 pairs: Mapping[str, Sequence[Pair]], keeps_best: bool, save_every_s: float,
                 progress: Progress) -> None:
-    """Train to the recipe's end, with log and checkpoints. keeps_best: write the weights of the best validation, not
-    the last."""
+    """Train to the recipe's end, with log and checkpoints.
+
+    pairs: for the validation, by flare class; empty for none. keeps_best: write the weights of the best validation, not
+    the last.
+    """
     iterations = trainer.recipe.iterations
     progress.stage("train", iterations, trainer.iteration)
     saved, started, first_iteration = time.monotonic(), time.monotonic(), trainer.iteration

@@ -178,6 +178,7 @@ class RemovalTrainer:
                 prediction = network(frame).flare.clamp(min=0)
                 error = ((frame - prediction).clamp(min=0) - scene).square().mean()
                 input_error = (frame - scene).square().mean()
+                # 1e-6 limits what a perfect prediction counts: a PSNR of 60 dB.
                 values.append(float(10 * torch.log10((input_error + 1e-6) / (error + 1e-6))))
             gains[kind] = round(float(np.mean(values)), 3)
         gains["mean"] = round(float(np.mean(list(gains.values()))), 3)
@@ -193,7 +194,8 @@ class RemovalTrainer:
                 for name, value in self.averaged_weights.items()}
 
     def state(self) -> dict[str, Tensor]:
-        """Return everything that a resumed training needs."""
+        """Return everything that a resumed training needs, on the CPU. Names begin with "network.", "averaged.",
+        "initial." or the optimiser's "moment."."""
         state = {f"network.{name}": value for name, value in self.network.state_dict().items()}
         state |= {f"averaged.{name}": value for name, value in self.averaged_weights.items()}
         state |= {f"initial.{name}": value for name, value in self.initial_weights.items()}
@@ -201,8 +203,12 @@ class RemovalTrainer:
         return {name: value.detach().cpu().contiguous() for name, value in state.items()}
 
     def load_state(self, state: Mapping[str, Tensor], iteration: int) -> None:
-        """Load a state, or weights alone, whose moments begin at zero. The weights' network may have fewer blocks and
-        attention layers; the added ones begin as the identity."""
+        """Load a state of `state`, or weights alone, whose moments begin at zero. The weights' network may have fewer
+        blocks and attention layers; the added ones begin as the identity.
+
+        iteration: that of the state; 0 for a training that begins, whose initial weights are these. Raises RunError
+        where the weights do not fit.
+        """
         self.iteration = iteration
         added: dict[str, Tensor] = {}
         if not any(name.startswith("network.") for name in state):
@@ -230,7 +236,8 @@ class RemovalTrainer:
 
 
 def _log_error_ratio(error: Tensor, flare_error: Tensor, error_floor: Tensor) -> Tensor:
-    """Return the log of squared errors relative to those of the untouched frame; where it got worse it counts twice."""
+    """Return the log of squared errors relative to those of the untouched frame, `flare_error`; where it is above 0, so
+    the frame got worse, it counts twice. error_floor: added to both."""
     log_ratio = torch.log((error + error_floor) / (flare_error + error_floor))
     return log_ratio + log_ratio.clamp(min=0)
 

@@ -44,7 +44,8 @@ class SharedBuffers:
         self._mapped: dict[tuple[int, int], Tensor] = {}
 
     def rows(self, count: int, length: int) -> Tensor:
-        """Return (count, length) float32, the same memory in all workers for the same arguments."""
+        """Return (count, length) float32, the same memory in all workers for the same arguments: later calls return it
+        again, with what it holds."""
         if (count, length) not in self._mapped:
             path = Path(self._folder) / f"{count}x{length}"
             path.touch()
@@ -84,6 +85,7 @@ class Worker:
         for tensor, buffer in _buffer_slices(tensors, rows[self.rank]):
             buffer.copy_(tensor)
         self.buffers.wait()
+        # All add the rows in the same order, so that rounding is the same too.
         for tensor, part in _buffer_slices(tensors, rows[0]):
             tensor.copy_(part)
         for row in rows[1:]:
@@ -92,11 +94,12 @@ class Worker:
         self.buffers.wait()  # before anyone writes again
 
     def is_responsible_for(self, number: int) -> bool:
-        """Return whether this worker does a piece of shared work."""
+        """Return whether this worker does piece `number` of shared work."""
         return number % self.count == self.rank
 
     def all_gather(self, tensors: Sequence[Tensor]) -> None:
-        """Replace those tensors that another worker is responsible for by its values. Raises RunError."""
+        """Replace those tensors that another worker is responsible for, by their place in `tensors`, by its values.
+        Raises RunError."""
         if self.buffers is None:
             return
         row = self.buffers.rows(1, sum(tensor.numel() for tensor in tensors))[0]
@@ -181,7 +184,7 @@ def _worker_main(rank: int, count: int, folder: str, barrier: Barrier, threads: 
 
 
 def _limit_threads(threads: int, count: int) -> None:
-    """Give this worker its share of the CPU's threads."""
+    """Give this worker its share of the CPU's threads. threads: of all `count` workers together."""
     torch.set_num_threads(max(threads // count, 1))
 
 

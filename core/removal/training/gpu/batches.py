@@ -35,7 +35,8 @@ def gpu_batches(recipe: Recipe, first: int, backgrounds: Backgrounds, lenses: Se
 
 
 def compose_batches(pools: Pools, recipe: Recipe, random: np.random.Generator) -> Iterator[Batch]:
-    """Yield batches of frames of one shape each, with flares of the pools."""
+    """Yield batches without end: scenes of one shape of the pools each, with flares of the pools. The first frames of a
+    batch, SECOND_FLARE_SHARE of them, get a second flare."""
     while True:
         number = int(random.choice(len(pools.shapes), p=[shape.share for shape in pools.shapes]))
         width, height, count, _ = pools.shapes[number]

@@ -141,7 +141,7 @@ def compose(scene: Tensor, gamma: Tensor, frames: FrameParameters,
     scene = torch.where(frames.mirrored > 0, scene.flip(3), scene).float() * frames.exposure
     rest, glow, light = (torch.zeros_like(scene) for _ in range(3))
     for number, (flares, placement) in enumerate(flares_and_placements):
-        rows = slice(0, len(flares.layers))
+        rows = slice(0, len(flares.layers))  # the frames that get this flare
         matrix, light_level = _choose_placement(flares, placement.matrices, scene[rows], frames.faces_light[rows] > 0)
         if number == 0:
             exposure = (frames.target_light / light_level.clamp(min=1e-3)).clamp(*random_cameras.EXPOSURE_LIMITS)
@@ -160,6 +160,7 @@ def compose(scene: Tensor, gamma: Tensor, frames: FrameParameters,
     displayed = _develop(exposed.clamp(0, 1).pow(1 / gamma[:, None, None, None]), frames)
     codes = torch.floor(displayed[0] * 255 + frames.dither)
     compressed = jpeg.simulate_jpeg(codes, frames.jpeg_quality.flatten().clamp(min=50))
+    # Quality 0 stands for no compression; what was computed for it, at 50, is not used.
     stored = torch.where(frames.jpeg_quality > 0, compressed, codes) / 255
     frame = torch.where(frames.has_flare > 0, stored, displayed[0])
     pictures = torch.stack([frame, displayed[1], displayed[2]])
@@ -186,7 +187,8 @@ def _add_flare(scene: Tensor, flare: Tensor, shoulder: Tensor) -> Tensor:
 
 
 def _develop(displayed: Tensor, frames: FrameParameters) -> Tensor:
-    """Apply the camera's curve and saturation, and the fade, to (k, n, 3, h, w)."""
+    """Apply the camera's curve and saturation, and the fade, to display values 0..1, (k, n, 3, h, w): k pictures of
+    each frame."""
     curve = displayed + frames.contrast * (displayed * displayed * (3 - 2 * displayed) - displayed)
     grey = curve.mean(2, keepdim=True)
     lifted = frames.lift + (1 - frames.lift) * (grey + frames.saturation * (curve - grey))
@@ -203,8 +205,12 @@ def _canvas_to_frame(matrices: Tensor, places: Tensor, size: int) -> Tensor:
 
 def _choose_placement(flares: FlareBatch, matrices: Tensor, scene: Tensor,
                       faces_light: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (n, 2, 3), each frame's first matrix, or where it `faces_light` that which puts the first light where the
-    scene is brightest; and the light there (n,)."""
+    """Return (n, 2, 3), each frame's first matrix, or where it `faces_light` (n,) that which puts the first light where
+    the scene is brightest; and the light there (n,).
+
+    matrices: (n, PLACEMENTS, 2, 3). scene: linear light (n, 3, h, w). For a light outside the frame the frame's edge
+    counts.
+    """
     n, _, height, width = scene.shape
     rows, columns = max(height // 16, 1), max(width // 16, 1)
     brightness = F.adaptive_avg_pool2d(scene.mean(1, keepdim=True), (rows, columns)).flatten(1)

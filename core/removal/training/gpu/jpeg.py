@@ -26,7 +26,7 @@ def simulate_jpeg(codes: Tensor, quality: Tensor) -> Tensor:
     codes: (n, 3, h, w), whole numbers 0..255 as floats, h and w multiples of SIZE_MULTIPLE; so is the result.
     quality: (n,), 50..100.
     """
-    scale = 200 - 2 * quality
+    scale = 200 - 2 * quality  # libjpeg's, for a quality of 50 or more
     ycc = torch.einsum("ij,njhw->nihw", _constant(_TO_YCC, codes), codes)
     luma = _quantise_blocks(ycc[:, :1] - 128, scale, _LUMA) + 128
     chroma = _quantise_blocks(F.avg_pool2d(ycc[:, 1:], 2), scale, _CHROMA)
@@ -36,7 +36,10 @@ def simulate_jpeg(codes: Tensor, quality: Tensor) -> Tensor:
 
 
 def _quantise_blocks(planes: Tensor, scale: Tensor, table: tuple[int, ...]) -> Tensor:
-    """Return (n, c, h, w) through the DCT of blocks with quantised coefficients."""
+    """Return planes (n, c, h, w) whose DCT coefficients are quantised, in blocks of BLOCK_SIZE.
+
+    scale: (n,), per cent, of the steps in `table`, which has them row by row.
+    """
     n, c, h, w = planes.shape
     dct = _dct_matrix(planes)
     steps = torch.floor((_constant(table, planes) * scale[:, None] + 50) / 100).clamp(1, 255)

@@ -90,7 +90,8 @@ def frame_shapes(recipe: Recipe, multiple: int) -> list[FrameShape]:
 
 
 def pool_sizes(free: int, shapes: Sequence[FrameShape], canvas: int) -> tuple[int, int]:
-    """Return how many scenes and flares fit into the pools' share of `free` bytes."""
+    """Return how many scenes and flares fit into the pools' share of `free` bytes, at most MAX_SCENES and MAX_FLARES.
+    canvas: side of a flare's canvas, pixels."""
     scene = 3 * BYTES_PER_HALF * sum(shape.width * shape.height * shape.share for shape in shapes)
     flare = FLARE_CHANNELS * BYTES_PER_HALF * canvas**2
     part = min(free * POOL_MEMORY_SHARE / (MAX_SCENES * scene + MAX_FLARES * flare), 1.0)
@@ -219,7 +220,10 @@ def _wait_until_ready(ready: threading.Event, drawing: Sequence[BaseProcess]) ->
 
 def _transfer_drawn(pools: Pools, memories: Sequence[Any], free_slots: Sequence[Any], drawn: Any,
                     ended: threading.Event, ready: threading.Event) -> None:
-    """Copy drawn items into the pools until the training has ended."""
+    """Copy drawn items into the pools until `ended` is set, and set `ready` once the pools hold enough.
+
+    memories, free_slots: by kind of item. drawn: queue of DrawnItems.
+    """
     while not ended.is_set():
         try:
             item: DrawnItem = drawn.get(timeout=0.2)
@@ -241,7 +245,11 @@ def _initialise_drawing() -> None:
 
 def _draw_scenes(seed: tuple[int, int], path: Path, shape: tuple[int, int], free_slots: Any, drawn: Any,
                  backgrounds: Backgrounds, shapes: Sequence[FrameShape]) -> None:
-    """Draw blocks of scenes without end, each of one of the shapes."""
+    """Draw blocks of scenes without end, each of one of the shapes; runs in a process of its own.
+
+    path, shape: file and shape of the memory, a row for each slot. free_slots: queue of slots to draw into. drawn:
+    queue of DrawnItems.
+    """
     _initialise_drawing()
     memory = np.memmap(path, np.float16, "r+", shape=shape)
     random = np.random.default_rng((*seed, SCENE))
@@ -258,7 +266,7 @@ def _draw_scenes(seed: tuple[int, int], path: Path, shape: tuple[int, int], free
 
 def _draw_flares(seed: tuple[int, int], path: Path, shape: tuple[int, int], free_slots: Any, drawn: Any, recipe: Recipe,
                  lenses: Sequence[Prescription], user_flares: UserFlares | None) -> None:
-    """Draw flares without end."""
+    """Draw flares without end, in a process of its own; path, shape, free_slots and drawn as for `_draw_scenes`."""
     _initialise_drawing()
     memory = np.memmap(path, np.float16, "r+", shape=shape)
     random = np.random.default_rng((*seed, FLARE))

@@ -88,6 +88,7 @@ class FITFLARE_PT_lights(_FitPanel, bpy.types.Panel):
         return super().poll(context) or not context.scene.fit_flare.flare
 
     def draw(self, context: bpy.types.Context) -> None:
+        """Draw the lights of the capture, the state of the search for lights, and the buttons that add lights."""
         layout, scene = self.layout, context.scene
         objects = lights.scene_lights(scene)
         if not objects:
@@ -120,6 +121,7 @@ class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
     page = "first_fit"
 
     def draw(self, context: bpy.types.Context) -> None:
+        """Draw a running fit alone; else settings, clean frames, state of the last fit, and the button of a fit."""
         layout, scene = self.layout, context.scene
         state, stage, folder = scene.fit_flare, fits.fit_state(scene), fits.run_folder(scene)
         job = jobs.find(folder)
@@ -261,6 +263,7 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
         self.layout.prop(context.scene.fit_flare, "show", text="")
 
     def draw(self, context: bpy.types.Context) -> None:
+        """Draw why the view shows no flare, if it shows none; then the sliders of all flares and of the chosen one."""
         layout, scene = self.layout, context.scene
         state = scene.fit_flare
         if not state.flare:
@@ -360,6 +363,7 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
     page = "editing"
 
     def draw(self, context: bpy.types.Context) -> None:
+        """Draw a running bake; else settings, result of the last bake, and the buttons; then the compositor."""
         layout, scene = self.layout, context.scene
         state = scene.fit_flare
         if not state.flare:

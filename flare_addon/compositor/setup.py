@@ -121,10 +121,11 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
         scene_socket = before or _render_picture(tree)
     if (size := tree.nodes.get(SIZE)) is not None:
         tree.nodes.remove(size)
+    # Pictures of files are scaled to the size of the render, which the render itself has.
     if scene_socket is not None and (scene_socket.node.name in (LAYERS, PLATE) or _is_crop(scene_socket.node)):
         scene_socket = _set_name(scale_to_render_size(tree, scene_socket, -3, 1), SIZE).outputs[0]
     tree.links.new(scene_socket, node.inputs["Scene"])
-    if not is_set_up or end.links[0].from_node == node:
+    if not is_set_up or end.links[0].from_node == node:  # else the artist has nodes between ours and the output
         tree.links.new(node.outputs["Image"], end)
     if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
         viewer = _set_name(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows

@@ -51,6 +51,7 @@ class FITFLARE_OT_add_library_flare(GuardedOperator, bpy.types.Operator):
         return self.execute(context)
 
     def act(self, context: bpy.types.Context) -> None:
+        """Add flares at the selected lights, else at one in view, else at a new one; add a camera if there is none."""
         scene = context.scene
         camera = _camera_of(scene) or _add_camera(context)
         targets = [] if self.light == "new" else _chosen_lights(context)

@@ -46,6 +46,7 @@ class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
         return baking.why_not(scene)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask before layers are replaced, then bake."""
         replaced: list[int] = []
         with report_errors(self) as outcome:
             replaced = shots.frames_to_replace(context.scene, self._chosen(context))

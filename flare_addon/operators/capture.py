@@ -68,6 +68,7 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
             layout.prop(self, name)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        """Import at once for a script; for a person begin an import in steps, which `modal` goes on with."""
         with report_errors(self) as outcome:
             chosen = Path(bpy.path.abspath(self.filepath or self.directory))
             if not chosen.exists() and self.directory:

@@ -104,6 +104,7 @@ class FITFLARE_OT_cancel(bpy.types.Operator):
         return bool(jobs.running())
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
+        """Stop the job in `folder`; without a folder all running jobs."""
         stopped = [job for job in jobs.running() if not self.folder or job.folder == Path(self.folder)]
         for job in stopped:
             job.stop()
@@ -146,6 +147,7 @@ class FITFLARE_OT_show_log(bpy.types.Operator):
     folder: bpy.props.StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        """Show the logs in `folder` one below the other: of the run, the events, and the other output of the engine."""
         parts = []
         for name in (LOG, jobs.EVENTS, jobs.LOG):
             path = Path(self.folder, name)

@@ -100,6 +100,7 @@ class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
+        """Show `filepath`, else the look that is chosen in the panel Library; warn of flares without a light object."""
         path = self.filepath or context.window_manager.fit_flare_library
         if not path:
             raise FlareFileError("Choose a flare of the library first.")
@@ -135,6 +136,7 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         return ""
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """Turn the largest 3D view to the camera, and wait for a click."""
         areas = [area for area in context.screen.areas if area.type == "VIEW_3D"]
         if not areas:
             self.report({"ERROR"}, "There is no 3D viewport to pick in.")
@@ -148,6 +150,7 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Take the first click in the picture; other events go on to Blender, so that the view can be zoomed."""
         # The view may have been closed or maximised meanwhile, and the camera deleted.
         area = next((area for area in context.screen.areas if area.as_pointer() == self._area), None)
         if event.type in {"ESC", "RIGHTMOUSE"} or area is None or self.why_not(context):
@@ -184,6 +187,11 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
             context.workspace.status_text_set(None)
 
     def act(self, context: bpy.types.Context) -> None:
+        """Place a light on the surface at (x, y) of the picture, or at a distance where there is none.
+
+        It is the new light of Add Flare. Where there is none, a light is added for the first flare without a light
+        object, or for a new flare.
+        """
         scene = context.scene
         depsgraph = context.evaluated_depsgraph_get()
         camera = scene.camera.evaluated_get(depsgraph)
@@ -228,6 +236,7 @@ class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def act(self, context: bpy.types.Context) -> None:
+        """Add a camera for the picture, with the lens of the scene's flare, and match size, frames and view to it."""
         scene = context.scene
         try:
             image = bpy.data.images.load(bpy.path.abspath(self.filepath), check_existing=True)

@@ -60,6 +60,7 @@ class FITFLARE_OT_remove_light(bpy.types.Operator):
     object: bpy.props.StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        """Unmark the light, and delete an empty that was made for it and has no children."""
         light = context.scene.objects.get(self.object)
         if light is None:
             self.report({"ERROR"}, f"The light {self.object!r} is not in this scene any more.")

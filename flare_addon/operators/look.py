@@ -130,6 +130,7 @@ class FITFLARE_OT_reset_look(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        """Reset the sliders of all flares together, of each flare and of each element."""
         state = context.scene.fit_flare
         for sliders in (state.master, *state.lights, *(part for item in state.lights for part in item.elements)):
             for name in EDIT_NAMES:

@@ -89,6 +89,7 @@ class FITFLARE_OT_make_flare(GuardedOperator, bpy.types.Operator):
             layout.prop(self, name)
 
     def act(self, _context: bpy.types.Context) -> None:
+        """Start the command `make-flare`; options at 0, and a squeeze of 1, are left to its defaults."""
         lens = bpy.path.abspath(self.filepath) if self.lens == FILE else self.lens
         if not lens:
             raise SettingsError("Choose a .lens file first.")

@@ -37,6 +37,7 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
         return "" if largest_view(context) is not None else "There is no 3D viewport in this window"
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """Render one frame at once, an animation frame by frame in `modal`."""
         with report_errors(self) as outcome:
             self._begin(context)
             if not self.animation:
@@ -52,6 +53,7 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
         return outcome.status
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        """Render all frames at once, for a script."""
         with report_errors(self) as outcome:
             self._begin(context)
             for _ in self._frames:

@@ -51,7 +51,7 @@ class ShotRenderer(ShotSource):
             scene, white = (None, 1.0) if self.run is None else (render_scene(self.run.gaussians, camera),
                                                                  self.run.gaussians.display_white)
             parts = linear_layers(dark if scene is None else scene.colour, flares, self.look.blend, white)
-        # Over black a flare only adds; what is below 0 there is rounding.
+        # Without a scene a layer is light alone, as `draw_layers` draws it: nothing negative.
         layers = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()
                   for name, layer in parts.flares.items()}
         depth = dark[..., 0] if scene is None else scene.depth

@@ -47,7 +47,7 @@ def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, he
 
 def draw_with_transmittance(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, height: int,
                             blend: Blend = "add", pixel_grid: PixelGrid | None = None) -> tuple[Floats, Floats]:
-    """Return the picture of `draw` and its transmittance (height, width), 1 everywhere for "add"."""
+    """Return the picture of `draw`, and the share of the light behind it that passes (height, width): 1 for "add"."""
     picture = np.zeros((height, width, 3), np.float32)
     transmittance = np.ones((height, width), np.float32)
     gaussians = concatenate(list(flares))

@@ -183,7 +183,7 @@ class LookEdits:
         return [f"{name}.{property_name}" for name, edit in (*light_edits, *parts) for property_name in _to_texts(edit)]
 
     def interpolate(self, other: LookEdits, share: float) -> LookEdits:
-        """Interpolate linearly between these edits (share 0) and others (1); mute and solo are these until share 1."""
+        """Interpolate linearly between these edits (share 0) and others (1); mute and solo change at share 1."""
         def between(a: Edit, b: Edit) -> Edit:
             if a == b:
                 return a

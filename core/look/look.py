@@ -151,7 +151,7 @@ class LightLook:
         sh = (rows["sh"] + offsets["sh"]).reshape(len(means), (self.form.sh_degree + 1) ** 2, 3)
         rings = arcs = None
         if form.rings:
-            raw = rows["rings"] + offsets["rings"]  # r0, and the logarithm of w
+            raw = rows["rings"] + offsets["rings"]  # r0, and the logarithm of w, clamped as in core.flare
             rings = np.stack([raw[:, 0], np.exp(np.clip(raw[:, 1], -3, 3))], -1)
         if form.arcs and rings is not None:
             own_rows = rows["arcs"] + offsets["arcs"]

@@ -82,8 +82,8 @@ def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: 
 
     composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size. unscored: (height,
     width), pixels in which the linear flare is not scored; by default the clipped ones. A flare also has `empty_psnr`,
-    the score of an empty flare. counted: (height, width), the pixels to score; the others equal the reference where a
-    score is of whole windows. None for all.
+    the score of an empty flare. counted: (height, width), the pixels to score, None for all; the others are replaced by
+    those of the reference, since some scores look at whole windows.
     """
     displayed, clean, filmed = _to_display(composite), _to_display(scene), frame.display()
     scores = {"composite": _score_picture(displayed, filmed, lpips, counted)}
@@ -113,6 +113,7 @@ def unscored_mask(capture: Capture, view: View, size: tuple[int, int] | None = N
     white = clipped_mask(frame)
     if scene is not None and flare is not None and frame.encoding != "linear":
         reached = (scene.linear() + flare.linear() >= 1).any(-1)
+        # Layers of another size than the frame do not tell.
         white = white | reached if reached.shape == white.shape else white
     return _downscale_mask(white, frame.size, size)
 

@@ -36,7 +36,7 @@ def edge_radius(aperture: Aperture, sectors: int) -> Array:
     angles = np.arange(sectors) / sectors * 2 * np.pi
     normals = np.radians(aperture.turn) + (np.arange(aperture.blades) + 0.5) / aperture.blades * 2 * np.pi
     apothem = np.cos(np.pi / aperture.blades) * (1 + aperture.uneven * rng.standard_normal(aperture.blades))
-    # A blade is a straight line at its apothem; it bounds the directions that it faces.
+    # A blade is a straight line at its apothem; it bounds the directions that it faces, within 87 degrees.
     facing = np.cos(angles[:, None] - normals)
     straight = np.where(facing > 0.05, apothem / np.maximum(facing, 0.05), np.inf).min(axis=1)
     return (1 - aperture.curved) * straight + aperture.curved

@@ -245,6 +245,7 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
             sx, sy = rays[..., STOP_X::2], rays[..., STOP_X + 1::2]
             _rasterise(rays, arrived, px, py, dense, cosine * sx - sine * sy, sine * sx + cosine * sy,
                        optics.aperture.radius, edges, settings.rim, bands[band], picture)
+    # OpenCV needs a blur above 0.
     soft = cv2.GaussianBlur(picture, (0, 0), max(settings.size * focal[0] * supersample, 0.3))
     small = cv2.resize(soft, (width, height), interpolation=cv2.INTER_AREA)
     return limited((small * np.float32(settings.gain)).astype(np.float32), settings.limit)
@@ -271,6 +272,7 @@ def _find_bundle(optics: Optics, slope: float, pair: tuple[int, int], surfaces: 
 
     The bundle's bounds are those of the rays of a coarse grid that pass, or nearly do, and one cell more.
     slope: tan of the field angle. surfaces: see `_trace_arguments`. grid: rays along each side."""
+    # Oblique rays may meet the plane of the first vertex outside the rim of the first surface.
     extent = 1.15 * optics.lens.semi_aperture[0]
     axis = np.linspace(-extent, extent, COARSE_RAYS)
     rays, arrived = trace_grid(axis, axis, slope, *pair, *surfaces)

@@ -148,6 +148,7 @@ def _partial_prefix(target: Path) -> str:
     name, so that they are found there after a kill."""
     if target.name.startswith(_PARTIAL) and (writer := _WRITER_TAG.search(target.name)):
         return target.name[:writer.start() + 1]
+    # File systems limit a name to 255 bytes.
     return f"{_PARTIAL}{os.fsencode(target.name)[:80].decode(errors='ignore')}-"
 
 

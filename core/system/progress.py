@@ -210,7 +210,7 @@ class TerminalProgress(Progress):
         self._reported = self._done
 
     def say(self, text: str) -> None:
-        if self._bar is not None and self._done >= self._total:
+        if self._bar is not None and self._done >= self._total:  # a full bar stays above the text
             self.close()
         elif self._bar is not None:
             self._bar.clear()

@@ -73,6 +73,7 @@ def flare_scene(
 
 
 def _no_gaussians() -> PlaneGaussians:
+    """Return a flare of no Gaussians."""
     return PlaneGaussians(*(np.zeros(shape, np.float32) for shape in ((0, 2), (0, 3), (0,), (0, 3))))
 
 
@@ -141,7 +142,9 @@ def _visible_elements(light: LightLook, edits: LookEdits | None, count: int) -> 
 
 
 def _part(gaussians: PlaneGaussians, row: int, light: NDArray[np.float64], width: float) -> dict[str, Any]:
-    """Return one Gaussian as a part of a preset's element."""
+    """Return one Gaussian as a part of a preset's element, as `preset` describes it.
+
+    row: its number. light (2,): position of the light; width: of the picture; both on the normalised plane."""
     distance = max(float(np.linalg.norm(light)), 1e-6)
     axis = light / distance
     mean = gaussians.means[row].astype(np.float64)
@@ -159,6 +162,7 @@ def _part(gaussians: PlaneGaussians, row: int, light: NDArray[np.float64], width
         "shape": "streak" if long > 4 * short else "glow"}
     if gaussians.rings is not None:
         r0, w = (float(value) for value in gaussians.rings[row])
+        # A ring whose line is thinner than a third of its radius has a dark middle; a thicker one looks like a disc.
         if r0 > w:
             part |= {"shape": "ring" if r0 > 3 * w else "disc", "radius": [r0 * float(long), r0 * float(short)],
                      "thickness": [w * float(long), w * float(short)]}

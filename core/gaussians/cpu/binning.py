@@ -114,7 +114,8 @@ def _pixel_rows(y, low, high, height):
 
 @inlined
 def _crossing(half_x, square, bend, lean, x):
-    """Return the lowest and highest point of the ellipse at the horizontal offset x, clamped to its extent.
+    """Return the smallest and largest y of the ellipse at the horizontal offset x, from its centre. x is clamped to the
+    ellipse's extent.
 
     square = t / C, bend = A D / C², lean = -A k / C."""
     x = _min(_max(x, -half_x), half_x)
@@ -134,6 +135,7 @@ def small_footprints(x, y, half_x, half_y, major, k, minor, reach, visible, widt
     columns = (to_ints(minimum(x + wide, splat(np.float32(width - 1)))) >> TILE_SHIFT_X) - column
     above, below = _rows_between(y, -half_y, half_y, height)
     row = above >> TILE_SHIFT_Y
+    # columns, rows: one less than the number of tiles covered
     rows = (below >> TILE_SHIFT_Y) - row
     tip, inverse = k * half_y, ONE / fma(major * k, k, minor)
     square, bend, lean = reach * inverse, major * inverse * (minor * inverse), -major * k * inverse
@@ -183,6 +185,7 @@ def _pack_rows(y, half_y, low, high, height, base):
 def _write_two(tile, first, end, tiles_x, i, slots_ahead, tile_list, at, tile_counts):
     """List a tile and the one below, covered in pixel rows first .. end - 1, counted from the upper tile's first row.
 
+    i: the Gaussian; at: next free place of the list, which is returned; slots_ahead: slot of an entry minus its place.
     Both are always written, without a branch; the next entry overwrites one that is not counted."""
     upper = np.int64(first < end) & np.int64(first < TILE_HEIGHT)
     lower = np.int64(end > TILE_HEIGHT)
@@ -200,7 +203,8 @@ def _write_two(tile, first, end, tiles_x, i, slots_ahead, tile_list, at, tile_co
 
 @inlined
 def _write_column(column, top, bottom, tiles_x, i, slots_ahead, tile_list, at, tile_counts):
-    """List the tiles of a column that cover pixel rows top .. bottom; return the next free place."""
+    """List the tiles of a column that cover pixel rows top .. bottom; return the next free place. Arguments as in
+    `_write_two`."""
     row, one = top >> TILE_SHIFT_Y, opaque(1)
     while row << TILE_SHIFT_Y <= bottom:
         base = row << TILE_SHIFT_Y
@@ -260,8 +264,8 @@ def exclusive_sum(bounds, start, end, firsts):
 def plan_parts(keys, bounds, chunk_bounds, step, work, starts, cuts):
     """Write the inputs of `list_sorted`: exclusive sums of chunk_bounds, and the cuts between parts of equal work.
 
-    starts (chunks,): the sums; the total is returned. cuts (parts + 1,): keys; the work between them is estimated from
-    every step-th Gaussian. work (HISTOGRAM_BINS,): workspace."""
+    starts (chunks,): the sums; the total, the number of slots, is returned. cuts (parts + 1,): keys; the work between
+    them is estimated from every step-th Gaussian. work (HISTOGRAM_BINS,): workspace."""
     capacity = exclusive_sum(chunk_bounds, 0, chunk_bounds.size, starts)
     parts = cuts.size - 1
     cuts[0], cuts[1:] = 0, CULLED_KEY
@@ -294,7 +298,8 @@ def plan_parts(keys, bounds, chunk_bounds, step, work, starts, cuts):
 def _collect_part(keys, bounds, low, high, cursors, pairs):
     """Collect the Gaussians with keys in low .. high - 1 in a range of pairs[0], key in the upper 32 bits, index below.
 
-    Returns the range's begin and length, the range of the keys, and an upper bound on the length of their tile list."""
+    The smallest key is subtracted. cursors[0]: next free place of pairs. Returns the range's begin and length, the
+    largest key that was written, and an upper bound on the length of their tile list."""
     count, capacity, smallest, largest = 0, 0, high, low
     for i in range(keys.size):
         key = np.int64(keys[i])
@@ -313,8 +318,8 @@ def _collect_part(keys, bounds, low, high, cursors, pairs):
 
 @inlined
 def _radix_sort(pairs, begin, count, largest, places):
-    """Sort pairs[0] by key into pairs[1]: three passes of a stable radix sort, with the shortest digits that the range
-    of keys allows. places (DIGITS, 2^11): workspace."""
+    """Sort `count` pairs from `begin` on by key, from pairs[0] into pairs[1]: three passes of a stable radix sort, with
+    the shortest digits that the largest key allows. places (DIGITS, 2^11): workspace."""
     length = 1
     while largest >> length > 0:
         length += 1
@@ -359,7 +364,8 @@ def _list_part(
 ):  # fmt: skip
     """List the tiles of sorted Gaussians; return the end of the list.
 
-    Replaces their bounds by the number of tiles, and firsts by their first slot."""
+    place: where the list begins; the other arguments as in `list_sorted`. Replaces their bounds by the number of tiles,
+    and firsts by their first slot."""
     end = begin + count
     for j in range(begin, end):
         far = _index_of(load_scalar(pairs, _min(j + PREFETCH_DISTANCE, end - 1)))  # accesses are scattered in memory
@@ -371,6 +377,7 @@ def _list_part(
         slot, before, tile = starts[i // CHUNK] + load_scalar(firsts, i), place, np.int64(load_scalar(tiles, i))
         if tile >= 0:
             packed, ahead = np.int64(load_scalar(rows, i)), slot - place
+            # The left column, then the right one; `last` is the end row, one past the last.
             first, last = packed & FIRST_MASK, (packed >> FIRST_BITS) & END_MASK
             place = _write_two(tile, first, last, tiles_x, i, ahead, tile_list, place, tile_counts)
             first, last = (packed >> COLUMN_BITS) & FIRST_MASK, packed >> (COLUMN_BITS + FIRST_BITS)

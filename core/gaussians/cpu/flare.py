@@ -130,7 +130,8 @@ RADIUS2_MIN = np.float32(1e-12)
 
 @inlined
 def _cutoff_log2(opacity, add):
-    """Return log2 of the peak over the smallest value that is drawn; negative if even the peak is below it."""
+    """Return log2 of the peak over the smallest value that is drawn, opacity / ALPHA_MIN or 1 / PROFILE_MIN; negative
+    if even the peak is below it."""
     share = 4096.0 if add else opacity * 255.0
     return math.log(share) / math.log(2.0) if share >= 1.0 else -1.0
 
@@ -155,12 +156,13 @@ def prepare_records(
     centres, covariances, opacities, colours, rings, arcs, width, height, add,
     records, shapes, keys, bounds, firsts, chunk_bounds,
 ):  # fmt: skip
-    """Write record, shape, and an upper bound on the number of tiles of each Gaussian; in float64, for needles.
+    """Write record, shape, key and an upper bound on the number of tiles of each Gaussian; in float64, for needles.
 
-    The key is the Gaussian's index; firsts, chunk_bounds: see `binning`. rings, arcs: empty if there are none. With the
-    blend "add" the opacity is multiplied into the colour.
+    The key is the Gaussian's index, so that the given order is kept; firsts, chunk_bounds: see `binning`. rings (n 2),
+    arcs (n 3): flat, empty if there are none. With the blend "add" the opacity is multiplied into the colour, and the
+    record's is 1.
     """
-    half = -0.5 / math.log(2.0)
+    half = -0.5 / math.log(2.0)  # h of `projection`
     for i in range(opacities.size):
         at = i * RECORD
         xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
@@ -194,6 +196,7 @@ def prepare_records(
         records[at + REACH] = half * reach * reach - MARGIN
         records[at + HALF_X], records[at + HALF_Y] = half_x, half_y
         _write_shape(shapes, i, r0, w, cutoff, k, arcs)
+        # Half a pixel wider than `binning` lists, so that rounding cannot make the bound too low.
         columns = _tiles(x, half_x + 0.5, width, TILE_SHIFT_X)
         keys[i], bounds[i] = i, columns * _tiles(y, half_y + 0.5, height, TILE_SHIFT_Y)
     for chunk in range(chunk_bounds.size):
@@ -219,7 +222,7 @@ def _write_shape(shapes, i, r0, w, cutoff, k, arcs):
 
 @inlined
 def _row_start(records, at, left, y):
-    """Return u of lane 0 and d_y in the pixel row y, and k, the step of u from row to row; all float64."""
+    """Return u at column `left` and d_y in the pixel row y, and k, the step of u from row to row; all float64."""
     dy = y + 0.5 - np.float64(load_scalar(records, at + Y))
     k = np.float64(load_scalar(records, at + K)) + np.float64(load_scalar(records, at + K_REST))
     return left + 0.5 - np.float64(load_scalar(records, at + X)) + k * dy, dy, k
@@ -234,7 +237,7 @@ def _distance(records, at, u, dy):
 
 @inlined
 def _negative_log2_profile(shapes, shape, z, u, dy, arcs):
-    """Return -log2 G; z = r - r0."""
+    """Return -log2 G. shape: offset in shapes; z = r - r0; arcs: whether there are arcs."""
     if not arcs:
         return z * z * load_scalar(shapes, shape + SHARPNESS)
     level = load_scalar(shapes, shape + ARC_NORM) - load_scalar(shapes, shape + ARC_Y) * dy
@@ -246,7 +249,7 @@ def _negative_log2_profile(shapes, shape, z, u, dy, arcs):
 
 @inlined
 def _add_row(state, at, e, records, record):
-    """Add one row of a Gaussian to the sums of a tile."""
+    """Add one row of a Gaussian to the sums of a tile. at: offset of the row in the state; e: the profile."""
     e = where(e >= PROFILE_MIN, e, ZERO)
     store(state, at + RED_PLANE, fma(e, load_scalar(records, record + RED), load(state, at + RED_PLANE)))
     store(state, at + GREEN_PLANE, fma(e, load_scalar(records, record + GREEN), load(state, at + GREEN_PLANE)))
@@ -255,7 +258,8 @@ def _add_row(state, at, e, records, record):
 
 @inlined
 def _add_plain(state, records, at, left, top, first, end, start):
-    """Add a plain Gaussian to rows first .. end, by the recurrence unless it is a needle (see `raster_forward`)."""
+    """Add a plain Gaussian to rows first .. end, by the recurrence unless it is a needle (see `raster_forward`). The
+    opacity in its record is 1."""
     step, one = load_scalar(records, at + STEP), opaque(1)
     needle, run = is_needle(records, at, end - first), run_length(records, at)
     e, r, _ = start
@@ -348,7 +352,7 @@ def raster(
 
 @inlined
 def _add_gradient(state, at, e, records, record):
-    """Return g and w for the blend "add", where Gaussians are independent."""
+    """Return g and w of one row for the blend "add", where Gaussians are independent: w = G, g = w v . colour."""
     w = where(e >= PROFILE_MIN, e, ZERO)
     vc = load(state, at + V_RED) * load_scalar(records, record + RED)
     vc = fma(load(state, at + V_GREEN), load_scalar(records, record + GREEN), vc)
@@ -389,7 +393,7 @@ def _needle_backward(state, records, at, left, top, first, end):
 
 @inlined
 def _plain_backward(state, records, at, left, top, first, end, start):
-    """Return the same gradient row by the recurrence and three sums per lane (see `raster_backward`)."""
+    """Return the gradient row of `_needle_backward` by the recurrence and three sums per lane (`raster_backward`)."""
     step, one, run = load_scalar(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)
     m0, m1, m2, colours = zero, zero, zero, (zero, zero, zero)
@@ -415,7 +419,8 @@ def _plain_backward(state, records, at, left, top, first, end, start):
 
 @inlined
 def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, arcs, add):
-    """Return the gradient row of a ring or arc."""
+    """Return the gradient row of a ring or arc: moments of h (see the module head), sums of g and of colours, the
+    gradients of r0 and w, and sums of g u and g d_y for b."""
     start, y, k = _row_start(records, at, left, top + first)
     r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
     zero = splat(ZERO)
@@ -471,7 +476,8 @@ def _tile_backward_plain(entries, begin, end, records, left, top, state, gradien
 
 @inlined
 def _tile_backward(entries, begin, used, end, records, shapes, left, top, state, arcs, add, gradients):
-    """Write the gradient rows of a tile's entries: rings or arcs."""
+    """Write the gradient rows of a tile's entries begin .. end, rings or arcs; zeros from `used` on, which were not
+    drawn."""
     for e in range(begin, used):
         prefetch(gradients, load_scalar(entries, min(e + PREFETCH_DISTANCE, end - 1) * ENTRY + SLOT) * RECORD)
         i = load_scalar(entries, e * ENTRY + GAUSSIAN)
@@ -487,7 +493,7 @@ def raster_backward(
     counter, scratch, entries, starts, ends, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
     image, alphas, d_image, d_alphas, gradients,
 ):  # fmt: skip
-    """Write the gradient row of each slot to `gradients`."""
+    """Write the gradient row of each slot, RECORD numbers, to `gradients`. shaped, arcs, add: see `raster`."""
     state, edge = scratch[:STATE_BACKWARD], scratch[STATE_BACKWARD:SCRATCH].reshape(6, EDGE)
     no_depth = np.bool_(False)
     while True:
@@ -495,7 +501,7 @@ def raster_backward(
         if tile >= ends.size:
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
-        a, b, c = starts[tile], ends[tile], starts[tile + 1]
+        a, b, c = starts[tile], ends[tile], starts[tile + 1]  # begin, end of the drawn entries, end
         load_tile(
             state, left, top, width, height, background, image, alphas, alphas, d_image, d_alphas, d_alphas,
             no_depth, edge,
@@ -524,14 +530,16 @@ def sum_gradients(
 ):  # fmt: skip
     """Write the gradients of the inputs from the gradient rows; see `projection` for the moments.
 
-    d_rings, d_arcs may be empty. row: workspace of 16."""
+    firsts, counts: first slot and number of slots of each Gaussian. d_rings, d_arcs may be empty. row: workspace of 16.
+    """
     for i in range(opacities.size):
         _add_rows(gradients, firsts[i], counts[i], row)
         xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
         yy = np.float64(covariances[3 * i + 2])
         determinant = xx * yy - xy * xy
         if not (determinant > 0 and yy > 0):
-            determinant, yy = 1.0, 1.0
+            determinant, yy = 1.0, 1.0  # it was not drawn: all sums are 0
+        # As `_from_moments` of `projection`, in float64.
         k, alpha, inverse = -xy / yy, yy / determinant, 1.0 / yy
         uu, uy, dd = alpha * row[G_UU], inverse * row[G_UY], inverse * inverse * row[G_YY]
         d_centres[2 * i] = alpha * row[G_U]
@@ -553,6 +561,7 @@ def sum_gradients(
         if d_rings.size > 0:
             d_rings[2 * i], d_rings[2 * i + 1] = row[G_R0], row[G_WIDTH]
         if d_arcs.size > 0:
+            # b·d depends on the centre; d_x = u - k d_y.
             d_centres[2 * i] -= row[G] * arcs[3 * i]
             d_centres[2 * i + 1] -= row[G] * arcs[3 * i + 1]
             d_arcs[3 * i], d_arcs[3 * i + 1] = row[G_ARC_U] - k * row[G_ARC_Y], row[G_ARC_Y]

@@ -106,7 +106,9 @@ ALPHA_MIN_INVERSE = np.float32(1 / rendering.ALPHA_MIN)
 MARGIN = np.float32(1e-4)
 """Added to the reach, in powers of two, so that rounding loses no pixel at the rim, where alpha is tested again."""
 NORM2_MIN = np.float32(1e-16)
+"""Smallest squared length of a quaternion: the square of `..projection.QUATERNION_MIN`."""
 TINY = np.float32(1e-24)
+"""Smallest squared distance from the camera; its inverse root is finite."""
 MAX_DETERMINANT, INFINITY = np.float32(1e30), np.float32(np.inf)
 RUN_LOG2_RANGE, RUN_MAX = np.float32(40), np.float32(32)
 """Bounds of a run of the recurrence in powers of two and in rows (see `raster_forward`), since rounding accumulates."""
@@ -114,7 +116,7 @@ RUN_LOG2_RANGE, RUN_MAX = np.float32(40), np.float32(32)
 
 @kernel
 def pack_camera(world_to_camera, intrinsics, width, height, near, dilation, camera):
-    """Write the packed camera from the flat matrices (4, 4) and (3, 3)."""
+    """Write the packed camera (CAMERA,) from the flat matrices (4, 4) and (3, 3); the position is -R^T t."""
     for i in range(3):
         position = 0.0
         for j in range(3):
@@ -222,7 +224,7 @@ def _multiply(a, s):
 
 @inlined
 def _image_axes(camera, v, scales, slopes, inverse_z):
-    """Return the rows a and b of T, and the slopes u at which J is taken."""
+    """Return the rows a and b of T, and the clamped slopes u_x, u_y at which J is taken; v: rows of V."""
     ux = minimum(maximum(slopes[0], camera[LOW_X]), camera[HIGH_X])
     uy = minimum(maximum(slopes[1], camera[LOW_Y]), camera[HIGH_Y])
     a = _scale(inverse_z * camera[FX], _multiply(_add_scaled(v[0], -ux, v[2]), scales))
@@ -232,7 +234,7 @@ def _image_axes(camera, v, scales, slopes, inverse_z):
 
 @inlined
 def _covariance(a, b, dilation):
-    """Return xx, xy, yy and the determinant."""
+    """Return xx, xy, yy and the determinant of the covariance, from the rows a and b of T; see the module head."""
     aa, bb, ab = _dot(a, a), _dot(b, b), _dot(a, b)
     n = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
     determinant = _dot(n, n) + (aa + bb + dilation) * dilation
@@ -282,7 +284,7 @@ def _load_opacities(opacities, first, raw):
 
 @inlined
 def _tiles_bound(x, y, half_x, half_y, visible, width, height):
-    """Return the number of tiles that the box around each Gaussian touches."""
+    """Return the number of tiles that the box around each Gaussian touches; 0 where `visible` is false."""
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     x0 = to_ints(minimum(maximum(x - half_x, ZERO), right)) >> TILE_SHIFT_X
     x1 = to_ints(minimum(maximum(x + half_x, ZERO), right)) >> TILE_SHIFT_X
@@ -296,7 +298,8 @@ def _project_block(
     means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, transposed, basis,
     records, centres, radii, depths, bounds, tiles, tile_rows, slopes_out,
 ):  # fmt: skip
-    """Project the 16 Gaussians from `first` on. slopes_out: see `project`."""
+    """Project the 16 Gaussians from `first` on. slopes_out: slopes of this block, see `project`; transposed, basis:
+    workspaces."""
     mean = _load3(means, first)
     px, py, pz = _to_camera(camera, mean)
     in_front = pz > camera[NEAR]
@@ -330,6 +333,7 @@ def _project_block(
     major = yy * H / where(visible, determinant, ONE)
     minor = inverse_y * H
     bend = fma(major * k, k, minor)
+    # Half a pixel wider than `binning` lists, so that rounding cannot make the bound too low.
     store(bounds, first, _tiles_bound(x, y, half_x + HALF, half_y + HALF, visible, width, height))
     tile, tile_row = small_footprints(x, y, half_x, half_y, major, k, minor, -(reach + MARGIN), visible, width, height)
     store(tiles, first, tile)
@@ -361,7 +365,8 @@ def _store2(array, first, x, y):
 
 @inlined
 def _colour_slopes(transposed, degree, direction, inverse_distance, out):
-    """Write the gradient of each colour by the mean: the slope's component tangential to the sphere of directions."""
+    """Write the gradient of each colour by the mean: the slope's component tangential to the sphere of directions, over
+    the distance."""
     for channel in range(3):
         g = harmonics.slope(transposed, degree, direction[0], direction[1], direction[2], channel)
         g = _scale(inverse_distance, _add_scaled(g, -_dot(g, direction), direction))
@@ -376,6 +381,7 @@ def project(
     """Write for each of n >= 16 Gaussians its record, centre, radius, depth (infinite for a culled one), an upper bound
     on the number of its tiles, and the tiles of small ones (`small_footprints`).
 
+    sh_width: numbers of a row of sh; degree: of the harmonics that are used.
     firsts, chunk_bounds: sums of the bounds within and over chunks (`binning`). d_centres: set to zero.
     slopes: gradients of the colours by the means, 9 vectors per block of 16; empty without gradients.
     raw: scales are logarithms and opacities logits."""
@@ -428,7 +434,7 @@ def _sum_rows(gradients, first_slot, count):
 
 @inlined
 def _gather_gradients(gradients, slots, counts, first, rows):
-    """Return the summed gradient rows of 16 Gaussians, one vector per field."""
+    """Return the summed gradient rows of the 16 Gaussians from `first` on, one vector per field; rows: workspace."""
     for i in range(LANES):
         store(rows, i * LANES, _sum_rows(gradients, load_scalar(slots, first + i), load_scalar(counts, first + i)))
     return transpose(load_rows(rows, 0, LANES))
@@ -443,6 +449,7 @@ def _add_to(sums, place, value, mask):
 def _add_camera_gradients(sums, is_new, mean, q, dv, dp, offset, intrinsics):
     """Add the camera gradients of 16 Gaussians; is_new: lanes that are not counted yet.
 
+    dv, dp, offset: gradients of V, of p, and of the offset from the camera to the mean; intrinsics: of fx, fy, cx, cy.
     V = R Q gives dV Q^T, p = R m + t gives dp m^T, and the position of the camera the opposite of the
     means' part by direction.
     """
@@ -458,7 +465,7 @@ def _add_camera_gradients(sums, is_new, mean, q, dv, dp, offset, intrinsics):
 
 @inlined
 def _offset_gradient(d_colour, slopes):
-    """Return the gradient of the offset from the camera to the means through the colours."""
+    """Return the gradient of the offset from the camera to the means through the colours; slopes: see `project`."""
     result = _scale(d_colour[0], (load(slopes, 0), load(slopes, 16), load(slopes, 32)))
     result = _add_scaled(result, d_colour[1], (load(slopes, 48), load(slopes, 64), load(slopes, 80)))
     return _add_scaled(result, d_colour[2], (load(slopes, 96), load(slopes, 112), load(slopes, 128)))
@@ -469,8 +476,10 @@ def _project_block_backward(
     means, quats, scales, opacities, sh_width, degree, raw, camera, records, colour_slopes, first, is_new, fields,
     transposed, rows, d_means, d_quats, d_scales, d_opacities, d_sh, row, cached, d_centres, sums, with_camera,
 ):  # fmt: skip
-    """Write the gradients of the 16 Gaussians from `first` on to rows from `row` on; cached: keep those of sh in the
-    cache, since they are read soon."""
+    """Write the gradients of the 16 Gaussians from `first` on to rows from `row` on.
+
+    fields: the summed gradient rows, one vector per field; colour_slopes: see `project`; cached: keep the gradients of
+    sh in the cache, since they are read soon; is_new, sums: for the camera, see `_add_camera_gradients`."""
     mean, scale = _load3(means, first), _load_scales(scales, first, raw)
     px, py, pz = _to_camera(camera, mean)
     in_front = pz > camera[NEAR]
@@ -492,7 +501,7 @@ def _project_block_backward(
     d_opacity = fields[G] * (ONE - opacity) if raw else fields[G] / where(is_unclamped, opacity, ONE)
     store(d_opacities, row, where(is_unclamped, d_opacity, ZERO))
 
-    # covariance -> a, b -> V, scales, slopes, depth
+    # covariance -> a, b -> V, scales, slopes, depth; na, nb, n2: gradients of V_0 S, V_1 S, V_2 S
     da = _add_scaled(_scale(d_xx * TWO, a), d_xy, b)
     db = _add_scaled(_scale(d_yy * TWO, b), d_xy, a)
     a_da, b_db = _dot(a, da), _dot(b, db)
@@ -579,7 +588,7 @@ def project_backward(
             for i in range(0, CAMERA_SUMS * LANES, LANES):
                 store(sums, i, splat(ZERO))
         for block in range(start, end, LANES):
-            first = min(block, end - LANES)
+            first = min(block, end - LANES)  # the last block overlaps the one before
             fields = _gather_gradients(gradients, slots, counts, first, rows)
             is_new = lane_index() >= np.float32(block - first)
             _project_block_backward(

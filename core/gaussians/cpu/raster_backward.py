@@ -81,7 +81,10 @@ SCRATCH = STATE + 6 * EDGE
 def _load_gradients(
     state, row, pixel, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
 ):  # fmt: skip
-    """Write one row of pixel gradients, and S before the first Gaussian, for 16 pixels from a flat index on."""
+    """Write one row of pixel gradients, and S before the first Gaussian, for 16 pixels from the flat index `pixel` on.
+
+    The background counts as an opposite gradient of alpha. Depth adds nothing to S, since the sum of
+    w (depth - mean depth) is 0."""
     at = row * ROW
     at_colour = 3 * pixel
     colour = deinterleave((load(image, at_colour), load(image, at_colour + 16), load(image, at_colour + 32)))
@@ -103,7 +106,9 @@ def _load_gradients(
 
 @inlined
 def row_gradient(state, at, e, records, record, with_depth):
-    """Return g and w of one row; update T and S."""
+    """Return g and w (see the module head) of one row of a Gaussian, and update T and S.
+
+    at: offset of the row in the state; e: opacity times profile."""
     t, s = load(state, at + T_PLANE), load(state, at + S_PLANE)
     counts = (e >= ALPHA_MIN) & (t >= T_MIN)
     w = where(counts, t * e, ZERO)
@@ -162,8 +167,9 @@ def moments(records, at, left, m0, m1, m2):
 
 @inlined
 def _recurrence_sums(state, records, at, left, top, first, end, start, with_depth):
-    """Return the same sums by the recurrence and three running sums per lane: of g over the rows, of the values of the
-    first sum, and of those of the second. A row j rows above the end counts 1, j and j (j + 1) / 2 times in them."""
+    """Return the sums of `_needle_sums` by the recurrence and three running sums per lane: of g over the rows, of the
+    values of the first sum, and of those of the second. A row j rows above the end counts 1, j and j (j + 1) / 2 times
+    in them."""
     step, one, run = load_scalar(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)
     m0, m1, m2 = zero, zero, zero
@@ -184,7 +190,8 @@ def _recurrence_sums(state, records, at, left, top, first, end, start, with_dept
             break
         e, r, _ = start_run(records, at, left, top + row)
         stop = min(row + run, end)
-    below = top_dy + np.float32(end - first)  # d_y of the row below the last; rows above it are 1, 2 ... less
+    # below: d_y of the row below the last; j rows above it d_y = below - j, and j² = 2 (j (j + 1) / 2) - j
+    below = top_dy + np.float32(end - first)
     m2 = m0 * (below * below) - m1 * (below * TWO + ONE) + m2 * TWO
     m1 = m0 * below - m1
     mu, my, muu, muy, myy = moments(records, at, left, m0, m1, m2)
@@ -193,7 +200,7 @@ def _recurrence_sums(state, records, at, left, top, first, end, start, with_dept
 
 @inlined
 def _gradient_row(state, records, at, left, top, first, end, start, with_depth):
-    """Return the gradient row (see `projection`) of one Gaussian in one tile."""
+    """Return the gradient row (see `layout`) of one Gaussian in one tile."""
     if is_needle(records, at, end - first):
         mu, my, muu, muy, myy, m, colours = _needle_sums(state, records, at, left, top, first, end, with_depth)
     else:
@@ -205,7 +212,9 @@ def _gradient_row(state, records, at, left, top, first, end, start, with_depth):
 
 @inlined
 def _edge_row(edge, pixel, count, image, alphas, depths, d_image, d_alphas, d_depths, with_depth):
-    """Copy the pixels of a tile row that lie inside the picture to `edge`, zeros beyond."""
+    """Copy the `count` pixels of a tile row that lie inside the picture to `edge` (6, EDGE), zeros beyond.
+
+    pixel: flat index of the first. Rows of edge: image, its gradient, then alpha and depth, each with its gradient."""
     edge[:, :] = ZERO
     lane, one = 0, opaque(1)
     while lane < 3 * count:
@@ -238,7 +247,7 @@ def load_tile(
             _edge_row(
                 edge, pixel, width - left, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
             )
-            _load_gradients(
+            _load_gradients(  # pixel * 0: `edge` begins at index 0; a constant would be compiled as another version
                 state, row, pixel * 0, background, edge[0], edge[2], edge[4], edge[1], edge[3], edge[5], with_depth
             )
         row += one
@@ -246,7 +255,7 @@ def load_tile(
 
 @inlined
 def _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth):
-    """Write the gradient rows of a tile's entries; zeros from `used` on, which were not drawn."""
+    """Write the gradient rows of a tile's entries begin .. end; zeros from `used` on, which were not drawn."""
     if begin < used:
         upcoming = next_entry(entries, begin, end, records, left, top)
         for e in range(begin, used):
@@ -265,7 +274,9 @@ def raster_backward(
     counter, scratch, entries, starts, ends, records, background, width, height, tiles_x, image, alphas, depths,
     d_image, d_alphas, d_depths, gradients,
 ):  # fmt: skip
-    """Write the gradient row of each slot to `gradients`. d_alphas and d_depths may be empty."""
+    """Write the gradient row of each slot, RECORD numbers, to `gradients`. d_alphas and d_depths may be empty.
+
+    starts, ends: see `raster`; scratch: workspace of SCRATCH numbers."""
     state, edge = scratch[:STATE], scratch[STATE:SCRATCH].reshape(6, EDGE)
     with_depth = d_depths.size > 0
     while True:

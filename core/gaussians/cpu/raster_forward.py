@@ -10,6 +10,10 @@ From row to row e follows a recurrence instead of an exponential: e' = e r, r' =
 r = 2^(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(2 C) - 1, which is small and exact for large Gaussians. The
 recurrence restarts after `run` rows, over which e changes by 40 powers of two, so that neither underflow nor rounding
 spoils it. Where runs would be too short (needles), e is computed for each row.
+
+Arguments of the functions here and in `raster_backward` and `flare`: records, at (or record): the records, and the
+offset of the Gaussian's; left, top: first pixel column and row of the tile; first, end: the rows of the tile from
+`first` to before `end`; state: the tile's workspace; start: e, r and d_y in row `first`, from `start_run`.
 """
 from __future__ import annotations
 
@@ -79,7 +83,7 @@ STATE = ROW * TILE_HEIGHT
 
 @inlined
 def offsets(records, at, left, y):
-    """Return u along the pixel row y of the tile, and d_y."""
+    """Return u at the 16 pixels from column `left` on of the pixel row y, and d_y."""
     dy = np.float32(y) + HALF - load_scalar(records, at + Y)
     dx = lane_index() + (np.float32(left) + HALF - load_scalar(records, at + X))
     return dx + load_scalar(records, at + K) * dy, dy
@@ -87,7 +91,7 @@ def offsets(records, at, left, y):
 
 @inlined
 def needle_offsets(records, at, left, y):
-    """Return u and d_y computed in float64, for needles, where the sum of large numbers is small."""
+    """Return the same u and d_y, computed in float64 for needles, where u is a small sum of large numbers."""
     dy = y + 0.5 - np.float64(load_scalar(records, at + Y))
     k = np.float64(load_scalar(records, at + K)) + np.float64(load_scalar(records, at + K_REST))
     u = left + 0.5 - np.float64(load_scalar(records, at + X)) + k * dy
@@ -103,7 +107,7 @@ def falloff(records, at, u, dy):
 
 @inlined
 def ratio(records, at, u, dy):
-    """Return the factor from this row to the next; clamped only where rows are zero."""
+    """Return r, the factor of e from this row to the next; `exp2` clamps it only where rows are zero anyway."""
     k, slope = load_scalar(records, at + K), load_scalar(records, at + A) * load_scalar(records, at + K)
     constant = slope * k + load_scalar(records, at + D) * (TWO * dy + ONE)
     return exp2(fma(u, TWO * slope, constant))
@@ -117,14 +121,16 @@ def run_length(records, at):
 
 @inlined
 def is_needle(records, at, rows):
-    """Return whether rows differ too much for the recurrence."""
+    """Return whether successive rows differ too much for the recurrence; never if all `rows` fit in one run."""
     run = run_length(records, at)
     return run < rows and run < MIN_RUN
 
 
 @inlined
 def start_tile(state, row_length, left, top, width, height):
-    """Set transmittance to 1 inside the picture and to 0 outside, so that no work is done there; all else to 0."""
+    """Set transmittance to 1 inside the picture and to 0 outside, so that no work is done there; all else to 0.
+
+    row_length: numbers of a row of the state."""
     at, line = 0, opaque(TILE_WIDTH)
     while at < row_length * TILE_HEIGHT:
         store(state, at, splat(ZERO))
@@ -149,7 +155,7 @@ def is_finished(state):
 
 @inlined
 def blend_row(state, at, e, records, record, with_depth):
-    """Blend one row of a Gaussian."""
+    """Blend one row of a Gaussian. at: offset of the row in the state; e: opacity times profile."""
     t = load(state, at + T_PLANE)
     alpha = where((e >= ALPHA_MIN) & (t >= T_MIN), e, ZERO)
     w = t * alpha
@@ -167,14 +173,14 @@ def blend_row(state, at, e, records, record, with_depth):
 
 @inlined
 def start_run(records, at, left, y):
-    """Return e and r in pixel row y of the tile, and d_y."""
+    """Return e and r (see the module head) in the pixel row y, and d_y."""
     u, dy = offsets(records, at, left, y)
     return falloff(records, at, u, dy) * load_scalar(records, at + OPACITY), ratio(records, at, u, dy), dy
 
 
 @inlined
 def next_entry(entries, e, end, records, left, top):
-    """Return offset of the record, rows and start of the run of entry e; of the last entry if e lies beyond it.
+    """Return offset of the record, first row, end row and start of entry number e; of the last entry if e lies beyond.
 
     Called before the previous entry is drawn, to hide the latency of the exponentials."""
     at_entry = min(e, end - 1) * ENTRY
@@ -215,7 +221,7 @@ def _blend(state, records, at, left, top, first, end, start, with_depth):
 
 @inlined
 def _copy(source, at, target, to, count):
-    """Copy the first `count` of a vector's numbers, or all."""
+    """Copy the first `count` of a vector's 16 numbers: all if count is larger, none if it is negative."""
     if count >= TILE_WIDTH:
         store(target, to, load(source, at))
         return
@@ -240,7 +246,7 @@ def write_tile(image, alphas, depths, medians, state, left, top, width, height, 
         store(state, at + T_PLANE, alpha)
         store_rows(state, at + RED_PLANE, TILE_WIDTH, interleave((red, green, blue)))
         _copy(state, at + T_PLANE, alphas, pixel, visible_columns)
-        third = 0
+        third = 0  # offset of the first, second or third vector of interleaved colours
         while third < 3 * TILE_WIDTH:
             _copy(state, at + RED_PLANE + third, image, 3 * pixel + third, 3 * visible_columns - third)
             third += one * TILE_WIDTH
@@ -254,7 +260,7 @@ def write_tile(image, alphas, depths, medians, state, left, top, width, height, 
 
 @inlined
 def _raster_tile(entries, begin, end, records, left, top, state, with_depth):
-    """Draw a tile; return the end of the drawn entries."""
+    """Draw entries begin .. end of a tile until all pixels are finished; return the end of the drawn entries."""
     if begin == end:
         return end
     upcoming = next_entry(entries, begin, end, records, left, top)
@@ -276,7 +282,8 @@ def raster(
 ):  # fmt: skip
     """Write colour (h w 3) and alpha (h w), flat; mean and median depth too unless `depths` is empty.
 
-    ends (tiles,): the end of each tile's drawn entries.
+    state: workspace of STATE numbers; starts (tiles + 1,): number of each tile's first entry; ends (tiles,): the end of
+    each tile's drawn entries, written for the backward pass.
     """
     with_depth = depths.size > 0
     while True:

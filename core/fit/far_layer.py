@@ -75,8 +75,8 @@ class FarLayer:
 
 @dataclass(frozen=True, eq=False)
 class SweepView:
-    """A view of the sweep: its small camera, display values (height, width, 3), and which
-    pixels count (height, width)."""
+    """A view of the sweep: its small camera, its picture (height, width, 3), display values, and which pixels (height,
+    width) count, None for all."""
 
     camera: Camera
     picture: Values

@@ -54,7 +54,7 @@ def _triangulate(capture: Capture,
                  progress: Progress) -> tuple[Floats, NDArray[np.uint8], dict[str, NDArray[np.int64]]]:
     """Return points (n, 3), colours (n, 3), and the indices of those observed in each view, by its name.
 
-    Each frame is matched with the next two; every match gives a point, in the colour of the first frame.
+    Each frame is matched with the next two; every sound match gives a point, in the colour of the first frame.
     """
     import cv2
 
@@ -98,7 +98,8 @@ def _features(sift: Any, picture: Picture) -> tuple[Floats, Any, NDArray[np.uint
 
 
 def _match(matcher: Any, first: Any, second: Any) -> NDArray[np.int64]:
-    """Return (n, 2) indices of features whose descriptors are nearest to each other and to no third one."""
+    """Return (n, 2) indices of features whose descriptors are nearest to each other, and by MATCH_RATIO nearer than to
+    any third. first, second: descriptors of two frames, None without features."""
     if first is None or second is None or min(len(first), len(second)) < 2:
         return np.zeros((0, 2), np.int64)
     forward = [(near.queryIdx, near.trainIdx) for near, other in matcher.knnMatch(first, second, 2)

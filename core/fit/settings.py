@@ -417,7 +417,8 @@ def _scale_schedule(settings: FitSettings, factor: float) -> FitSettings:
 def _shorten_schedule(settings: FitSettings, count: int, max_gaussians: int) -> FitSettings:
     """Return a schedule for a short fit: events at the same shares of the whole, and higher rates.
 
-    A light starts with `count` Gaussians; the scene has at most `max_gaussians`.
+    A light starts with `count` Gaussians; the scene has at most `max_gaussians`. Where the scene is
+    fitted alone first, the flare's density changes later.
     """
     length = settings.iterations
     every = max(round(length / 40), 20)

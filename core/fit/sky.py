@@ -25,7 +25,9 @@ COLOUR_QUANTILE = 0.25
 
 
 def add_sky_points(capture: Capture, views: tuple[View, ...], frames: Frames) -> PointCloud:
-    """Return the capture's points with points on a sphere about them that some view sees, in the colours of the frames.
+    """Return the capture's points and points on a sphere about them, without those that no view sees.
+
+    The points on the sphere have the colours of the frames at the usual exposure.
     """
     points = capture.points
     middle = np.mean([view.camera.position for view in views], 0)

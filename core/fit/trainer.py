@@ -186,8 +186,8 @@ class Trainer(FlareTrainer):
 
     @torch.no_grad()
     def _turn_far_layer(self, rows: Tensor, before: Tensor) -> None:
-        """Turn far Gaussians (rows), which were at `before`, by the angle at which a Gaussian one extent away would
-        appear to move by the optimiser's step."""
+        """Turn far Gaussians (rows), which were at `before`, by the angle that the optimiser's step has at the distance
+        of one extent."""
         if self.scene.far is not None and self.fits_scene and len(rows):
             steps = self.optimisers.scene.last_step("means", rows) * (self.scene.far.radius / self.extent)
             self.scene.means[rows] = self.scene.far.move(before, steps)
@@ -279,7 +279,7 @@ class Trainer(FlareTrainer):
 
     def _joint_target(self, targets: Targets, picture: Tensor, light_discs: Tensor | None) -> Tensor:
         """Return the target of the composite: the frame. If frames go above white, a light's disc only has to be white
-        or brighter: there the target is the composite itself (`picture`), where that is so."""
+        or brighter: there the target is the composite itself (`picture`), but 1 at least."""
         if self.frames.display_white == 1 or light_discs is None:
             return targets.frame
         return torch.where(light_discs[..., None], picture.clamp_min(1), targets.frame)

@@ -74,7 +74,8 @@ def outlier_warnings(losses: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def moved_light_warnings(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
-    """Return a sentence for each light that the fit moved from its position in the capture."""
+    """Return a sentence for each light that the fit moved from its position in the capture; it moves none that has
+    places by frame."""
     if flare.frame_lights is not None:
         return ()
     distances = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in

@@ -16,9 +16,9 @@ from torch import Tensor, nn
 class FrameLights(nn.Module):
     """Places and brightness of lights by frame.
 
-    positions: (frames, lights, 3) world units. brightness: of each light relative to its usual one; a sparse table, so
-    that a step changes only the frame that it uses. prior: (frames, lights) brightness in the lights' file, NaN where
-    it has none.
+    positions: (frames, lights, 3) world units. brightness: (frames, lights) relative to the usual one, 1 at first where
+    `prior` is NaN; a sparse table, so that a step changes only the frames that its loss uses. prior: (frames, lights)
+    brightness in the lights' file, NaN where it has none.
     """
 
     positions: Tensor

@@ -295,7 +295,7 @@ class FlareModel(nn.Module):
                 for name, gaussians in flares.items()}
 
     def shares(self, visibilities: Mapping[str, Tensor] | None, frame: str) -> Mapping[str, Tensor] | None:
-        """Return visibility times brightness of each light, by name; None where neither is known, for 1."""
+        """Return visibility times brightness of each light, by name; None where neither is known: all are 1."""
         brightness = None if self.frame_lights is None else self.frame_lights.brightness_in(frame)
         if brightness is None:
             return visibilities

@@ -80,8 +80,9 @@ def visibility_behind(scene: SceneGaussians, world_to_camera: NDArray[np.float64
                       settings: VisibilitySettings, clear: float = 1.0) -> tuple[float, tuple[float, ...] | None]:
     """Return the visibility of a placed light behind a scene, 0..1, and the visible shares of the cells of its extent.
 
-    For a point, the shares are the light's own, None. For an extent, the visibility is 1, and the shares are the
-    light's own times those behind the scene. world_to_camera: (4, 4). clear: see `visibility_from`.
+    For a point, which has no cells, the shares are None. For an extent, the visibility is 1, and the shares are the
+    light's own times those behind the scene, each cell as a disk of its size. world_to_camera: (4, 4). clear: see
+    `visibility_from`.
     """
     pose = np.asarray(world_to_camera, np.float64)
     eye = -pose[:3, :3].T @ pose[:3, 3]
@@ -184,7 +185,7 @@ def _occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: V
 
 
 def _look_along(position: Tensor, forward: Tensor) -> Tensor:
-    """Return world_to_camera (4, 4) of a camera that looks along the unit vector `forward`, turned about it anyhow."""
+    """Return world_to_camera (4, 4) of a camera that looks along the unit vector `forward`, with any roll."""
     helper = torch.eye(3)[int(forward.abs().argmin())]
     right = torch.linalg.cross(helper, forward)
     right = right / right.norm()

@@ -140,7 +140,7 @@ class Capture:
         yield
         turned = [turned_frame for frame in posed if (turned_frame := _to_turned(frame, matched.files.get(frame.name)))]
         upright, sentences = (find_upright(turned, solve.points) if has_cameras
-                              else ({frame.posed.name for frame in turned}, []))
+                              else ({frame.posed.name for frame in turned}, []))  # the one camera is made upright
         turned_by_name = {frame.posed.name: frame for frame in turned if frame.posed.name in upright}
         views, frames, order, names_of = [], {}, {}, {}
         yield
@@ -157,6 +157,7 @@ class Capture:
             if name in frames:
                 raise CaptureError(f"{folder}: the frame {name} has two poses; remove one of them.")
             views.append(_to_view(name, frame, size, frame.name in upright))
+            # The order counts poses without a picture as well, so that a missing one does not change the split.
             frames[name], order[name], names_of[frame.name] = path, number, name
         lights = read_lights(find_entry(folder, LIGHTS) or folder / LIGHTS)
         yield
@@ -176,7 +177,7 @@ class Capture:
             capture.left_out = {reason: tuple(each) for reason, each in (
                 ("no pose", matched.unposed), ("a pose without a frame", matched.missing)) if each}
         if (folder / "split.json").exists():
-            capture.split(None)
+            capture.split(None)  # raises where it is not valid
         return capture
 
     def reopen(self) -> Capture:

@@ -31,6 +31,7 @@ def read_mask(path: Path) -> Picture:
     if alpha is not None:
         visible = values * alpha[..., None]
         values = visible if visible.max() > 0 else np.repeat(np.float32(1) - alpha[..., None], 3, -1)
+    # Relative to the largest value, so that a mask with values 0 and 1 of 255 is one too.
     return Picture((values / max(float(values.max()), 1e-6) > 0.5).astype(np.float32), "linear")
 
 

@@ -27,7 +27,8 @@ MIN_ACCELERATION, MAX_ACCELERATION = 0.003, 0.03
 UNLIKELY_GATE = 0.4
 """Factor on the tolerance where one of track and source looks like a lamp and the other hardly does."""
 MAX_WAIT, MAX_GAP = 2, 24
-"""Frames to the next source of a track, first without and then with knowledge of what comes later."""
+"""Number of frames without a source after which a track still waits for the next one, and the largest gap, frames,
+over which two tracks are joined."""
 SIZE_COST, COLOUR_COST, EVIDENCE_COST, GAP_COST = 0.4, 0.3, 0.5, 0.06
 """Weights of the change of size (logarithm), colour and evidence, and of a frame without a source, beside distance over
 gate."""

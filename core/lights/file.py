@@ -77,6 +77,7 @@ def write_lights(path: Path, lights: Sequence[FoundLight], views: Sequence[tuple
         if any(_is_same_light(light.xyz, xyz, views) for xyz in known):
             continue
         entries.append(_to_entry(light, _free_name({entry["name"] for entry in entries})))
+    # For `found`: all places of this run, written or not, and those of earlier ones that it did not find again.
     places = [[round_for_text(float(x)) for x in light.xyz] for light in lights]
     places += [xyz for xyz in found_before if not any(_is_same_light(place, xyz, views) for place in places)]
     known_paths = [*(_places_by_frame(entry) for entry in entries if "frames" in entry), *paths_before]

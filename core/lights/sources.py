@@ -101,7 +101,7 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
 def _parts(region: Mask, largest: float) -> Iterator[tuple[Mask, tuple[int, int]]]:
     """Yield the thick parts of a spot, without spikes, with their corners (x, y) in it.
 
-    region: mask (h, w) of the spot. It has no parts where a disc with an area of more than `largest` px² fits in.
+    region: mask (h, w) of the spot. Nothing is yielded where a disc with an area of more than `largest` px² fits in.
     """
     import cv2
 

@@ -138,7 +138,7 @@ def _nfa(observations: Observations, support: int, visible: int) -> float:
 
 
 def binomial_tail(successes: int, trials: int, probability: float) -> float:
-    """Return the probability of at least so many successes in independent trials.
+    """Return the probability of at least `successes` in `trials` independent trials of this probability each.
 
     Computed in logarithms: from some 1030 trials on the binomial coefficients exceed floats.
     """

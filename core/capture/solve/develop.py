@@ -42,6 +42,7 @@ def write_capture(sources: Sequence[SourceFrame], solved: Solved, out: Path, wor
             undistorted[frame.lens] = _undistorted_camera(frame.lens)
         camera = undistorted[frame.lens].scaled(*target)
         _write_frame(source, frame, camera, work / "images" / names[frame.index])
+        # One object for all frames of a lens and size: the model then has one camera for them.
         lens = lenses.setdefault((frame.lens, target), Lens("PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy),
                                                             *target))
         pixels = frame.lens.undistort(frame.pixels) * (camera.fx, camera.fy) + (camera.cx, camera.cy)

@@ -313,8 +313,8 @@ def _cleaning_folder(capture: Path) -> Path:
 
 
 def cleaning_args(scene: Any, capture: Path) -> list[object]:
-    """Return the arguments of the command `remove`: with the run where the fit is finished, else with the network and
-    the matte."""
+    """Return the arguments of the command `remove`: with the run where the fit of this capture is finished, else with
+    the network, the matte and the choice of glow."""
     folder, space = run_folder(scene), plate_space.command_args(scene)
     if folder is not None and fit_state(scene) == "finished" and _may_belong_to(folder, capture):
         moved_capture = ["--capture", capture] if _capture_has_moved(folder, capture) else []

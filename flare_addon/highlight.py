@@ -59,7 +59,10 @@ def touched(scene: Any) -> Touched | None:
 
 
 def highlighted(edits: LookEdits, chosen: Touched, elements: Mapping[str, list[str]]) -> LookEdits:
-    """Return edits that dim all but the touched element, and show it where it is muted. elements: names by flare."""
+    """Return edits that dim all but the touched element, and show it where it is muted.
+
+    elements: names of the elements by name of the flare.
+    """
     def dimmed(edit: Edit) -> Edit:
         return replace(edit, intensity=DIMMED * edit.intensity)
 

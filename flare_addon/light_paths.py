@@ -184,7 +184,8 @@ def _picture_names(clip: Any) -> dict[int, str]:
 def write_tracks(clip: Any, only_selected: bool = False) -> int:
     """Write the tracks of a clip as lights on the picture into lights.json; return their number.
 
-    Entries of the same name keep brightness by frame; other entries stay. Raises CaptureError without tracks.
+    An entry with the name of a track keeps its brightness by frame; entries of other names stay. Raises CaptureError
+    without tracks.
     """
     names, (width, height) = _picture_names(clip), tuple(clip.size)
     tracks = [track for track in clip.tracking.tracks if track.select or not only_selected]

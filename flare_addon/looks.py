@@ -42,7 +42,7 @@ def look_of(scene: Any) -> Look:
         try:
             result: Look | str = read(path)
         except FlareFileError as problem:
-            result = str(problem)
+            result = str(problem)  # kept too, so that a panel does not read a bad file at each redraw
         known = _cache[str(path)] = (stamp, result)
     if isinstance(known[1], str):
         raise FlareFileError(known[1])

@@ -99,7 +99,10 @@ class ShotReading:
 
 def scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int], flare: Path, run: Path | None) -> Shot:
     """Return the shot of these camera objects at these frames, as `ShotReading` reads it; the scene's current frame is
-    restored."""
+    restored.
+
+    camera_objects: [] for the scene's camera. flare: the .flare. run: the run whose scene is baked too, or None.
+    """
     reading = ShotReading(scene, camera_objects, frames)
     try:
         while reading.done < reading.total:

@@ -45,8 +45,9 @@ def read_shot(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[in
     """Return the shot of the scene's active camera at these frames, in the coordinates of Blender's world.
 
     Markers may change the camera; the shot has the name of the scene. names: objects that are lights; without any, the
-    scene's lamps. radius: radius of the lights' discs for soft occlusion, world units; 0 for a part of the distance.
-    Raises CaptureError for a scene without a camera, a light or a named object.
+    scene's lamps. radius: radius of the lights' discs for soft occlusion, world units; 0 for that of the flare or lamp,
+    else a part of the distance. done: called after each frame. Raises CaptureError for a scene without a camera, a
+    light or a named object.
     """
     light_objects = _find_lights(scene, names)
     if not light_objects:
@@ -146,8 +147,9 @@ def write_capture(scene: Any, plates: Mapping[int, Path], folder: Path, names: S
                   done: Callable[[], None] = lambda: None) -> int:
     """Write a capture of the scene's camera; return its number of frames.
 
-    lights.json is written where there are lights (`names`, or the scene's lamps). plates: the picture of each frame.
-    Raises CaptureError where the scene has no camera, and as `exporter.write_frames` does.
+    lights.json is written where there are lights (`names`, or the scene's lamps), each at its place in the last frame.
+    plates: the picture of each frame. done: called after each frame. Raises CaptureError where the scene has no camera,
+    and as `exporter.write_frames` does.
     """
     _active_camera(scene)
     light_objects = _find_lights(scene, names)

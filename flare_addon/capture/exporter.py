@@ -100,8 +100,9 @@ def write_frames(scene: Any, camera: Any, plates: Mapping[int, Path], folder: Pa
     """Write the pictures and points of a capture; return the frames of its transforms.json.
 
     transforms.json is written last, by `write_cameras`, since it marks a complete capture. The scene is left at the
-    last frame. camera: None for the scene's camera in each frame. plates: the picture of each frame. Raises
-    CaptureError where there are no points, or the folder or the plates cannot be used, and FrameError.
+    last frame. camera: None for the scene's camera in each frame. plates: the picture of each frame. done: called after
+    each frame. Raises CaptureError where there are no points, or the folder or the plates cannot be used, and
+    FrameError.
     """
     _check_free(folder, plates)
     _check_shape(scene, plates)

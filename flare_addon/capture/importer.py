@@ -133,7 +133,7 @@ def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) ->
 
 def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Capture, collection: Any
                  ) -> Steps[Imported]:
-    """Add the objects of a capture to a new collection, in steps."""
+    """Add the objects of a capture, in steps, to a new collection that is not linked to the scene yet."""
     notes: list[str] = []
     extent = capture.extent
     scene.collection.children.link(collection)
@@ -189,7 +189,10 @@ def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> A
 
 def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, settings: ImportSettings, scene: Any,
                  notes: list[str]) -> Steps[tuple[Any, ...]]:
-    """Add the cameras, with animation and frames as the settings say, in steps; append warnings to `notes`."""
+    """Add the cameras, with animation and frames as the settings say, in steps; append warnings to `notes`.
+
+    extent: of the capture, world units; cameras are drawn at a part of it.
+    """
     frames = number_views(view.name for view in capture.views)
     number = {frame.view: frame.number for frame in frames}
     folders: dict[str, list[View]] = {}
@@ -242,7 +245,10 @@ def camera_differences(all_cameras: Sequence[Camera]) -> Iterator[str]:
 
 
 def _add_camera(collection: Any, root: Any, name: str, view: View, aspect: tuple[float, float], size: float) -> Any:
-    """Add a camera object with the intrinsics and the pose of a view; return it."""
+    """Add a camera object with the intrinsics and the pose of a view; return it.
+
+    aspect: the scene's pixel aspect. size: of the drawn camera, units of the capture.
+    """
     data = bpy.data.cameras.new(name)
     data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR
     data.lens, data.shift_x, data.shift_y = cameras.lens_of(view.camera, SENSOR, aspect)
@@ -257,7 +263,10 @@ def _add_camera(collection: Any, root: Any, name: str, view: View, aspect: tuple
 
 
 def _animate(camera: Any, views: Sequence[View], numbers: Sequence[int], aspect: tuple[float, float]) -> None:
-    """Insert keys of location and rotation at the frames' numbers, and of focal length and shift where they change."""
+    """Insert keys of location and rotation at the frames' numbers, and of focal length and shift where they change.
+
+    numbers: frame of each view. aspect: the scene's pixel aspect.
+    """
     matrices = [view.camera.camera_to_world @ FLIP_YZ for view in views]
     places = np.array([matrix[:3, 3] for matrix in matrices])
     turns = np.array([quaternion_from_rotation(matrix[:3, :3]) for matrix in matrices])

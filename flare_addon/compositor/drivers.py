@@ -157,7 +157,8 @@ def _slider(scene: Any, path: str) -> tuple[Any, str]:
 def _count_solos(scene: Any, node: Any, numbers: Sequence[int]) -> tuple[Any, str]:
     """Drive a property of the node by the number of solo flares; return its data block and path.
 
-    The expression of each Gain could not hold all flares, since it is limited to 255 characters.
+    numbers: indices of the flares that have layers. The expression of each Gain could not hold all flares, since it is
+    limited to 255 characters.
     """
     node[SOLOS] = 0.0
     driver = node.driver_add(f'["{SOLOS}"]').driver

@@ -127,7 +127,10 @@ def scale_to_render_size(tree: Any, socket: Any, column: float, row: float) -> A
 
 
 def crop_to_frame(tree: Any, socket: Any, window: DataWindow, column: float, row: float) -> Any:
-    """Add a node that cuts the overscan of a picture off, since Blender ignores data windows; return it."""
+    """Add a node that cuts the overscan of a picture off, since Blender ignores data windows; return it.
+
+    socket: output socket of the picture. window: its data window.
+    """
     node = new_node(tree, "CompositorNodeCrop", column, row)
     (left, top), (width, height), (_, stored) = window.origin, window.frame, window.size
     bottom = stored + top - height  # rows of overscan below the frame; Blender counts from there

@@ -229,8 +229,8 @@ def _depends_on(candidate: Any, node: Any) -> bool:
 def _image_under_flare(tree: Any, node: Any, state: Any) -> Any:
     """Return the output socket of the artist's image under the flare; None where there is none.
 
-    It feeds our node, or fed the output before the set-up. A node that depends on the flare would make a cycle and does
-    not count.
+    It feeds our node (`node`), or fed the output before the set-up (`state`, as `set_up` stored it). A node that
+    depends on the flare would make a cycle and does not count.
     """
     feeder = tree.nodes.get(state["from"])
     outputs = feeder.outputs if feeder else ()
@@ -245,7 +245,8 @@ def _undo_set_up(scene: Any, tree: Any, source: Any, node_settings: dict[str, An
                  state: dict[str, Any]) -> None:
     """Restore the scene after files without flare layers.
 
-    node_settings: the previous settings of the layers' node, None where it is new. state: from `_scene_state`.
+    source: the node that shows the layers. node_settings: its previous settings, None where it is new. state: from
+    `_scene_state`.
     """
     image = source.image
     if node_settings is not None:

@@ -17,6 +17,7 @@ Studies:
   extrapolation   our form, with a stretch of the path held out instead of every n-th view
   reconstruction  the paper's table 3: 3DGS trained on the frames, on the frames with a bilateral grid for each, and on
                   flare-free frames, judged on exact flare-free views; the scene of our form beside them
+  far layer       our form with a far layer and without one, taught by exact flare-free frames and split by parallax
 
 Each fit has a folder of its own under --out, named after its settings: finished ones are not repeated, not for another
 study either, and broken ones go on where they were.
@@ -103,7 +104,7 @@ def ours(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
 
 
 def papers(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
-    """Return the paper's form and loss at the same length, with the same rates."""
+    """Return the paper's form and loss at this length, with our rates. changes: as for `ours`."""
     settings = length(model="paper", mode=mode)
     return override_settings(settings, {name.replace("__", "."): value for name, value in changes.items()})
 
@@ -171,7 +172,7 @@ def experiments(length: Length) -> list[Experiment]:
 
 
 def displaced(capture: Capture, sigma: float, seed: int = 0) -> Capture:
-    """The capture with each light moved once, by noise of this sigma along each axis."""
+    """Move each light of the capture once, by noise of this sigma (scene units) along each axis; return the capture."""
     if sigma:
         noise = np.random.default_rng(seed).normal(0, sigma, (len(capture.lights), 3))
         capture.lights = tuple(Light(light.name, np.asarray(light.xyz) + shift)
@@ -180,14 +181,17 @@ def displaced(capture: Capture, sigma: float, seed: int = 0) -> Capture:
 
 
 def stretch(capture: Capture, share: float = 0.15) -> list[str]:
-    """Names of the views in one stretch in the middle of the path."""
+    """Return the names of the views in one stretch in the middle of the path. share: of all views."""
     count = max(round(share * len(capture.views)), 1)
     first = (len(capture.views) - count) // 2
     return [view.name for view in capture.views[first : first + count]]
 
 
 def run(experiment: Experiment, folder: Path, capture: Path, width: int, progress: Progress) -> dict[str, Any]:
-    """Return the scores of one experiment, from its folder if it was done before."""
+    """Return the scores of one experiment, read from `folder` if it was done before, else written there.
+
+    folder: of this experiment and capture. width: of the frames that are fitted, pixels.
+    """
     file = folder / SCORES
     if file.exists():
         stored: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
@@ -223,6 +227,7 @@ def _train(trainer: KnownScene | BilateralTrainer, stage: str, iterations: int, 
 
 
 def _known(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
+    """Fit the flare alone over the exact scene; return its scores."""
     trainer = KnownScene(capture, settings)
     _train(trainer, "flare alone", settings.iterations, progress)
     return score(trainer, capture.split(settings.holdout)[1])
@@ -240,6 +245,7 @@ class _SceneAlone:
 
 
 def _graded(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
+    """Fit the scene with a bilateral grid for each frame; return its scores."""
     trainer = BilateralTrainer(capture, settings)
     _train(trainer, "scene with grids", settings.iterations, progress)
     return _scores(_SceneAlone(trainer.scene), capture.folder, settings, progress)
@@ -259,6 +265,7 @@ def _capture_of(folder: Path, capture: Path, **origins: str) -> Capture:
 
 
 def _cleaned(folder: Path, capture: Path, progress: Progress) -> Capture:
+    """Return a copy of the capture, in `folder`, whose clean frames `remove` made."""
     copy = _capture_of(folder, capture)
     if not copy.has_removed:
         clean_capture(copy, Remover(glow="remove"), progress)
@@ -268,7 +275,7 @@ def _cleaned(folder: Path, capture: Path, progress: Progress) -> Capture:
 def _scores(renderer: Run | _SceneAlone, folder: Path, settings: FitSettings, progress: Progress) -> dict[str, Any]:
     """Return means over the held-out views of the unchanged capture: lights are displaced for the fit alone.
 
-    `hidden`: see `hidden_lights`, over all views, since few of those held out hide a light.
+    folder: of the capture. `hidden`: see `hidden_lights`, over all views, since few of those held out hide a light.
     """
     capture = Capture.open(folder)
     held_out = capture.split(settings.holdout)[1]
@@ -276,7 +283,7 @@ def _scores(renderer: Run | _SceneAlone, folder: Path, settings: FitSettings, pr
     evaluated = evaluate(renderer, capture, {view: frames.camera(view) for view in held_out}, progress,
                          frames.picture_area)
     scores: dict[str, Any] = {layer: part for layer, part in evaluated.items() if isinstance(part, dict)}
-    if settings.mode == "3dgs":  # what it calls a flare is nothing at all
+    if settings.mode == "3dgs":  # it has no flare to score
         scores = {layer: part for layer, part in scores.items() if not layer.startswith("flare")}
     else:
         hidden = hidden_flare(renderer, folder, {view: frames.camera(view) for view in capture.views})
@@ -301,7 +308,7 @@ def _cell(values: Iterable[float | None], digits: int) -> str:
 
 
 def tables(results: Results) -> str:
-    """Return a table for each study; figures are means over the captures that all of its rows have."""
+    """Return a Markdown table for each study; figures are means over the captures that all of its rows have."""
     parts = []
     for study, rows in results.items():
         names = shared(rows)
@@ -320,7 +327,7 @@ def tables(results: Results) -> str:
 
 
 def shared(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Names of the captures that every row of a study has, in the first row's order."""
+    """Return the names of the captures that every row of a study has, in the first row's order."""
     first, *others = rows.values()
     return [name for name in first if all(name in other for other in others)]
 
@@ -337,7 +344,10 @@ def by_capture(rows: Mapping[str, Mapping[str, dict[str, Any]]]) -> str:
 
 
 def plot(rows: Mapping[str, Mapping[str, dict[str, Any]]], picture: Path) -> None:
-    """Plot the flare's PSNR against the displacement of its light."""
+    """Plot the flare's PSNR against the displacement of its light, a line for each choice of corrections.
+
+    rows: of a study of robustness, named "CORRECTIONS, sigma S".
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -363,7 +373,10 @@ def _commit() -> str:
 
 
 def write(results: Results, section: str, length: str, document: Path) -> str:
-    """Write the tables, with commit and settings, into a section of the document; return them."""
+    """Write the tables, with commit and settings, into a section of the document; return the text.
+
+    length: a phrase on preset, iterations and size, for the heading.
+    """
     commits = {result["commit"]: None for rows in results.values() for row in rows.values() for result in row.values()}
     head = f"Fitted at commit {', '.join(commits)}; times include other load on the machine. {report.conditions()}"
     text = f"## Figures: {length[0].lower()}{length[1:]}\n\n{head}\n\n{tables(results)}"

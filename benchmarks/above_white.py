@@ -35,6 +35,7 @@ class FloatFrames(Capture):
     """A capture whose frames and clean frames are made of its exact layers."""
 
     def frame(self, view: View, size: tuple[int, int] | None = None) -> Picture:
+        """Return the sum of the exact layers, linear. Raises CaptureError without them."""
         scene, flare = self.truth_scene(view, size), self.truth_flare(view, size)
         if scene is None or flare is None:
             raise CaptureError(f"{self.folder} has no exact layers of {view.name}.")
@@ -45,7 +46,7 @@ class FloatFrames(Capture):
 
 
 def scores(run: Run, capture: Capture) -> list[float]:
-    """Return the scores of `COLUMNS`, averaged over the held-out views."""
+    """Return the scores of `COLUMNS`, averaged over the held-out views that have them."""
     rows = []
     for view in capture.split(run.settings.holdout)[1]:
         layers = run.render(view.camera)

@@ -39,13 +39,17 @@ def targets() -> dict[str, Tensor]:
 
 
 def fit_psnr(target: Tensor, count: int, arcs: bool, seed: int, iterations: int = 600) -> float:
-    """Fit `count` randomly initialised Gaussians with the rates of a short fit; return the PSNR, dB."""
+    """Fit `count` randomly initialised Gaussians to a picture (SIZE, SIZE) of linear light; return the PSNR, dB.
+
+    arcs: fit arcs too.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(shape, generator=generator)
 
     rings = torch.zeros(count, 2)
+    # Every fourth begins as a ring: radius 3, and width 0.5 as a logarithm.
     rings[::4] = torch.tensor([3.0, math.log(0.5)])
     initial = {
         "means": (uniform(-0.3, 0.3, count, 2), 2e-3),
@@ -56,6 +60,7 @@ def fit_psnr(target: Tensor, count: int, arcs: bool, seed: int, iterations: int 
     }  # fmt: skip
     rows = {name: torch.nn.Parameter(values) for name, (values, _) in initial.items()}
     adam = torch.optim.Adam([{"params": [rows[name]], "lr": rate} for name, (_, rate) in initial.items()])
+    # Rates are constant in the first half, then fall to a twentieth.
     schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda i: 0.05 ** max(2 * i / iterations - 1, 0))
     loss = target.new_zeros(())
     for _ in range(iterations):

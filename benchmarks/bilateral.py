@@ -33,7 +33,7 @@ class BilateralGrids(torch.nn.Module):
         self.cells = torch.nn.ParameterList(Parameter(identity.clone()) for _ in range(views))
 
     def forward(self, number: int, picture: Tensor) -> Tensor:
-        """Apply the transforms of frame `number` to the picture (h, w, 3), display values."""
+        """Return the picture (h, w, 3), display values, with the transforms of frame `number` applied."""
         height, width, _ = picture.shape
         y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
         luma = (picture.detach() @ picture.new_tensor(LUMA)).clamp(0, 1) * 2 - 1
@@ -60,7 +60,7 @@ class BilateralTrainer(Trainer):
         self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.grid_optimiser, 0.01 ** (1 / settings.iterations))
 
     def step(self) -> dict[str, float]:
-        """Make one iteration on the next view, with the grid's regulariser and step."""
+        """Make one iteration on the next view, with a step of its grid and the penalty of its total variation."""
         figures = super().step()
         number = self._number(self._view())
         (TOTAL_VARIATION_WEIGHT * self.grids.total_variation(number)).backward()
@@ -71,6 +71,7 @@ class BilateralTrainer(Trainer):
 
     def _flare_background(self, targets: Targets, scene: Tensor,  # noqa: ARG002 - the trainer's own door
                           light_discs: Tensor | None) -> Tensor:  # noqa: ARG002
+        """Return the scene through the grid of its view, which the trainer compares with the frame."""
         return self.grids(self._number(self._view()), scene)
 
     def _number(self, view: View) -> int:

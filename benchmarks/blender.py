@@ -26,7 +26,7 @@ CAMERAS, POINTS, GAUSSIANS, LEVELS, LAMPS = 400, 100_000, 2_000, 16, 100
 
 
 def load_module(name: str) -> Any:
-    """Import a module of the tree as a part of the package fit_flare."""
+    """Import the module of this name in the tree, as a part of the package that run.py registers."""
     spec = importlib.util.spec_from_file_location("run", ROOT / "headless" / "run.py")
     assert spec is not None
     assert spec.loader is not None
@@ -36,12 +36,13 @@ def load_module(name: str) -> Any:
 
 
 def make_capture(folder: Path, cameras: int = CAMERAS) -> Path:
-    """Write a capture: a binary COLMAP model of cameras on a circle, grey frames, and points."""
+    """Write a capture: a binary COLMAP model of cameras on a circle, grey frames of 96 x 54, and points."""
     import zlib
 
     model, images = folder / "sparse" / "0", folder / "images"
     model.mkdir(parents=True)
     images.mkdir()
+    # One grey PNG, written by hand: 54 rows, each a filter byte and 96 pixels.
     raw = zlib.compress(b"".join(b"\0" + b"\x80" * 3 * 96 for _ in range(54)))
 
     def chunk(kind: bytes, data: bytes) -> bytes:
@@ -77,6 +78,7 @@ def make_flare(path: Path) -> Path:
     arrays["0.gaussians.opacity_logits"] -= 3
     arrays["0.gaussians.rings"] = np.zeros((n, 2))
     arrays["0.gaussians.offsets"], arrays["0.gaussians.latent"] = np.zeros((n, 2)), random.normal(size=(n, 4))
+    # Two features for each level of two hash grids; the offsets of every parameter and of the place on the plane.
     view, heads = 4 * LEVELS, sum(widths.values()) + 2
     shapes = {"view_layer": (128, view), "layers.0": (128, 128), "layers.1": (128, 128), "head": (heads, 128),
               "correction.0": (128, view), "correction.2": (2, 128)}
@@ -107,7 +109,7 @@ def make_flare(path: Path) -> Path:
 
 
 def time_range(call: Any, times: int = 10) -> tuple[float, float]:
-    """Return the fastest and the slowest of some calls, ms."""
+    """Return the fastest and the slowest of `times` calls, ms."""
     times_ms = []
     for _ in range(times):
         start = time.perf_counter()
@@ -117,7 +119,10 @@ def time_range(call: Any, times: int = 10) -> tuple[float, float]:
 
 
 def time_lamps(looks: Any, overlay: Any, look: Path, window: Any) -> list[str]:
-    """Return lines on the overlay of a hundred lamps with one look, with a camera that moves and one that stands."""
+    """Return lines on the overlay of a hundred lamps with one look, with a camera that moves and one that stands.
+
+    looks, overlay: modules of the add-on. look: a .flare. window: the region that is drawn.
+    """
     import bpy
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)

@@ -37,7 +37,11 @@ THRESHOLDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 @dataclass
 class Tally:
-    """Counts over all pictures at one threshold."""
+    """Counts over all pictures at one threshold.
+
+    pixels: hit, false and missed pixels, by kind of truth. detected: lights that a detection lies on, of `lights`.
+    false: detections on no light.
+    """
 
     pixels: dict[str, np.ndarray] = field(default_factory=lambda: {"shape": np.zeros(3), "glare": np.zeros(3)})
     detected: int = 0
@@ -59,7 +63,7 @@ class Tally:
         self.lights += len(picture.masks)
 
     def row(self, truth: str) -> tuple[float, float, float, float]:
-        """Precision, recall, F1 and IoU by pixel."""
+        """Return precision, recall, F1 and IoU by pixel. truth: "shape" or "glare"."""
         hit, false, missed = self.pixels[truth]
         precision, recall = hit / max(hit + false, 1), hit / max(hit + missed, 1)
         harmonic = 2 * precision * recall / max(precision + recall, 1e-9)
@@ -67,14 +71,14 @@ class Tally:
 
 
 def pictures(photos: Sequence[Path], number: int, seed: int) -> Iterator[LitPicture]:
-    """`number` compositions over the photographs in turn."""
+    """Yield `number` compositions of 1 to 5 lights over the photographs in turn."""
     for i in range(number):
         rng = np.random.default_rng((seed, i))
         yield compose_lights(read_picture(photos[i % len(photos)]), rng, int(rng.integers(1, 6)))
 
 
 def in_pictures(detector: Detector, photos: Sequence[Path], number: int, seed: int) -> dict[float, Tally]:
-    """Tallies by threshold, from one detection a picture at the lowest."""
+    """Return tallies by threshold; the detector, made for the lowest, runs once for each picture."""
     tallies = {threshold: Tally() for threshold in THRESHOLDS}
     for picture in pictures(photos, number, seed):
         detections = detector.detect(picture.picture)
@@ -84,7 +88,7 @@ def in_pictures(detector: Detector, photos: Sequence[Path], number: int, seed: i
 
 
 def in_captures(folders: Sequence[Path], detector: Detector) -> None:
-    """Print the 3D error of every light of every capture."""
+    """Print the 3D error of every light of every capture, of the nearest found light that is not taken yet."""
     print(f"{'capture':24s} {'light':12s} {'error':>9s} {'of extent':>9s} {'median px':>9s} {'support':>8s}")
     for folder in folders:
         try:

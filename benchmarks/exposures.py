@@ -32,11 +32,14 @@ from core.metrics.evaluation import LAYERS, evaluate
 
 COLUMNS = ("mode", "frames", "fitted as", *LAYERS, "error, stops")
 ROUNDS = 1.5
-"""Periods of that variation along the shot."""
+"""Periods of the exposure's variation along the shot."""
 
 
 class Drifting(Capture):
-    """A capture whose views are multiplied by factors; clipped at white, in 8 bits."""
+    """A capture whose light is multiplied by a factor for each view, `times` by name.
+
+    Frames and clean frames are clipped at white and rounded to 8 bits; exact layers are not.
+    """
 
     def __init__(self, capture: Capture, times: Mapping[str, float]) -> None:
         self.__dict__.update(capture.__dict__)
@@ -68,7 +71,7 @@ class Drifting(Capture):
 
 
 def scores(run: Run, capture: Capture) -> list[str]:
-    """PSNR of each layer, dB, means over the held-out views."""
+    """Return the PSNR of each of LAYERS, dB, as text: means over the held-out views, "-" for a layer without."""
     _, views = capture.with_exposures(run.exposures).split(run.settings.holdout)
     cameras = {view: view.camera.scaled(run.settings.width) for view in views}
     results: dict[str, Any] = evaluate(run, capture, cameras)
@@ -76,7 +79,7 @@ def scores(run: Run, capture: Capture) -> list[str]:
 
 
 def compare(capture: Capture, mode: str, args: argparse.Namespace) -> list[list[str]]:
-    """A row for the unchanged capture, and one for each way to fit the drifting one."""
+    """Return a row for the unchanged capture, and one for each way to fit the drifting one."""
     count = len(capture.views)
     stops = {view.name: args.stops * math.sin(2 * math.pi * ROUNDS * number / count)
              for number, view in enumerate(capture.views)}
@@ -93,7 +96,10 @@ def compare(capture: Capture, mode: str, args: argparse.Namespace) -> list[list[
 
 
 def _error(estimated: Mapping[str, float], stops: Mapping[str, float]) -> str:
-    """Standard deviation from the true exposures, stops."""
+    """Return the standard deviation of estimated exposures from the true ones, stops, as text.
+
+    estimated: factors by view. stops: true exposures by view; {} for a constant one.
+    """
     if not estimated:
         return "none"
     return f"{np.std([math.log2(value) - stops.get(name, 0.0) for name, value in estimated.items()]):.3f}"

@@ -28,7 +28,10 @@ Pixels = NDArray[np.float32]
 
 
 def side_by_side(capture: Capture, name: str, runs: list[Run]) -> Pixels:
-    """Return the picture, display values (h, w, 3). Raises CaptureError if the view or its layers are missing."""
+    """Return the picture, display values (h, w, 3), at the width of the first run. name: of the view, any suffix.
+
+    Raises CaptureError if the view or its layers are missing.
+    """
     view = next((each for each in capture.views if Path(each.name).stem == Path(name).stem), None)
     if view is None:
         raise CaptureError(f"{capture.folder} has no view {name}; give a frame's name.")

@@ -42,6 +42,7 @@ def hidden_flare(renderer: Renderer, folder: Path, cameras: Mapping[View, Camera
 
 
 def _residual(kinds: Mapping[str, list[float]]) -> dict[str, Any]:
+    """Return mean energy and number of views by kind, and the residual. kinds: energies by view, of one light."""
     means = {kind: float(np.mean(energies)) for kind, energies in kinds.items()}
     counts = {f"{kind}_views": len(energies) for kind, energies in kinds.items()}
     return {**means, **counts, "residual": means["hidden"] / max(means["visible"], 1e-12)}

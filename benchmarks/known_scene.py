@@ -36,7 +36,7 @@ class KnownScene(Trainer):
         if loss.requires_grad:
             loss.backward()
         self.optimisers.step(scene=False)
-        self._change_flare_density()
+        self._change_flare_density()  # adds and removes flare Gaussians as in any fit
         return {"loss": float(loss.detach())}
 
 

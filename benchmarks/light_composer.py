@@ -38,7 +38,10 @@ class LitPicture:
 
 def compose_lights(photo: Picture, rng: np.random.Generator, count: int) -> LitPicture:
     """Draw `count` lights that do not overlap over a photograph (display values, h x w x 3); fewer where
-    MAX_ATTEMPTS find no room."""
+    MAX_ATTEMPTS find no room.
+
+    Radii are 0.4 to 3 % of the longer side.
+    """
     height, width = photo.pixels.shape[:2]
     side = max(width, height)
     light = np.zeros_like(photo.pixels)
@@ -68,12 +71,16 @@ def compose_lights(photo: Picture, rng: np.random.Generator, count: int) -> LitP
 
 
 def _draw_shape(size: tuple[int, int], centre: NDArray[np.float64], radius: float, rng: np.random.Generator) -> Pixels:
-    """Draw the coverage (h, w) of an emitting shape, with a soft edge of one pixel."""
+    """Draw the coverage (h, w), 0..1, of a random emitting shape, with a soft edge of one pixel.
+
+    size: (h, w). centre and radius: pixels.
+    """
     v, u = np.mgrid[:size[0], :size[1]].astype(np.float32) + 0.5
     angle = rng.uniform(0, np.pi)
     x = (u - centre[0]) * np.cos(angle) + (v - centre[1]) * np.sin(angle)
     y = (v - centre[1]) * np.cos(angle) - (u - centre[0]) * np.sin(angle)
     kind, aspect = rng.uniform(), rng.uniform(0.4, 0.9)
+    # inside: pixels from the edge, negative outside. A disc, an ellipse or a rounded bar.
     if kind < 0.55:
         inside = radius - np.hypot(x, y)
     elif kind < 0.8:
@@ -85,7 +92,7 @@ def _draw_shape(size: tuple[int, int], centre: NDArray[np.float64], radius: floa
 
 
 def _render_light(shape: Pixels, radius: float, rng: np.random.Generator) -> Pixels:
-    """Render a light as a lens images it, linear (h, w, 3)."""
+    """Render a light as a lens images it, linear (h, w, 3). shape: its coverage (h, w). radius: pixels."""
     tint = rng.uniform(0, 1)
     colour = np.array([1, 0.55 + 0.45 * tint, 0.25 + 0.75 * tint]) if rng.uniform() < 0.7 else \
         np.array([0.45 + 0.4 * tint, 0.7 + 0.3 * tint, 1])
@@ -101,6 +108,7 @@ def _render_light(shape: Pixels, radius: float, rng: np.random.Generator) -> Pix
     spikes = np.cos((angle - rotation) * blades / 2) ** 2
     star = spikes ** 200 / (1 + np.sqrt(r2)) ** np.float32(1.5)
     psf = rng.uniform(0.003, 0.03) * glow / glow.sum() + rng.uniform(0.0005, 0.004) * star / star.sum()
+    # Padding to twice the size keeps the convolution from wrapping around.
     spectrum = np.fft.rfft2(np.fft.ifftshift(psf)) * np.fft.rfft2(np.pad(shape, ((0, height), (0, width))))
     scattered = np.fft.irfft2(spectrum, s=psf.shape)[:height, :width]
     return np.asarray(radiance * (core + scattered)[..., None] * colour, np.float32)

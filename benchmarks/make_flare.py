@@ -48,7 +48,10 @@ def parse_setting(text: str) -> tuple[str, Any]:
 
 
 def write_sheet(file: Path, settings: TracedFlareSettings, model: FlareModel, path: TracedPictures) -> None:
-    """Write traced flare, fitted flare and difference side by side, one row for each of SHEET_ROWS places."""
+    """Write traced flare, fitted flare and 0.5 + their difference side by side, a row for each of SHEET_ROWS places.
+
+    path: the tracing along the path; its places are spread evenly, without the ends.
+    """
     chosen = np.linspace(1, len(path.places) - 2, SHEET_ROWS).round().astype(int)
     fitted = draw_fitted(model, traced_camera(settings), path.places[chosen])
     rows = [side_by_side([srgb_from_linear(np.clip(truth, 0, 1)), srgb_from_linear(np.clip(drawn, 0, 1)),
@@ -58,7 +61,7 @@ def write_sheet(file: Path, settings: TracedFlareSettings, model: FlareModel, pa
 
 
 def main() -> int:
-    """The benchmark."""
+    """Trace and fit each lens, and print its row; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("lenses", nargs="+", metavar="LENS", help=".lens files, or names of lenses of the program")
     parser.add_argument("--sheets", type=Path, metavar="FOLDER", help="write a sheet for each lens")

@@ -40,11 +40,12 @@ def measure_process(args: list[object]) -> tuple[float, float]:
         if child.returncode:
             noise.seek(0)
             raise RuntimeError(noise.read().decode()[-2000:])
+    # In KiB, on macOS in bytes.
     return usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1 << 20), time.monotonic() - began
 
 
 def camera_at(angle: float, width: int, height: int) -> Camera:
-    """Return a camera on an arc about the origin."""
+    """Return a camera on an arc about the origin, 4 units away, that looks at it. angle: radians; y points down."""
     position = np.array([4 * np.sin(angle), -0.3, -4 * np.cos(angle)])
     forward = -position / np.linalg.norm(position)
     right = np.cross([0.0, 1.0, 0.0], forward)
@@ -94,7 +95,10 @@ def measure_bake(run: Path, size: str) -> None:
 
 
 def measure_fit(counts: list[int], size: str) -> None:
-    """Measure fits that visit every view once."""
+    """Measure fits that visit every view once. counts: numbers of frames. size: WIDTHxHEIGHT.
+
+    There is no preview and no occlusion, and few scene Gaussians, so that the frames make the difference.
+    """
     width, height = map(int, size.split("x"))
     for count in counts:
         with tempfile.TemporaryDirectory() as folder:
@@ -107,6 +111,7 @@ def measure_fit(counts: list[int], size: str) -> None:
 
 
 def main() -> None:
+    """Measure what the arguments name, and print a line for each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="*", default=["bake", "fit"])
     parser.add_argument("--run", type=Path, default=ROOT / "build" / "demo" / "run")

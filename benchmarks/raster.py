@@ -51,7 +51,7 @@ DOCUMENT = report.RESULTS / "rasterizer.md"
 
 
 class Case(NamedTuple):
-    """Number of Gaussians and flare Gaussians, and size of the picture."""
+    """Numbers of scene and flare Gaussians, size of the picture, and the resolution that flares are drawn at."""
 
     gaussians: int
     width: int
@@ -76,11 +76,11 @@ ITERATION_CASES = (
 PEER_CASES = RASTER_CASES[:5]
 CURVE = (10_000, 20_000, 50_000, 100_000, 200_000, 350_000, 500_000)
 SLOW_FROM = 150_000
-"""Number of Gaussians or pixels from which the torch kernel sets are omitted, since they take too long."""
+"""Number of Gaussians or pixels from which the kernel set `tiles` is omitted, since it takes too long."""
 
 
 def our_rasterizer(name: str) -> Rasterizer:
-    """One of our kernel sets as an engine."""
+    """Return one of our kernel sets as a rasterizer."""
 
     def render(*args: object) -> Tensor:
         return rasterization(*args, kernels=name, depth=False).colour  # type: ignore[arg-type]
@@ -103,7 +103,7 @@ def gsplat_rasterizer(
 
 
 class Raster:
-    """Forward, and forward with backward, of one job by one engine."""
+    """Forward, and forward with backward, of one case by one rasterizer. kernel_set: draws the flares, if any."""
 
     def __init__(self, case: Case, rasterizer: Rasterizer, kernel_set: str | None, device: str) -> None:
         self.case, self.rasterizer, self.kernel_set = case, rasterizer, kernel_set
@@ -172,13 +172,13 @@ class Iteration:
 
 
 def too_slow(name: str, case: Case) -> bool:
-    """Return whether a case takes too long for a torch kernel set."""
+    """Return whether a case takes too long for the kernel set `torch` or `tiles`."""
     size = max(case.gaussians, case.width * case.height)
     return (name == "torch" and size > 20_000) or (name == "tiles" and size >= SLOW_FROM)
 
 
 def raster_section(rasterizers: dict[str, Rasterizer], thread_counts: list[int], rounds: int, device: str) -> str:
-    """Return tables of forward, and of forward + backward."""
+    """Return tables of forward, and of forward + backward. rounds: of `median_times`."""
     work: dict[str, Callable[[], object]] = {}
     for case in RASTER_CASES:
         for name, rasterizer in rasterizers.items():
@@ -276,7 +276,7 @@ def stage_section(thread_counts: list[int], rounds: int) -> str:
 
 
 def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Return the median seconds of each stage over repetitions of a step."""
+    """Return the median seconds of each stage over repetitions of a step; the stages are timed inside `parallel`."""
     step()  # loads the kernels
     spent: dict[str, float] = {}
     parallel = importlib.import_module("core.gaussians.cpu.threads").parallel
@@ -292,7 +292,7 @@ def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
     for module in users:
         module.parallel = timed  # type: ignore[attr-defined]
     try:
-        for _ in range(3 + repeats):
+        for _ in range(3 + repeats):  # the first three are left out
             spent.clear()
             iteration_time = time_once(step)
             for name, functions in STAGES.items():
@@ -399,7 +399,11 @@ def peer_section(checkout: Path, rounds: int) -> str:
 
 
 def probe(what: str, name: str) -> dict[str, float]:
-    """Measure one figure, in a process of its own."""
+    """Return the figures of one measurement, which runs in a process of its own.
+
+    what: "start", seconds of the imports and of two iterations; "both", seconds of forward + backward; "memory", the
+    resident memory before training and its peak, MB. name: of the kernel set.
+    """
     case = Case(50_000, 480, 270)
     if what == "start":
         imported = time.perf_counter() - START

@@ -42,13 +42,13 @@ def process_section(sets: list[str]) -> str:
     rows = []
     for what, variables in INSTRUCTIONS.items():
         with tempfile.TemporaryDirectory() as cache:
-            _probe("start", "cpu", FIT_FLARE_CACHE=cache, **variables)
+            _probe("start", "cpu", FIT_FLARE_CACHE=cache, **variables)  # compiles
             rows.append([what, milliseconds(_probe("both", "cpu", FIT_FLARE_CACHE=cache, **variables)["both"])])
     return text + "\n\n" + table(["50k, 480x270, forward + backward, ms, all threads", "cpu"], rows)
 
 
 def _probe(what: str, name: str, **variables: str) -> dict[str, float]:
-    """Return what `raster.py --probe` measures in a process of its own, with these environment variables."""
+    """Return what `raster.py --probe WHAT NAME` measures (see `probe` there), with these environment variables."""
     done = subprocess.run(
         [sys.executable, str(SCRIPT), "--probe", what, name],
         env={**os.environ, **variables}, capture_output=True, text=True, check=True,

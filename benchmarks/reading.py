@@ -68,7 +68,7 @@ def read_by_capture(path: Path) -> int:
 
 
 def read_by_video(path: Path) -> int:
-    """Read a video by this program."""
+    """Read a video by this program; return the number of frames."""
     count = 0
     with Video(path) as video:
         for frame in video:
@@ -96,7 +96,7 @@ def read_by_picture(folder: Path) -> int:
 
 def measure(readers: dict[str, Callable[[Path], int]], path: Path, frames: int,
             rounds: int) -> dict[str, tuple[float, float]]:
-    """Return for each reader the milliseconds per frame, of the clock and of the processor."""
+    """Return for each reader the milliseconds per frame, of the clock and of the processor: the least of all rounds."""
     best = dict.fromkeys(readers, (np.inf, np.inf))
     for _ in range(rounds):
         for name, read in readers.items():

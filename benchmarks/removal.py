@@ -88,7 +88,7 @@ def draw_plate(path: Path, width: int, height: int) -> None:
 
 
 def measure_plate(plate: Path, size: int = WORKING_SIZE, weights: Path | None = None) -> None:
-    """Print seconds and peak megabytes; the process that `speed` measures."""
+    """Print seconds and peak megabytes of one plate; `speed` runs it in a process of its own."""
     began = time.perf_counter()
     remover = Remover(weights, working_size=size)
     loaded = time.perf_counter()
@@ -132,7 +132,7 @@ def sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | No
         truth = read_picture(capture / "truth" / "scene" / f"{path.stem}.exr").display()
         frame, result = (part.astype(np.float32) / 255 for part in (read_plate(path).codes, codes))
         scores.append((psnr(frame, truth), psnr(result, truth)))
-        if number % max(len(paths) // SHOWN_FRAMES, 1) == 5:
+        if number % max(len(paths) // SHOWN_FRAMES, 1) == 5:  # evenly spaced, from the sixth frame
             rows.append(np.concatenate([frame, result, np.clip(truth, 0, 1)], 1))
         errors = (frame - truth, result - truth)
         if previous_errors is not None:
@@ -177,7 +177,7 @@ def clean(folders: list[Path], weights: Path | None = None) -> None:
         codes = remover.remove(plate)[0]
         if np.array_equal(codes, plate.codes):
             unchanged += 1
-            values.append(100.0)
+            values.append(100.0)  # in place of an infinite PSNR
             continue
         values.append(psnr(codes / plate.max_code, plate.codes / plate.max_code))
     print(f"{len(values)} pictures, {unchanged} kept to the last bit; PSNR against the input: median "
@@ -256,7 +256,7 @@ def coloured(folders: list[Path], lenses: Path | None = None, weights: Path | No
 
 
 def confidence(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 600) -> None:
-    """Fit and score the weights that tell flares from scenes and their grades."""
+    """Fit and score the weights of the confidence that a predicted flare is real."""
     from core.removal.inference.confidence import BIAS, FEATURE_WEIGHTS, confidence_from_log_odds
     from core.removal.training.backgrounds import read_backgrounds
 
@@ -305,7 +305,8 @@ def _draw_features(remover: Remover, seed: int, count: int, backgrounds: Any, le
 def _logistic(features: Any, gains: Any) -> Any:
     """Fit weights (6,) of features (n, 5) and a constant to the log odds that a prediction is useful.
 
-    Predictions are weighted by their gain. Newton's method with a ridge of one observation.
+    The constant is last. Predictions are weighted by the size of their gain, up to 15 dB. Newton's method; the weights
+    of the standardised features, but not the constant, have a ridge of one observation.
     """
     mean, deviation = features.mean(0), features.std(0)
     design = np.column_stack([(features - mean) / deviation, np.ones(len(features))])
@@ -316,12 +317,12 @@ def _logistic(features: Any, gains: Any) -> Any:
         step = design.T @ (counts * (probabilities - flares)) + ridge @ solution
         curvature = counts * probabilities * (1 - probabilities)
         solution -= np.linalg.solve(design.T @ (design * curvature[:, None]) + ridge, step)
-    weights = solution[:-1] / deviation
+    weights = solution[:-1] / deviation  # of the features as they are
     return np.append(weights, solution[-1] - weights @ mean)
 
 
 class _AsphericBank:
-    """A bank of the ghosts of lights through moulded aspheres and nothing besides."""
+    """A source of flares for `make_pair`: the ghosts of lights through moulded aspheres and nothing besides."""
 
     def __init__(self, seed: tuple[int, ...]) -> None:
         self._seed = seed
@@ -360,8 +361,10 @@ def _held_out_backgrounds(folders: list[Path]) -> Any:
 
 def _gain(remover: Remover, seed: tuple[int, ...], bank: Any, backgrounds: Any,
           against_light_share: float = 0.0) -> float:
-    """Return the gain, dB, for the picture of a seed with a flare of the bank. against_light: share of pictures with
-    their lights against a bright scene."""
+    """Return the gain of the removal in PSNR, dB, for the picture of a seed with a flare of the bank.
+
+    against_light_share: probability that its lights stand in a bright part of the scene.
+    """
     from core.removal.training.pairs import make_pair
 
     pair = make_pair(np.random.default_rng(seed), bank, backgrounds, *SIZE, clean_share=0,
@@ -390,7 +393,7 @@ def matte(folders: list[Path], lenses: Path | None = None, weights: Path | None 
 
 
 def _rough_matte(frame: Any, truth: Any) -> Any:
-    """Return a matte (height, width), 0..1: specks are overlooked, the rest is circled widely."""
+    """Return a matte (height, width), 0..1, of where the pictures differ: specks are left out, the rest is widened."""
     import cv2
 
     changed = (np.abs(frame - truth).max(-1) > 0.05).astype(np.uint8)

@@ -58,7 +58,10 @@ class RenderedScene(NamedTuple):
 
 
 def synthetic(form: FlareForm, blend: Blend, size: int = SCENE, flare: int = FLARE) -> RenderedScene:
-    """Return three lights in front of the workload's camera, with untrained flares."""
+    """Return three lights in front of the workload's camera, with untrained flares.
+
+    size: number of scene Gaussians. flare: number of flare Gaussians for each light.
+    """
     generator = torch.Generator().manual_seed(0)
     positions = torch.tensor([[0.6, -0.4, 3.0], [-1.0, 0.3, 4.0], [0.2, 0.8, 5.0]], dtype=torch.float64)
     query = QueryRange((-1, -1, -1), (1, 1, 1), (1, 1, 1))
@@ -67,7 +70,10 @@ def synthetic(form: FlareForm, blend: Blend, size: int = SCENE, flare: int = FLA
 
 
 def load_run(folder: Path) -> RenderedScene:
-    """Return a run's scene and flares, for its capture's first camera with all lights in front of it."""
+    """Return a run's scene and flares, for its capture's first camera with all lights in front of it.
+
+    A run with fewer than three lights has its first one again.
+    """
     from core.capture import Capture
 
     run = Run.open(folder)
@@ -89,7 +95,7 @@ def load_run(folder: Path) -> RenderedScene:
 def stages(
     rendered: RenderedScene, lights: int, width: int, height: int, kernel_set: str, device: str
 ) -> dict[str, Callable[[], object]]:
-    """Return each stage of a frame as a function to time."""
+    """Return each of STAGES of a frame as a function to time; the first `lights` lights have flares."""
     focal = rendered.focal * width
     camera = Camera(width, height, focal, focal, width / 2, height / 2, rendered.pose)
     pose = torch.from_numpy(camera.world_to_camera)
@@ -125,7 +131,7 @@ def stages(
 
 
 def measure(rendered: RenderedScene, kernel_set: str, device: str, rounds: int) -> str:
-    """Return the table of the stages of a frame."""
+    """Return the table of the stages of a frame; a frame's time is their sum, with one of the two flare rasters."""
     rows = []
     for width, height in SIZES:
         for lights in (1, 2, 3):

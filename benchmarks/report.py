@@ -17,13 +17,13 @@ RESULTS = ROOT / "docs" / "results"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Markdown; columns but the first to the right."""
+    """Return a Markdown table; all columns but the first are aligned to the right."""
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def milliseconds(seconds: float | None) -> str:
-    """Format with three digits; a dash for None."""
+    """Format seconds as milliseconds with three digits; None as a dash."""
     if seconds is None:
         return "–"
     value = seconds * 1e3
@@ -31,7 +31,7 @@ def milliseconds(seconds: float | None) -> str:
 
 
 def processor() -> str:
-    """Model, cores in use and widest vectors."""
+    """Return the processor's model, its widest vectors, and the cores that this process may use, as text."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
@@ -71,7 +71,10 @@ def write_section(path: Path, name: str, text: str) -> None:
 
 
 def plot_times(lines: dict[str, dict[str, float]], picture: Path) -> None:
-    """Draw times, ms, against the number of Gaussians, a line for each kernel set."""
+    """Draw times, ms, against the number of Gaussians, a line for each kernel set.
+
+    lines: seconds by number of Gaussians (as text), by kernel set.
+    """
     import matplotlib
 
     matplotlib.use("Agg")

@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def score(args: argparse.Namespace, name: str, seed: int) -> list[str]:
-    """Return the cells of one shot."""
+    """Return the cells of `COLUMNS` for one shot; the first three figures are flare, dB, and relative error."""
     folder = prepare(args.out, name, seed, args.tracks)
     capture = Capture.open(folder, need_cameras=False)
     mode: Any = "default" if args.plates == "exact" else "estimated"
@@ -91,7 +91,10 @@ def score(args: argparse.Namespace, name: str, seed: int) -> list[str]:
 
 
 def prepare(out: Path, name: str, seed: int, tracks: str) -> Path:
-    """Return the folder of a shot with lights and clean frames, made where they are missing."""
+    """Return the folder of a shot with lights and clean frames, made where they are missing.
+
+    tracks: "lights" for those that the command finds, "exact" for the exact ones.
+    """
     folder = out / f"{name}_{seed}_{tracks}"
     if not (folder / "split.json").is_file():
         subprocess.run([sys.executable, ROOT / "sample_scenes" / "render_shot.py", "--shot", name, "--seed", str(seed),
@@ -121,7 +124,11 @@ def _with_exact_plates(folder: Path) -> Capture:
 
 
 def _score_view(run: Run, capture: Capture, view: View, size: int, folder: Path, label: str) -> list[float] | None:
-    """Return the scores of a view; None where it shows no flare."""
+    """Return nine scores of a view; None where it shows no flare.
+
+    Three pairs of the flare's PSNR, dB, and its relative error in linear light: for no flare, for the network, for the
+    fit. Then the PSNR against the exact scene: of the frame, the network's clean frame and the fit's.
+    """
     camera = view.camera.scaled(size)
     frame = capture.frame(view, camera.size)
     truth, flare_truth = capture.truth_scene(view, camera.size), capture.truth_flare(view, camera.size)
@@ -149,7 +156,9 @@ def _read(path: Path, size: tuple[int, int]) -> Pixels:
 
 
 def _brightness_error(run: Run, capture: Capture, folder: Path) -> float:
-    """Return the largest error of the brightness of a light in the frame, over the shot; each light's scale is free.
+    """Return the largest error of the brightness of a light in the frame, over the shot.
+
+    Brightness has no unit, so each light's is scaled to the exact one by least squares.
 
     Lights are compared with the exact ones nearest to their paths.
     """

@@ -32,7 +32,10 @@ COLUMNS = ("size", "", "scene, dB", "composite", "linear flare", "its light")
 
 
 def scores(run: Run, capture: Capture, views: Sequence[View], width: int) -> tuple[float, float, float, float]:
-    """Return PSNR of scene, composite and linear flare, and the flare's mean light, averaged over the views."""
+    """Return PSNR of scene, composite and linear flare, dB, and the flare's mean light, averaged over the views.
+
+    width: at which they are rendered, pixels. Raises CaptureError without exact layers.
+    """
     rows = []
     for view in views:
         camera = view.camera.scaled(width)
@@ -52,7 +55,7 @@ def scores(run: Run, capture: Capture, views: Sequence[View], width: int) -> tup
 
 
 def compare_sizes(run: Run, capture: Capture, fitted_width: int, max_width: int) -> list[list[str]]:
-    """Return a row for each size, with the pixel grid and without."""
+    """Return two rows for each size up to `max_width`, with the pixel grid of the fit and without."""
     _, views = capture.split(run.settings.holdout)
     scene, flare = run.scene, run.flare
     assert flare is not None

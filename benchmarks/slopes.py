@@ -85,13 +85,14 @@ def frames(folder: Path, count: int, progress: Progress) -> None:
 
 def iterations(folder: Path, count: int, progress: Progress) -> None:
     """Fit for `count` iterations without clones, since the memory of clones is no leak."""
+    # Cloning would begin and end after the last iteration.
     never = {f"{part}.{end}": 10 * count for part in ("scene.classic", "scene.mcmc", "flare.density")
              for end in ("start", "stop")}
     growing(folder, count, progress, **never)
 
 
 def growing(folder: Path, count: int, progress: Progress, **changes: int) -> None:
-    """Fit for `count` iterations. changes: settings by name."""
+    """Fit for `count` iterations, in which Gaussians may be cloned. changes: settings by name."""
     capture = Capture.open(flared_capture(folder / "capture", count=7, dots=60))
     settings = override_settings(preset("draft", iterations=count), {"flare.count": 24, **changes})
     fit(capture, settings, folder / "run", progress)
@@ -109,7 +110,7 @@ def slope(x: list[float], y: list[float]) -> float:
 
 
 def measure(kind: str, count: int) -> int:
-    """Do the work of one kind, print its line, return the exit status."""
+    """Do the work of one kind and print its line; return the exit status, 1 where something grows too much."""
     torch.set_num_threads(1)
     progress = Sampling()
     with tempfile.TemporaryDirectory(prefix="slopes-") as folder:

@@ -24,11 +24,14 @@ from core.fit.trainer import Trainer
 
 SIGMAS = (0.0, 0.1, 0.25, 0.5, 1.0)
 NEAR = 0.012
+"""Distance of a snapped light from the exact one that counts as near, relative to the frame's width."""
 
 
 def errors(capture: Capture, places: ArrayLike) -> NDArray[np.float64]:
-    """Return (lights,), the mean distance in the frame, relative to its width, of these places (lights, 3) from the
-    lights."""
+    """Return (lights,): the mean distance of each light from its place in `places` (lights, 3), in widths of the frame.
+
+    Views in which one of the two is behind the camera are left out.
+    """
     distances = []
     for view in capture.views:
         pixels, depth = view.camera.project([light.xyz for light in capture.lights])

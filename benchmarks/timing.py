@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import torch
 
 MAX_CASE_SECONDS = 0.25
-"""Seconds up to which a short case is repeated in each turn."""
+"""Seconds that the repetitions of a short case take in each turn, at most."""
 
 
 def time_once(work: Callable[[], object]) -> float:
@@ -47,7 +47,7 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 def on_threads(count: int, work: Callable[[], object]) -> Callable[[], object]:
-    """Return the work with this number of threads."""
+    """Return a function that does the work with this number of threads of torch."""
 
     def run() -> None:
         with torch_threads(count):

@@ -31,10 +31,15 @@ from sample_scenes.render_shot import CACHE, make_shot
 from sample_scenes.shot_scenes import SHOTS
 
 MIN_VISIBLE = 0.3
+"""Visible share of a light's disc from which a frame is said to show it."""
 
 
 def measure(capture: Capture, truth: Light, visible: dict[str, float], light: TrackedLight) -> dict[str, Any]:
-    """Return the figures of one light. visible: share of its disc that is visible, by frame."""
+    """Return the figures of one light. truth: the exact one. visible: share of its disc that is visible, by frame.
+
+    Numbers of frames: visible, followed, keys, doubtful, doubtful_visible. Lists of errors: seen (pixels, in frames
+    that show the light), sure (pixels, where the place is not doubtful), brightness.
+    """
     size = np.array(capture.views[0].camera.size)
     errors, shown, brightness = {}, [], []
     for name, key in truth.keys.items():
@@ -56,7 +61,7 @@ def measure(capture: Capture, truth: Light, visible: dict[str, float], light: Tr
 
 
 def match(truth: Light, lights: list[TrackedLight]) -> TrackedLight | None:
-    """Return the light that is nearest to a true one in most of the frames that show it."""
+    """Return the light that is within 10 pixels of a true one in the most frames; None where none ever is."""
     def near(light: TrackedLight) -> int:
         return sum(float(np.linalg.norm(light.keys[name].place - truth.keys[name].xy)) < 10 for name in light.support)
 

@@ -56,7 +56,10 @@ class Truth:
 
 
 def camera_path(number: int, count: int) -> NDArray[np.float64]:
-    """A slow arc from left to right, rising and coming nearer, with a turn of the head; another than the capture's."""
+    """Return the pose (4, 4), world to camera, of frame `number` of `count` on a path that the capture does not have.
+
+    It is a slow arc from left to right, rising and coming nearer, with a pan.
+    """
     t = number / max(count - 1, 1)
     azimuth = np.radians(-32 + 64 * t)
     distance = 5.9 - 0.5 * t
@@ -66,7 +69,7 @@ def camera_path(number: int, count: int) -> NDArray[np.float64]:
 
 
 def move_world(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A rigid motion of the world (4, 4), and the pose in it."""
+    """Return a rigid motion of the world (4, 4), and the pose (4, 4), world to camera, in the moved world."""
     angle = np.radians(117.0)
     motion = np.eye(4)
     motion[:3, :3] = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
@@ -75,7 +78,10 @@ def move_world(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Truth]:
-    """Return frames with exact flares. Each light is hidden in some frames, and partly hidden in those next to them."""
+    """Return `count` frames with exact flares. world: "same" or "moved". size: width and height, pixels.
+
+    Each light is hidden in some frames, and partly hidden in those next to them.
+    """
     sources = sources_of(look)
     width, height = size
     truths = []
@@ -99,8 +105,10 @@ def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Tr
 
 
 def rendered_target(folder: Path, scene: Path, look: Look) -> tuple[list[Truth], Target]:
-    """The frames of a capture with exact layers, and the target that a transfer on to it has: its cameras, the
-    places of its lights, and its splats, but nothing that only the truth knows."""
+    """Return the frames of a capture with exact layers, and the capture as a target.
+
+    The target has its cameras, the places of its lights and the splats `scene`, but nothing that only the truth knows.
+    """
     capture = Capture.open(folder)
     shares = read_json(folder / "truth" / "visible_share.json", CaptureError)
     target_ = capture_target(capture, look, sources_of(look), scene=scene)
@@ -117,24 +125,25 @@ def rendered_target(folder: Path, scene: Path, look: Look) -> tuple[list[Truth],
 
 
 def sources_of(look: Look) -> dict[str, str]:
-    """The light of the look that was found nearest to where each of the desk's lights is."""
+    """Return the nearest light of the look for each of the desk's lights, by name."""
     return {light.name: min(look.lights, key=lambda source: float(np.linalg.norm(source.xyz - light.xyz))).name
             for light in DESK.lights}
 
 
 def background(camera: Camera) -> Pixels:
-    """A plain scene: dim, brighter to one side, scene-linear."""
+    """Return a plain scene (h, w, 3), scene-linear: dim, and brighter to the right."""
     ramp = np.linspace(0.02, 0.12, camera.width, dtype=np.float32)
     return np.broadcast_to(ramp[None, :, None] * np.array([1.0, 0.9, 0.8], np.float32),
                            (camera.height, camera.width, 3)).copy()
 
 
 def psnr(first: Pixels, second: Pixels) -> float:
-    """Against 1, dB."""
+    """Return the PSNR of two pictures whose white is 1, dB, at most 120."""
     return float(-10 * np.log10(max(float(((first - second) ** 2).mean()), 1e-12)))
 
 
 def main() -> None:
+    """Transfer the flare of the run to the target, and print and write the scores."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--world", choices=("same", "moved"), default="same")
@@ -198,7 +207,11 @@ def main() -> None:
 
 
 def is_inside(training: object, view: ViewOfLight, distance: float) -> bool:
-    """Return whether a light is in the range of the training views: of its position, up to mirroring, and distance."""
+    """Return whether a light is in the range of the training views.
+
+    training: of `Transfer.training_views`. The range is of the light's place in the frame, up to mirroring, and of its
+    distance from the camera.
+    """
     lights, distances = np.abs(training.lights), training.distances  # type: ignore[attr-defined]
     place = np.abs(view.light)
     return bool((place <= lights.max(0)).all() and distances.min() <= distance <= distances.max())

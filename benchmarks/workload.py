@@ -61,7 +61,7 @@ def intrinsics(width: int, height: int) -> Tensor:
 
 
 def flares(n: int, width: int, height: int, seed: int = 1) -> Flares:
-    """Return n flare Gaussians for a picture of this size."""
+    """Return n flare Gaussians for a picture of this size, pixels."""
     rng = np.random.default_rng(seed)
     covered = np.exp(rng.uniform(math.log(0.05), math.log(0.4), n)) * width * height
     opacities = np.exp(rng.uniform(math.log(0.006), math.log(0.03), n))
@@ -70,6 +70,7 @@ def flares(n: int, width: int, height: int, seed: int = 1) -> Flares:
     theta = rng.uniform(0, math.pi, n)
     c, s = np.cos(theta), np.sin(theta)
     a, b = variance * stretch, variance / stretch
+    # 0.3 px² is the low-pass filter of 3DGS.
     covariances = np.stack([c * c * a + s * s * b + 0.3, c * s * (a - b), s * s * a + c * c * b + 0.3], 1)
     centres = np.stack([rng.uniform(0.1, 0.9, n) * width, rng.uniform(0.1, 0.9, n) * height], 1)
     values = (centres, covariances, opacities, rng.uniform(0, 1, (n, 3)))

@@ -35,7 +35,10 @@ class PictureIndex:
             self._folded.setdefault(canonical_name(name).casefold(), name)
 
     def find(self, frame: Path | str) -> str | None:
-        """Return the name below the folder of a frame's picture, or None."""
+        """Return the name below the folder of a frame's picture, or None.
+
+        Its own name is tried first, then other suffixes, then the same without regard to case.
+        """
         name = canonical_name(frame)
         stem = PurePosixPath(name)
         keys = [name, *(str(stem.with_suffix(suffix)) for suffix in _SUFFIXES if stem.name)]
@@ -58,7 +61,7 @@ def matching_pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         return matches
     pictures = PictureIndex(layer)
     for name in names:
-        safe_join(layer, name, CaptureError)
+        safe_join(layer, name, CaptureError)  # raises for a name that leads out
         match = pictures.find(name)
         if match is not None:
             matches[name] = safe_join(layer, match, CaptureError)

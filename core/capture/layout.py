@@ -78,6 +78,7 @@ def count_images(model: Path) -> int:
         if binary is not None and binary.is_file():
             with open_regular(binary) as stream:
                 number = int(struct.unpack("<Q", stream.read(8))[0])
+            # More images than the file has room for: it is damaged.
             return number if number * _MIN_IMAGE_BYTES < binary.stat().st_size else 0
         text = find_entry(model, "images.txt")
         return 0 if text is None else len(image_lines(read_text(text, MAX_MODEL_BYTES, UTF8_SIG).splitlines()))

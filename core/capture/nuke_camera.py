@@ -198,7 +198,7 @@ class _Node:
         return self._curves(name, 1)[0] if name in self.knobs else {0: default}
 
     def _curves(self, name: str, number: int | None = None) -> list[Curve]:
-        """Return the curves of a knob; zeros where it is not in the script."""
+        """Return the curves of a knob; zeros where it is not in the script. number: of its values; None for any."""
         if name not in self.knobs and number is not None:
             return [{0: 0.0}] * number
         curves = [self._curve(name, word) for word in _words(self.knobs[name])]

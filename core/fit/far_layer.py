@@ -95,7 +95,7 @@ def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) ->
     if patches is None:
         return None
     distances = np.linalg.norm(capture.points.xyz - _centre(cameras), axis=1)
-    focal = max(frames.camera(view).focal_length for view in sampled)
+    focal = max(frames.camera(view).focal_length for view in sampled)  # the longest lens shows the most parallax
     radius = max(RADIUS_FACTOR * float(np.quantile(distances, FARTHEST_QUANTILE)), extent * focal / MAX_PARALLAX_PX)
     sphere = FarSphere(tuple(map(float, _centre(cameras))), radius)
     return FarLayer(sphere, _far_points(sphere, patches, sampled, frames))

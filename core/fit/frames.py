@@ -78,7 +78,8 @@ class Frames:
         self.capture = capture
         self.display_white = display_white
         self._width = width
-        self._codes = 65535 / display_white  # 16 bit keeps the smoothness of linear footage at half the size of float
+        # Codes per display value: 16 bit keep the smoothness of linear footage at half the size of float.
+        self._codes = 65535 / display_white
         self.cache = PictureCache(memory)
         self.reference = ("" if frames_only else "removed" if capture.has_removed else
                           "truth" if truth and capture.has_truth else "")

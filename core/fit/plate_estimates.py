@@ -97,6 +97,7 @@ class PlateEstimator:
         # A flare only adds light, so no plate is brighter than its frame.
         lowest = srgb_from_linear(np.minimum(np.minimum(gain * background, frame), own).clip(0))
         change = -_small_parts(shot.plates[name] - lowest)  # 0 or less: the plate only becomes darker
+        # A change that is very large is no missed flare.
         confidence = confidence / (1 + (change.min(-1, keepdims=True) / MAX_MISSED_FLARE) ** 4)
         return np.asarray(shot.plates[name] + confidence * change, np.float32)
 

@@ -83,6 +83,7 @@ class Trainer(FlareTrainer):
             exposures = metering.measure_exposures(capture, self.frames, progress) if is_measured else {}
         self.exposures = exposures
         capture = capture.with_exposures(exposures)
+        # The cameras name their frames only where lights have a place or brightness by frame.
         self.capture = capture = capture.with_frame_names() if has_frame_lights(capture) else capture
         self.views, _ = capture.split(settings.holdout)
         self.extent = capture.extent

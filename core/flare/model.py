@@ -115,6 +115,7 @@ class LightFlare(nn.Module):
         change = self.network(rows["positions"], latent, features)
 
         def deformed(name: str) -> Tensor:
+            """Return canonical rows plus the network's offsets for this view."""
             return rows[name] + change[name]
 
         light = view.light

@@ -95,6 +95,7 @@ def parse_value(kind: Any, value: Any) -> Any:
             if not math.isfinite(value):
                 raise ValueError("it must be a finite number")
             return float(value)
+        # Exact types, since to Python True is an int.
         if type(value) is option or (option is type(None) and value is None):
             return value
     raise ValueError(f"{value!r} is not {_type_name(kind)}")

@@ -83,7 +83,8 @@ def _space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> Colou
 
 
 def _invert(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) -> Pixels:
-    """Return the values 0..1 at which `curve` gives `light`: the nearest by its samples, moved by one secant step.
+    """Return the values 0..1 at which `curve` gives `light`: interpolated in its samples, then moved by one
+    secant step.
 
     decoded: the curve's samples at `ramp`, never decreasing. They alone are coarse where the curve is flat or steep.
     """
@@ -125,6 +126,7 @@ def _description(tags: dict[bytes, bytes]) -> str:
 
 
 def _parse_xyz(data: bytes) -> tuple[float, float, float]:
+    """Return X, Y, Z of a tag of type `XYZ`, in fixed-point numbers of 16.16 bits. Raises UnreadableProfile."""
     if len(data) < 20:
         raise UnreadableProfile("is damaged")
     x, y, z = struct.unpack(">3i", data[8:20])
@@ -139,7 +141,7 @@ def _parse_curve(data: bytes) -> Table:
         if len(values) != count:
             raise UnreadableProfile("is damaged")
         if count == 0:
-            return lambda x: np.asarray(x, np.float32)
+            return lambda x: np.asarray(x, np.float32)  # linear
         if count == 1:
             return _power(float(values[0]) / 256)  # the exponent, with 8 bits behind the point
         table, places = values.astype(np.float64) / 65535, np.linspace(0, 1, count)
@@ -147,13 +149,14 @@ def _parse_curve(data: bytes) -> Table:
     if data[:4] == b"para" and len(data) >= 12:
         kind = int.from_bytes(data[8:10], "big")
         if kind <= 4:
-            length = (1, 3, 4, 5, 7)[kind]
+            length = (1, 3, 4, 5, 7)[kind]  # number of parameters, fixed-point of 16.16 bits
             if len(data) >= 12 + 4 * length:
                 return _parametric(kind, [n / 65536 for n in struct.unpack(f">{length}i", data[12:12 + 4 * length])])
     raise UnreadableProfile("is damaged")
 
 
 def _power(gamma: float) -> Table:
+    """Return the curve x**gamma, 0 below 0. Raises UnreadableProfile for an exponent that no picture has."""
     if not 0.1 <= gamma <= 10:
         raise UnreadableProfile("has a curve that no picture has")
     return lambda x: np.power(np.maximum(x, 0), np.float32(gamma)).astype(np.float32)
@@ -165,7 +168,7 @@ def _parametric(kind: int, numbers: list[float]) -> Table:
     kind: the number of the function, 0..4. numbers: its parameters, in the order g, a, b, c, d, e, f.
     """
     g, a, b, c, d, e, f = (numbers + [0.0] * 7)[:7]
-    power = _power(g)  # raises where no picture has such an exponent
+    power = _power(g)  # checks the exponent too
     if kind == 0:
         return power
     if a == 0:

@@ -79,7 +79,8 @@ def file_kind(path: Path) -> Kind:
 
 
 def describe(path: Path, kind: Kind) -> Description:
-    """Read the header of a file of one of this module's formats. Raises FrameError."""
+    """Read the header of a file of one of this module's formats. Width and height are those of the pixels that
+    `decode_foreign` returns. Raises FrameError."""
     if kind in OIIO_KINDS or kind == "tiff":
         return _describe_by_oiio(path, kind)
     if kind == "raw":
@@ -121,7 +122,7 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
         if getattr(picture, "n_frames", 1) > 1:
             raise FrameError(f"{path} has {picture.n_frames} frames; export them as files of their own.")
         orientation = _avif_orientation(picture) if kind == "avif" else 1
-        frame = _av1_frame(path) if kind == "avif" and picture.mode == "RGB" else None
+        frame = _av1_frame(path) if kind == "avif" and picture.mode == "RGB" else None  # without alpha
         if frame is not None and frame.colour.bits > 8 and (frame.raw.width, frame.raw.height) == picture.size:
             return _bgr(apply_orientation(frame.stored_codes(), orientation))  # Pillow would round to 8 bits
         is_transparent = picture.has_transparency_data

@@ -43,7 +43,10 @@ def views_of_file(path: Path) -> list[View]:
 
 
 def views_of_parts(parts: _Parts) -> list[View]:
-    """Return the views of an EXR's parts, that of the main part first; empty for a picture of one view."""
+    """Return the views of an EXR's parts, that of the main part first; empty for a picture of one view.
+
+    They are the views inside the main part, else the parts that name their view.
+    """
     main = main_part([(number, names) for number, (_, names) in enumerate(parts)])
     if inside := stereo_views(*parts[main]):
         return [view._replace(part=main) for view in inside]

@@ -59,7 +59,7 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
     if name == "tiff":
         spec.attribute("planarconfig", "contig")
         compression = spec.get_string_attribute("compression")
-        if compression in ("jpeg", "webp", "lerc"):  # with loss, or without but not in every build
+        if compression in ("jpeg", "webp", "lerc"):  # which may lose
             spec.attribute("compression", "zip")
     with atomic_path(path) as temporary:
         output = oiio.ImageOutput.create(name)

@@ -45,6 +45,7 @@ _PLACEMENT = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio
 _UNWRITTEN = ("heif", "avif", "jxl", "jp2", "gif", "psd")
 """Formats whose clean plates are PNG."""
 _JPEG_QUALITY = 97
+"""OpenCV's quality of JPEG, up to 100."""
 _JPEGS, _TIFFS = JPEG_SUFFIXES, (".tif", ".tiff")
 _DEPTHS: dict[str, tuple[type, ...]] = {".png": (np.uint8, np.uint16), **dict.fromkeys(_JPEGS, (np.uint8,))}
 """Pixel types by suffix, for formats that cannot hold every plate; OpenCV would convert others to 8 bit silently."""

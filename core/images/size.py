@@ -31,6 +31,7 @@ def picture_size(path: Path | str) -> tuple[int, int]:
             size = _size_from_header(stream)
         if not kind and holds_video(head):
             raise FrameError(f"{path} holds a video, not a picture; give it the suffix of its format, such as .mp4.")
+        # `_size_from_header` reads neither BigTIFF nor these formats, of raw files only the size of a preview.
         if is_big or kind not in ("png", "jpeg", "tiff", "exr", ""):
             size = describe(path, kind)[:2]
     except OSError as problem:

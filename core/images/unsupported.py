@@ -69,8 +69,9 @@ def unsupported_reason(path: Path) -> str:
 
 
 def needs_openimageio(path: Path) -> bool:
-    """True for a TIFF that OpenCV decodes as something else, or not at all: BigTIFF, 16 bit floats, 16 bit planes, 0
-    for white, grey with alpha, other depths than 8 and 16 bits, and compressions that it is built without."""
+    """True for a TIFF that OpenCV decodes as something else, or not at all: BigTIFF; 16 bit floats; planes, or 0 for
+    white, of more than 8 bits; grey with alpha; depths that are none of 1, 8, 16, 32 and 64 bits; and compressions that
+    it is built without."""
     with open_regular(path) as stream:
         if stream.read(4) in tiff.BIG_TIFF:
             return True

@@ -216,7 +216,7 @@ class Video:
             self._container = None
 
     def __iter__(self) -> Iterator[VideoFrame]:
-        """Yield the frames from that of `seek`, else from the first one; then `problems` is complete."""
+        """Yield the frames from that of `seek`, else from the first one. `problems` is complete after the last one."""
         number, start = self._start, self._start
         self._start, self.problems = 0, []
         damaged, colours = list[int](), dict[tuple[int, ...], VideoColour]()

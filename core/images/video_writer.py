@@ -135,6 +135,7 @@ def rewrite_video(source: Path, target: Path, codec: str, change: Change, *,
 
 
 def _copy_tags(tags: Any, target: Any, skipped: tuple[str, ...]) -> None:
+    """Copy tags, but those whose names start with one of `skipped`."""
     target.update({name: value for name, value in tags.items() if not name.lower().startswith(skipped)})
 
 
@@ -144,7 +145,8 @@ def _copy_chapters(source: Any, target: Any) -> None:
 
 
 def _timecode(container: Any, stream: Any) -> str | None:
-    """Return the timecode of the first frame, wherever a container keeps it."""
+    """Return the timecode of the first frame: a tag of the stream, of the container, or of a stream of its own; None
+    for none."""
     for tags in (stream.metadata, container.metadata, *(other.metadata for other in container.streams)):
         for name, value in tags.items():
             if name.lower() == "timecode":

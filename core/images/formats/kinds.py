@@ -39,7 +39,7 @@ _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b
 def kind_of(head: bytes, suffix: str) -> Kind:
     """Return the format of a file by its first HEAD_BYTES, and by its suffix where a format has no signature."""
     named = SUFFIXES.get(suffix.lower(), "")
-    if head[:4] in _TIFFS or named == "raw":
+    if head[:4] in _TIFFS or named == "raw":  # most raw files are TIFFs by their first bytes
         return "raw" if named == "raw" else "tiff"
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
         return "webp"

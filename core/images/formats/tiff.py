@@ -104,7 +104,7 @@ def read_tags(stream: BinaryIO, numbers: Container[int], at: int | None = None) 
         values = np.dtype(types[kind]).newbyteorder(layout.order)
         length = count * values.itemsize * (2 if kind in _RATIONALS else 1)
         raw = entry[layout.place:][:length]
-        if length > layout.entry - layout.place:
+        if length > layout.entry - layout.place:  # then the field holds the offset of the values
             start = layout.number(entry[layout.place:])
             if start + length > stream.seek(0, io.SEEK_END):  # reading asks for all the memory that is claimed
                 continue
@@ -129,6 +129,7 @@ def page_count(stream: BinaryIO) -> int:
     """Count the pages, without the thumbnails that some programs add."""
     count = 0
     for layout, entries in _directories(stream):
+        # The numbers of 32 bits of the tag SUBFILE, of which a page has one at most.
         kinds = [layout.number(entry[layout.place:], "I") for entry in entries if layout.number(entry, "H") == SUBFILE]
         count += not any(kind & 1 for kind in kinds)  # bit 0: a reduced copy of another page
     return count

@@ -166,6 +166,7 @@ def _is_between(numbers: Sequence[int], ranges: Sequence[range]) -> bool:
 
 
 def _no_frames(frames: Sequence[NumberedFrame], text: str) -> SettingsError:
+    """Return the error for a list `text` of which no frame exists."""
     numbers = [frame.number for frame in frames]
     existing = f"there are {min(numbers)} to {max(numbers)}" if frames else "there are none"
     return SettingsError(f"None of the frames {text!r} exists; {existing}.")

@@ -101,6 +101,7 @@ class HashGrid:
         return np.asarray((self._row_values(rows) * weights[..., None]).sum(1).reshape(-1), np.float32)
 
     def _row_values(self, rows: NDArray[np.int64]) -> Floats:
+        """Return the values (..., features) of table rows (...); 0 for those that are not stored."""
         values = np.zeros((*rows.shape, self._values.shape[1]), np.float32)
         if len(self._rows):
             index = np.minimum(np.searchsorted(self._rows, rows), len(self._rows) - 1)
@@ -202,10 +203,11 @@ class Network:
         return {name: every[:, a:b] for name, a, b in zip(self._heads, edges[:-1], edges[1:], strict=True)}
 
     def _encode_gaussians(self, encoded: Floats) -> Floats:
+        """Return the contribution of encoded Gaussians (n, d) to the first layer, (n, width)."""
         return np.asarray(encoded @ self._t["network.gaussian_layer.weight"].T, np.float32)
 
     def _concatenated_offsets(self, gaussian_features: Floats, features: Floats) -> Floats:
-        """Return the offsets of all heads, (n, sum of their widths)."""
+        """Return the offsets of all heads, (n, sum of their widths); see `_encode_gaussians` and `view_features`."""
         x = gaussian_features + self._linear("network.view_layer", features[None])
         np.maximum(x, 0, out=x)
         for name in self._hidden:
@@ -219,6 +221,7 @@ class Network:
         return self._linear("network.correction.2", hidden)[0]
 
     def _linear(self, name: str, x: Floats) -> Floats:
+        """Return x (n, inputs) after the linear layer of this name, (n, outputs)."""
         result = x @ self._t[f"{name}.weight"].T
         result += self._t[f"{name}.bias"]
         return np.asarray(result, np.float32)

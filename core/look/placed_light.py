@@ -166,7 +166,7 @@ def multiply(gaussians: PlaneGaussians, factor: ArrayLike, blend: Blend) -> Plan
     values = np.asarray(factor, np.float64)
     if (values == 1).all():
         return gaussians
-    strongest = float(values.max())  # the tint's largest channel is 1, as `apply_colour` needs for the blend "over"
+    strongest = float(values.max())  # not in the tint, so that with the blend "over" a factor below 1 dims opacities
     red, green, blue = (values / strongest if strongest > 0 else values).tolist()
     return apply_colour(gaussians, Edit(intensity=strongest, tint=(red, green, blue)), blend)
 

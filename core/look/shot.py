@@ -206,6 +206,7 @@ def _read_light(entry: Mapping[str, Any]) -> PlacedLight:
 
 
 def _to_int(value: Any) -> int:
+    """Return a whole number of JSON. Raises TypeError or ValueError for anything else."""
     number = _to_float(value)
     if number != int(number):
         raise ValueError(f"{value!r} is no whole number")
@@ -213,6 +214,7 @@ def _to_int(value: Any) -> int:
 
 
 def _to_float(value: Any) -> float:
+    """Return a finite number of JSON. Raises TypeError or ValueError for anything else, True and False included."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{value!r:.100} is no number")
     number = float(value)

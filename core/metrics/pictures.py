@@ -54,6 +54,7 @@ def _masked_difference(image: Array, target: Array, mask: Array | None) -> NDArr
 
 
 def _check_same_size(image: Array, target: Array) -> None:
+    """Raise SettingsError if two pictures have different sizes."""
     if image.shape != target.shape:
         raise SettingsError(f"Pictures of sizes {image.shape} and {target.shape} cannot be compared; "
                             f"resize one of them.")

@@ -161,7 +161,7 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
                 ramp = min(max(ramp, MIN_EDGE), MAX_EDGE)
                 slope1, slope2 = (y2 - y0) / area, (y0 - y1) / area
                 for y in range(max(0, math.ceil(low_y - 0.5)), min(height - 1, math.floor(high_y - 0.5)) + 1):
-                    # Barycentric coordinates run linearly along a row: b = start + slope (u - x0).
+                    # Barycentric coordinates run linearly along a row: b = start + slope u, u and v from (x0, y0).
                     v = y + 0.5 - y0
                     start1, start2 = (x0 - x2) * v / area, (x1 - x0) * v / area
                     left, right = _non_negative_span(start1, slope1, low_x - x0, high_x - x0)

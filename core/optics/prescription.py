@@ -127,7 +127,7 @@ def trace_ghost_pairs(lens: Prescription) -> list[GhostPath]:
     """Return every pair of glass surfaces that reflects, with the paraxial system of each wavelength."""
     focus = lens.back_focus()
     indices_by_channel = [lens.indices(wavelength) for wavelength in CHANNEL_WAVELENGTHS]
-    # The stop and other planes in one medium reflect nothing.
+    # The stop, and surfaces between equal indices, reflect nothing.
     refracting = [k for k in range(len(lens.index)) if abs(lens.index[k] - _index_before(lens.index, k)) > 1e-3]
     paths = []
     for i in refracting:

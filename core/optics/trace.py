@@ -108,7 +108,7 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
         before = index[at - 1] if at > 0 else 1.0
         after = index[at]
         n0, n2 = (before, after) if step > 0 else (after, before)
-        # Normal against the ray.
+        # The normal, turned along the ray.
         nx, ny, nz = -c * px, -c * py, 1.0 - c * (pz - z0)
         cosine = nx * dx + ny * dy + nz * dz
         if cosine < 0.0:

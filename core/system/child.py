@@ -114,6 +114,7 @@ class _ChildProgress(Progress):
         self._pass_on("check")
 
     def _pass_on(self, name: str, *args: Any, **figures: float) -> None:
+        """Have the parent call the method `name` of its progress. Raises Cancelled where the parent says to stop."""
         with self._lock:
             _send(self._to_parent, ("progress", name, args, figures))
             if not self._replies.get():

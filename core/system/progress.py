@@ -167,6 +167,7 @@ class _LineProgress:
         self._figures = "".join(f"  {name} {value}" for name, value in figures.items())
 
     def update(self, steps: int) -> None:
+        """Count steps, and print a line if one is due."""
         self._done += steps
         if self._done >= self._total or time.monotonic() - self._reported > 10:
             self._reported = time.monotonic()

@@ -140,6 +140,7 @@ def _open_regular(name: str, flags: int) -> int:
 
 
 def _check_mode(path: Path | str, mode: int) -> None:
+    """Raise SpecialFileError for a `mode` (of stat) of a pipe, a socket or a device."""
     for is_kind, kind in _KINDS:
         if is_kind(mode):
             raise SpecialFileError(errno.EINVAL, f"it is {kind}, not a file", str(path))

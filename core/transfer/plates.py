@@ -89,7 +89,7 @@ class ColouredPlate:
             grown = alpha_with_light(alpha, lit)
             top = np.float32(np.iinfo(stored_alpha.dtype).max if stored_alpha.dtype.kind == "u" else 1)
             if stored_alpha.dtype.kind == "u":  # the colours belong to the alpha as it is stored
-                grown = np.ceil(grown * top - np.float32(1e-3)) / top  # rounding must not cost a code
+                grown = np.ceil(grown * top - np.float32(1e-3)) / top  # a rounding error must not add a code
             values = self.space.from_linear(lit / np.maximum(grown, 1e-6)[..., None])
             if self.plate.straight_alpha is None:  # the file's colours are multiplied by it
                 values = values * grown[..., None]

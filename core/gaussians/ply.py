@@ -175,7 +175,7 @@ def _header(path: Path, head: bytes) -> _Header:
         raise FlareFileError(f"{path} is not a PLY file of Gaussians; export the scene as one.")
     near, display_white, pixel_grid = NEAR, 1.0, None
     far: FarSphere | None = None
-    for words in parsed.comments:
+    for words in parsed.comments:  # a comment that is no number, or out of range, leaves the default
         with contextlib.suppress(ValueError):
             match words:
                 case [word, number] if word == NEAR_COMMENT:

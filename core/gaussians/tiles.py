@@ -121,6 +121,7 @@ class _DrawTiles(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, lists: TileLists, blend: Blend, median: bool, *parts: Tensor | None) -> Any:
+        """Return pictures and median rows of the tiles; parts: the fields of `WhitenedGaussians`."""
         ctx.lists, ctx.blend = lists, blend
         gaussians = _append_empty(WhitenedGaussians(*parts))  # type: ignore[arg-type]
         n, channels = len(gaussians.values) - 1, gaussians.values.shape[1] - 1
@@ -148,6 +149,7 @@ class _DrawTiles(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, _: Tensor) -> Any:
+        """Return the gradients of the parts, from that of the pictures; see the head of `tiled`."""
         picture, *parts = ctx.saved_tensors
         lists: TileLists = ctx.lists
         gaussians = _append_empty(WhitenedGaussians(*parts))

@@ -176,6 +176,7 @@ class _DrawTiles(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, lists: TileLists, blend: Blend, *parts: Tensor | None) -> Any:
+        """Return pictures and median rows of the tiles; parts: the fields of `WhitenedGaussians`."""
         ctx.lists, ctx.blend = lists, blend
         _, values, _, _ = parts
         assert values is not None
@@ -190,6 +191,7 @@ class _DrawTiles(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, _: Tensor) -> Any:
+        """Return the gradients of the parts, from that of the pictures."""
         picture, *parts = ctx.saved_tensors
         places, values, rings, arcs = parts
         channels = values.shape[1] - 1

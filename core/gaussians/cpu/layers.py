@@ -162,6 +162,7 @@ class _Upsample(torch.autograd.Function):
     def forward(  # type: ignore[override]
                 ctx: Any, colour: Tensor, t: Tensor, factor: int, width: int, height: int
     ) -> tuple[Tensor, Tensor]:
+        """Return colour (height, width, 3) and transmittance (height, width); see `upsample_layer` of `..layers`."""
         small_height, small_width = t.shape
         ctx.sizes = small_width, small_height, factor, width, height
         ctx.set_materialize_grads(False)
@@ -175,6 +176,7 @@ class _Upsample(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, d_large: Tensor | None, d_large_t: Tensor | None) -> Any:  # type: ignore[override]
+        """Return the gradients of the small colour and transmittance; None arrives for a result that was not used."""
         small_width, small_height, factor, width, height = ctx.sizes
         d_colour, d_colour_flat = buffers.tensor_and_array(small_height, small_width, 3)
         d_t, d_t_flat = buffers.tensor_and_array(small_height, small_width)

@@ -311,6 +311,7 @@ _target_moments = _TargetMoments()
 class _L1Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, lam: float) -> Tensor:  # type: ignore[override]
+        """Return the loss, a scalar; its gradient by the image is computed at once and kept for `backward`."""
         height, width, _ = image.shape
         mu_y, s_y = _target_moments(target)
         value, gradient = np.empty(1, np.float32), EMPTY

@@ -4,12 +4,12 @@
 One vector is a row of a tile. For the rows of an entry, with e = opacity 2^(A u² + D d_y²) (see `projection`):
 
     alpha = e where e >= 1/255 and T >= 1e-4, else 0
-    w = T alpha,   C = C + w colour,   T = T - w
+    w = T alpha,   picture = picture + w colour,   T = T - w
 
 From row to row e follows a recurrence instead of an exponential: e' = e r, r' = r + r step, where
-r = 2^(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(2 C) - 1, which is small and exact for large Gaussians. The
-recurrence restarts after `run` rows, over which e changes by 40 powers of two, so that neither underflow nor rounding
-spoils it. Where runs would be too short (needles), e is computed for each row.
+r = 2^(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(2 (A k² + D)) - 1, which is small and exact for large Gaussians.
+The recurrence restarts after `run` rows, over which e changes by 40 powers of two, so that neither underflow nor
+rounding spoils it. Where runs would be too short (needles), e is computed for each row.
 
 Arguments of the functions here and in `raster_backward` and `flare`: records, at (or record): the records, and the
 offset of the Gaussian's; left, top: first pixel column and row of the tile; first, end: the rows of the tile from

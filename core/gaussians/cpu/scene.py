@@ -40,6 +40,10 @@ class _Rasterize(torch.autograd.Function):
         world_to_camera: Tensor, intrinsics: Tensor, background: Tensor, frame: _RasterOptions,
         centre_gradients: Tensor,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
+        """Return colour, alpha, mean depth and median depth, the last two None without depth.
+
+        Puts centres and radii into frame.projected, and zeros into centre_gradients (n, 2). `slopes` are written for
+        the backward pass alone."""
         n, w, h = len(means), frame.width, frame.height
         camera = np.empty(projection.CAMERA, np.float32)
         projection.pack_camera(
@@ -82,6 +86,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None, *_: Any) -> Any:
+        """Return the gradients of all inputs, or step the parameters by them if steps are pending (`stepping`)."""
         means, quats, scales, opacities, sh, _, alpha, _ = ctx.saved_tensors  # raises if they were changed in place
         frame, bins = ctx.frame, ctx.bins
         records, camera, slopes, ends, behind, inputs, pictures = ctx.arrays

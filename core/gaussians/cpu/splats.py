@@ -23,6 +23,9 @@ class _Splat(torch.autograd.Function):
         ctx: Any, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
         rings: Tensor | None, arcs: Tensor | None, add: bool, grid: TileGrid,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Return colour (h, w, 3) and alpha (h, w), over black; arcs: (n, 3) b and m.
+
+        Rings, arcs and the blend "add" have kernels of their own; other Gaussians use the scene's."""
         n, h, w = len(centres), grid.height, grid.width
         shaped = rings is not None or arcs is not None
         inputs = [flat(t) for t in (centres, covariances, opacities, colours)]
@@ -55,6 +58,7 @@ class _Splat(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None) -> Any:
+        """Return the gradients of the inputs; None arrives for a result that was not used."""
         *inputs, image, alpha = ctx.saved_tensors
         add, grid, bins, ends, records, shapes = ctx.state
         covariances, opacities, colours, rings, arcs = inputs[1:]

@@ -49,10 +49,11 @@ class _Worker:
     """A thread that waits for calls and makes them."""
 
     def __init__(self, counters: Array) -> None:
+        """counters: the two of the pool, one a row."""
         self._counters = counters
         self._call: _Call | None = None
-        self._number = 0
-        self._done = np.zeros(1, np.int64)
+        self._number = 0  # of the latest call
+        self._done = np.zeros(1, np.int64)  # number of the latest call that is done; the caller spins on it
         self._error: BaseException | None = None
         self._is_asleep = False
         self._state = threading.Lock()  # guards _call and _is_asleep

@@ -155,7 +155,7 @@ def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
             lpips: Perceptual | None) -> Scores:
     """Return the scores of a picture against the truth; None for one that is infinite or cannot be computed.
 
-    mask: display values (height, width, 3), white where the flare is; None for no masked score.
+    mask: display values (height, width, 3), above 0.5 in a channel where masked_psnr counts; None for no such score.
     """
     small = min(picture.shape[:2]) < 11  # the side of SSIM's window
     scores: Scores = {"psnr": psnr(picture, truth), "ssim": None if small else ssim(picture, truth),

@@ -48,6 +48,7 @@ KIND = "fit-flare diffusion removal"
 _UNET_LAYERS = ["to_q", "to_k", "to_v", "to_out.0", "conv1", "conv2", "conv_shortcut", "conv_in", "conv_out",
                 "proj_in", "proj_out", "ff.net.0.proj", "ff.net.2", "downsamplers.0.conv", "upsamplers.0.conv"]
 _VAE_LAYERS = r".*(encoder|decoder)\..*(conv1|conv2|conv_shortcut|conv_in|to_q|to_k|to_v|to_out\.0|samplers\.0\.conv)$"
+"""Layers with LoRAs: ends of names in the UNet; a pattern for whole names in the VAE."""
 
 
 def check_packages() -> None:
@@ -68,7 +69,8 @@ class DiffusionRemoval(nn.Module):
     prompt: Tensor
 
     def __init__(self, base: Path | str, rank: int = RANK) -> None:
-        """Raises EngineError where packages are missing, RunError where the base cannot be read."""
+        """base: folder of the base model, or its name in the local cache. rank: of the LoRAs. Raises EngineError where
+        packages are missing, RunError where the base cannot be read."""
         super().__init__()
         check_packages()
         from diffusers import AutoencoderKL, DDPMScheduler, UNet2DConditionModel

@@ -34,8 +34,8 @@ WRAP_SHARE = 8
 def fill_hidden(plate: Plate) -> Plate:
     """Return the plate opaque, its hidden parts filled with a continuation of the colours beside them.
 
-    A plate without straight alpha below 1 is returned as it is: premultiplied codes hold no hidden colours.
-    The colours that a file stores under alpha 0 are arbitrary, and black there would look like a vignette.
+    A plate without straight alpha below 1 is returned as it is: premultiplied codes hold no hidden colours. Those that
+    a file stores under straight alpha 0 are arbitrary, and black there would look like a vignette.
     """
     import cv2
 

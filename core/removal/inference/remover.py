@@ -138,7 +138,7 @@ class Remover:
         """
         opaque, margin = fill_hidden(plate), wrap_margin(plate)
         network_plate, gain = to_network_plate(opaque)
-        wrapped = wrap_plate(network_plate, margin)
+        wrapped = wrap_plate(network_plate, margin)  # the plate itself where nothing had to be changed
         prediction = prediction or self.predict(self._scale_to_input(wrapped))
         maps = fit_guided_filter(prediction.display, self.linear_flare(prediction, inside_matte=matte is not None))
         codes = wrapped.codes.copy()
@@ -182,7 +182,7 @@ class Remover:
         codes, encoding, max_code = plate.codes[plate.picture_area.slices], plate.encoding, plate.max_code
         height, width = codes.shape[:2]
         new_width, new_height = input_size(width, height, self.working_size)
-        if new_width > width or new_height > height:
+        if new_width > width or new_height > height:  # a picture smaller than the working size is enlarged
             light = np.clip(to_linear(codes, encoding, max_code), 0, 1)
             scaled = cv2.resize(light, (new_width, new_height), interpolation=cv2.INTER_LINEAR)
         else:

@@ -75,6 +75,7 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
         return digest_inputs(repr((fit_digest, camera.numbers, lights)), [frame.source])
 
     def clean(frame: CleanFrame) -> PreparedResults:
+        """Compute a frame's results; frames with a dim flare are counted when they are written."""
         plate, codes, flare, gains = _clean_view(renderer, capture, views_by_name[frame.name], above_white)
 
         def write() -> None:

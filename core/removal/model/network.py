@@ -123,6 +123,7 @@ class Attention(nn.Module):
         nn.init.zeros_(self.proj.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return features x (n, width, rows, columns) plus what each position gathers from all others."""
         n, width, rows, columns = x.shape
         position = _position_channels(x, rows, columns)
         encoding = [position, position[:2] / (position[2:].sqrt() + 0.1)]  # with the direction from the centre
@@ -160,6 +161,7 @@ class RemovalNetwork(nn.Module):
 
     def __init__(self, widths: tuple[int, ...], blocks: tuple[int, ...], attention: tuple[int, ...]) -> None:
         super().__init__()
+        # The finest level has the frame's own pixels beside what every level has.
         channels = (3 * SHUFFLE_FACTOR**2 + INPUT_CHANNELS, *(INPUT_CHANNELS for _ in widths[1:]))
         self.input_convs = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1)
                                          for a, b in zip(channels, widths, strict=True))
@@ -172,6 +174,7 @@ class RemovalNetwork(nn.Module):
             nn.ModuleList(Attention(width, self.HEADS, POSITION_OCTAVES) for _ in range(count))
             for width, count in zip(widths[-2:], attention, strict=True))
         self.attention = nn.ModuleList(Attention(width, self.HEADS) for width in widths[-2:])
+        # For each pixel of a position: the flare of three channels, and the share of each that is not glow.
         self.head = nn.Conv2d(widths[0], 6 * SHUFFLE_FACTOR**2, 1)
         nn.init.normal_(self.head.weight, std=1e-3)
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]

@@ -157,7 +157,7 @@ def _draw_texture(random: Random) -> Array:
             place = tuple(int(part) for part in random.uniform(0, TEXTURE_SIZE, 2))
             cv2.circle(specks, place, int(log_uniform(random, 1, 14)), (random.uniform(-0.8, 0.4),), -1, cv2.LINE_AA)
         texture += cv2.GaussianBlur(specks, (0, 0), log_uniform(random, 0.5, 4))
-    if random.random() < 0.5:  # fringes
+    if random.random() < 0.5:  # fringes, which fade from the edge inwards
         inward = np.maximum(0.97 - r, 0)
         texture += random.uniform(0.1, 0.6) * np.cos(log_uniform(random, 20, 120) * np.sqrt(inward + 0.01)) \
             * np.exp(-inward / random.uniform(0.05, 0.4))

@@ -97,6 +97,7 @@ def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, c
                 kx, ky = (x - clip_centre[channel, 0]) / clip_radius[channel], \
                     (y - clip_centre[channel, 1]) / clip_radius[channel]
                 outside = math.sqrt(kx * kx + ky * ky)
+                # 1 inside all three images, 0 outside, smooth over the width of the edge
                 cover = min(max((1 - far) / edge + 0.5, 0.0), 1.0)
                 cover *= min(max((1 - outside) * clip_radius[channel] / (edge * r) + 0.5, 0.0), 1.0)
                 if cover <= 0:

@@ -59,6 +59,7 @@ def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Arra
     bend = random.normal(0, 0.12) if random.random() < 0.3 else 0.0
     width, opening = log_uniform(random, 0.002, 0.04), log_uniform(random, 0.003, 0.15)
     reach, power, end = log_uniform(random, 0.03, 1.5), random.uniform(0.7, 3), log_uniform(random, 0.25, 4)
+    # Brightness of the beam on the other side of the light: the same, or in equal parts less or none.
     other_side = 1.0 if random.random() < 0.6 else random.random() * (random.random() < 0.5)
     profile_draw, level = random.random(), log_uniform(random, 0.1, 1) if fainter else 1.0
     rays = _draw_ray_profile(random) if random.random() < 0.5 else None
@@ -70,12 +71,12 @@ def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Arra
     for rotation, strength in ((0.0, level), (math.pi, level * other_side)):
         deviation = angle - direction - rotation - bend * r
         deviation = np.arctan2(np.sin(deviation), np.cos(deviation))
-        u = np.minimum(np.abs(deviation), 1.5) * r / spread
+        u = np.minimum(np.abs(deviation), 1.5) * r / spread  # distance from the axis, in half widths
         profile = (np.exp(-(u**2)) if profile_draw < 0.4 else 1 / (1 + u**2) ** 1.5 if profile_draw < 0.7 else
                    np.exp(-(u**4)))
         if rays is not None:
             profile = profile * rays(deviation / max(opening, 0.01))
-        light += np.minimum(strength * profile * falloff, 30)
+        light += np.minimum(strength * profile * falloff, 30)  # steep falloffs are huge at the light itself
     return np.asarray(light[..., None] * np.maximum(colour, 0.05), np.float32)
 
 

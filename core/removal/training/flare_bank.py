@@ -116,7 +116,8 @@ class UserFlares:
     """The user's flare layers, as pictures or video frames, read when they are drawn."""
 
     def __init__(self, folder: Path | str, size: int) -> None:
-        """Raises SettingsError where the folder holds neither pictures nor videos, or none that can be read."""
+        """size: side of the canvas, pixels. Raises SettingsError where the folder holds neither pictures nor videos, or
+        none that can be read."""
         folder = Path(folder)
         # By the folder beside it, as in Flare7K++: another set may have flares of the same names.
         lights = {(path.parent.parent, path.stem): path for path in folder.glob("**/Light_Source/*")

@@ -85,7 +85,7 @@ class MuonAdamW:
                 continue
             if moment == "momentum":
                 self._momenta[name].copy_(value)
-            elif name not in self._matrices:  # old checkpoints have AdamW's moments of all of them
+            elif name not in self._matrices:  # some checkpoints have AdamW's moments of all of them
                 parameter = self._parameters[name]
                 # In the parameter's memory layout: a fused step walks through both in memory order.
                 self._adam.state[parameter][moment] = (
@@ -113,7 +113,7 @@ def orthogonalise(matrices: Tensor) -> Tensor:
     a, b, c = NEWTON_SCHULZ_COEFFICIENTS
     tall = matrices.shape[-2] > matrices.shape[-1]
     wide = matrices.mT if tall else matrices
-    # The Frobenius norm exceeds every singular value, and the iteration needs them at 1 at most.
+    # No singular value exceeds the Frobenius norm, and the iteration needs them at 1 at most.
     wide = wide / torch.linalg.matrix_norm(wide, keepdim=True).clamp(min=1e-7)
     square = torch.bmm(wide, wide.mT)
     factors = torch.eye(square.shape[-1], dtype=square.dtype, device=square.device).expand_as(square)

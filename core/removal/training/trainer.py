@@ -49,6 +49,7 @@ class RemovalTrainer:
     """Network and optimiser at an iteration, of one worker."""
 
     def __init__(self, recipe: Recipe, worker: Worker = SINGLE_WORKER) -> None:
+        """Build a network with random weights by the recipe's seed, the same for all workers, at iteration 0."""
         self.recipe, self.iteration, self.worker = recipe, 0, worker
         self.device = device()
         torch.manual_seed(recipe.seed)
@@ -56,7 +57,8 @@ class RemovalTrainer:
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on CPUs
         self.optimiser = MuonAdamW(self.network, recipe.weight_decay)
         self.averaged_weights = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
-        self.initial_weights: dict[str, Tensor] = {}
+        self.initial_weights: dict[str, Tensor] = {}  # empty unless the training begins with given weights
+        # A graph cannot branch: one with and one without the loss of the PSNR phase.
         self._graphed_gradients = {phase: GraphedFunction(partial(self._gradients, phase)) for phase in (False, True)}
         self._pending_metrics: AsyncCopy | None = None
         if self.device.type == "cuda":
@@ -203,8 +205,8 @@ class RemovalTrainer:
         return {name: value.detach().cpu().contiguous() for name, value in state.items()}
 
     def load_state(self, state: Mapping[str, Tensor], iteration: int) -> None:
-        """Load a state of `state`, or weights alone, whose moments begin at zero. The weights' network may have fewer
-        blocks and attention layers; the added ones begin as the identity.
+        """Load what `state` returned, or weights alone; the moments then begin at zero. The network of weights alone
+        may have fewer blocks and attention layers; the added ones begin as the identity.
 
         iteration: that of the state; 0 for a training that begins, whose initial weights are these. Raises RunError
         where the weights do not fit.

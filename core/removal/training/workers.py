@@ -71,7 +71,8 @@ class SharedBuffers:
 
 @dataclass(frozen=True)
 class Worker:
-    """One of `count` processes that share a training; the first saves and reports."""
+    """One of `count` processes that share a training; the first, of rank 0, saves and reports. buffers: None for a
+    worker that is alone."""
 
     rank: int
     count: int

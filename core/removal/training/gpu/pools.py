@@ -129,6 +129,7 @@ class Pools:
                 pool = self._scenes[item.shape]
                 first = self.scenes_stored[item.shape] % len(pool)
                 slots = slice(first, first + SCENES_PER_BLOCK)
+                # `drawn` has room for the largest shape.
                 pool[slots].copy_(values[:pool[slots].numel()].view(SCENES_PER_BLOCK, *pool.shape[1:]))
                 self._gammas[item.shape][slots].copy_(torch.from_numpy(item.metadata))
             else:
@@ -175,6 +176,7 @@ def filled_pools(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses:
     """
     spawning = multiprocessing.get_context("spawn")
     process_counts = (max(processes // 2, 1), max(processes - processes // 2, 1))
+    # numbers in one slot, by kind
     lengths = (SCENES_PER_BLOCK * 3 * max(shape.width * shape.height for shape in pools.shapes),
                FLARE_CHANNELS * recipe.canvas_size**2)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:

@@ -66,7 +66,7 @@ class TrainedCamera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def pixel_ratio(self, width: int, height: int) -> float:
-        """Return how many pixels of a picture of this size, with this field of view, lie along one of this camera's.
+        """Return how many pixels of a picture lie along one of this camera's, if both have the same field of view.
 
         Compares widths; for a portrait and a landscape picture the long sides, since the camera is turned then."""
         turned = (width < height) != (self.width < self.height)

@@ -75,7 +75,7 @@ class PlaneGaussians:
         if self.rings is not None:  # a ring's area: radius times width, that of the plain profile for r0 = 0
             r0, w = self.rings.T
             area = area * (w * w + np.sqrt(np.pi / 2) * np.maximum(r0, 0) * w)
-            # i0 of more than 500 would overflow.
+            # The exponentials of large numbers overflow.
             clipped = np.clip(np.maximum(r0, 0) * self.arc_strengths.astype(np.float64), 0, 500)
             area = area * np.i0(clipped) * np.exp(-clipped)  # mean of the arc's factor over the ring
         return np.asarray(self.opacities * area * luminance, np.float32)

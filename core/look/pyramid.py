@@ -39,12 +39,12 @@ def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, 
                   min_texels: float = MIN_TEXELS) -> NDArray[np.int64]:
     """Return the index in `levels` (n,) of the grid for each Gaussian; covariances (n, 3) in px².
 
-    It is the coarsest grid on which the Gaussian's narrow side has a deviation of `min_texels`, else the finest.
+    It is the coarsest grid on which the Gaussian's narrow side deviates by `min_texels` or more, else the finest.
     """
     xx, xy, yy = covariances.T
     half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     narrow = np.sqrt(np.maximum(half - root, 0))
-    if rings is not None:  # the line of a ring has the width w
+    if rings is not None:  # the line of a ring is w times as wide as its ellipse
         narrow = narrow * np.minimum(rings[:, 1], 1)
     return np.clip(np.searchsorted(np.array(levels), narrow / min_texels, side="right") - 1, 0, len(levels) - 1)
 

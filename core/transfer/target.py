@@ -219,7 +219,7 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
         is_stored_as_seen = view.lens is None and not view.upright
         undistorted = None if is_stored_as_seen or path is None else _undistorted(capture, view)
         window = camera_window(view.camera, path) if undistorted is None and path is not None else None
-        states = [lit.light_state(light, view) for light in known]
+        states = [lit.light_state(light, view) for light in known]  # a light of unknown brightness counts as on
         placed = tuple(PlacedLight(state.name, sources[state.name], state.xyz, 1.0 if state.on is None else state.on,
                                    light.extent) for light, state in zip(known, states, strict=True))
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)

@@ -75,7 +75,8 @@ class TransferSettings:
 class Transfer:
     """The transfer of a flare to a target; `frame_renderer` renders frames, `bake` writes them.
 
-    training: poses (4, 4) of the training views, for a .flare that does not list them.
+    training: poses (4, 4) of the training views, for a .flare that does not list them. config: OpenColorIO
+    configuration with the space of the plates, if any.
     """
 
     def __init__(self, flare: Path, target: Target, settings: TransferSettings | None = None,

@@ -48,15 +48,18 @@ class Aberrations(NamedTuple):
 
 
 def draw_ghosts(seed: Sequence[int], lights: Sequence[Point], size: int) -> Array:
-    """Return (size, size, 3), linear light >= 0: the ghosts of all lights through the lens of a seed, at its
-    brightness."""
+    """Return (size, size, 3), linear light >= 0: the ghosts of all lights through one lens. The seed determines the
+    lens and how bright its ghosts are."""
     layer = sum((draw_light_ghosts(np.random.default_rng(seed), light, size) for light in lights),
                 np.zeros((size, size, 3), np.float32))
     return layer * np.float32(log_uniform(np.random.default_rng((*seed, 1)), 0.03, 1.0))
 
 
 def draw_light_ghosts(random: Random, light: Point, size: int) -> Array:
-    """Return (size, size, 3), the ghosts of one light; evenly lit ones have a brightness of 0.1 to 1."""
+    """Return (size, size, 3), the ghosts of one light; evenly lit ones have a brightness of 0.1 to 1.
+
+    random: determines the lens; each light of a picture has one of the same seed.
+    """
     layer = np.zeros((size, size, 3), np.float32)
     texture = _draw_texture(random)
     contrast = log_uniform(random, 0.1, 1.0)  # of the texture, about

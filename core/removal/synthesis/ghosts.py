@@ -30,6 +30,7 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
     """Return the ghosts of one light through a lens: (size, size, 3), the brightest parts around 1.
 
     light: on the canvas, where radius 1 is the corner of the sensor.
+
     Random are the stop's blades and opening, the coatings' colours, how many weak ghosts are visible and how bright
     they are. The lens determines where ghosts lie, how large they are, how they are clipped and how their colours
     separate.
@@ -59,7 +60,7 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
     # Ghosts differ by orders of magnitude; cameras show the strong ones. The power brings weak ones closer.
     reference, power = np.median([candidate[0] for candidate in strongest[:5]]), random.uniform(0.45, 1.0)
     saturation = random.uniform(0, 0.8) if random.random() < 0.6 else 0.0  # real coatings have many layers
-    unit = HALF_DIAGONAL * crop
+    unit = HALF_DIAGONAL * crop  # of the canvas, mm
     for strength, weight, ghost in strongest:
         # A ray of height h and slope u meets the stop at a h + b u, and the sensor at s h + t u. The one through the
         # stop's centre has h = -b u / a, which gives the ghost's centre; its radius is the stop's times |s / a|.

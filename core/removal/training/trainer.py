@@ -125,8 +125,9 @@ class RemovalTrainer:
         return loss, dict(zip(METRICS, metrics.tolist(), strict=True))
 
     def _schedule(self) -> tuple[bool, Tensor]:
-        """Return whether the training is in its PSNR phase; then (3,): the power of the flare's mean square, that of a
-        faint flare, and the error floor."""
+        """Return whether the training is in its PSNR phase; then (3,): the power that a flare's mean square is raised
+        to, the mean square of a faint flare (FAINT_FLARE_MSE), and that of an error that does not matter
+        (ERROR_FLOOR_MSE)."""
         progress = min(self.iteration / self.recipe.iterations, 1.0)
         faint_mse = FAINT_FLARE_MSE[0] * (FAINT_FLARE_MSE[1] / FAINT_FLARE_MSE[0]) ** max(4 * progress - 3, 0.0)
         first, last = ERROR_FLOOR_MSE
@@ -139,14 +140,17 @@ class RemovalTrainer:
 
         At first, the loss of a picture is its squared error, divided by its flare's mean square to a power that rises
         from 0.5 to 1. So strong flares, which are learned sooner, count more at the start; at the end faint ones count
-        as much. In the PSNR phase, the loss is the log of the error divided by that square, the negative of the
-        picture's gain in PSNR; pictures that get worse count twice. The recipe mixes it with the mean of the same over
-        patches. The prediction without the glow has half the weight of the whole one.
+        as much. In the PSNR phase, the loss is the log of the squared error divided by the flare's mean square, which
+        is the negative of the picture's gain in PSNR but for a factor; pictures that get worse count twice. The recipe
+        mixes it with the mean of the same over patches. The prediction without the glow has half the weight of the
+        whole one.
 
         psnr_phase, schedule: the results of `_schedule`, passed in so that one captured graph serves every iteration.
         """
         with _autocast(self.device):
             prediction = self.network(frame)
+        # First axis: the whole flare, and the flare without glow. Pictures (2, n, 3, h, w), mean squares over the
+        # channels (2, n, h, w), then over each picture (2, n).
         targets = torch.stack([frame - scene, frame - scene_with_glow])
         flares = targets.square().mean(2)
         errors = (torch.stack([prediction.flare, prediction.flare_without_glow]) - targets).square().mean(2)

@@ -65,10 +65,10 @@ class Adam:
 
     @contextmanager
     def step_in_backward(self) -> Iterator[None]:
-        """Let the backward pass within the context step all parameters of a scene, as soon as it has their gradients,
-        which then need not be written. The CPU kernels do so.
+        """Within the context, a backward pass may step the parameters of a scene as soon as it has their gradients,
+        which it then need not write. The CPU kernels do so.
 
-        The steps are the same; the gradients of stepped parameters stay None, and `step` makes the other steps. Only
+        The steps are those of `step`, which then makes the others alone: gradients of stepped parameters are None. Only
         for a scene whose whole gradient comes from one `rasterization`: raises RunError if a parameter gets a gradient
         after its step.
         """

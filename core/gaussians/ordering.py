@@ -56,7 +56,8 @@ def nearest_distances(points: Tensor, neighbours: int = 3) -> Tensor:
     half_width = BLOCK + 2 * k
     for block_number, (start, block) in enumerate(zip(starts, blocks, strict=True)):
         around = points[order[max(0, start - half_width) : start + half_width]]  # at least k + 1 points
-        bound = _kth(block, around, k)[:, -1].amax()
+        bound = _kth(block, around, k)[:, -1].amax()  # no k-th neighbour of this block's points is farther
+        # Along each axis, between this block's box and all boxes; 0 where they overlap.
         gaps = (lows - highs[block_number]).clamp(min=0) + (lows[block_number] - highs).clamp(min=0)
         near = torch.nonzero(torch.linalg.vector_norm(gaps, dim=-1) <= bound)[:, 0].tolist()
         distances = _kth(block, torch.cat([blocks[other] for other in near]), k)

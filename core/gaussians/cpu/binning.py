@@ -2,7 +2,7 @@
 """Assigns Gaussians to tiles, nearest first; called by `tiles.bin_gaussians` between projection and rasterization.
 
 The extent of a Gaussian is the ellipse at which alpha is 1/255, so low opacity makes it smaller (SnugBox of Hanson et
-al. 2025, Speedy-Splat). In a column of tiles it covers the pixel rows between the ellipse's lowest and highest point
+al. 2025, Speedy-Splat). In a column of tiles it covers the pixel rows between the ellipse's smallest and largest y
 there (their AccuTile). With X the offset of the column's edge from the centre, and the record's A, k, D, C and reach t
 (all but k negative),
 
@@ -103,7 +103,8 @@ def _max(a, b):
 
 @inlined
 def _pixel_rows(y, low, high, height):
-    """Return the first and last pixel row whose centre lies within y + low .. y + high; first > last if none does."""
+    """Return the first and last pixel row whose centre lies within y + low .. y + high, widened by ROW_MARGIN; first >
+    last if none does."""
     top = _max(y + low - (HALF + ROW_MARGIN), ZERO)
     bottom = _min(y + high - (HALF - ROW_MARGIN), np.float32(height - 1))
     first = int(top)
@@ -137,6 +138,7 @@ def small_footprints(x, y, half_x, half_y, major, k, minor, reach, visible, widt
     row = above >> TILE_SHIFT_Y
     # columns, rows: one less than the number of tiles covered
     rows = (below >> TILE_SHIFT_Y) - row
+    # tip: X of the ellipse's smallest y; its largest y lies at -tip
     tip, inverse = k * half_y, ONE / fma(major * k, k, minor)
     square, bend, lean = reach * inverse, major * inverse * (minor * inverse), -major * k * inverse
     left = to_floats(column << TILE_SHIFT_X) - x
@@ -176,7 +178,9 @@ def _crossings(half_x, square, bend, lean, x):
 
 @inlined
 def _pack_rows(y, half_y, low, high, height, base):
-    """Pack the first and end pixel row of y + low .. y + high, clamped to the ellipse's own rows; 0 if none."""
+    """Pack the first and end pixel row of y + low .. y + high, clamped to the ellipse's own rows; 0 if none.
+
+    base: the pixel row that is counted as 0."""
     first, last = _rows_between(y, maximum(low, -half_y), minimum(high, half_y), height)
     return where(first <= last, (first - base) | ((last + 1 - base) << FIRST_BITS), 0)
 
@@ -232,7 +236,7 @@ def _list_gaussian(records, i, width, height, tiles_x, slots_ahead, tile_list, p
         top, bottom = _pixel_rows(y, -half_y, half_y, height)
         return _write_column(column, top, bottom, tiles_x, i, slots_ahead, tile_list, place, tile_counts)
     major, k, minor = load_scalar(records, at + A), load_scalar(records, at + K), load_scalar(records, at + D)
-    tip = k * half_y  # the highest point lies at -tip, the lowest at tip
+    tip = k * half_y  # X of the ellipse's smallest y; its largest y lies at -tip
     inverse, one = ONE / (major * k * k + minor), opaque(1)
     square, lean = load_scalar(records, at + REACH) * inverse, -major * k * inverse
     bend = major * inverse * (minor * inverse)

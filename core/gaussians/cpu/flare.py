@@ -123,6 +123,7 @@ PROFILE_MIN = np.float32(rendering.PROFILE_MIN)
 TWO_LN2 = np.float32(2 * math.log(2))
 RADIUS_MIN = np.float32(1e-6)
 RADIUS2_MIN = np.float32(1e-12)
+"""Smallest Mahalanobis distance of rings, as in `..reference`, and its square."""
 
 
 # --- records ---------------------------------------------------------------------------------------------
@@ -147,7 +148,8 @@ def _arc_strength(arcs, i, xx, xy, yy):
 
 @inlined
 def _tiles(centre, half, size, shift):
-    """Return the number of tiles that centre - half .. centre + half touches along one axis."""
+    """Return the number of tiles that centre - half .. centre + half touches along one axis of `size` pixels; a tile
+    has 2^shift."""
     return (int(min(centre + half, size - 1.0)) >> shift) - (int(max(centre - half, 0.0)) >> shift) + 1
 
 

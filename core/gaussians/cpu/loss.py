@@ -54,7 +54,7 @@ from .vector import (
 
 HALO = definition.WINDOW // 2
 PAD = LANES  # zeros on both sides of a scratch row, at least 3 HALO
-STEP = 3
+STEP = 3  # numbers from a pixel to its neighbour in x
 BAND = LANES - 2 * HALO
 """Rows of a band: together with those that their windows cover, as many as there are vectors in a tuple of rows."""
 WEIGHTS = definition.window(torch.zeros(1)).numpy().astype(np.float32)
@@ -284,10 +284,11 @@ class _TargetMoments:
     MAX_BYTES = 256 << 20
 
     def __init__(self) -> None:
+        # By id of the tensor: a reference to it, its version, and the moments; the latest used is last.
         self._entries: dict[int, tuple[weakref.ref[Tensor], int, Array]] = {}
 
     def __call__(self, target: Tensor) -> Array:
-        """Return the moments (2, values) of a target, from the cache while the tensor is unchanged."""
+        """Return mu_y and s_y (2, values) of a target, from the cache while the tensor is unchanged."""
         key = id(target)
         entry = self._entries.pop(key, None)
         if entry is not None and entry[0]() is target and entry[1] == target._version:

@@ -91,6 +91,7 @@ CAMERA = 25
 # Sums over Gaussians for the camera's gradient: rotation 0..8, translation 9..11, fx fy cx cy, then
 POSITION_SUM, CAMERA_SUMS = 16, 32
 SLOPES = 9
+"""Vectors of colour slopes for a block of 16 Gaussians: 3 colours times 3 axes."""
 
 TRANSPOSED = harmonics.ROWS * LANES
 SQUARE = LANES * LANES

@@ -57,7 +57,7 @@ def camera_at(angle: float, width: int, height: int) -> Camera:
 
 
 def make_capture(folder: Path, count: int, width: int, height: int) -> Path:
-    """Write a capture of noisy frames with their clean frames, and 2,000 points."""
+    """Write a capture of `count` noisy frames with equal clean frames, and 2,000 points."""
     random = np.random.default_rng(0)
     xyz, rgb = random.uniform(-1.2, 1.2, (2000, 3)), random.integers(20, 235, (2000, 3))
     model = folder / "sparse" / "0"

@@ -154,6 +154,7 @@ class Iteration:
         self.optimiser = Adam(parameters, rates, kernels=self.fused)  # type: ignore[arg-type]
 
     def step(self) -> None:
+        """Make one iteration: render, L1 + SSIM, backward and Adam."""
         s, size = self.scene, (self.case.width, self.case.height)
         picture = rasterization(
             s.means, s.quaternions, s.log_scales, s.opacity_logits, s.sh, *self.camera, *size,
@@ -178,7 +179,7 @@ def too_slow(name: str, case: Case) -> bool:
 
 
 def raster_section(rasterizers: dict[str, Rasterizer], thread_counts: list[int], rounds: int, device: str) -> str:
-    """Return tables of forward, and of forward + backward. rounds: of `median_times`."""
+    """Return tables of forward, and of forward + backward. Keys of the times: case, rasterizer, threads, kind."""
     work: dict[str, Callable[[], object]] = {}
     for case in RASTER_CASES:
         for name, rasterizer in rasterizers.items():
@@ -232,7 +233,7 @@ def gpu_section(rounds: int) -> str:
 
 
 def iteration_section(sets: list[str], thread_counts: list[int], rounds: int) -> str:
-    """Return the table of training iterations."""
+    """Return the table of training iterations. sets: names of kernel sets."""
     work: dict[str, Callable[[], object]] = {}
     for case in ITERATION_CASES:
         for name in sets:
@@ -338,7 +339,7 @@ def flare_section(sets: list[str], rounds: int) -> str:
 def _splat_work(
     inputs: list[Tensor], width: int, height: int, rings: Tensor | None, blend: str, resolution: str, name: str
 ) -> Callable[[], object]:
-    """Return a function that splats the flare Gaussians, forward and backward."""
+    """Return a function that splats the flare Gaussians `inputs`, forward and backward. name: of the kernel set."""
     upstream = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0))
 
     def run() -> None:
@@ -375,7 +376,7 @@ def curve_section(rasterizers: dict[str, Rasterizer], rounds: int, device: str, 
 
 
 def peer_section(checkout: Path, rounds: int) -> str:
-    """Return the table of OpenSplat's rasterizer beside ours."""
+    """Return the table of OpenSplat's rasterizer, built from `checkout`, beside ours; it has colours in place of SH."""
     module, rows = opensplat.build(checkout), []
     threads = torch.get_num_threads()
     for case in PEER_CASES:

@@ -288,6 +288,7 @@ def _draw_features(remover: Remover, seed: int, count: int, backgrounds: Any, le
 
     features, gains = [], []
     for number in range(count):
+        # Two thirds are without flare; the others have each class in turn.
         bare, kind = number % 3 > 0, FLARE_CLASSES[number // 3 % len(FLARE_CLASSES)]
         pair = make_pair(np.random.default_rng((seed, number)), SingleFlareBank((seed, number), 160, lenses, kind),
                          backgrounds, *SIZE, clean_share=float(bare), lifted_black_share=0.25, shoulder_share=0.3,
@@ -373,6 +374,7 @@ def _gain(remover: Remover, seed: tuple[int, ...], bank: Any, backgrounds: Any,
 
 
 def _print_gains(name: str, gains: Any) -> None:
+    """Print the mean of gains (n,), dB, and how many are below -0.5."""
     print(f"{name} gain {np.mean(gains):+.2f} dB, made worse by 0.5 dB {np.mean(np.array(gains) < -0.5):.1%} of "
           f"{len(gains)}")
 
@@ -443,6 +445,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
 
 
 def main() -> None:
+    """Run the benchmark that the arguments name; its parameters are its options."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = parser.add_subparsers(required=True, metavar="BENCHMARK")
     for benchmark in (speed, measure_plate, sample, clean, scenes, matte, against, coloured, confidence, aspheric,

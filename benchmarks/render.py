@@ -58,7 +58,7 @@ class RenderedScene(NamedTuple):
 
 
 def synthetic(form: FlareForm, blend: Blend, size: int = SCENE, flare: int = FLARE) -> RenderedScene:
-    """Return three lights in front of the workload's camera, with untrained flares.
+    """Return a scene and three lights in front of the workload's camera, with untrained flares.
 
     size: number of scene Gaussians. flare: number of flare Gaussians for each light.
     """

@@ -127,7 +127,8 @@ def _score_view(run: Run, capture: Capture, view: View, size: int, folder: Path,
     """Return nine scores of a view; None where it shows no flare.
 
     Three pairs of the flare's PSNR, dB, and its relative error in linear light: for no flare, for the network, for the
-    fit. Then the PSNR against the exact scene: of the frame, the network's clean frame and the fit's.
+    fit. Then the PSNR against the exact scene: of the frame, the network's clean frame and the fit's. size: width,
+    pixels. folder: of the shot. label: of the fit, as in the name of its folder of clean frames.
     """
     camera = view.camera.scaled(size)
     frame = capture.frame(view, camera.size)

@@ -102,9 +102,10 @@ class _JointProgress:
 
 def _run_all(commands: Sequence[Sequence[str]], jobs: int, counter: _JointProgress,
              continue_on_failure: bool) -> list[Child]:
-    """Run the processes, `jobs` at once; return those that failed.
+    """Run the processes, `jobs` at once; return those that failed. counter: gets their events.
 
-    Any that still run on an early exit are stopped. Raises Cancelled and EngineError.
+    Those that still run at an early exit are stopped; without continue_on_failure the first failure is one. Raises
+    Cancelled and EngineError.
     """
     event_queue: EventQueue = queue.Queue()
     variables = _child_environment(min(jobs, len(commands)))

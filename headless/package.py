@@ -34,7 +34,10 @@ def find_packer() -> list[str]:
 
 
 def build(packer: list[str], out: Path) -> int:
-    """Build the extension into a folder, check it, and print its size; return the exit status."""
+    """Build the extension into a folder, check it, and print its size; return the exit status.
+
+    packer: of `find_packer`.
+    """
     out.mkdir(parents=True, exist_ok=True)
     status = subprocess.run([*packer, "build", "--source-dir", str(ROOT), "--output-dir", str(out)],
                             check=False).returncode

@@ -230,7 +230,7 @@ def fetch(url: str, file: Path, digest: str) -> None:
 
 
 def download_weights(url: str, file: Path, digest: str) -> str:
-    """Run the step of the weights; return "" on success, else the sentence about its failure."""
+    """Run the step of the weights (`weights_step`); return "" on success, else a sentence on its failure."""
     step = weights_step(url, file, digest)
     emit(type="say", text=step.message)
     try:

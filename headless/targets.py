@@ -105,7 +105,7 @@ def check_options(options: TargetOptions, kind: str) -> None:
     """Raise SettingsError for an option that has no effect on this kind of target."""
     for name in dict.fromkeys(name for names in TARGET_OPTIONS.values() for name in names):
         value = getattr(options, name)
-        # 0 is a value that was given for fall_off (by itself: as far as in the first frame), else a default.
+        # 0 is a default, but for --fall-off without a DISTANCE.
         if (value or (value == 0.0 and name == "fall_off")) and name not in TARGET_OPTIONS[kind]:
             raise SettingsError(f"--{name.replace('_', '-')} does not apply to a {kind} as the target; leave it out.")
 

@@ -24,7 +24,7 @@ SHOT_NOISE = 0.0025
 
 
 def write_layer(path: Path, pixels: Pixels, level: float) -> None:
-    """Write half-float R G B, DWAB at `level` (45 is OpenEXR's default; more is smaller)."""
+    """Write pixels (h, w, 3) as half-float R G B, DWAB at `level` (45 is OpenEXR's default; more is smaller)."""
     import OpenEXR
 
     header: dict[str, object] = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.DWAB_COMPRESSION,
@@ -43,7 +43,7 @@ def expose(linear: Pixels, rng: np.random.Generator) -> Pixels:
 
 
 def write_frame(path: Path, linear: Pixels, seed: tuple[int, ...]) -> None:
-    """Write a display frame as a JPEG without chroma subsampling; the noise depends on `seed` alone."""
+    """Expose linear light and write it as a JPEG without chroma subsampling; the noise depends on `seed` alone."""
     import cv2
 
     stored = np.round(expose(linear, np.random.default_rng(seed)) * 255).astype(np.uint8)

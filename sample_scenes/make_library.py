@@ -159,7 +159,7 @@ def make_library(folder: Path, names: list[str], progress: Progress) -> None:
 
 
 def write_sheet(folder: Path, file: Path) -> None:
-    """Write all looks of the library as one JPEG."""
+    """Write the thumbnails of all looks that the library folder holds as one JPEG."""
     import cv2
 
     looks = [look for look in LOOKS if (folder / f"{look.name}.flare").is_file()]

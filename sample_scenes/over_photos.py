@@ -62,7 +62,7 @@ def add_flares(capture: Capture, out: Path, setup: LensSetup, light: NDArray[np.
 
 
 def _write_model(capture: Capture, folder: Path, width: int) -> None:
-    """Write cameras at the new size, the capture's points, and which photograph shows which points."""
+    """Write cameras at `width`, the capture's points, and which photograph shows which points."""
     frames = []
     for view in capture.views:
         camera = view.camera.scaled(width)

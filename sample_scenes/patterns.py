@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws textures from a seed: posters, paper with writing, wood, marble, maps, tiles. All are sRGB 0..1.
+"""Draws textures from a seed: posters, paper with writing, wood, marble, maps, tiles.
+
+Textures are sRGB (height, width, 3), 0..1; sizes are pixels.
 
 Structure from motion needs corners and blobs at several scales, a fit of Gaussians needs textures that are not finer
 than a pixel; every pattern here is between the two.
@@ -158,7 +160,7 @@ def tiles(rng: np.random.Generator, height: int, width: int, palette: Palette, r
     tall, wide = height / rows, width / columns
     gap = max(2, int(0.04 * tall))
     for row in range(rows):
-        for column in range(-1 if offset else 0, columns):
+        for column in range(-1 if offset else 0, columns):  # -1: the half tile at the left of a shifted row
             shift = 0.5 * (row % 2) if offset else 0.0
             y0, y1 = int(row * tall) + gap, int((row + 1) * tall)
             x0, x1 = max(int((column + shift) * wide) + gap, 0), min(int((column + shift + 1) * wide), width)
@@ -204,6 +206,7 @@ def facade(rng: np.random.Generator, height: int, width: int, palette: Palette, 
     for floor in range(floors):
         for bay in range(bays):
             top, left = int((floor + 0.22) * tall), int((bay + 0.3) * wide)
+            # On the ground floor some windows reach down as doors.
             down = int((floor + (1.0 if floor == floors - 1 and rng.random() < 0.4 else 0.78)) * tall)
             right = int((bay + 0.7) * wide)
             edge = max(3, int(0.06 * wide))

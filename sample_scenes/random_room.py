@@ -158,7 +158,10 @@ class Room:
                 self._add_light("SPOT", position, power * 8, colour)
 
     def _add_light(self, kind: str, position: Position, power: float, colour: Colour | None = None) -> None:
-        """Add one of Blender's lights, SPOT or AREA, without a visible shape."""
+        """Add one of Blender's lights, SPOT or AREA, without a visible shape.
+
+        power: watts. colour: None for a random one.
+        """
         random = self.random
         bpy.ops.object.light_add(type=kind, location=position)
         light = bpy.context.object

@@ -120,6 +120,7 @@ def torch(seed: int) -> ShotScene:
     start = rng.uniform(2.4, 3.0)
 
     def state(index: int) -> FrameState:
+        """Return frame `index`: the torch on a winding path, and the walker, who crosses steadily."""
         turn = 2 * np.pi * index / wave
         place = np.array([2.25 * np.sin(turn + phase[0]) + 0.35 * np.sin(2.3 * turn + phase[1]),
                           -0.25 + 0.62 * np.sin(1.6 * turn + phase[2]), 4.3 + 0.7 * np.sin(0.8 * turn + phase[3])])
@@ -161,6 +162,7 @@ def drive(seed: int) -> ShotScene:
     speed = (start - rng.uniform(6.2, 8.0)) / FRAMES
 
     def state(index: int) -> FrameState:
+        """Return frame `index`: the camera 0.22 m farther than in the one before, the other car, and its headlights."""
         eye = np.array([1.4, 0.0, 0.22 * index]) + jitter[index]
         far = start + 0.22 * index - speed * index  # the camera drives 0.22 a frame
         sway = 0.12 * np.sin(index / 5)
@@ -212,6 +214,7 @@ def pan(seed: int) -> ShotScene:
     tremble = np.cumsum(rng.normal(size=(FRAMES, 2)), 0) * 0.0006
 
     def state(index: int) -> FrameState:
+        """Return frame `index`: the turned camera, walker and cart, and the lamp."""
         part = index / (FRAMES - 1)
         angle = direction * reach * np.cos(np.pi * (part * 1.15 - 0.05)) + 0.12 + tremble[index, 0]
         rotation = _pitch(float(-0.05 + tremble[index, 1])) @ _yaw(float(angle))

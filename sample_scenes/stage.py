@@ -55,7 +55,7 @@ def plain_material(name: str, colour: Vec, roughness: float = 0.5, metallic: flo
 
 
 def _add(name: str, mesh: bmesh.types.BMesh, materials: Sequence[Any], smooth: bool = False) -> Any:
-    """Add a mesh with these materials to the scene; return its object."""
+    """Add a mesh with these materials to the scene; return its object. smooth: shade its faces as one surface."""
     data = bpy.data.meshes.new(name)
     for face in mesh.faces:
         face.smooth = smooth
@@ -161,7 +161,7 @@ def rod(name: str, start: Vec, end: Vec, radius: float, material: Any) -> Any:
 
 
 def monkey(name: str, size: float, location: Vec, material: Any, turn: float = 0.0) -> Any:
-    """Add Blender's monkey head, subdivided once."""
+    """Add Blender's monkey head, subdivided once. turn: degrees about z."""
     bpy.ops.mesh.primitive_monkey_add(size=size, location=location, rotation=(0, 0, np.radians(turn)))
     obj = bpy.context.object
     obj.name = name
@@ -196,7 +196,7 @@ def lamp(light: LightSource) -> Any:
         source = bpy.data.objects.new(f"{light.name} lamp", data)
         source.location = light.xyz
         if light.distant:
-            data.angle = 2 * np.arctan(light.radius / np.linalg.norm(light.xyz))
+            data.angle = 2 * np.arctan(light.radius / np.linalg.norm(light.xyz))  # the apparent diameter
             source.rotation_euler = (-Vector(light.xyz)).to_track_quat("-Z", "Y").to_euler()
         else:
             data.shadow_soft_size = light.radius
@@ -206,7 +206,7 @@ def lamp(light: LightSource) -> Any:
 
 
 def softbox(name: str, location: Vec, target: Vec, size: Vec, power: float, colour: Vec) -> Any:
-    """Add an area light that faces `target` and is invisible to cameras."""
+    """Add an area light that faces `target` and is invisible to cameras. size: width and height. power: watts."""
     data = bpy.data.lights.new(name, "AREA")
     data.shape, data.size, data.size_y = "RECTANGLE", size[0], size[1]
     data.energy, data.color = power, colour

@@ -127,7 +127,10 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 def _train_diffusion(args: argparse.Namespace, recipe: Recipe, backgrounds: Backgrounds,
                      lenses: Sequence[Prescription], user_flares: UserFlares | None,
                      progress: Progress) -> dict[str, Any]:
-    """Train a LoRA for one-step diffusion. Raises SettingsError."""
+    """Train a LoRA for one-step diffusion on synthesised pairs; return the command's result.
+
+    user_flares: None without --flares. Raises SettingsError, and EngineError without the packages.
+    """
     from ...core.metrics.lpips import Lpips
     from ...core.removal.inference import diffusion
     from ...core.removal.training.batches import Batches

@@ -79,7 +79,8 @@ class LightLook:
     def __init__(self, name: str, xyz: NDArray[np.float64], form: FlareForm, query_range: QueryRange,
                  rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: Blend,
                  listed: list[Element], clear_visibility: float = 1.0) -> None:
-        """rows: canonical Gaussians by name; tensors: the network's; listed: elements in the file, or [].
+        """rows: parameters of the canonical Gaussians, (n, width) each, by name; tensors: the light's in the file, the
+        network's among them; listed: elements in the file, or [].
         clear_visibility: visibility of the unoccluded light through the scene of its fit, 0..1
         (`core.flare.model.FlareModel`)."""
         self.name, self.xyz, self.form, self.query_range, self.blend = name, xyz, form, query_range, blend

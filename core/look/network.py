@@ -155,7 +155,7 @@ class Network:
     def __init__(self, tensors: Mapping[str, NDArray[Any]], heads: Mapping[str, int], levels: int, base: int,
                  query_range: QueryRange, encoded: Floats) -> None:
         """tensors: by their names in the file, without the light's number. heads: width of each offset by name.
-        levels, base: see `FlareForm`. encoded: (n, d) frequency-encoded canonical positions, followed by latent codes."""
+        levels, base: see `FlareForm`. encoded: (n, d) frequency-encoded canonical positions, then latent codes."""
         self._t = {name: np.asarray(value, np.float32) for name, value in tensors.items()
                    if not name.endswith(".rows")}
         self._heads, self._range = dict(heads), query_range

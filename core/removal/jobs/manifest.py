@@ -46,6 +46,9 @@ def digest_inputs(maker: str, sources: Iterable[Path]) -> str:
 class Manifest:
     """The manifest of one output folder; its keys are the frames' names below the folder.
 
+    Arguments of the methods: name, source and results are those of a `clean_frames.CleanFrame`; digest is a text of
+    `digest_inputs`.
+
     Any number of processes may add to it, also for the same frames: every method reads the file anew, once.
     """
 

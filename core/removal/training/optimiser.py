@@ -43,8 +43,8 @@ class MuonAdamW:
 
     @torch.no_grad()
     def step(self, rate: float, worker: Worker = SINGLE_WORKER) -> None:
-        """Take one step with the gradients of the parameters, and clear them. Workers have the same gradients and share
-        the work of Muon's steps, nearly a third of an iteration's."""
+        """Take one step of learning rate `rate` with the parameters' gradients, and clear them. Workers have the same
+        gradients and share the work of Muon's steps, nearly a third of an iteration's."""
         matrices_to_step = {name: matrix for name, matrix in self._matrices.items()
                             if self._parameters[name].grad is not None}
         gradients = [_as_matrix(cast(Tensor, self._parameters[name].grad)) for name in matrices_to_step]

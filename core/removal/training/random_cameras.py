@@ -101,7 +101,7 @@ class FlareAppearance(NamedTuple):
 
 
 def draw_appearance(random: Random, strength: float) -> FlareAppearance:
-    """Draw the appearance of a flare of that strength."""
+    """Draw the appearance of a flare of that strength, 1 for the first of a frame."""
     blur = random.uniform(0.3, 2.0) if random.random() < 0.25 else 0.0
     colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
     gain = np.float32(math.exp(random.normal(0, 0.6)) * strength)

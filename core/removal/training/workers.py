@@ -118,7 +118,7 @@ SINGLE_WORKER = Worker(0, 1)
 
 
 def _buffer_slices(tensors: Sequence[Tensor], row: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield each tensor, in its memory order, and its slice of a row."""
+    """Yield each tensor, with its dimensions in memory order so that copies are contiguous, and its slice of a row."""
     first = 0
     for tensor in tensors:
         in_memory_order = tensor.permute(sorted(range(tensor.ndim), key=tensor.stride, reverse=True))

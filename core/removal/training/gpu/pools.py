@@ -211,6 +211,7 @@ def filled_pools(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses:
 
 
 def _wait_until_ready(ready: threading.Event, drawing: Sequence[BaseProcess]) -> None:
+    """Wait for `ready`. Raises RunError where a process ends before that, and after START_TIMEOUT_S."""
     for _ in range(round(START_TIMEOUT_S / 0.5)):
         if ready.wait(0.5):
             return

@@ -254,7 +254,7 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
 def limited(light: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
     """Return light (..., 3), dimmed in the same hue where a channel exceeds `limit`."""
     brightest = light.max(-1, keepdims=True)
-    if brightest.max() <= limit:
+    if not (brightest > np.float32(limit)).any():
         return light
     return np.asarray(light * np.minimum(limit / np.maximum(brightest, 1e-6), 1), np.float32)
 

@@ -235,4 +235,4 @@ def test_flare_from_footage_runs_shot_on_the_clip(said: Any) -> None:
     assert "none.mp4 is missing; choose a video" in missing
     assert "The frames are not there; put them back." in refused
     assert said["footage that failed changes no run"] and said["footage in the panel"]
-    assert said["footage's command"] == ["shot", "X/clip.mp4", "--out", "X/clip_flare_1", "--preset", "standard"]
+    assert said["footage's command"] == ["shot", "X/clip.mp4", "--out", "X/clip_flare_1", "--preset", "high"]

@@ -172,7 +172,7 @@ preferences.engine = sham
 behave("refuses")
 clip = folder / "clip.mp4"
 clip.touch()
-before = scene.fit_flare.run
+before, scene.fit_flare.preset = scene.fit_flare.run, "high"
 said["footage"] = [refusal(lambda path=path: ops.flare_from_footage(filepath=str(path)))
                    for path in (folder / "none.mp4", clip)]
 said["footage that failed changes no run"] = scene.fit_flare.run == before

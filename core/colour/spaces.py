@@ -72,7 +72,7 @@ class ColourSpace:
         levels = np.array([0.02, 0.18, 0.9], np.float32)
         colours = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(-1, 3)
         samples = np.concatenate([self.to_linear(colours), self.from_linear(colours)]).ravel()
-        digits = " ".join(f"{value:.3g}" for value in samples)  # digits that machines agree on
+        digits = " ".join(f"{value:.3g}" for value in samples)  # three digits, on which machines agree
         return hashlib.blake2b(digits.encode(), digest_size=8).hexdigest()
 
 
@@ -80,17 +80,20 @@ def matrix_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
     """Return the matrix (3, 3) from linear R, G, B to CIE X, Y, Z, white at Y = 1 (SMPTE RP 177)."""
     x, y = np.array(chromaticities[0::2]), np.array(chromaticities[1::2])
     columns = np.stack([x / y, np.ones(4), (1 - x - y) / y])
+    # Scales each primary such that R = G = B = 1 gives the white.
     return np.asarray(columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3]))
 
 
 def matrix_between(source: Chromaticities, target: Chromaticities) -> NDArray[np.float64]:
-    """Return the matrix (3, 3) from one linear R, G, B to another, with the white point adapted."""
+    """Return the matrix (3, 3) from the linear R, G, B of `source` to that of `target`; its white becomes the other's
+    (Bradford's adaptation)."""
     first, second = (_BRADFORD @ _white(space) for space in (source, target))
     adapted = np.linalg.inv(_BRADFORD) @ np.diag(second / first) @ _BRADFORD
     return np.asarray(np.linalg.inv(matrix_to_xyz(target)) @ adapted @ matrix_to_xyz(source))
 
 
 def _white(chromaticities: Chromaticities) -> NDArray[np.float64]:
+    """Return X, Y, Z of the white, with Y = 1."""
     x, y = chromaticities[6:]
     return np.array([x / y, 1.0, (1 - x - y) / y])
 

@@ -107,6 +107,7 @@ def foreign_names(path: Path | str) -> dict[bytes, bytes]:
         for part in {part for part, _, _ in places}:
             stored = [name for number, _, name in places if number == part]
             readable = [name if is_utf8(name) else _in_ascii(name) for name in stored]
+            # Two names have become one, or the ranks of the names differ.
             if len(set(readable)) < len(set(stored)) or [sorted(stored).index(name) for name in stored] != [
                     sorted(readable).index(name) for name in readable]:
                 example = min(names.values()).decode("latin-1")
@@ -121,6 +122,7 @@ def _in_ascii(name: bytes) -> bytes:
 
 
 def is_utf8(text: bytes) -> bool:
+    """True if bytes are valid UTF-8."""
     try:
         text.decode("utf-8")
     except UnicodeDecodeError:
@@ -229,7 +231,8 @@ def main_part(parts: Sequence[tuple[_Part, Container[str]]]) -> _Part:
 
 
 def window_from_header(path: Path, header: Mapping[str, Any]) -> DataWindow:
-    """Read the data window from an EXR's header."""
+    """Read the data window from an EXR's header, with its origin relative to the frame's. Raises FrameError for a size
+    that is empty or too large."""
     stored, frame = (checked_size(path, (int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1))
                      for low, high in (header["dataWindow"], header["displayWindow"]))
     (x, y), (left, top) = header["dataWindow"][0], header["displayWindow"][0]

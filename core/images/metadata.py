@@ -59,7 +59,7 @@ _CAMERA_CLAIMS = ("MotionPhoto", "MicroVideo")
 _THUMBNAILS = "http://ns.adobe.com/xap/1.0/g/img/"
 """Name space of XMP of thumbnails, which would show the flare."""
 _EXTENDED_CLAIMS = ("http://ns.google.com/photos/1.0/depthmap/", "http://ns.adobe.com/xmp/note/")
-"""Those that go with the segments of extended XMP."""
+"""First letters of the name spaces that go with the segments of extended XMP."""
 
 
 def copy_metadata(encoded: bytes, source: Path, *, has_alpha: bool) -> bytes:
@@ -155,7 +155,10 @@ def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
 
 
 def _without_resource_thumbnails(segments: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
-    """Return a JPEG's segments without the thumbnails in Photoshop's image resources, which may span several."""
+    """Return a JPEG's segments without the thumbnails in Photoshop's image resources.
+
+    The resources may span several segments, so they are joined, and split anew where the first of them was.
+    """
     numbers = [number for number, (marker, content) in enumerate(segments)
                if marker == jpeg.APP13 and content.startswith(jpeg.PHOTOSHOP)]
     resources = b"".join(segments[number][1][len(jpeg.PHOTOSHOP):] for number in numbers)
@@ -201,7 +204,8 @@ def _without_claims(segment: bytes) -> bytes:
 
 
 def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
-    """Return a TIFF with all tags of the source but those of its structure, and its Exif and GPS directories."""
+    """Return the TIFF `encoded` with all tags of the source `data` but those of its structure, and with its Exif and
+    GPS directories."""
     every = _AllBut(_STRUCTURE_TAGS)
     tags = tiff.read_tags(io.BytesIO(data), every)
     directories = {number: tags.pop(number) for number in (EXIF_DIRECTORY, GPS_DIRECTORY) if number in tags}
@@ -214,7 +218,7 @@ def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
     encoded = tiff.with_tags(encoded, tags)
     for number, place in directories.items():
         if len(place.values) == 1:
-            # 0xA005 is the offset of another directory, which is not copied.
+            # 0xA005 is the offset of another directory (interoperability), which is not copied.
             inner = tiff.read_tags(io.BytesIO(data), _AllBut({0xA005}), int(np.uint32(place.values[0])))
             encoded = tiff.with_directory(encoded, number, inner)
     return encoded

@@ -308,7 +308,7 @@ def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
         channels = {**{name: pixels for name, pixels in channels.items() if name not in ("Y", "RY", "BY")},
                     **{name: colour[..., k] for k, name in enumerate("RGB")}}
     names = ["R", "G", "B"] if all(name in channels for name in "RGB") else ["Y"] if "Y" in channels else []
-    if not names and (views := stereo_views(header, channels)):  # every view behind its name
+    if not names and (views := stereo_views(header, channels)):  # every view's channels are behind its name
         names = list(dict.fromkeys(views[0].channels))
     if not names:
         raise missing_rgb(path, channels)
@@ -342,7 +342,7 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
     if alpha is not None:
         plate = replace(plate, alpha=alpha)
     suffix = _format_suffix(path, plate)
-    if suffix == ".exr":
+    if suffix == ".exr":  # of a Radiance HDR or a raw file, which have no alpha
         light = plate.space.to_linear(codes.astype(np.float32) / np.float32(plate.max_code))
         write_exr(path, {name: light[..., k] for k, name in enumerate("RGB")})
         return

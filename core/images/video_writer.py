@@ -105,6 +105,7 @@ def rewrite_video(source: Path, target: Path, codec: str, change: Change, *,
     """
     av = import_av()
     encoder = CODECS[codec]
+    # `video` decodes the frames; `other` is the same file, read beside it for its sound, subtitles and tags.
     with Video(source) as video, atomic_path(target) as temporary, av.open(str(source), metadata_errors="replace") as \
             other:
         # Without this, FFmpeg drops tags of other names than its own, such as "com.apple.quicktime.make".

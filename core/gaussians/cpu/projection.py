@@ -532,7 +532,7 @@ def _project_block_backward(
     d_pz = fields[G_DEPTH] - inverse_z * (fma(d_sx, slopes[0], d_sy * slopes[1]) + a_da + b_db)
     dp = (d_sx * inverse_z, d_sy * inverse_z, d_pz)
 
-    # colour -> coefficients, direction; rows that are 0 in the record were cut off
+    # colour -> coefficients, direction; colours that are 0 in the record were clamped
     record_fields = transpose(load_rows(records, first * RECORD, RECORD))
     d_colour = (
         where(record_fields[RED] > ZERO, fields[G_RED], ZERO),

@@ -360,7 +360,7 @@ def where(typing_context, mask, a, b):  # noqa: ARG001
 
 
 def _make_min_max(sign: str) -> Callable[..., Any]:
-    """Return the definition of the function of a and b that returns a if a `sign` b, else b, so also if one is NaN.
+    """Return the definition of the function of a and b that returns a if a `sign` b, else b, as for NaN.
 
     A comparison and a select: one instruction everywhere, whereas llvm.minnum adds a test for NaN."""
     def define(typing_context, a, b):  # noqa: ARG001

@@ -393,7 +393,7 @@ def write(results: Results, section: str, length: str, document: Path) -> str:
 
 
 def main() -> None:
-    """See the module's head."""
+    """Fit and score the experiments that the arguments select, and write their tables."""
     parser = argparse.ArgumentParser(description="Takes the model's choices away one by one.")
     parser.add_argument("--captures", nargs="+", type=Path, default=[SAMPLE])
     parser.add_argument("--only", nargs="+", choices=STUDIES)

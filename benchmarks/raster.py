@@ -92,7 +92,7 @@ def gsplat_rasterizer(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
 ) -> Tensor:  # fmt: skip
-    """gsplat's CUDA rasterizer."""
+    """Return the colour (h, w, 3) by gsplat's CUDA rasterizer, with the near plane of our kernels."""
     import gsplat
 
     colour, _, _ = gsplat.rasterization(

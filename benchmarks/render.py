@@ -120,6 +120,7 @@ def stages(
     flare = evaluate_flares()
     pixel_gaussians = to_pixels(flare, intrinsics)
     arcs = None if flare.arcs is None else arcs_to_pixels(flare.arcs, pixel_gaussians[1], intrinsics)
+    # What `composite` is timed on; rings and arcs do not change its time.
     behind, front = render_scene(), splat(
         *pixel_gaussians, flare.opacities, flare.colours, width, height, blend=rendered.blend, kernels=kernel_set  # type: ignore[arg-type]
     )

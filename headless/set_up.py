@@ -209,7 +209,10 @@ def weights_step(url: str, file: Path, digest: str) -> Step:
 
 
 def fetch(url: str, file: Path, digest: str) -> None:
-    """Download `url` to `file`, whole or not at all. Raises OSError, ValueError for another SHA-256 than `digest`."""
+    """Download `url` to `file`, whole or not at all.
+
+    Raises OSError, and ValueError for a file that is too large or has another SHA-256 than `digest`.
+    """
     print(f"Downloading {url}", flush=True)
     file.parent.mkdir(parents=True, exist_ok=True)
     partial = file.with_name(f".{file.name}.{os.getpid()}")

@@ -111,7 +111,7 @@ def check_options(options: TargetOptions, kind: str) -> None:
 
 
 def find_flare(args: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
-    """Return the .flare of --flare, a file or a run, and the poses (4, 4), world to camera, of its training views.
+    """Return the .flare of FLARE, a file or a run, and the poses (4, 4), world to camera, of its training views.
 
     The views are those of --capture, else of the run's capture; None where there is neither.
     """
@@ -135,6 +135,9 @@ def find_flare(args: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
 
 def open_target(options: TargetOptions, flare: Path, training: list[Floats] | None = None) -> Target:
     """Open the target that --to names. training: poses of training views, for a .flare that does not store its own.
+
+    Pictures, and a folder of them, have lights in 2D: those of --light, else highlights or lights that are detected.
+    Other targets have cameras and lights in 3D.
 
     Raises SettingsError, CaptureError, FrameError and RunError.
     """
@@ -177,7 +180,7 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
         return picture_target(to, look, named, sources, distances, detector=detector,
                               focal=options.focal, centre=centre, space=space, training=views)
     if kind in (".blend", ".json"):
-        path = shot_path(options) if kind == ".blend" else to[0]
+        path = shot_path(options) if kind == ".blend" else to[0]  # the Blender step has written that of a .blend
         shot = Shot.read(path)
         numbers = [NumberedFrame("", number, "") for number in sorted({shot_frame.frame for shot_frame in shot.frames})]
         return shot_target(shot, look, sources, plates=options.plates, scene=options.scene,

@@ -63,7 +63,7 @@ class Room:
             self._add_light("AREA", self._random_position(self.height * 0.97), math.exp(random.uniform(2, 6)))
 
     def _add_sky(self) -> None:
-        """Light the world by a random environment map, or evenly and dimly."""
+        """Light the world by a random environment map, or half of the indoor rooms evenly and dimly."""
         random = self.random
         if self.indoors and random.random() < 0.5:
             stage.uniform_world(random_colour(random, 0.3), 0.01 if self.dark else 0.2)

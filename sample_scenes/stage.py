@@ -219,7 +219,7 @@ def softbox(name: str, location: Vec, target: Vec, size: Vec, power: float, colo
 
 
 def uniform_world(colour: Vec, strength: float) -> None:
-    """Set a world of one colour."""
+    """Set a world of one linear colour, times `strength`, in all directions."""
     world = bpy.data.worlds.new("World")
     bpy.context.scene.world = world
     world.use_nodes = True

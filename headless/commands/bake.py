@@ -47,7 +47,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def draw_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Bake a shot without an engine."""
+    """Bake a shot by numpy, without an engine."""
     from ...core.bake.shot_frames import LookRenderer
 
     if args.run.suffix.lower() != ".json":

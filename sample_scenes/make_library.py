@@ -61,7 +61,7 @@ SHORT_FIT = {"tracing.positions": 48, "fit.iterations": 1200, "fit.gaussians": 8
 GHOST_FIT = {"tracing.positions": 96, "fit.iterations": 1500, "fit.gaussians": 1600, "fit.max_gaussians": 2000}
 """Settings of the fits of looks with strong ghosts."""
 BARE = (0.0,)
-"""A coating of glass that has none."""
+"""Wavelength 0 stands for glass without a coating."""
 WHITE, BLUE, AMBER = (1.0, 1.0, 1.0), (0.2, 0.45, 1.0), (1.0, 0.55, 0.2)
 
 LOOKS = (

@@ -104,6 +104,7 @@ def read_settings(args: argparse.Namespace) -> TracedFlareSettings:
     if args.dispersion is not None:
         values["ghosts.dispersion"] = args.dispersion == "on"
     if args.coating is not None:
+        # The option has nanometres, the setting micrometres.
         values["glass.coating"] = [number / 1000 for number in _parse_numbers("--coating", args.coating)]
     if args.colour is not None:
         values["colour"] = _parse_numbers("--colour", args.colour)
@@ -123,7 +124,7 @@ def _parse_numbers(option: str, text: str) -> list[float]:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    """Read the tables of a TOML file as values by dotted name. Raises SettingsError."""
+    """Read a TOML file as values by name, those in a table by "table.name". Raises SettingsError."""
     try:
         tables = parse_toml(read_text(path, MAX_TOML_BYTES, UTF8_SIG))
     except (OSError, ValueError) as problem:

@@ -41,6 +41,7 @@ def build(scene: SceneDescription) -> None:
             front = s.picture_material(f"house {side} {index}", p.facade(
                 rng, int(150 * tall), int(150 * long), palette, 2 + int(tall > 4.6), 3), 0.9)
             end = s.picture_material(f"end {side} {index}", p.tiles(rng, 500, 400, p.STONE, 14, 8, offset=True), 0.9)
+            # The fronts face the street, and away from it.
             s.box(f"house {side} {index}", (3.0, long, tall), (side * (5.0 + rng.uniform(-0.3, 0.3)), y + long / 2, 0),
                   [end, front, end, front, end])
             y += long

@@ -15,6 +15,7 @@ from .desk import LAMP, LANTERN
 
 CENTRE = np.array([40.0, -12.0, 3.0])
 TURN = np.radians(117.0)
+"""Place of the room's origin in the world, and the room's turn about z."""
 
 
 def world(x: float, y: float, z: float) -> tuple[float, float, float]:

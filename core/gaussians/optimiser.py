@@ -68,9 +68,9 @@ class Adam:
         """Within the context, a backward pass may step the parameters of a scene as soon as it has their gradients,
         which it then need not write. The CPU kernels do so.
 
-        The steps are those of `step`, which then makes the others alone: gradients of stepped parameters are None. Only
-        for a scene whose whole gradient comes from one `rasterization`: raises RunError if a parameter gets a gradient
-        after its step.
+        The steps are the same as in `step`, which then makes the others; gradients of stepped parameters stay None.
+        Only for a scene whose whole gradient comes from one `rasterization`: raises RunError if a parameter gets a
+        gradient after its step.
         """
         fused: FusedKernels | None = None
         steps: dict[str, Any] = {}

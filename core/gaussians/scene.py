@@ -54,8 +54,8 @@ class SceneGaussians(nn.Module):
         self.near = NEAR
         """Camera depth up to which Gaussians are culled, world units; smaller in a world of a large unit."""
         self.antialiased = False
-        """True for a scene that was trained with a mip filter: what the low-pass filter of the pixel thickens loses
-        opacity by as much (Yu et al. 2024; gsplat's rasterize_mode "antialiased")."""
+        """True for a scene that was trained with a mip filter: a Gaussian that the low-pass filter enlarges loses
+        opacity by the same factor (Yu et al. 2024; gsplat's rasterize_mode "antialiased")."""
         self.pixel_grid: PixelGrid | None = None
         """Pixel grid of the frames that the scene was fitted to, or None if unknown; see `conventions.pixel_grid`."""
         self.far: FarSphere | None = None

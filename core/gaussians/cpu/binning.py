@@ -278,7 +278,7 @@ def plan_parts(keys, bounds, chunk_bounds, step, work, starts, cuts):
         key = np.int64(keys[i])
         if key < CULLED_KEY:
             low, high = min(key, low), max(key, high)
-    shift = 0
+    shift = 0  # a bin holds 2^shift keys
     while (high - low) >> shift >= HISTOGRAM_BINS:
         shift += 1
     work[:] = 0
@@ -329,6 +329,7 @@ def _radix_sort(pairs, begin, count, largest, places):
         length += 1
     digit = (length + DIGITS - 1) // DIGITS
     mask = (1 << digit) - 1
+    # places: the count of each digit, then the first place of its pairs
     places[:, : mask + 1] = 0
     for j in range(begin, begin + count):
         key = pairs[0, j] >> 32
@@ -381,7 +382,8 @@ def _list_part(
         slot, before, tile = starts[i // CHUNK] + load_scalar(firsts, i), place, np.int64(load_scalar(tiles, i))
         if tile >= 0:
             packed, ahead = np.int64(load_scalar(rows, i)), slot - place
-            # The left column, then the right one; `last` is the end row, one past the last.
+            # The left column, then the right one, of which nothing is counted if it is not covered. `last` is the end
+            # row, one past the last.
             first, last = packed & FIRST_MASK, (packed >> FIRST_BITS) & END_MASK
             place = _write_two(tile, first, last, tiles_x, i, ahead, tile_list, place, tile_counts)
             first, last = (packed >> COLUMN_BITS) & FIRST_MASK, packed >> (COLUMN_BITS + FIRST_BITS)

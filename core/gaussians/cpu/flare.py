@@ -282,7 +282,7 @@ def _add_plain(state, records, at, left, top, first, end, start):
 @inlined
 def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs, add):
     """Draw a ring or arc in rows first .. end; rows that it does not reach cost little."""
-    start, y, k = _row_start(records, at, left, top + first)
+    start, y, k = _row_start(records, at, left, top + first)  # start: u of lane 0; y: d_y
     r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
     row, one = first, opaque(1)
     while row < end:
@@ -346,6 +346,7 @@ def raster(
         else:
             end = _draw_tile(entries, begin, end, records, shapes, left, top, state, arcs, add)
         ends[tile] = end
+        # alphas stand for the depths, which are not written
         write_tile(image, alphas, alphas, alphas, state, left, top, width, height, background, no_depth)
 
 
@@ -423,7 +424,7 @@ def _plain_backward(state, records, at, left, top, first, end, start):
 def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, arcs, add):
     """Return the gradient row of a ring or arc: moments of h (see the module head), sums of g and of colours, the
     gradients of r0 and w, and sums of g u and g d_y for b."""
-    start, y, k = _row_start(records, at, left, top + first)
+    start, y, k = _row_start(records, at, left, top + first)  # start: u of lane 0; y: d_y
     r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
     zero = splat(ZERO)
     sums, colours, mass = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
@@ -504,7 +505,7 @@ def raster_backward(
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         a, b, c = starts[tile], ends[tile], starts[tile + 1]  # begin, end of the drawn entries, end
-        load_tile(
+        load_tile(  # alphas and d_alphas stand for the depths, which are not read
             state, left, top, width, height, background, image, alphas, alphas, d_image, d_alphas, d_alphas,
             no_depth, edge,
         )  # fmt: skip

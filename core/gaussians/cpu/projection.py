@@ -168,6 +168,7 @@ def _rotation(w, x, y, z):
 @inlined
 def _rotation_backward(w, x, y, z, g):
     """Return the gradient of the unit quaternion from that of the rotation's rows."""
+    # Sums and differences of mirrored elements.
     s01, s02, s12 = g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][2] + g[2][1]
     d10, d02, d21 = g[1][0] - g[0][1], g[0][2] - g[2][0], g[2][1] - g[1][2]
     return (
@@ -450,7 +451,8 @@ def _add_to(sums, place, value, mask):
 def _add_camera_gradients(sums, is_new, mean, q, dv, dp, offset, intrinsics):
     """Add the camera gradients of 16 Gaussians; is_new: lanes that are not counted yet.
 
-    dv, dp, offset: gradients of V, of p, and of the offset from the camera to the mean; intrinsics: of fx, fy, cx, cy.
+    mean, q: m and the rows of Q. dv, dp, offset: gradients of V, of p, and of the offset from the camera to the mean.
+    intrinsics: gradients of fx, fy, cx, cy.
     V = R Q gives dV Q^T, p = R m + t gives dp m^T, and the position of the camera the opposite of the
     means' part by direction.
     """
@@ -480,7 +482,8 @@ def _project_block_backward(
     """Write the gradients of the 16 Gaussians from `first` on to rows from `row` on.
 
     fields: the summed gradient rows, one vector per field; colour_slopes: see `project`; cached: keep the gradients of
-    sh in the cache, since they are read soon; is_new, sums: for the camera, see `_add_camera_gradients`."""
+    sh in the cache, since they are read soon; is_new, sums: for the camera, see `_add_camera_gradients`;
+    transposed, rows: workspaces."""
     mean, scale = _load3(means, first), _load_scales(scales, first, raw)
     px, py, pz = _to_camera(camera, mean)
     in_front = pz > camera[NEAR]

@@ -233,7 +233,7 @@ def _copy(source, at, target, to, count):
 
 @inlined
 def write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth):
-    """Write the finished tile to the picture; overwrites the state."""
+    """Write the finished tile, over the background, to the flat pictures; overwrites the state."""
     visible_columns = width - left
     row, one = 0, opaque(1)
     while row < min(TILE_HEIGHT, height - top):

@@ -290,7 +290,7 @@ def relocated_opacity_and_scale(opacity: Tensor, copies: Tensor) -> tuple[Tensor
     """Return opacity and scale factor of `copies` Gaussians in one place that together render as one of `opacity`; all
     (n,).
 
-    o' = 1 - (1 - o)^(1/N) preserves the centre; o / sum_{j=1..N} (-1)^(j-1) C(N, j) o'^j / sqrt(j) preserves the
+    For N copies, o' = 1 - (1 - o)^(1/N) preserves the centre; o / sum_{j=1..N} (-1)^(j-1) C(N, j) o'^j / sqrt(j), the
     integral along a line through it (Kheradmand et al. 2024, eq. 8, with its double sum over binomials in closed form).
     """
     o, count = opacity.double(), copies.double()

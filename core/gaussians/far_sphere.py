@@ -45,4 +45,5 @@ class FarSphere:
         """Return means (m, 3) on the sphere, moved along it by steps (m, 3), world units."""
         centre = torch.tensor(self.centre, dtype=means.dtype, device=means.device)
         away = means + steps - centre
+        # The clamp bounds the factor, for a step that leads close to the centre.
         return centre + away * (self.radius / away.norm(dim=-1, keepdim=True).clamp(min=self.min_distance))

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,12 +50,20 @@ class NukeCamera:
     """A camera of frames by their numbers.
 
     poses: camera to world (4, 4), in Nuke's axes. focal: focal length relative to the width of the frame, or to its
-    height where `by_height`.
+    height where `by_height`. is_still: nothing of it is animated, and it has one frame, 0, that stands for all.
     """
 
     poses: Mapping[int, Floats]
     focal: Mapping[int, float]
     by_height: bool = False
+    is_still: bool = False
+
+    def at_frames(self, numbers: Iterable[int]) -> NukeCamera:
+        """Return the camera at these frames, where it is still; else the camera as it is."""
+        if not self.is_still:
+            return self
+        numbers = list(numbers)
+        return replace(self, poses=dict.fromkeys(numbers, self.poses[0]), focal=dict.fromkeys(numbers, self.focal[0]))
 
     def lens(self, number: int, size: tuple[int, int], aspect: float) -> Lens:
         """Return the lens of a frame of this size in pixels and pixel aspect ratio."""
@@ -82,7 +90,7 @@ def write_nuke_capture(camera: NukeCamera, plates: Mapping[int, Path], folder: P
 
     Raises CaptureError where no plate has a pose, and FrameError for one that cannot be read.
     """
-    tally = Tally("frame", "written")
+    tally, camera = Tally("frame", "written"), camera.at_frames(plates)
     numbers = sorted(set(plates) & set(camera.poses))
     tally.skip("the camera has no key there", *(plates[number].name for number in sorted(set(plates) - set(numbers))))
     if not numbers:
@@ -177,7 +185,7 @@ class _Node:
         focal, aperture = self._one("focal", DEFAULT_FOCAL), self._one("haperture", DEFAULT_APERTURE)
         if self.knobs.get("useMatrix") == "true":
             curves = self._curves("matrix", 16)
-            numbers = _common_frames(*curves, focal, aperture)
+            numbers, is_still = _common_frames(*curves, focal, aperture)
             poses = {number: np.array([_at(curve, number) for curve in curves]).reshape(4, 4) for number in numbers}
             if any(not is_rotation(pose[:3, :3]) or (pose[3] != (0, 0, 0, 1)).any() for pose in poses.values()):
                 raise self._problem("its matrix is no rotation with a translation")
@@ -186,13 +194,14 @@ class _Node:
             if order not in ROTATION_ORDERS:
                 raise self._problem(f"its rotation order is {order}")
             translation, rotation = (self._curves(name, 3) for name in ("translate", "rotate"))
-            numbers = _common_frames(*translation, *rotation, focal, aperture)
+            numbers, is_still = _common_frames(*translation, *rotation, focal, aperture)
             poses = {number: _pose([_at(curve, number) for curve in translation],
                                    [_at(curve, number) for curve in rotation], order) for number in numbers}
         if not poses:
             raise self._problem("its curves have no frame in common")
         # An aperture of 0 gives NaN, which `read_nuke_camera` refuses.
-        return NukeCamera(poses, {number: _at(focal, number) / (_at(aperture, number) or math.nan) for number in poses})
+        return NukeCamera(poses, {number: _at(focal, number) / (_at(aperture, number) or math.nan) for number in poses},
+                          is_still=is_still)
 
     def _one(self, name: str, default: float) -> Curve:
         return self._curves(name, 1)[0] if name in self.knobs else {0: default}
@@ -256,10 +265,10 @@ def _finite(word: str) -> float:
     return number
 
 
-def _common_frames(*curves: Curve) -> set[int]:
-    """Return the frames that all animated curves have a key at; of a still camera frame 0 alone."""
+def _common_frames(*curves: Curve) -> tuple[set[int], bool]:
+    """Return the frames that all animated curves have a key at, and whether none is animated: then frame 0 alone."""
     animated = [set(curve) for curve in curves if len(curve) > 1]
-    return set.intersection(*animated) if animated else {0}
+    return (set.intersection(*animated), False) if animated else ({0}, True)
 
 
 def _at(curve: Curve, number: int) -> float:

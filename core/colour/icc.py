@@ -137,9 +137,9 @@ def _parse_curve(data: bytes) -> Table:
     """Return a curve of type `curv` or `para` as a function of 0..1. Raises UnreadableProfile."""
     if data[:4] == b"curv" and len(data) >= 12:
         count = int.from_bytes(data[8:12], "big")
-        values = np.frombuffer(data[12:12 + 2 * count], ">u2")
-        if len(values) != count:
+        if len(data) < 12 + 2 * count:
             raise UnreadableProfile("is damaged")
+        values = np.frombuffer(data[12:12 + 2 * count], ">u2")
         if count == 0:
             return lambda x: np.asarray(x, np.float32)  # linear
         if count == 1:

@@ -82,7 +82,7 @@ class VideoColour:
         top = np.iinfo(kind).max
         matrix, offset = self._decoding
         if planes.shape[-1] == 1:
-            levels = np.arange(1 << self.bits) * matrix[0, 0] + offset[0]
+            levels = (np.arange(1 << self.bits) - self._black) * matrix[0, 0]  # without the offset of the differences
             table = (np.clip(levels / self.signal_top, 0, 1) * top + 0.5).astype(kind)
             return np.asarray(cv2.merge([np.take(table, np.minimum(planes[..., 0], (1 << self.bits) - 1))] * 3))
         if kind == np.uint8 and self.matrix == RGB:
@@ -147,14 +147,19 @@ class VideoColour:
         return HLG_HEADROOM if self.transfer == "HLG" else 1.0
 
     @property
+    def _black(self) -> int:
+        """The code of black in luma and in R G B (ITU-T H.273, 8.3)."""
+        return 16 << (self.bits - 8) if self.limited else 0
+
+    @property
     def _decoding(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return matrix (3, 3) and offset (3,): signal R G B = matrix @ codes + offset; codes of RGB planes are R G B.
         """
-        # Codes that luma and colour differences span, and that of black (ITU-T H.273, 8.3).
+        # Codes that luma and colour differences span (ITU-T H.273, 8.3).
         step, top = float(1 << (self.bits - 8)), float((1 << self.bits) - 1)
-        luma, difference, black = ((219 * step, 224 * step, 16 * step) if self.limited else (top, top, 0.0))
+        luma, difference = (219 * step, 224 * step) if self.limited else (top, top)
         if self.matrix == RGB:
-            return np.eye(3) / luma, np.full(3, -black / luma)
+            return np.eye(3) / luma, np.full(3, -self._black / luma)
         if self.matrix == YCGCO:
             matrix = np.array([[1.0, -1, 1], [1, 1, 0], [1, -1, -1]])
         else:
@@ -166,7 +171,7 @@ class VideoColour:
                                [1, 2 - 2 * blue, 0]])
         matrix = matrix / [luma, difference, difference]
         middle = float(1 << (self.bits - 1))
-        return matrix, -matrix @ [black, middle, middle]
+        return matrix, -matrix @ [self._black, middle, middle]
 
 
 def usual_matrix(width: int, height: int) -> int:

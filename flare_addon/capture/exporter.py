@@ -258,7 +258,7 @@ def scene_points(scene: Any, camera: Any) -> np.ndarray[Any, Any]:
             item.data.vertices.foreach_get("co", flat)
             parts.append(_transform(flat.reshape(-1, 3), item.matrix_world))
     every = np.concatenate(parts) if parts else np.zeros((0, 3))
-    return every[:: max(len(every) // MAX_POINTS, 1)]
+    return every[:: max(-(-len(every) // MAX_POINTS), 1)]
 
 
 def _transform(points: np.ndarray[Any, Any], matrix: Any) -> np.ndarray[Any, Any]:

@@ -151,6 +151,7 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
     for item, light in zip(lights, capture.lights, strict=True):
         if light.moves:
             light_paths.key_path(item, light, capture, scene_frames)
+    yield  # the last place at which a cancel finds the scene's own state unchanged
     state = scene.fit_flare
     if state.root is not None:
         state.root.fit_flare.is_root = True  # earlier versions did not store it
@@ -158,7 +159,6 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
     state.root = None  # so that the frames of an earlier capture are not changed
     state.footage = "images"
     state.capture, state.root = blend_relative(folder), root
-    yield
     show_recorded(scene, folder)
     state.known_lights = "\n".join(light.name for light in capture.lights)
     if settings.frames:

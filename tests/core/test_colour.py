@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from core.colour import REC_709, colour_space, space_of_chromaticities
+from core.colour.icc import UnreadableProfile, _parse_curve
 from core.colour.spaces import AP1, REC_2020, built_in_names, matrix_between
 from core.errors import SettingsError
 
@@ -132,3 +133,9 @@ def test_blender_s_library_is_used_inside_blender() -> None:
     assert ended.returncode == 0, ended.stderr
     expected = colour_space("acescg").to_linear(np.float32([[0.1, 0.5, 1]]))
     np.testing.assert_allclose(json.loads(ended.stdout.splitlines()[-1]), expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("data", [b"curv" + bytes(4) + (2).to_bytes(4, "big") + b"\0\1\0", b"curv" + bytes(7)])
+def test_a_curve_that_is_cut_short_is_damaged(data: bytes) -> None:
+    with pytest.raises(UnreadableProfile, match="damaged"):
+        _parse_curve(data)

@@ -22,6 +22,19 @@ ROTATE = np.array([[-5.0, 20.0, 3.0], [-6.0, 24.0, 2.0], [-7.0, 28.0, 1.0]])
 FOCAL, APERTURE = 35.0, 24.576
 
 
+def test_a_camera_that_stands_has_its_pose_in_every_plate(tmp_path: Path) -> None:
+    script = tmp_path / "still.nk"
+    script.write_text("Camera2 {\n translate {1 2 3}\n rotate {0 10 0}\n focal 30\n}\n")
+    plates = {}
+    for number in NUMBERS:
+        plates[number] = tmp_path / f"plate.{number}.png"
+        cv2.imwrite(str(plates[number]), np.full((48, 64, 3), 90, np.uint8))
+    tally = write_nuke_capture(read_nuke_camera(script), plates, tmp_path / "capture", Progress())
+    views = Capture.open(tmp_path / "capture").views
+    assert len(views) == len(NUMBERS) == tally.used
+    assert all((view.camera.world_to_camera == views[0].camera.world_to_camera).all() for view in views)
+
+
 def turn(axis: int, degrees: float) -> np.ndarray:
     """A right-handed rotation about an axis, by Rodrigues' formula."""
     vector = np.eye(3)[axis] * math.radians(degrees)

@@ -345,3 +345,25 @@ def test_a_flare_video_that_claims_too_many_frames_is_drawn(tmp_path: Path, monk
     write_video(path, "libx264", "yuv420p", [stripes(96, 6 * STRIPE)] * 3)
     monkeypatch.setattr(flare_bank, "Video", Longer)
     assert UserFlares(path.parent, 256).draw(np.random.default_rng(0)).rest.max() > 0.1
+
+
+@pytest.mark.parametrize(("name", "pixels", "bits", "matrix"), [
+    ("a.mkv", "gray", 8, 1), ("b.mkv", "gray", 8, 5), ("c.mkv", "gray10le", 10, 1), ("d.mkv", "gray16le", 16, 9)])
+def test_grey_videos_have_the_light_of_their_codes(tmp_path: Path, name: str, pixels: str, bits: int,
+                                                   matrix: int) -> None:
+    """Their file names a matrix, which means nothing for one plane."""
+    top = (1 << bits) - 1
+    codes = np.repeat(np.array([[0, top // 4, top // 2, top]], np.uint8 if bits == 8 else np.uint16), 16, 1)
+    codes = np.repeat(codes, 32, 0)
+    with av.open(str(tmp_path / name), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 32, pixels
+        stream.codec_context.color_range, stream.codec_context.colorspace = 2, matrix
+        frame = av.VideoFrame.from_ndarray(codes, pixels)
+        frame.color_range, frame.colorspace = 2, matrix
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with Video(tmp_path / name) as video:
+        read = next(iter(video)).pixels()
+    read = read / np.iinfo(read.dtype).max
+    np.testing.assert_allclose(read[16, 8::16, 0], [0, 0.25, 0.5, 1], atol=0.01)

@@ -213,12 +213,21 @@ def flare_shares(flare: FlareModel, views: Sequence[View], frames: Frames,
 
 def select_flaring(shares: Mapping[str, tuple[float, float]]) -> list[str]:
     """Return the names of the lights that flare; the one with the largest share if none does."""
-    flaring = [name for name, (share, peak) in shares.items() if share >= MIN_SHARE and peak >= MIN_PEAK]
+    flaring = [name for name in shares if _flares(shares[name])]
     return flaring or [max(shares, key=lambda name: shares[name])]
 
 
+def _flares(share_and_peak: tuple[float, float]) -> bool:
+    """Return whether a light with this share of all flare light, and this peak, flares."""
+    share, peak = share_and_peak
+    return share >= MIN_SHARE and peak >= MIN_PEAK
+
+
 def share_sentences(shares: Mapping[str, tuple[float, float]], flaring: Sequence[str]) -> list[str]:
-    """Return sentences for the user about the lights' shares."""
+    """Return sentences for the user about the lights' shares. flaring: the lights that the .flare has."""
+    if not any(map(_flares, shares.values())):
+        return [f"No light of the capture flares: the flare of each is below {MIN_PEAK:g} of white everywhere. The "
+                f"flare layers of this run are dark, and its .flare has {', '.join(flaring)} alone."]
     listed = ", ".join(f"{name} {100 * share:.1f} %" for name, (share, _) in
                        sorted(shares.items(), key=lambda item: -item[1][0]))
     sentences = [f"Shares of the flare by light: {listed}."]

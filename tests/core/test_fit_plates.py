@@ -122,10 +122,17 @@ def test_a_doubtful_brightness_is_only_a_first_guess(tmp_path: Path) -> None:
     assert lights.prior.isnan()[:, 0].tolist() == [True, False, True, False]
 
 
-def test_all_lights_stay_where_none_flares() -> None:
-    shares = {"a": (0.6, 0.0), "b": (0.4, 0.0)}
+def test_lights_that_do_not_flare_are_left_out_and_named() -> None:
+    shares = {"a": (0.999, 0.5), "b": (0.001, 0.5)}
     assert select_flaring(shares) == ["a"]
-    assert "b" in share_sentences(shares, ["a"])[1]
+    assert share_sentences(shares, ["a"])[1].endswith("everywhere): b.")
+
+
+def test_a_capture_in_which_no_light_flares_is_reported() -> None:
+    dark = {"a": (0.9, 0.001), "b": (0.1, 0.0)}
+    assert select_flaring(dark) == ["a"]
+    (sentence,) = share_sentences(dark, ["a"])
+    assert "No light of the capture flares" in sentence and "has a alone" in sentence
 
 
 def test_the_plates_lack_the_flare(run: Run, tmp_path: Path) -> None:

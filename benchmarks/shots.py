@@ -67,7 +67,8 @@ def main() -> None:
 
 
 def score(args: argparse.Namespace, name: str, seed: int) -> list[str]:
-    """Return the cells of `COLUMNS` for one shot; the first three figures are flare, dB, and relative error."""
+    """Return the cells of `COLUMNS` for one shot. Those of *no flare*, *network* and *fit* have two figures each: PSNR
+    of the flare, dB, and its relative error."""
     folder = prepare(args.out, name, seed, args.tracks)
     capture = Capture.open(folder, need_cameras=False)
     mode: Any = "default" if args.plates == "exact" else "estimated"
@@ -76,7 +77,7 @@ def score(args: argparse.Namespace, name: str, seed: int) -> list[str]:
     settings = override_settings(settings, {"width": args.size, "seed": seed, **{
         key: float(value) for key, value in changes.items()}})
     label = "-".join((args.tracks, args.plates, str(args.iterations), str(args.size), *args.changes))
-    if args.plates == "exact":  # removed/ would come first
+    if args.plates == "exact":  # a fit prefers removed/ to exact layers, so it gets a copy without
         capture = _with_exact_plates(folder)
     run = fit(capture, settings, folder / f"run-{label}", resume=True)
     run = Run.open(run.folder)

@@ -138,7 +138,8 @@ def merge_entry(known: Mapping[str, Any], name: str, xyz: Sequence[float], keys:
 def key_path(item: Any, light: Light, capture: Capture, scene_frames: Mapping[str, int]) -> None:
     """Key the location of an empty, a child of the root, along the path of a light of lights.json.
 
-    A path on the picture lies on the rays of its pixels. scene_frames: frame of each view, by its name.
+    A light that is known on the picture alone is put on the rays of its pixels (`Capture.light_state`). scene_frames:
+    frame of each view, by its name.
     """
     for view in capture.views:
         state = capture.light_state(light, view)

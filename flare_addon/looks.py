@@ -274,8 +274,10 @@ def place_lights(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.fl
 
 def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.float64], item: Any, *,
                 hides: bool, rendered: set[Any]) -> PlacedLight:
-    """Return the light of a flare as a camera sees it. Raises CaptureError.
+    """Return the light of a flare as a camera sees it. Of a light with an extent, `shares` has the visible share of
+    each cell, and its visibility is 1.
 
+    Raises CaptureError where the light's object is disabled, so that its place is unknown, unless its flare is dark.
     camera: matrix_world of the camera. to_capture: matrix (4, 4) from Blender's world to the coordinates of the result.
     item: the flare. hides: whether objects hide the light. rendered: `lamp_drive.rendered_collections` of the scene.
     """

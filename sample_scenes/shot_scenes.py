@@ -223,8 +223,8 @@ def pan(seed: int) -> ShotScene:
                   for items, far, side, pace, passed in ((walker, 4.6, 1.0, 0.11, passes[0]),
                                                          (cart, 5.0, -1.0, 0.22, passes[1]))
                   for item in items]
-        lamp = Lamp(place, 0.13, colour, 50.0, 5.0)
-        return FrameState(np.zeros(3), rotation, things, {"lamp": lamp}, {"lamp": 0.7})
+        lamp = Lamp(place, 0.13, colour, 50.0, 5.0)  # radius, colour, radiance, power
+        return FrameState(np.zeros(3), rotation, things, {"lamp": lamp}, {"lamp": 0.7})  # strength of its flare
 
     return ShotScene(camera, ("wide", "fast")[seed % 2], square, np.array([0.36, 0.37, 0.40]), state, 6.2)
 

@@ -113,10 +113,11 @@ def to_pixels(gaussians: PlaneGaussians, intrinsics: Tensor,
 
 
 def arcs_to_pixels(arcs: Tensor, covariances: Tensor, intrinsics: Tensor) -> Tensor:
-    """Return b (n, 2), px^-1: the inverse of covariances (n, 3), px^2, times arcs (n, 2) on the plane, in pixels.
+    """Return b (n, 2), px^-1, of the factor exp(b d) on Gaussians in pixels, for arcs (n, 2) on the plane.
 
-    covariances: of `to_pixels`, with the low-pass. An arc shifts the mean of a plain Gaussian by covariance times b,
-    and the low-pass leaves this shift as it is. In double precision, for needles.
+    An arc is the shift of the mean that the factor gives a Gaussian without a ring: covariance times b. covariances (n,
+    3), px^2: of `to_pixels`, which include the low-pass, so that the low-pass does not change the shift. In double
+    precision, since covariances of long thin Gaussians are nearly singular.
     """
     x, y = (arcs * intrinsics.diagonal()[:2]).double().unbind(-1)
     xx, xy, yy = covariances.double().unbind(-1)

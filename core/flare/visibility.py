@@ -105,11 +105,11 @@ def visibility_behind(scene: SceneGaussians, world_to_camera: NDArray[np.float64
 @torch.no_grad()
 def clear_visibilities(scene: SceneGaussians, model: FlareModel, poses: Sequence[Tensor], settings: VisibilitySettings,
                        kernels: Kernels = "auto", frames: Sequence[str] = ()) -> Tensor:
-    """Return (lights,), the visibility of each light where nothing hides it: that in the clearest tenth of these poses
-    (4, 4). frames: names of their frames, where lights move.
+    """Return (lights,), the visibility of each light where nothing hides it: that which a tenth of these poses (4, 4)
+    reach. frames: names of their frames, where lights move.
 
-    0 where even those see less than MIN_CLEAR: a scene that hides a light from everywhere, such as one that the light
-    was placed inside of, says nothing about it, and its visibilities are 1.
+    0 stands for unknown, where that is below MIN_CLEAR: the scene hides the light from everywhere, such as one that the
+    light was placed inside of. `relative_to_clear` gives 1 then.
     """
     cameras = [-pose[:3, :3].double().T @ pose[:3, 3].double() for pose in poses]
     places = [model.positions_in(frame) for frame in frames or [""] * len(poses)]

@@ -173,10 +173,11 @@ class Plate:
 
     @property
     def warning(self) -> str:
-        """Sentences on a suffix that is not that of the file's contents, and on what a plate with changed codes cannot
-        keep; "" for none."""
+        """Sentences for the user, "" for none: that the suffix is not that of the file's contents, and what is lost
+        when a plate with changed codes is written."""
         suffix, kind = self.path.suffix.lower(), file_kind(self.path)
         written, sentence = SUFFIX_KINDS.get(_format_suffix(self.path, self)), ""
+        # Only where the clean plate keeps the file's name, and with it the suffix.
         if clean_name(self.path) == self.path and kind not in ("", SUFFIX_KINDS.get(suffix)):
             sentence = f"{self.path} holds {kind.upper()} data, whatever its name; " + (
                 "so does the result of that name." if written == kind else

@@ -99,9 +99,10 @@ def plane_arrays(frame: Any, planar: PlaneFormat) -> list[NDArray[Any]]:
 
 
 def stack_planes(arrays: list[NDArray[Any]], planar: PlaneFormat) -> NDArray[Any]:
-    """Stack planes without alpha to (height, width, 1 or 3), in memory that the next call of this thread overwrites.
+    """Stack the planes of a frame to (height, width, 1 or 3); a plane of alpha is left out.
 
-    Chroma is interpolated linearly between the centres of its samples.
+    Three channels lie in memory that the next call of this thread overwrites; grey is a view of its plane. Chroma is
+    interpolated linearly between the centres of its samples.
     """
     import cv2
 

@@ -307,7 +307,7 @@ def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Chang
     limited = _is_limited(planar, video, encoder)
     last: int | None = None
     for frame in video:
-        both = change(frame)
+        both = change(frame)  # codes before and after, None where no pixel changes
         raw = apply_change(frame, *both) if both is not None else frame.raw
         if raw.format.name != planar.name or (not planar.is_rgb and frame.colour.limited != limited):
             raw = _reformat(raw, frame, planar, context, limited=limited)

@@ -52,8 +52,8 @@ def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str,
 def save_exr_parts(path: Path | str, parts: Sequence[tuple[Mapping[str, Any], Mapping[str, NDArray[Any]]]],
                    commit_lock: AbstractContextManager[None] | None = None, source: Path | None = None) -> None:
     """Write parts, each with its header and channels. commit_lock: see `atomic_path`. source: the EXR that they were
-    read from. Its texts and names that are not UTF-8 are written byte for byte in place of those that `exr.py` read
-    for them, which have the same lengths.
+    read from. `exr.py` reads its texts and names that are not UTF-8 as others of the same lengths; their own bytes are
+    written back over these.
 
     Raises OSError where the system refuses, for instance for a full disk, and FrameError for a path that is not UTF-8.
     """
@@ -73,7 +73,7 @@ def save_exr_parts(path: Path | str, parts: Sequence[tuple[Mapping[str, Any], Ma
             raise OSError(errno.ENOSPC if full else errno.EIO, str(problem), str(path)) from problem
         if strings or names:
             _restore_bytes(temporary, strings, names)
-        # Errors on closing the file are not reported.
+        # OpenEXR reports no error on closing a file, so a full disk shows as a file that is empty or cut short.
         if not temporary.stat().st_size or is_exr_truncated(temporary):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 

@@ -82,9 +82,11 @@ class Chain:
         return np.asarray(self.places[-1 if at_end else 0] + (frame - start) * self.velocity(at_end))
 
     def acceleration(self, diagonal: float) -> float:
-        """Return the acceleration, pixels per frame²: a high one, from the 80th percentile of the changes of velocity.
+        """Return a high estimate of the acceleration, pixels per frame²: 1.5 times the 80th percentile of the changes
+        of velocity.
 
-        It is kept within MIN_ACCELERATION and MAX_ACCELERATION. diagonal: of the frames, pixels.
+        It is kept within MIN_ACCELERATION and MAX_ACCELERATION; of fewer than three frames it is the former. diagonal:
+        of the frames, pixels.
         """
         places, frames = self.places, np.array(self.frames)
         least, most = MIN_ACCELERATION * diagonal, MAX_ACCELERATION * diagonal
@@ -142,7 +144,8 @@ def _cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | 
         gate = (BASE_GATE * diagonal + SPEED_GATE * speed
                 + 0.5 * chain.acceleration(diagonal) * (gap * gap - 1 + (before - 1) * gap))
     if chain.evidence >= LIKELY > source.evidence:
-        # A lamp that something begins to hide looks less like one, where it was expected, and only at once.
+        # A lamp that something begins to hide looks less like one: such a source counts only in the very next frame,
+        # near the predicted place, and if it has not grown.
         if gap > 1 or source.detection.radius > 1.3 * last.detection.radius:
             return None
         gate *= UNLIKELY_GATE

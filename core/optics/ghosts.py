@@ -127,8 +127,10 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
     """Add the cells of a traced grid to `picture`, each as two triangles.
 
     rays: (rows, columns, FIELDS). arrived: which of them reach the sensor. px, py: where, in pixels. light: their
-    density. stop_x, stop_y: (rows, columns, passages) on the stop, mm, of radius `radius`; edges: its `edge_radius`.
-    rim: see `GhostSettings`. colour (3,): of this wavelength.
+    density. stop_x, stop_y: (rows, columns, 3), where a ray passes the stop each time, mm; a passage that it does not
+    make repeats the first. radius: of the stop, mm. edges (sectors,): distance of the stop's edge from its centre,
+    relative to `radius`, in equal sectors of the angle from +x. rim: see `GhostSettings`. colour (3,): of this
+    wavelength.
     """
     rows, columns = px.shape
     height, width = picture.shape[0], picture.shape[1]

@@ -110,7 +110,7 @@ def is_same_process(pid: int, started: float) -> bool:
 
 def is_running(pid: int) -> bool:
     """True if a process of that id exists."""
-    if WINDOWS or PROC.is_dir():
+    if WINDOWS or PROC.is_dir():  # on Windows os.kill would end it; /proc tells processes that ended from others
         return _start_time(pid) is not None
     try:
         os.kill(pid, 0)

@@ -116,9 +116,9 @@ def input_sockets(tree: Any) -> list[Any]:
 
 
 def incoming_picture(tree: Any, name: str) -> Any:
-    """Return the socket of the picture that comes into an effect's tree; None before 5.3.
+    """Return the socket of the picture that comes into an effect's tree, of its Group Input node; None before 5.3.
 
-    A node for it has this name where the tree has none.
+    The tree's input and the node are added where they are missing. name: of a node that is added.
     """
     if not HAS_EFFECTS:
         return None

@@ -67,7 +67,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Clean the plates, in `--jobs` processes. Raises FrameError for plates that failed, after the others are done."""
+    """Subtract the flare of a fitted run (--run), or clean a video or plates, the latter in `--jobs` processes.
+
+    Raises SettingsError for options that do not go together, and FrameError for plates that failed, after the others
+    are done.
+    """
     from ...core.images.video import is_video
 
     if (args.run is None) == (not args.plates):

@@ -14,9 +14,9 @@ SUN = LightSource("sun", (float(DISTANCE * np.sin(AZIMUTH) * np.cos(ELEVATION)),
 
 
 def path(numbers: Array) -> Array:
-    """Return poses (n, 4, 4), world to camera, of a walk along the terrace.
+    """Return poses (n, 4, 4), world to camera, of a walk along the terrace: to either side and back in 60 numbers.
 
-    The camera turns with it until the sun leaves the frame.
+    The camera faces the terrace's centre as it walks, and pans, so that the sun leaves the frame at times.
     """
     poses = []
     for t in np.asarray(numbers) / 60:

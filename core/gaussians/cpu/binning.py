@@ -197,7 +197,7 @@ def _write_two(tile, first, end, tiles_x, i, slots_ahead, tile_list, at, tile_co
     tile_list[at * LIST_ENTRY + 2] = ((tile << ROW_BITS | first) << ROW_BITS) | (_min(end, TILE_HEIGHT) - 1)
     tile_counts[tile] += upper
     at += upper
-    tile += tiles_x * lower
+    tile += tiles_x * lower  # without a lower tile it stays, so that the index below is inside tile_counts
     tile_list[at * LIST_ENTRY], tile_list[at * LIST_ENTRY + 1] = i, at + slots_ahead
     first = _max(first - TILE_HEIGHT, 0)
     tile_list[at * LIST_ENTRY + 2] = ((tile << ROW_BITS | first) << ROW_BITS) | (end - TILE_HEIGHT - 1)
@@ -302,8 +302,9 @@ def plan_parts(keys, bounds, chunk_bounds, step, work, starts, cuts):
 def _collect_part(keys, bounds, low, high, cursors, pairs):
     """Collect the Gaussians with keys in low .. high - 1 in a range of pairs[0], key in the upper 32 bits, index below.
 
-    The smallest key is subtracted. cursors[0]: next free place of pairs. Returns the range's begin and length, the
-    largest key that was written, and an upper bound on the length of their tile list."""
+    The smallest key is subtracted. bounds: the most tiles that each Gaussian may have. cursors[0]: next free place of
+    pairs. Returns the range's begin and length, the largest key that was written, and an upper bound on the length of
+    their tile list."""
     count, capacity, smallest, largest = 0, 0, high, low
     for i in range(keys.size):
         key = np.int64(keys[i])
@@ -312,7 +313,7 @@ def _collect_part(keys, bounds, low, high, cursors, pairs):
             capacity += bounds[i]
             smallest = min(key, smallest)
             largest = max(key, largest)
-    begin = at = atomic_add(cursors, 0, count + 1)
+    begin = at = atomic_add(cursors, 0, count + 1)  # one more for a last pair that is written but not counted
     for i in range(keys.size):  # every pair is written, and overwritten if not counted: no unpredictable branch
         key = np.int64(keys[i])
         pairs[0, at] = (key - smallest) << 32 | i

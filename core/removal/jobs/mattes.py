@@ -85,7 +85,11 @@ def _is_same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def _read_matte_values(path: Path) -> NDArray[np.float32]:
-    """Return (height, width): the matte's brightest channel times its alpha; transparent counts as black."""
+    """Return (height, width), 0..1: the matte's brightest channel; transparent counts as black.
+
+    A straight alpha multiplies it. An EXR's alpha, whose colours are premultiplied, only limits it; where the colours
+    of an EXR are black everywhere, its alpha is the matte, unless it is opaque everywhere.
+    """
     matte = read_plate(path)
     values = np.nan_to_num(matte.codes.max(-1).astype(np.float32) / np.float32(matte.max_code), nan=0.0, posinf=1.0)
     alpha = matte.straight_alpha

@@ -48,4 +48,4 @@ def compose_batches(pools: Pools, recipe: Recipe, random: np.random.Generator) -
                                          second=second).to(device))
                   for number_of_flares, second in ((count, False), (second_count, True))]
         frames = draw_frame_parameters(random, count, recipe).to(device)
-        yield Batch(*compose(scenes, gammas, frames, flares), 1.0)
+        yield Batch(*compose(scenes, gammas, frames, flares), 1.0)  # share: all of the iteration's frames

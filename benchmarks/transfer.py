@@ -78,9 +78,10 @@ def move_world(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Truth]:
-    """Return `count` frames with exact flares. world: "same" or "moved". size: width and height, pixels.
+    """Synthesise `count` frames with exact flares on a new camera path. size: width and height, pixels.
 
-    Each light is hidden in some frames, and partly hidden in those next to them.
+    world: "same" keeps the capture's coordinates, "moved" turns and shifts the target. Each light is hidden in some
+    frames, and partly hidden in those next to them.
     """
     sources = sources_of(look)
     width, height = size

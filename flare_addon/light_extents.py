@@ -61,7 +61,8 @@ def _of_lamp(data: Any, linear: Floats) -> LightExtent | None:
 
 
 def _of_shape(evaluated: Any, linear: Floats) -> LightExtent:
-    """Return the extent of a mesh's surface, or of a curve without one, by its points. Raises ValueError."""
+    """Return the extent of a mesh or curve object: points spread evenly over its faces, or along its vertices if it has
+    none. linear: (3, 3) of the object's matrix. Raises ValueError if it has no area or no length."""
     mesh = evaluated.to_mesh()
     try:
         places = np.empty(3 * len(mesh.vertices), np.float32)

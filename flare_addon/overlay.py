@@ -181,7 +181,8 @@ def touch_region(centres: Floats, covariances: Floats, radii: Floats, width: int
 
 
 def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -> dict[int, Quads]:
-    """Return the quads of Gaussians by level (the divisor of the size), in pixels of the level and drawing order."""
+    """Return the quads of the Gaussians that touch the region, by level: the divisor of the size of the buffer that
+    they are drawn in. Lengths are pixels of that buffer; quads are in drawing order, with "over" back to front."""
     blend = look.blend
     centres, covariances = to_pixels(gaussians, window.intrinsics, look.pixel_grid)
     radii, arcs = extent(gaussians, blend), arcs_to_pixels(gaussians, window.intrinsics)

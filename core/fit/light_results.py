@@ -255,7 +255,7 @@ def without_other_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:
 def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
     """Write lights.json of a run: the lights of the capture with their places and fitted brightness, by frame.
 
-    Lights that are not in `flare` have no brightness. Nothing is written for lights that stand and stay on.
+    Lights that are not in `flare` have no brightness. Nothing is written where all lights are static and always on.
     """
     lights = flare.frame_lights
     if lights is None:

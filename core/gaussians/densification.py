@@ -99,8 +99,8 @@ class Classic:
 
     @torch.no_grad()
     def update(self, iteration: int) -> bool:
-        """Clone, split and prune in iterations that are due for it, likewise reset opacities; return whether rows
-        changed."""
+        """Every `every` iterations clone, split and prune; every `reset_every` iterations reset the opacities. Return
+        whether rows were added or removed."""
         s = self.settings
         if iteration > s.stop:
             return False
@@ -208,8 +208,7 @@ class Mcmc:
 
     @torch.no_grad()
     def update(self, iteration: int) -> bool:
-        """Relocate and add Gaussians in iterations that are due for it; inject noise in all. Return whether rows
-        changed."""
+        """Every `every` iterations relocate and add Gaussians; in each inject noise. Return whether rows changed."""
         s = self.settings
         changed = s.start < iteration <= s.stop and iteration % s.every == 0
         if changed:

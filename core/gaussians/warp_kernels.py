@@ -214,7 +214,8 @@ def _as_warp_array(tensor: Tensor) -> Any:
 
 
 def _launch(kernel: Any, lists: TileLists, blend: Blend, parts: Any, more: list[Any]) -> None:
-    """Launch a kernel with one thread for each pixel of each tile; more: its last arguments."""
+    """Launch a kernel with one thread for each pixel of each tile. parts: the fields of `WhitenedGaussians`; absent
+    rings and arcs are passed as zeros. more: Warp arrays behind the common ones, the outputs among them."""
     places, values, rings, arcs = parts
     shapes = values.new_zeros(len(values), SHAPES)
     if rings is not None:

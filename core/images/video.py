@@ -65,10 +65,10 @@ _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
 
 def import_av() -> ModuleType:
-    """Import PyAV, which passes on none of FFmpeg's messages. Raises EngineError where it is not installed.
+    """Import PyAV. Raises EngineError where it is not installed.
 
-    No level of messages is set: that would install a callback in Python, on which decoding threads wait while a file is
-    closed.
+    By default PyAV prints none of FFmpeg's messages. `av.logging.set_level` must not be called: it installs a callback
+    in Python, for which decoding threads wait while a file is closed.
     """
     try:
         import av

@@ -156,8 +156,11 @@ def _timecode(container: Any, stream: Any) -> str | None:
 
 
 def _output_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFormat:
-    """Return the planar format that is encoded: the source's if the encoder keeps it, else the same without alpha if it
-    takes that, else one of the encoder's own for alpha, for more than 8 bits, or for any."""
+    """Return the planar format to encode, the first of these that applies.
+
+    The source's, if the encoder keeps it; the source's, without alpha where the encoder has none, if the encoder
+    accepts that and is not one of limited range; the encoder's formats for alpha, for more than 8 bits, or for any.
+    """
     av = import_av()
     _, planar = to_planar(first.raw, video.colour.limited)
     accepted = {pixel_format.name for pixel_format in av.codec.Codec(encoder.name, "w").video_formats or ()}

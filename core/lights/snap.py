@@ -142,7 +142,8 @@ def _are_on_peaks(views: Sequence[FlareView], positions: Floats) -> NDArray[np.b
 
 
 def _are_unobserved(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
-    """Return (n,), True for lights that stand in a clipped sky in most views that have a flare and show them."""
+    """Return (n,), True for each light that lies in clipped sky in most of its views: those that have it in the frame,
+    and a flare of at least MIN_FLARE of the mean."""
     unobserved = np.zeros(len(positions), bool)
     levels = [float(view.flare.mean()) for view in views]
     flaring = [view for view, level in zip(views, levels, strict=True) if level >= MIN_FLARE * np.mean(levels)]

@@ -381,7 +381,8 @@ def _add_moments(sums, h, u, dy):
 
 @inlined
 def _needle_backward(state, records, at, left, top, first, end):
-    """Return the gradient row of a plain Gaussian with the blend "add", with an exponential for each row."""
+    """Return the gradient row of a plain Gaussian with the blend "add" that is too narrow for the recurrence over rows,
+    so that each row has its own exponential: sums of g by the five moments of `_add_moments`, a zero, then R, G, B."""
     zero = splat(ZERO)
     sums, colours = (zero, zero, zero, zero, zero), (zero, zero, zero)
     row, one = first, opaque(1)

@@ -89,9 +89,10 @@ def short(value: int) -> Tag:
 
 
 def read_tags(stream: BinaryIO, numbers: Container[int], at: int | None = None) -> dict[int, Tag]:
-    """Read tags of the first page, or of the directory at offset `at`, without damaged ones; none of other files.
+    """Read the tags `numbers` of the first page, or of the directory at offset `at`. Damaged tags are left out; a file
+    that is no TIFF gives {}.
 
-    Whole numbers and offsets of 64 bits come as 32 bits, as a TIFF holds them; larger ones are left out.
+    Whole numbers of 64 bits, of a BigTIFF, are returned as those of 32 bits, and left out where they do not fit.
     """
     layout, entries = next(_directories(stream, at), _NO_DIRECTORY)
     tags: dict[int, Tag] = {}

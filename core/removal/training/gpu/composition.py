@@ -122,7 +122,8 @@ def draw_frame_parameters(random: Random, count: int, recipe: Recipe) -> FramePa
 
 def draw_flare_placements(random: Random, count: int, canvas: int, width: int, height: int, *,
                           second: bool = False) -> FlarePlacements:
-    """Draw the placements of `count` flares, the first or the second of their frames, float32."""
+    """Draw placement and appearance of `count` flares, one per frame, float32. second: they are the second flares of
+    their frames, whose strength is random."""
     shining = [random_cameras.draw_appearance(random, random_cameras.draw_second_strength(random) if second else 1.0)
                for _ in range(count)]
     blurs, colours, gains, max_means = (np.array(part) for part in zip(*shining, strict=True))

@@ -43,9 +43,8 @@ class FITFLARE_PT_node_bake(_NodePanel, bpy.types.Panel):
     draw, _draw_compositor = FITFLARE_PT_bake.draw, FITFLARE_PT_bake._draw_compositor
 
 
-class FITFLARE_PT_image_picture(bpy.types.Panel):
+class FITFLARE_PT_image_picture(_ImagePanel, bpy.types.Panel):
     bl_label, bl_idname = "Picture", "FITFLARE_PT_image_picture"
-    bl_space_type, bl_region_type, bl_category = "IMAGE_EDITOR", "UI", jobs.SIDEBAR_TAB
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

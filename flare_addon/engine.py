@@ -17,7 +17,7 @@ from ..core.system.files import remove_folder, write_text
 from ..core.system.processes import child_environment, find_python
 from . import jobs, weights
 from .jobs import Job
-from .user_settings import engine_path, user_folder
+from .user_settings import check_online_access, configured_path, user_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN_SCRIPT = ROOT / "headless" / "run.py"
@@ -45,10 +45,7 @@ def virtual_environment() -> Path:
 
 def configured_engine() -> tuple[str, str]:
     """Return the source and the path of a configured engine: FIT_FLARE_ENGINE, else the preferences, else ("", "")."""
-    for source, path in ((ENGINE_VARIABLE, os.environ.get(ENGINE_VARIABLE, "")), ("the preferences", engine_path())):
-        if path:
-            return source, path
-    return "", ""
+    return configured_path(ENGINE_VARIABLE, "engine")
 
 
 def find_engine() -> Path | None:
@@ -121,8 +118,7 @@ def set_up() -> Job:
 
     Raises EngineError where Blender's online access is off, or where a damaged earlier engine cannot be removed.
     """
-    if not bpy.app.online_access:
-        raise EngineError("Blender's online access is off; allow it in Preferences > System > Network, then set up.")
+    check_online_access("set up")
     if is_set_up() and not (virtual_environment() / "pyvenv.cfg").is_file():  # damaged
         _remove_environment(virtual_environment())
     command_line = [*weights.SET_UP, str(virtual_environment()), *weights.download_args()]

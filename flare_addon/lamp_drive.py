@@ -94,7 +94,7 @@ def rendered_collections(scene: Any) -> set[Any]:
             for collection in enabled_collections(layer.layer_collection, "hide_render")}
 
 
-def is_shown(target: Any, depsgraph: Any, rendered: set[Any]) -> bool:
+def is_visible(target: Any, depsgraph: Any, rendered: set[Any]) -> bool:
     """Return whether a light object shines at the current frame.
 
     It does not if it is disabled in renders or in viewports, nor if no collection of it is rendered. Of an empty,
@@ -140,7 +140,7 @@ def dark_reason(scene: Any, depsgraph: Any, item: Any, rendered: set[Any] | None
     """
     target = item.target
     rendered = rendered_collections(scene) if rendered is None else rendered
-    if item.follow_visibility and not is_shown(target, depsgraph, rendered):
+    if item.follow_visibility and not is_visible(target, depsgraph, rendered):
         return f"{target.name} is disabled, and its flare with it: enable it, or switch Follow Visibility off."
     if item.follow_direction and scene.camera is not None and has_direction(item):
         matrix, eye = target.evaluated_get(depsgraph).matrix_world, scene.camera.matrix_world.translation

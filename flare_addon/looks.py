@@ -282,7 +282,7 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
     item: the flare. hides: whether objects hide the light. rendered: `lamp_drive.rendered_collections` of the scene.
     """
     eye, target = camera.translation, item.target
-    is_dark = item.follow_visibility and not lamp_drive.is_shown(target, depsgraph, rendered)
+    is_dark = item.follow_visibility and not lamp_drive.is_visible(target, depsgraph, rendered)
     try:
         placed = world_matrix(target, depsgraph)
     except CaptureError:

@@ -16,6 +16,8 @@ from .layouts import draw_progress, label_lines
 from .reports import GuardedOperator
 from .user_settings import PACKAGE
 
+NO_ONLINE_ACCESS = "Allow Online Access in Preferences > System > Network first"
+"""The reason why a button that downloads is off."""
 DOWNLOAD_SIZE = f"about {'3 GB, most of it CUDA,' if sys.platform == 'linux' else '1 GB'} to download once"
 
 
@@ -153,7 +155,7 @@ class FITFLARE_OT_set_up_engine(GuardedOperator, bpy.types.Operator):
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:
         if not bpy.app.online_access:
-            return "Allow Online Access in Preferences > System > Network first"
+            return NO_ONLINE_ACCESS
         job = engine.set_up_job()
         if job is not None and job.running:
             return "The engine is being set up"
@@ -180,7 +182,7 @@ class FITFLARE_OT_download_weights(GuardedOperator, bpy.types.Operator):
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:
         if not bpy.app.online_access:
-            return "Allow Online Access in Preferences > System > Network first"
+            return NO_ONLINE_ACCESS
         if weights.find() is not None:
             return "The weights are installed already"
         return "" if weights.source_url() else "This extension was not installed from a repository that offers them"

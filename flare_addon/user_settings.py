@@ -6,10 +6,13 @@ depend on the panel of the preferences, which uses these modules itself.
 """
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 import bpy
+
+from ..core.errors import EngineError
 
 PACKAGE = (__package__ or "").rpartition(".")[0]  # such as "bl_ext.user_default.fit_flare"
 
@@ -35,17 +38,31 @@ def addon_preferences() -> Any:
 
 def engine_path() -> str:
     """Return the engine that the preferences name; "" where they name none."""
-    preferences = addon_preferences()
-    return bpy.path.abspath(preferences.engine) if preferences is not None and preferences.engine else ""
-
-
-def weights_path() -> str:
-    """Return the weights that the preferences name; "" where they name none."""
-    preferences = addon_preferences()
-    return bpy.path.abspath(preferences.weights) if preferences is not None and preferences.weights else ""
+    return _stored_path("engine")
 
 
 def library_path() -> str:
     """Return the folder of the library that the preferences name; "" where they name none."""
+    return _stored_path("library")
+
+
+def configured_path(variable: str, preference: str) -> tuple[str, str]:
+    """Return the source and the path of what users configure: the environment variable, else the preference of that
+    name, else ("", "")."""
+    for source, path in ((variable, os.environ.get(variable, "")), ("the preferences", _stored_path(preference))):
+        if path:
+            return source, path
+    return "", ""
+
+
+def _stored_path(preference: str) -> str:
+    """Return the absolute path in a preference; "" where it is empty."""
     preferences = addon_preferences()
-    return bpy.path.abspath(preferences.library) if preferences is not None and preferences.library else ""
+    path = "" if preferences is None else getattr(preferences, preference)
+    return bpy.path.abspath(path) if path else ""
+
+
+def check_online_access(action: str) -> None:
+    """Raise EngineError where Blender's online access is off. action: what to do once it is on, such as "download"."""
+    if not bpy.app.online_access:
+        raise EngineError(f"Blender's online access is off; allow it in Preferences > System > Network, then {action}.")

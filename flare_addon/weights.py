@@ -7,7 +7,6 @@ Every command of the engine gets their path as FIT_FLARE_WEIGHTS.
 """
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from urllib.parse import urljoin
@@ -19,7 +18,7 @@ from ..core.removal.model.weights_file import IN_THE_BOX, WEIGHTS_VARIABLE, publ
 from ..core.system.processes import child_environment
 from . import jobs
 from .jobs import Job
-from .user_settings import PACKAGE, user_folder, weights_path
+from .user_settings import PACKAGE, check_online_access, configured_path, user_folder
 
 FOLDER = "weights"
 PLATFORM = "https://extensions.blender.org/"
@@ -36,10 +35,7 @@ def downloaded_file() -> Path:
 
 def configured() -> tuple[str, str]:
     """Return the source and the path of configured weights: FIT_FLARE_WEIGHTS, else the preferences, else ("", "")."""
-    for source, path in ((WEIGHTS_VARIABLE, os.environ.get(WEIGHTS_VARIABLE, "")), ("the preferences", weights_path())):
-        if path:
-            return source, path
-    return "", ""
+    return configured_path(WEIGHTS_VARIABLE, "weights")
 
 
 def find() -> Path | None:
@@ -87,8 +83,7 @@ def download_args() -> list[str]:
 
 def download() -> Job:
     """Download the weights. Raises EngineError where Blender's online access is off or no repository offers them."""
-    if not bpy.app.online_access:
-        raise EngineError("Blender's online access is off; allow it in Preferences > System > Network, then download.")
+    check_online_access("download")
     args = download_args()
     if not args:
         raise EngineError("No repository offers the weights of the removal network; name their file under Removal "

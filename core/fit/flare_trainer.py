@@ -23,12 +23,11 @@ from ..flare.model import FlareModel
 from ..system.progress import Progress
 from .checkpoint import State
 from .frames import Frames
+from .light_brightness import normalise_brightness, solve_brightness
 from .light_results import (
     flare_shares,
-    normalise_brightness,
     select_flaring,
     share_sentences,
-    solve_brightness,
     without_other_lights,
     write_frame_lights,
 )

@@ -34,7 +34,7 @@ from .checkpoint import FitInputs, State
 from .flare_trainer import FlareTrainer
 from .frames import Frames, Targets, masked
 from .initialise import initial_flare
-from .light_results import solve_brightness
+from .light_brightness import solve_brightness
 from .optimisers import Optimisers
 from .plate_estimates import PlateEstimator, ShotFrames
 from .plate_scene import PlateScene

@@ -22,7 +22,7 @@ _EYES = ("left", "right")
 _WINDOWS = ("dataWindow", "displayWindow")
 
 
-class View(NamedTuple):
+class StereoView(NamedTuple):
     """A view, the names of its three colour channels, and the number of the part that holds them; a grey view has one
     name three times."""
 
@@ -35,14 +35,14 @@ _Parts = Sequence[tuple[Mapping[str, Any], Collection[str]]]
 """Header and channel names of each part of an EXR."""
 
 
-def views_of_file(path: Path) -> list[View]:
+def views_of_file(path: Path) -> list[StereoView]:
     """Return the views of an EXR file, that of its main part first; empty for a picture of one view. Raises FrameError.
     """
     return views_of_parts([(header, [channel.name for channel in header["channels"]])
                            for header in read_exr_headers(path)])
 
 
-def views_of_parts(parts: _Parts) -> list[View]:
+def views_of_parts(parts: _Parts) -> list[StereoView]:
     """Return the views of an EXR's parts, that of the main part first; empty for a picture of one view.
 
     They are the views inside the main part, else the parts that name their view.
@@ -50,11 +50,11 @@ def views_of_parts(parts: _Parts) -> list[View]:
     main = main_part([(number, names) for number, (_, names) in enumerate(parts)])
     if inside := stereo_views(*parts[main]):
         return [view._replace(part=main) for view in inside]
-    views: dict[str, View] = {}
+    views: dict[str, StereoView] = {}
     for number in (main, *(number for number in range(len(parts)) if number != main)):
         header, names = parts[number]
         if (view := _view_of_part(header)) and (colours := _colours(names, "")):
-            views.setdefault(view, View(view, colours, number))
+            views.setdefault(view, StereoView(view, colours, number))
     return list(views.values()) if len(views) > 1 else []
 
 
@@ -66,7 +66,7 @@ def _view_of_part(header: Mapping[str, Any]) -> str:
     return last if last.lower() in _EYES else ""
 
 
-def stereo_views(header: Mapping[str, Any], names: Collection[str]) -> list[View]:
+def stereo_views(header: Mapping[str, Any], names: Collection[str]) -> list[StereoView]:
     """Return the views in one part of an EXR, the one at the root first; empty for a picture of one view.
 
     names: of the channels. Without the attribute multiView, views are the channel prefixes "left" and "right"; the
@@ -76,10 +76,10 @@ def stereo_views(header: Mapping[str, Any], names: Collection[str]) -> list[View
     prefixed = dict.fromkeys(name.rpartition(".")[0] for name in names if name.count(".") == 1)
     eyes = listed[1:] or [name for name in prefixed if name.lower() in _EYES]
     root = listed[0] if listed else next(name for name in (*_EYES, "root") if name not in [eye.lower() for eye in eyes])
-    views = [View(root, colours)] if (colours := _colours(names, "")) else []
+    views = [StereoView(root, colours)] if (colours := _colours(names, "")) else []
     if not views and listed:
         eyes = listed  # the first one is behind its name too
-    views += [View(eye, colours) for eye in eyes if (colours := _colours(names, f"{eye}."))]
+    views += [StereoView(eye, colours) for eye in eyes if (colours := _colours(names, f"{eye}."))]
     return views if len(views) > 1 else []
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .exr_views import View, views_of_parts
+from .exr_views import StereoView, views_of_parts
 from .plates import Plate, write_plate, write_results
 from .write import write_exr
 
@@ -23,7 +23,7 @@ def _parts_of_plate(plate: Plate) -> list[tuple[Mapping[str, Any], Mapping[str, 
     return list(plate.extras.get("parts") or [(plate.extras.get("header", {}), plate.extras.get("channels", {}))])
 
 
-def _views_of_plate(plate: Plate) -> list[View]:
+def _views_of_plate(plate: Plate) -> list[StereoView]:
     """Return the views of a plate, that of its codes first; empty for a picture of one view."""
     return views_of_parts(_parts_of_plate(plate))
 
@@ -36,7 +36,8 @@ def split_views(plate: Plate) -> list[tuple[str, Plate]]:
     return [(view.name, _view_plate(plate, view, *parts[view.part])) for view in views]
 
 
-def _view_plate(plate: Plate, view: View, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]]) -> Plate:
+def _view_plate(plate: Plate, view: StereoView, header: Mapping[str, Any],
+                channels: Mapping[str, NDArray[Any]]) -> Plate:
     """Return the plate of one view. header, channels: of the part that holds it."""
     return replace(plate, codes=np.stack([np.asarray(channels[name]) for name in view.channels], -1),
                    grey=len(set(view.channels)) == 1, extras={"header": header, "channels": channels})

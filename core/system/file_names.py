@@ -44,7 +44,7 @@ def canonical_name(name: PurePath | str) -> str:
 def name_below(folder: Path, name: str) -> str:
     """Return the end of an absolute path of another machine that lies in a folder; other names as they are.
 
-    "C:/work/shot/images/1.png" is images/1.png if the folder has images/.
+    "D:/shots/one/images/1.png" is images/1.png if the folder has images/.
     """
     parts = PurePosixPath(name.replace("\\", "/")).parts
     if not parts or ".." in parts or not (parts[0] == "/" or _DRIVE.fullmatch(parts[0])):

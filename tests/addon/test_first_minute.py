@@ -152,7 +152,7 @@ def test_area_lights_flare_as_areas(facts: Any) -> None:
     assert "choose Point as its extent" in facts["an area of nothing"]
 
 
-def test_an_area_light_behind_a_fence_is_baked_as_it_is_shown(facts: Any) -> None:
+def test_bake_and_camera_view_agree_on_an_area_light_behind_a_fence(facts: Any) -> None:
     """Block of first_minute.py: "lights that are areas"."""
     shares = 0.5, 0.48, 0.5  # of the lamp, exactly
     for (difference, ratio, brightest, share), exact in zip(facts["behind a fence"], shares, strict=True):

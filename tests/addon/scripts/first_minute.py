@@ -330,7 +330,7 @@ ops.bake()
 overlay, cameras = part("flare_addon.overlay"), part("flare_addon.cameras")
 
 
-def shown(scene):
+def camera_view(scene):
     """The flare as the overlay draws it."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     camera = scene.camera.evaluated_get(depsgraph)
@@ -345,11 +345,12 @@ for number in (1, 2, 3):
     scene.frame_set(number)
     with_flare, item.intensity = rendered(scene), 0.0
     baked, item.intensity = with_flare - rendered(scene), 1.0
-    fenced.append([float(np.abs(codes(shown(scene)) - codes(baked)).max()), float(baked.sum() / shown(scene).sum()),
+    visible = camera_view(scene)
+    fenced.append([float(np.abs(codes(visible) - codes(baked)).max()), float(baked.sum() / visible.sum()),
                    float(codes(baked).max()), brightness(scene) / whole])
 item.extent = "point"
 bpy.context.view_layer.update()
-facts["a point"] = float(np.abs(codes(shown(scene)) - codes(drawn(scene))).max())
+facts["a point"] = float(np.abs(codes(camera_view(scene)) - codes(drawn(scene))).max())
 item.extent = "auto"
 facts["behind a fence"] = fenced
 ops.remove_compositor()

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Solves the brightness of lights by frame over a fitted flare, and normalises it.
+
+The plate trainer solves it at times during a fit; `flare_trainer` solves and normalises it at the end, in frames that
+the fit has not seen too.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from ..capture import View
+from ..capture.discs import CLIP_LEVEL
+from ..colour.srgb import linear_from_srgb
+from ..conventions.splatting import C0
+from ..flare.frame_lights import FrameLights
+from ..flare.model import FlareModel
+from ..system.least_squares import robust_bounded_fit
+from .frames import Frames, Targets
+from .rendering import RenderedView
+
+RenderView = Callable[[View], RenderedView]
+
+MAX_BRIGHTNESS = 4.0
+"""Largest brightness that a frame may give a light, relative to its usual one."""
+PRIOR_WEIGHT = 1e-6
+"""Weight per pixel of the present brightness."""
+CORRELATION_SHARE = 0.005
+"""Share of a frame's pixels whose errors count as one, because neighbouring errors of a plate are alike."""
+STEP_SCALE = 0.2
+"""Change of brightness from frame to frame that counts as usual."""
+MIN_CERTAINTY = 1e-3
+"""Certainty of a brightness that a frame does not show."""
+FLARE_ERROR, OUTSIDE_ERROR, PRIOR_ERROR = 0.1, 2.0, 0.1
+"""Standard deviations of a brightness by the flare, at the least, of one by the flare of a light outside the frame, and
+of one in the lights' file: a plate that holds part of the flare biases the first, the second has only ghosts, and
+clipping and glare bias the third."""
+EDGE_SHARE = 0.03
+"""Distance from the frame's edge, as a share of its width, within which a light counts as outside for its brightness:
+its core may be cut off."""
+TV_REWEIGHTINGS, TV_EPSILON = 30, 1e-3
+
+
+@torch.no_grad()
+def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, render_view: RenderView) -> None:
+    """Set the brightness of the lights in these views, which are in the order of the shot.
+
+    The present flares at that brightness explain frame - scene best. Where a frame leaves it uncertain, the brightness
+    in the lights' file and that of the neighbouring frames decide (`smooth_with_steps`). The flare stays as it is:
+    held-out frames give the places and the brightness of lights, and nothing else.
+    """
+    lights = flare.frame_lights
+    if lights is None:
+        return
+    weight = lights.brightness.weight
+    rows = [lights.rows[view.name] for view in views]
+    solved, certainty = np.zeros((2, len(views), len(flare.names)))
+    for number, (view, row) in enumerate(zip(views, rows, strict=True)):
+        start = weight[row].clamp(0, MAX_BRIGHTNESS).numpy().astype(np.float64)
+        weight[row] = 1.0  # so that the layers have their usual strength
+        rendered = render_view(view)
+        columns = [rendered.layers.flares[name].numpy() if name in rendered.layers.flares else None
+                   for name in flare.names]
+        solved[number], certainty[number] = _solve(frames.targets(view), rendered.layers.scene.numpy(), columns, start)
+    prior = lights.prior[rows].numpy().astype(np.float64)
+    prior_certainty = np.isfinite(prior) / PRIOR_ERROR**2
+    inside = np.array([_lights_in_frame(lights, view, EDGE_SHARE) for view in views])
+    certainty = np.minimum(certainty, 1 / np.where(inside, FLARE_ERROR, OUTSIDE_ERROR) ** 2)
+    total = certainty + prior_certainty
+    solved = (certainty * solved + prior_certainty * np.nan_to_num(prior)) / np.maximum(total, 1e-9)
+    for light in range(len(flare.names)):
+        smooth = smooth_with_steps(solved[:, light], total[:, light])
+        weight[rows, light] = torch.from_numpy(smooth.clip(0, MAX_BRIGHTNESS)).float()
+
+
+def _lights_in_frame(lights: FrameLights, view: View, edge: float = 0.0) -> NDArray[np.bool_]:
+    """Return (lights,) which lights lie on the frame of a view. edge: width of its border that does not count, as a
+    share of the frame's width."""
+    camera = view.camera
+    pixels, depth = camera.project(lights.positions[lights.rows[view.name]].numpy())
+    margin = edge * camera.width
+    return camera.contains(pixels, depth) & camera.contains(pixels - margin, depth) & camera.contains(
+        pixels + margin, depth)
+
+
+def smooth_with_steps(values: NDArray[np.float64], certainty: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return x (n,) that minimises sum certainty (x - values)^2 / 2 + sum |change of x| / STEP_SCALE.
+
+    certainty: 1 / variance of each value. It is total variation denoising, by reweighted least squares.
+    """
+    smooth = values.copy()
+    if len(values) < 2:
+        return smooth
+    for _ in range(TV_REWEIGHTINGS):
+        springs = 1 / (STEP_SCALE * (np.abs(np.diff(smooth)) + TV_EPSILON))
+        smooth = _solve_tridiagonal(certainty + MIN_CERTAINTY, springs, (certainty + MIN_CERTAINTY) * values)
+    return smooth
+
+
+def _solve_tridiagonal(weights: NDArray[np.float64], springs: NDArray[np.float64],
+                       target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Solve (diag(weights) + the Laplacian of a chain with these springs) x = target, by elimination."""
+    diagonal = weights.copy()
+    diagonal[:-1] += springs
+    diagonal[1:] += springs
+    right = target.copy()
+    for index in range(1, len(target)):
+        factor = springs[index - 1] / diagonal[index - 1]
+        diagonal[index] -= factor * springs[index - 1]
+        right[index] += factor * right[index - 1]
+    solution = right / diagonal
+    for index in range(len(target) - 2, -1, -1):
+        solution[index] += springs[index] * solution[index + 1] / diagonal[index]
+    return solution
+
+
+def _solve(targets: Targets, scene: NDArray[np.float32], flares: Sequence[NDArray[np.float32] | None],
+           start: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the strengths (lights,) of flares (height, width, 3), linear light, in a frame over its scene, and their
+    certainty, 1 / variance.
+
+    flares: None for a light behind the camera. start: (lights,) present strengths, which stay, with a certainty of 0,
+    where a light has no flare in the frame.
+    """
+    solved, certainty = start.copy(), np.zeros(len(start))
+    present = [number for number, flare in enumerate(flares) if flare is not None and flare.max() > 0]
+    frame = targets.frame.numpy()
+    usable = (frame < CLIP_LEVEL).all(-1)
+    if not present or not usable.any():
+        return solved, certainty
+    light = (linear_from_srgb(frame) - scene)[usable].ravel().astype(np.float64)
+    columns = np.stack([np.asarray(flares[number])[usable].ravel() for number in present], 1).astype(np.float64)
+    solved[present] = robust_bounded_fit(columns, light, start[present], 0.0, MAX_BRIGHTNESS, PRIOR_WEIGHT)
+    residual = light - columns @ solved[present]
+    energies = np.square(columns).sum(0)
+    # If errors were independent, the variance of a strength would be variances / energies, by the squared errors at
+    # each pixel (White 1980); but `area` pixels count as one. The last term keeps the certainty finite.
+    variances = (np.square(columns) * residual[:, None] ** 2).sum(0) / np.maximum(energies, 1e-12)
+    area = CORRELATION_SHARE * len(light)
+    certainty[present] = energies / (area * variances + 1e-6 * area)
+    return solved, certainty
+
+
+@torch.no_grad()
+def normalise_brightness(flare: FlareModel, views: Sequence[View]) -> None:
+    """Scale each light so that its brightness is 1 in the brightest of these views, and its flare to match.
+
+    Views with the light in the frame decide, if there are any: elsewhere its brightness is uncertain.
+    """
+    lights = flare.frame_lights
+    if lights is None:
+        return
+    for number, light in enumerate(flare.lights):
+        inside = [lights.rows[view.name] for view in views if _lights_in_frame(lights, view)[number]]
+        rows = inside or [lights.rows[view.name] for view in views]
+        brightest = float(lights.brightness.weight[rows, number].max())
+        if brightest <= 0:
+            continue
+        lights.brightness.weight[:, number] /= brightest
+        _scale_colours(light.gaussians["sh"], light.network.head, light.network.names, light.network.widths, brightest)
+
+
+def _scale_colours(sh: torch.Tensor, head: nn.Linear, names: Sequence[str], widths: Sequence[int],
+                   factor: float) -> None:
+    """Multiply the colours 0.5 + C0 (sh + change) + ... of Gaussians by a factor, `change` the network's offset.
+
+    names, widths: the parts of the output of `head`, the network's last layer.
+    """
+    sh *= factor
+    sh[:, :3] += (factor - 1) * 0.5 / C0
+    first = sum(widths[:names.index("sh")])
+    rows = slice(first, first + widths[names.index("sh")])
+    head.weight[rows] *= factor
+    head.bias[rows] *= factor

@@ -19,7 +19,7 @@ from core.removal.inference.framing import (
     MAX_ASPECT,
     fill_hidden,
     input_size,
-    merge_columns,
+    merge_margins,
     predict_in_parts,
     wrap_columns,
     wrap_margin,
@@ -173,10 +173,10 @@ def test_a_panorama_has_no_seam(flare_everywhere: Path, tmp_path: Path, monkeypa
 
 def test_the_margins_of_a_panorama_merge_to_the_whole() -> None:
     light = np.random.default_rng(0).random((4, 40, 3)).astype(np.float32)
-    np.testing.assert_allclose(merge_columns(wrap_columns(light, 10), 10), light, atol=1e-6)
+    np.testing.assert_allclose(merge_margins(wrap_columns(light, 10), 10), light, atol=1e-6)
     assert wrap_columns(light, 0) is light
     ramp = np.broadcast_to(np.arange(60, dtype=np.float32)[None, :, None], (1, 60, 3))
-    merged = merge_columns(ramp, 10)[0, :, 0]  # the predictions of an edge differ by 40
+    merged = merge_margins(ramp, 10)[0, :, 0]  # the predictions of an edge differ by 40
     assert abs(merged[0] - merged[-1]) < 6
     np.testing.assert_array_equal(merged[10:30], ramp[0, 20:40, 0])
 

@@ -80,7 +80,7 @@ class DiffusionRemoval(nn.Module):
         source = str(base)
         try:
             tokenizer = CLIPTokenizer.from_pretrained(source, subfolder="tokenizer", local_files_only=True)
-            text = CLIPTextModel.from_pretrained(source, subfolder="text_encoder", local_files_only=True)
+            text_encoder = CLIPTextModel.from_pretrained(source, subfolder="text_encoder", local_files_only=True)
             self.unet = UNet2DConditionModel.from_pretrained(source, subfolder="unet", local_files_only=True)
             self.vae = AutoencoderKL.from_pretrained(source, subfolder="vae", local_files_only=True)
             schedule = DDPMScheduler.from_pretrained(source, subfolder="scheduler", local_files_only=True)
@@ -90,7 +90,7 @@ class DiffusionRemoval(nn.Module):
                            "--base.") from problem
         self.rank = rank
         self.register_buffer("alpha_cumprod", schedule.alphas_cumprod[NOISE_STEP].clone(), persistent=False)
-        self.register_buffer("prompt", _embed_prompt(tokenizer, text), persistent=False)
+        self.register_buffer("prompt", _embed_prompt(tokenizer, text_encoder), persistent=False)
         self.requires_grad_(False)
         self.unet.add_adapter(LoraConfig(r=rank, lora_alpha=rank, init_lora_weights="gaussian",
                                          target_modules=_UNET_LAYERS))
@@ -105,7 +105,8 @@ class DiffusionRemoval(nn.Module):
         encoder, decoder = self.vae.encoder, self.vae.decoder
         in_channels = [block.resnets[0].in_channels for block in encoder.down_blocks][::-1]
         out_channels = [block.resnets[0].in_channels for block in decoder.up_blocks]
-        layers = nn.ModuleList(nn.Conv2d(a, b, 1, bias=False) for a, b in zip(in_channels, out_channels, strict=True))
+        layers = nn.ModuleList(nn.Conv2d(encoder_width, decoder_width, 1, bias=False) for encoder_width, decoder_width
+                               in zip(in_channels, out_channels, strict=True))
         for layer in layers:
             nn.init.constant_(layer.get_parameter("weight"), 1e-5)
         return layers
@@ -134,6 +135,7 @@ class DiffusionRemoval(nn.Module):
         return x.chunk(2, 1)[0] * self.vae.config.scaling_factor, features
 
     def _decode(self, latents: Tensor, features: list[Tensor]) -> Tensor:
+        """Return the frames (n, 3, h, w), -1..1, of latents and encoder features, as `_encode` returns them."""
         decoder, x = self.vae.decoder, latents / self.vae.config.scaling_factor
         if self.vae.post_quant_conv is not None:
             x = self.vae.post_quant_conv(x)
@@ -173,10 +175,10 @@ def read_rank(path: Path | str) -> int:
 
 
 @torch.no_grad()
-def _embed_prompt(tokenizer: Any, text: Any) -> Tensor:
+def _embed_prompt(tokenizer: Any, text_encoder: Any) -> Tensor:
     tokens = tokenizer(PROMPT, padding="max_length", max_length=tokenizer.model_max_length, truncation=True,
                        return_tensors="pt")
-    embedded: Tensor = text(tokens.input_ids)[0]
+    embedded: Tensor = text_encoder(tokens.input_ids)[0]
     return embedded
 
 
@@ -212,8 +214,8 @@ class DiffusionRemover(Remover):
     min_mean_flare = 0.0
 
     def __init__(self, base: Path | str, lora: Path | str, *, working_size: int = WORKING_SIZE) -> None:
-        """base: as for `DiffusionRemoval`. lora: the file that `DiffusionRemoval.save` wrote. Raises EngineError,
-        RunError."""
+        """base: as for `DiffusionRemoval`. lora: the file that `DiffusionRemoval.save` wrote. working_size: long side
+        of the model's input, pixels. Raises EngineError, RunError."""
         # Remover.__init__ would load the network. The model does not separate the glow, so all of it is removed.
         self.working_size, self.glow = working_size, "remove"
         self.model = DiffusionRemoval(base, read_rank(lora))
@@ -234,35 +236,35 @@ class DiffusionRemover(Remover):
         return single_prediction(np.ascontiguousarray(flare[0].permute(1, 2, 0).cpu().numpy()))
 
 
-def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[[int], tuple[Pixels, Pixels]],
+def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw_pair: Callable[[int], tuple[Pixels, Pixels]],
                     iterations: int, progress: Progress, *, resume: bool = False,
                     perceptual: Callable[[Tensor, Tensor], Tensor] | None = None) -> Path:
     """Train the model and return the path of its weights, lora.safetensors in `folder`, which is saved every SAVE_EVERY
     iterations.
 
-    draw: returns the frame and the scene of an iteration. perceptual: as for `DiffusionTrainer`. resume: continue the
-    training in the folder; the moments of the optimiser start at zero. Raises RunError, SettingsError, Cancelled.
+    draw_pair: returns the frame and the scene of an iteration. perceptual: as for `DiffusionTrainer`. resume: continue
+    the training in the folder; the moments of the optimiser start at zero. Raises RunError, SettingsError, Cancelled.
     """
     if iterations < 1:
         raise SettingsError("A training needs at least one iteration.")
     folder = Path(folder)
     with folder_lock(folder):
-        path, first = folder / "lora.safetensors", 0
+        path, start_iteration = folder / "lora.safetensors", 0
         if path.exists():
             if not resume:
                 raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
-            first = int(json.loads(model.load(path).get("iteration", "0")))
+            start_iteration = int(json.loads(model.load(path).get("iteration", "0")))
         trainer = DiffusionTrainer(model, perceptual=perceptual)
-        progress.stage("train", iterations, min(first, iterations))
-        iteration = first
+        progress.stage("train", iterations, min(start_iteration, iterations))
+        completed = start_iteration
         try:
-            for number in range(first, iterations):
-                metrics = trainer.step(*draw(number))
-                iteration = number + 1
-                if iteration % SAVE_EVERY == 0:
-                    model.save(path, {"iteration": str(iteration)})
+            for index in range(start_iteration, iterations):
+                metrics = trainer.step(*draw_pair(index))
+                completed = index + 1
+                if completed % SAVE_EVERY == 0:
+                    model.save(path, {"iteration": str(completed)})
                 progress.advance(1, **metrics)
         finally:
-            if iteration > first:
-                model.save(path, {"iteration": str(iteration)})
+            if completed > start_iteration:
+                model.save(path, {"iteration": str(completed)})
     return path

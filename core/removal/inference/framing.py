@@ -44,9 +44,9 @@ def fill_hidden(plate: Plate) -> Plate:
         return plate
     height, width = alpha.shape
     scale = min(FILL_SIZE / max(height, width), 1)
-    small = max(round(width * scale), 1), max(round(height * scale), 1)
+    small_size = max(round(width * scale), 1), max(round(height * scale), 1)
     light = plate.space.to_linear(plate.values) * alpha[..., None]
-    filling = _diffuse(*(np.asarray(cv2.resize(part, small, interpolation=cv2.INTER_AREA), np.float32)
+    filling = _pull_push_fill(*(np.asarray(cv2.resize(part, small_size, interpolation=cv2.INTER_AREA), np.float32)
                          for part in (light, alpha)))
     # Where alpha is partial, the filling shows through.
     light += (1 - alpha)[..., None] * np.asarray(cv2.resize(filling, (width, height)), np.float32)
@@ -57,17 +57,17 @@ def fill_hidden(plate: Plate) -> Plate:
     return replace(plate, codes=codes, alpha=None)
 
 
-def _diffuse(light: Pixels, alpha: Pixels) -> Pixels:
+def _pull_push_fill(light: Pixels, alpha: Pixels) -> Pixels:
     """Fill premultiplied light (h, w, 3) where its alpha (h, w) is below 1 by means over larger and larger windows
     (pull-push, Gortler et al. 1996)."""
     import cv2
 
     if min(alpha.shape) <= 2:
-        total = alpha.sum()
-        return np.broadcast_to(light.sum((0, 1)) / max(total, np.float32(1e-6)), light.shape).astype(np.float32)
-    coarse = _diffuse(np.asarray(cv2.pyrDown(light), np.float32), np.asarray(cv2.pyrDown(alpha), np.float32))
-    above = np.asarray(cv2.pyrUp(coarse, dstsize=(alpha.shape[1], alpha.shape[0])), np.float32)
-    return light + (1 - alpha)[..., None] * above
+        alpha_sum = alpha.sum()
+        return np.broadcast_to(light.sum((0, 1)) / max(alpha_sum, np.float32(1e-6)), light.shape).astype(np.float32)
+    coarse = _pull_push_fill(np.asarray(cv2.pyrDown(light), np.float32), np.asarray(cv2.pyrDown(alpha), np.float32))
+    upsampled = np.asarray(cv2.pyrUp(coarse, dstsize=(alpha.shape[1], alpha.shape[0])), np.float32)
+    return light + (1 - alpha)[..., None] * upsampled
 
 
 def wrap_margin(plate: Plate) -> int:
@@ -98,8 +98,8 @@ def wrap_columns(pixels: NDArray[Any], margin: int) -> NDArray[Any]:
     return np.concatenate([pixels[:, pixels.shape[1] - margin:], pixels, pixels[:, :margin]], 1) if margin else pixels
 
 
-def merge_columns(light: Pixels, margin: int) -> Pixels:
-    """Return light (height, width, 3) from that of a wrapped plate, (height, width + 2 margin, 3).
+def merge_margins(light: Pixels, margin: int) -> Pixels:
+    """Remove the margins of a wrapped plate's light: (height, width + 2 margin, 3) to (height, width, 3).
 
     Each margin is a second prediction of the columns at the other edge. It counts half at the seam and falls linearly
     to nothing within `margin` columns, where the first prediction has more picture around it.
@@ -108,23 +108,24 @@ def merge_columns(light: Pixels, margin: int) -> Pixels:
         return light
     width = light.shape[1] - 2 * margin
     merged = light[:, margin:margin + width].copy()
-    share = (np.arange(margin, 0, -1, dtype=np.float32) - np.float32(0.5))[None, :, None] / (2 * margin)
-    merged[:, :margin] += share * (light[:, margin + width:] - merged[:, :margin])
-    merged[:, width - margin:] += share[:, ::-1] * (light[:, :margin] - merged[:, width - margin:])
+    weight = (np.arange(margin, 0, -1, dtype=np.float32) - np.float32(0.5))[None, :, None] / (2 * margin)
+    merged[:, :margin] += weight * (light[:, margin + width:] - merged[:, :margin])
+    merged[:, width - margin:] += weight[:, ::-1] * (light[:, :margin] - merged[:, width - margin:])
     return merged
 
 
 def input_size(width: int, height: int, working_size: int) -> tuple[int, int]:
     """Return (width, height) of the network's input for a picture: the long side is the working size, or that of each
     part of a long picture; multiples of SIZE_MULTIPLE."""
-    long, short = max(width, height), min(width, height)
-    scale = working_size / long
-    if long > MAX_ASPECT * short:
-        scale = min(working_size / (PART_ASPECT * short), MAX_LONG_SIDE * working_size / long)
+    long_side, short_side = max(width, height), min(width, height)
+    scale = working_size / long_side
+    if long_side > MAX_ASPECT * short_side:
+        scale = min(working_size / (PART_ASPECT * short_side), MAX_LONG_SIDE * working_size / long_side)
     # Rounding a side up must not exceed the long side.
-    largest = max(int(max(long * scale, working_size)) // SIZE_MULTIPLE, 2)
-    columns, rows = (int(np.clip(round(side * scale / SIZE_MULTIPLE), 2, largest)) for side in (width, height))
-    return columns * SIZE_MULTIPLE, rows * SIZE_MULTIPLE
+    max_multiple = max(int(max(long_side * scale, working_size)) // SIZE_MULTIPLE, 2)
+    input_width, input_height = (int(np.clip(round(side * scale / SIZE_MULTIPLE), 2, max_multiple)) * SIZE_MULTIPLE
+                                 for side in (width, height))
+    return input_width, input_height
 
 
 def predict_in_parts(display: Pixels, predict: Callable[[Pixels], Pixels]) -> Pixels:
@@ -138,17 +139,17 @@ def predict_in_parts(display: Pixels, predict: Callable[[Pixels], Pixels]) -> Pi
     if height > width:
         return predict_in_parts(display.swapaxes(0, 1), lambda part: predict(part.swapaxes(0, 1)).swapaxes(0, 1)
                                 ).swapaxes(0, 1)
-    part = PART_ASPECT * height
+    part_width = PART_ASPECT * height
     # Parts begin half a part apart at most. Their weight falls to 0 at their ends, so no seam shows.
-    starts = np.linspace(0, width - part, -(-2 * (width - part) // part) + 1).round().astype(int)
-    place = np.arange(part, dtype=np.float32) + np.float32(0.5)
-    weight = np.minimum(place, part - place)[None, :, None]
-    total, merged = np.zeros((1, width, 1), np.float32), None
+    starts = np.linspace(0, width - part_width, -(-2 * (width - part_width) // part_width) + 1).round().astype(int)
+    position = np.arange(part_width, dtype=np.float32) + np.float32(0.5)
+    weight = np.minimum(position, part_width - position)[None, :, None]
+    weight_sum, merged = np.zeros((1, width, 1), np.float32), None
     for start in starts:
-        prediction = predict(display[:, start:start + part]) * weight
+        prediction = predict(display[:, start:start + part_width]) * weight
         if merged is None:
             merged = np.zeros((height, width, prediction.shape[2]), np.float32)
-        merged[:, start:start + part] += prediction
-        total[:, start:start + part] += weight
+        merged[:, start:start + part_width] += prediction
+        weight_sum[:, start:start + part_width] += weight
     assert merged is not None
-    return merged / total
+    return merged / weight_sum

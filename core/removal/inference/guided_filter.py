@@ -55,9 +55,9 @@ def fit_guided_filter(display: Pixels, flare: Pixels) -> GuidedFilterMaps:
     def mean(values: Pixels) -> Pixels:
         return np.asarray(cv2.blur(values, window, borderType=cv2.BORDER_REFLECT), np.float32)
 
-    reach = (4 * RADIUS + 1, 4 * RADIUS + 1)  # as far as a clipped pixel affects the two means
+    clipped_reach = (4 * RADIUS + 1, 4 * RADIUS + 1)  # as far as a clipped pixel affects the two means
     # guidance: share of the guided filter in the result, 0..1; it falls off smoothly around clipped pixels.
-    clipped = cv2.dilate((display.max(-1) > CLIPPING_LEVEL).astype(np.uint8), np.ones(reach, np.uint8))
+    clipped = cv2.dilate((display.max(-1) > CLIPPING_LEVEL).astype(np.uint8), np.ones(clipped_reach, np.uint8))
     guidance = mean(clipped.astype(np.float32))[..., None]
     mean_display, mean_flare = mean(display), mean(flare)
     covariance = mean(display * flare) - mean_display * mean_flare
@@ -69,8 +69,8 @@ def fit_guided_filter(display: Pixels, flare: Pixels) -> GuidedFilterMaps:
     guidance = guidance * cv2.dilate(near_flare, np.ones(window, np.uint8))[..., None]
     # Windows with an edge count: their fit holds on both of its sides.
     weight = (variance + np.float32(EPSILON)) * near_flare
-    total = mean(variance + np.float32(EPSILON))
-    gain, offset = mean(gain * weight) / total, mean(offset * weight) / total
+    mean_weight = mean(variance + np.float32(EPSILON))
+    gain, offset = mean(gain * weight) / mean_weight, mean(offset * weight) / mean_weight
     return GuidedFilterMaps(guidance * gain, guidance * offset + (1 - guidance) * flare)
 
 
@@ -78,7 +78,7 @@ def upsample_flare(maps: GuidedFilterMaps, codes: NDArray[Any], encoding: Encodi
                    max_code: float) -> Iterator[tuple[slice, Pixels]]:
     """Yield (rows, linear flare of those rows (n, width, 3)) for a plate's codes (height, width, 3), top to bottom.
 
-    The flare is 0 or more, and no more than the plate's light.
+    max_code: the code of white, of "srgb" codes. The flare is 0 or more, and no more than the plate's light.
     """
     import cv2
 
@@ -88,11 +88,12 @@ def upsample_flare(maps: GuidedFilterMaps, codes: NDArray[Any], encoding: Encodi
     for first in range(0, height, STRIP_ROWS):
         rows = slice(first, min(first + STRIP_ROWS, height))
         y = ((np.arange(first, rows.stop, dtype=np.float32) + 0.5) * (map_height / height) - 0.5)[:, None]
-        low = max(int(y[0, 0]) - 2, 0)  # rows of the maps that the strip needs, with some to spare
-        high = min(int(y[-1, 0]) + 4, map_height)
-        map_x, map_y = np.broadcast_to(x, (len(y), width)), np.broadcast_to(y - low, (len(y), width))
+        map_top = max(int(y[0, 0]) - 2, 0)  # rows of the maps that the strip needs, with some to spare
+        map_bottom = min(int(y[-1, 0]) + 4, map_height)
+        map_x, map_y = np.broadcast_to(x, (len(y), width)), np.broadcast_to(y - map_top, (len(y), width))
         gain, offset = (np.concatenate([
-            cv2.remap(np.ascontiguousarray(part[low:high]), np.ascontiguousarray(map_x[:, left:left + REMAP_COLUMNS]),
+            cv2.remap(np.ascontiguousarray(part[map_top:map_bottom]),
+                      np.ascontiguousarray(map_x[:, left:left + REMAP_COLUMNS]),
                       np.ascontiguousarray(map_y[:, left:left + REMAP_COLUMNS]), cv2.INTER_LINEAR,
                       borderMode=cv2.BORDER_REPLICATE) for left in range(0, width, REMAP_COLUMNS)], 1)
                         for part in (maps.gain, maps.offset))

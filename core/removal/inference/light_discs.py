@@ -59,14 +59,14 @@ DISTANCE_LEVELS = 4
 class _LightDiscs(NamedTuple):
     """Bright regions that may be light discs.
 
-    labels: (h, w), 0 outside. The others have one value per label, (count,). by_contrast, by_glow: certainty that the
-    region is a light disc, 0..1, by its contrast and by the glow about it. peak_observed, peak_clean: greatest
-    brightness of the region, as filmed and without the flare.
+    labels: (h, w), 0 outside. The others have one value per label, (count,). contrast_certainty, glow_certainty:
+    certainty that the region is a light disc, 0..1, by its contrast and by the glow about it. peak_observed,
+    peak_clean: greatest brightness of the region, as filmed and without the flare.
     """
 
     labels: NDArray[np.int32]
-    by_contrast: NDArray[Any]
-    by_glow: NDArray[Any]
+    contrast_certainty: NDArray[Any]
+    glow_certainty: NDArray[Any]
     peak_observed: NDArray[Any]
     peak_clean: NDArray[Any]
 
@@ -79,32 +79,32 @@ def retained_fraction(display: Pixels, flare: Pixels, glow_fraction: Pixels, *, 
     """
     observed, clean = display.mean(-1), np.maximum(display - flare, 0).mean(-1)
     discs = _find_light_discs(observed, clean, flare.mean(-1), (flare * glow_fraction).mean(-1))
-    glow_kept = (_retained_glow(discs, clean)[..., None] * glow_fraction if keep_glow
-                 else np.zeros_like(glow_fraction))
-    return np.asarray(np.maximum(_retained_discs(discs, observed, clean)[..., None], glow_kept), np.float32)
+    retained_glow = (_retained_glow_fraction(discs, clean)[..., None] * glow_fraction if keep_glow
+                     else np.zeros_like(glow_fraction))
+    return np.asarray(np.maximum(_retained_on_discs(discs, observed, clean)[..., None], retained_glow), np.float32)
 
 
-def _retained_discs(discs: _LightDiscs, observed: Pixels, clean: Pixels) -> NDArray[Any]:
+def _retained_on_discs(discs: _LightDiscs, observed: Pixels, clean: Pixels) -> NDArray[Any]:
     """Return the fraction of the flare that is kept on the light discs themselves and their rims, 0..1, (h, w).
 
     observed, clean: brightness (h, w) as filmed and without the flare.
     """
     with_rim = _dilate_labels(discs.labels, RIM_SIZE)
-    by_contrast = (discs.by_contrast[with_rim]
-                   * np.clip(clean / discs.peak_clean[with_rim], 0, 1) ** BRIGHTNESS_EXPONENT)
-    by_glow = discs.by_glow[discs.labels] * _centre_weight(discs.labels)
-    return np.asarray(np.interp(observed, RIM_RAMP, (0, 1)) * np.maximum(by_contrast, by_glow))
+    retained_by_contrast = (discs.contrast_certainty[with_rim]
+                            * np.clip(clean / discs.peak_clean[with_rim], 0, 1) ** BRIGHTNESS_EXPONENT)
+    retained_by_glow = discs.glow_certainty[discs.labels] * _centre_weight(discs.labels)
+    return np.asarray(np.interp(observed, RIM_RAMP, (0, 1)) * np.maximum(retained_by_contrast, retained_by_glow))
 
 
-def _retained_glow(discs: _LightDiscs, clean: Pixels) -> NDArray[Any]:
+def _retained_glow_fraction(discs: _LightDiscs, clean: Pixels) -> NDArray[Any]:
     """Return the fraction of the glow that is kept, (h, w): greatest at the light discs, falling off with distance.
 
     clean: brightness (h, w) without the flare.
     """
     import cv2
 
-    certainty = np.maximum(discs.by_contrast, discs.by_glow) * np.interp(discs.peak_observed, DISC_PEAK_RAMP, (0, 1))
-    certainty = certainty[discs.labels]
+    certainty = np.maximum(discs.contrast_certainty, discs.glow_certainty)
+    certainty = (certainty * np.interp(discs.peak_observed, DISC_PEAK_RAMP, (0, 1)))[discs.labels]
     falloff = np.float32(GLOW_FALLOFF * max(certainty.shape))
     proximity = np.zeros(certainty.shape, np.float32)
     # At each of some levels: the falloff from the nearest disc of greater certainty. Their mean weights the glow about
@@ -128,7 +128,7 @@ def _find_light_discs(observed: Pixels, clean: Pixels, flare: Pixels, glow: Pixe
     count, components = cv2.connectedComponents((observed > MIN_DISC_BRIGHTNESS).astype(np.uint8))
     labels = np.asarray(components, np.int32)
     surround = np.where(_dilate_labels(labels, RIM_SIZE) > 0, 0, _dilate_labels(labels, SURROUND_SIZE))
-    # The core is the brighter part of a region, without the pixels that it shares with its surroundings.
+    # core: the label of each pixel in the brighter part of its region; the darker ones are partly surroundings.
     core = np.where(observed >= _label_means(observed, labels, count)[labels], labels, 0)
     contrast, observed_contrast = (_label_means(brightness, core, count) - _label_means(brightness, surround, count)
                                    for brightness in (clean, observed))
@@ -138,10 +138,11 @@ def _find_light_discs(observed: Pixels, clean: Pixels, flare: Pixels, glow: Pixe
     area_weight[pixels < MIN_DISC_PIXELS] = 0
     area_weight[0] = 0  # the label of what is outside
     return _LightDiscs(
-        labels, area_weight * np.interp(contrast, CONTRAST_RAMP, (0, 1)),
-        area_weight * np.interp(glow_fraction, SURROUND_GLOW_RAMP, (0, 1))
-        * np.interp(observed_contrast, OBSERVED_CONTRAST_RAMP, (0, 1)),
-        _label_maxima(observed, core, count), _label_maxima(clean, core, count))
+        labels=labels,
+        contrast_certainty=area_weight * np.interp(contrast, CONTRAST_RAMP, (0, 1)),
+        glow_certainty=(area_weight * np.interp(glow_fraction, SURROUND_GLOW_RAMP, (0, 1))
+                        * np.interp(observed_contrast, OBSERVED_CONTRAST_RAMP, (0, 1))),
+        peak_observed=_label_maxima(observed, core, count), peak_clean=_label_maxima(clean, core, count))
 
 
 def _centre_weight(labels: NDArray[np.int32]) -> Pixels:

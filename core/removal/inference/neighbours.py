@@ -70,28 +70,29 @@ class ShotPredictor:
         frame = self._predict_frame(path, features)
         # Each neighbour is predicted before its flows, which need that prediction's features.
         return plate, filter_in_time(frame, [
-            Neighbour(self._predict_frame(neighbour, theirs), weight, self._flow(path, neighbour),
+            Neighbour(self._predict_frame(neighbour, neighbour_features), weight, self._flow(path, neighbour),
                       self._flow(neighbour, path))
-            for side in (before[::-1], after) for neighbour, theirs, weight in self._follow_shot(features, side)],
+            for side in (before[::-1], after)
+            for neighbour, neighbour_features, weight in self._follow_shot(features, side)],
             self._remover.sensitivity.log_odds_bias)
 
     def _follow_shot(self, features: FrameFeatures,
                      side: Sequence[Path]) -> Iterator[tuple[Path, FrameFeatures, np.float32]]:
         """Yield (frame, its features, its weight) at NEIGHBOUR_OFFSETS to one side of a frame, nearest first.
 
-        features: of the frame. side: the frames on that side, nearest first. A weight is the least similarity on the
-        way there.
+        features: of the frame. side: the frames on that side, nearest first. A weight, 0..1, is the least
+        `shot_similarity` of two successive frames on the way.
 
         A moving camera soon shows something else, so the shot is followed from each of its frames to the next. Frames
         that differ, as by a flash, are skipped.
         """
-        weight, last = np.float32(1), features
+        min_similarity, previous_features = np.float32(1), features
         for offset, path in enumerate(side, 1):
-            theirs = self._features[path]
-            if theirs is not None and (similarity := shot_similarity(last, theirs)) > 0:
-                weight, last = min(weight, similarity), theirs
+            path_features = self._features[path]
+            if path_features is not None and (similarity := shot_similarity(previous_features, path_features)) > 0:
+                min_similarity, previous_features = min(min_similarity, similarity), path_features
                 if offset in NEIGHBOUR_OFFSETS:
-                    yield path, theirs, weight
+                    yield path, path_features, min_similarity
 
     def _compute_features(self, plate: Plate) -> FrameFeatures:
         return frame_features(self._remover.to_network_input(plate))

@@ -38,28 +38,28 @@ _MAX_GAIN = 1024.0
 _MAX_SAMPLES = 500_000
 
 
-def usual_exposure(plate: Plate) -> np.float32:
+def gain_to_usual_exposure(plate: Plate) -> np.float32:
     """Return the gain that brings a scene-linear plate to the exposure of a usual photograph; 1 for other plates.
 
     A multiple of the exposure gives the same picture times the gain, so the network predicts the same flare.
     """
     if plate.encoding != "linear":
         return np.float32(1)
-    step = max(int(np.sqrt(plate.codes.shape[0] * plate.codes.shape[1] / _MAX_SAMPLES)), 1)
-    luminance = finite_light(plate.codes[::step, ::step]) @ LUMINANCE.astype(np.float32)
+    stride = max(int(np.sqrt(plate.codes.shape[0] * plate.codes.shape[1] / _MAX_SAMPLES)), 1)
+    luminance = finite_light(plate.codes[::stride, ::stride]) @ LUMINANCE.astype(np.float32)
     luminance = luminance[luminance > 0]  # borders are black
     if not len(luminance):
         return np.float32(1)
-    bright, highlight = np.percentile(luminance, _PERCENTILES)
-    level = np.sqrt(max(bright * min(highlight, _MAX_HIGHLIGHT * bright), 0))
-    return np.float32(np.clip(_USUAL_LEVEL / max(level, 1e-9), 1 / _MAX_GAIN, _MAX_GAIN))
+    bright_level, highlight_level = np.percentile(luminance, _PERCENTILES)
+    picture_level = np.sqrt(max(bright_level * min(highlight_level, _MAX_HIGHLIGHT * bright_level), 0))
+    return np.float32(np.clip(_USUAL_LEVEL / max(picture_level, 1e-9), 1 / _MAX_GAIN, _MAX_GAIN))
 
 
 def to_network_plate(plate: Plate) -> tuple[Plate, np.float32]:
     """Return a plate as the network sees it, sRGB codes or Rec. 709 light of a usual exposure, and the gain that its
     light was multiplied by for that; the plate itself if nothing had to change."""
     rec709 = plate.in_rec709
-    gain = usual_exposure(rec709)
+    gain = gain_to_usual_exposure(rec709)
     return (rec709 if gain == 1 else replace(rec709, codes=finite_light(rec709.codes) * gain, extras={})), gain
 
 
@@ -87,11 +87,11 @@ def downscale_linear(codes: NDArray[Any], encoding: Encoding, max_code: float, w
 
     rows = codes.shape[0]
     result = np.zeros((height, width, 3), np.float32)
-    step = max(height * STRIP_ROWS // rows, 1)
-    for start in range(0, height, step):
-        stop = min(start + step, height)
-        first, last = start * rows // height, max(-(-stop * rows // height), start * rows // height + 1)
-        strip = np.clip(to_linear(codes[first:last], encoding, max_code), 0, 1)
+    strip_rows = max(height * STRIP_ROWS // rows, 1)
+    for start in range(0, height, strip_rows):
+        stop = min(start + strip_rows, height)
+        first_row, end_row = start * rows // height, max(-(-stop * rows // height), start * rows // height + 1)
+        strip = np.clip(to_linear(codes[first_row:end_row], encoding, max_code), 0, 1)
         result[start:stop] = cv2.resize(strip, (width, stop - start), interpolation=cv2.INTER_AREA)
     return result
 

@@ -29,7 +29,7 @@ from .device import select_device
 from .framing import (
     fill_hidden,
     input_size,
-    merge_columns,
+    merge_margins,
     predict_in_parts,
     wrap_columns,
     wrap_margin,
@@ -155,14 +155,14 @@ class Remover:
                 removed[rows] = removed_light(observed[rows], clean[rows], light, encoding, max_code)
         if wrapped is plate:
             return codes, flare.astype(np.float16)
-        light = merge_columns(flare.astype(np.float32), margin) / gain
+        light = merge_margins(flare.astype(np.float32), margin) / gain
         alpha = plate.straight_alpha
         if alpha is not None:
             light = np.where(alpha[..., None] > 0, light, 0)  # codes under alpha 0 are arbitrary, and stay
-        written = np.minimum(plate.light_in_plate_primaries(light), MAX_FLOAT16)
+        written_flare = np.minimum(plate.light_in_plate_primaries(light), MAX_FLOAT16)
         if alpha is not None:
-            written = written * alpha[..., None]  # as much as a composite of the plate shows
-        return plate.without_light(light), written.astype(np.float16)
+            written_flare = written_flare * alpha[..., None]  # as much as a composite of the plate shows
+        return plate.without_light(light), written_flare.astype(np.float16)
 
     def clean_display(self, display: Pixels) -> Pixels:
         """Return display values 0..1 (height, width, 3) without flare, with the precision of 16 bit codes."""

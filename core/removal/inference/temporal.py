@@ -98,14 +98,15 @@ def shot_similarity(first: FrameFeatures, second: FrameFeatures) -> np.float32:
     return np.float32(np.clip((correlation - low) / (high - low), 0, 1))
 
 
-def filter_in_time(frame: FramePrediction, neighbours: Sequence[Neighbour], bias: float = 0) -> FlarePrediction:
+def filter_in_time(frame: FramePrediction, neighbours: Sequence[Neighbour],
+                   log_odds_bias: float = 0) -> FlarePrediction:
     """Return the prediction for a frame, corrected with those for its neighbours.
 
-    bias: added to the log odds of a flare (`confidence.Sensitivity`).
+    log_odds_bias: added to the log odds of a flare (`confidence.Sensitivity`).
     """
     display, prediction = frame.features.display, frame.prediction
     confidence = shot_confidence([(prediction, 1.0), *((neighbour.frame.prediction, float(neighbour.weight))
-                                                       for neighbour in neighbours)], bias)
+                                                       for neighbour in neighbours)], log_odds_bias)
     flare = np.minimum(merge_flare(prediction), display)
     if neighbours:
         reference = _clean_estimate(frame)

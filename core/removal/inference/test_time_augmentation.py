@@ -77,18 +77,18 @@ def merge_flare(prediction: TtaPrediction) -> Pixels:
     return flare
 
 
-def shot_confidence(frames: Sequence[tuple[TtaPrediction, float]], bias: float = 0) -> np.float32:
+def shot_confidence(frames: Sequence[tuple[TtaPrediction, float]], log_odds_bias: float = 0) -> np.float32:
     """Return the confidence in a predicted flare, 0..1, from the predictions of frames of one shot with their weights.
 
     The log odds are averaged: a flare that is plain in neighbouring frames is trusted in this one too and does not
-    flicker. 1 where no frame has features. bias: added to the log odds (`confidence.Sensitivity`).
+    flicker. 1 where no frame has features. log_odds_bias: added to the log odds (`confidence.Sensitivity`).
     """
     weighted = [(prediction.features.log_odds, weight) for prediction, weight in frames
                 if prediction.features is not None and weight > 0]
     if not weighted:
         return np.float32(1)
     log_odds, weights = zip(*weighted, strict=True)
-    return confidence_from_log_odds(float(np.average(log_odds, weights=weights)) + bias)
+    return confidence_from_log_odds(float(np.average(log_odds, weights=weights)) + log_odds_bias)
 
 
 def _predict_channel(predict: PredictFn, display: Pixels, channel: int) -> Pixels:

@@ -40,6 +40,8 @@ MAX_TILE_ASPECT = 2
 squeezed."""
 CANVAS_SIZE = 640
 """Side of the canvas of synthesised flares, pixels."""
+WORSE_BY_DB = 0.5
+"""Loss of PSNR from which on a picture counts as made worse."""
 IDENTICAL_PSNR = 100.0
 """PSNR in dB of identical pictures in gains and means, in place of infinity."""
 Scores = dict[str, float | None]
@@ -63,19 +65,19 @@ def read_cases(folder: Path | str) -> list[Case]:
     if not folder.is_dir():
         raise SettingsError(f"{folder} is {'no folder' if folder.exists() else 'missing'}; give a folder with input/ "
                             "and gt/, or a folder of such folders.")
-    for inputs in sorted(path for path in folder.rglob("*") if path.is_dir()):
-        root = inputs.parent
-        if inputs.name.lower() not in INPUT_FOLDERS or inputs != _find_folder(root, INPUT_FOLDERS):
+    for input_folder in sorted(path for path in folder.rglob("*") if path.is_dir()):
+        root = input_folder.parent
+        if input_folder.name.lower() not in INPUT_FOLDERS or input_folder != _find_folder(root, INPUT_FOLDERS):
             continue
-        truth = _find_folder(root, TRUTH_FOLDERS)
-        if truth is None:
+        truth_folder = _find_folder(root, TRUTH_FOLDERS)
+        if truth_folder is None:
             continue
         mask_folder = _find_folder(root, ("mask",))
         category = root.relative_to(folder).as_posix() if root != folder else root.name
-        truths, masks = _index_by_key(truth), _index_by_key(mask_folder) if mask_folder else {}
-        for key, path in _index_by_key(inputs).items():
+        truths, masks = _index_by_key(truth_folder), _index_by_key(mask_folder) if mask_folder else {}
+        for key, path in _index_by_key(input_folder).items():
             if key not in truths:
-                raise SettingsError(f"{path} has no counterpart in {truth}; add it, or remove the picture.")
+                raise SettingsError(f"{path} has no counterpart in {truth_folder}; add it, or remove the picture.")
             cases.append(Case(path.stem, category, _case_reader(path, truths[key], masks.get(key))))
     if not cases:
         raise SettingsError(f"{folder} holds no pairs; give a folder with input/ and gt/, or a folder of such folders.")
@@ -122,8 +124,8 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
 
     clean: removes the flare from display values (height, width, 3). gain_db: PSNR minus that of the untouched input;
     where two pictures are identical, IDENTICAL_PSNR counts, in means too. made_worse: share of pictures with a gain
-    below -0.5 dB. failed: messages about pairs that cannot be read, which are left out. masked_psnr: over the pixels of
-    the mask. lpips is null without weights for it. Raises FrameError where no pair can be read.
+    below -WORSE_BY_DB. failed: messages about pairs that cannot be read, which are left out. masked_psnr: over the
+    pixels of the mask. lpips is null without weights for it. Raises FrameError where no pair can be read.
     """
     progress = progress or Progress()
     progress.stage("eval-removal", len(cases))
@@ -167,17 +169,17 @@ def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return means over the cases, and the share that became worse by more than 0.5 dB.
+    """Return means over the cases, and the share that became worse by more than WORSE_BY_DB.
 
     rows: of `evaluate`, one dictionary per case.
     """
     gains = [row["gain_db"] for row in rows]
     summary: dict[str, Any] = {"count": len(rows), "gain_db": _mean(gains),
-                               "made_worse": round(sum(gain < -0.5 for gain in gains) / max(len(gains), 1), 4)}
-    for side in ("result", "input"):
-        others = sorted({name for row in rows for name in row[side]} - {"psnr"})
-        summary[side] = {"psnr": _mean([_psnr_or_identical(row[side]) for row in rows]),
-                         **{name: _mean([row[side].get(name) for row in rows]) for name in others}}
+                               "made_worse": round(sum(gain < -WORSE_BY_DB for gain in gains) / max(len(gains), 1), 4)}
+    for picture in ("result", "input"):
+        metrics = sorted({name for row in rows for name in row[picture]} - {"psnr"})
+        summary[picture] = {"psnr": _mean([_psnr_or_identical(row[picture]) for row in rows]),
+                            **{name: _mean([row[picture].get(name) for row in rows]) for name in metrics}}
     return summary
 
 
@@ -192,18 +194,20 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def format_table(scores: dict[str, Any]) -> str:
-    """Return the means as text: the result, in brackets the input."""
+    """Return the means as text, a line per category: the result, in brackets the input. scores: what `evaluate`
+    returned."""
     lines = [f"{'category':24}{'n':>5}{'PSNR':>16}{'gain':>7}{'SSIM':>18}{'LPIPS':>8}{'FLIP':>8}{'worse':>7}"]
-    for name, part in [*scores["categories"].items(), ("all", scores["mean"])]:
-        after, before = part["result"], part["input"]
-        levels = f"{format_cell(after['psnr'], 2)} ({format_cell(before['psnr'], 2)})"
-        likeness = f"{format_cell(after['ssim'], 4)} ({format_cell(before['ssim'], 4)})"
-        lines.append(f"{name:24.24}{part['count']:>5}{levels:>16}{format_cell(part['gain_db'], 2):>7}{likeness:>18}"
-                     f"{format_cell(after['lpips'], 4):>8}{format_cell(after['flip'], 4):>8}{part['made_worse']:>7.1%}")
+    for name, means in [*scores["categories"].items(), ("all", scores["mean"])]:
+        after, before = means["result"], means["input"]
+        psnr_cell = f"{format_cell(after['psnr'], 2)} ({format_cell(before['psnr'], 2)})"
+        ssim_cell = f"{format_cell(after['ssim'], 4)} ({format_cell(before['ssim'], 4)})"
+        lines.append(f"{name:24.24}{means['count']:>5}{psnr_cell:>16}{format_cell(means['gain_db'], 2):>7}"
+                     f"{ssim_cell:>18}{format_cell(after['lpips'], 4):>8}{format_cell(after['flip'], 4):>8}"
+                     f"{means['made_worse']:>7.1%}")
     return "\n".join(lines)
 
 
-def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores: dict[str, Any],
+def draw_worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores: dict[str, Any],
                 width: int = 400) -> Pixels:
     """Return a sheet (rows, 4 * width, 3) of the pictures with the lowest gain, worst first: input | result | truth |
     removed flare times 2, display values.
@@ -240,15 +244,15 @@ def synthetic_cases(seed: int, count: int, backgrounds: Backgrounds, lenses: Seq
     from .training.flare_bank import SingleFlareBank
     from .training.pairs import make_pair
 
-    def reader(index: int, number: int) -> Callable[[], tuple[Pixels, Pixels, None]]:
+    def reader(class_index: int, number: int) -> Callable[[], tuple[Pixels, Pixels, None]]:
         def read() -> tuple[Pixels, Pixels, None]:
-            random = np.random.default_rng((seed, index, number))
-            bank = SingleFlareBank((seed, index, number), CANVAS_SIZE, lenses, FLARE_CLASSES[index])
+            random = np.random.default_rng((seed, class_index, number))
+            bank = SingleFlareBank((seed, class_index, number), CANVAS_SIZE, lenses, FLARE_CLASSES[class_index])
             pair = make_pair(random, bank, backgrounds, *size, clean_share=0)
             return np.round(pair.frame * 255).astype(np.float32) / 255, pair.scene, None
 
         return read
 
-    return [Case(f"{number:04d}", kind, reader(index, number))
-            for index, kind in enumerate(FLARE_CLASSES) for number in range(count)]
+    return [Case(f"{number:04d}", flare_class, reader(class_index, number))
+            for class_index, flare_class in enumerate(FLARE_CLASSES) for number in range(count)]
 

@@ -64,7 +64,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         progress.say("LPIPS is not computed; name the folder of its weights with --lpips.")
     scores = evaluation.evaluate(cases, remover.clean_display, progress, lpips=perceptual)
     write_json(args.out / SCORES, scores)
-    write_png(args.out / SHEET, evaluation.worst_sheet(cases, remover.clean_display, scores))
+    write_png(args.out / SHEET, evaluation.draw_worst_sheet(cases, remover.clean_display, scores))
     progress.say(evaluation.format_table(scores))
     if scores["failed"]:
         raise FrameError(f"{len(scores['failed'])} of {len(cases)} pairs could not be read; the scores of the others "

@@ -88,10 +88,10 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def _clean_video(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Clean the frames of one video, and write them as a video when all are clean."""
-    from ...core.removal.jobs.clean_video import check_request, frames_folder, write_clean_video
+    from ...core.removal.jobs.clean_video import frames_folder, require_single_video, write_clean_video
 
     target = args.out
-    source = check_request(args.plates, target, args.codec)
+    source = require_single_video(args.plates, target, args.codec)
     args.out = frames_folder(target)
     result = _clean_plates(args, progress)
     if write_clean_video(source, target, args.codec, progress, overwrite=args.overwrite):

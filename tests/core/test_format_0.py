@@ -105,6 +105,6 @@ def test_a_training_stopped_in_format_0_resumes_to_the_same_weights(files: Path)
     path = training_run.train(recipe, files / "training", backgrounds(), built_in_lenses(), processes=1, resume=True)
     made, expected = load_file(path), load_file(files / "expected_weights.safetensors")
     assert len(made) == len(expected)
-    network, reference = weights.load(path), weights.load(files / "expected_weights.safetensors")
+    network, reference = weights.load_network(path), weights.load_network(files / "expected_weights.safetensors")
     for ours, theirs in zip(network.parameters(), reference.parameters(), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=2e-2, atol=1e-3)

@@ -50,7 +50,7 @@ def backgrounds() -> Backgrounds:
 
 
 def widths_of(path: Path) -> tuple[int, ...]:
-    return tuple(see.out_channels for see in weights.load(path).input_convs)  # type: ignore[union-attr, misc]
+    return tuple(see.out_channels for see in weights.load_network(path).input_convs)  # type: ignore[union-attr, misc]
 
 
 class StopAfter(Progress):
@@ -372,7 +372,7 @@ def test_added_blocks_leave_the_prediction_unchanged(tmp_path: Path) -> None:
     assert [len(level) for level in grown.network.encoder] == [1, 1, 2, 1, 3]  # type: ignore[arg-type]
     frame = torch.rand(1, 3, 64, 64)
     with torch.no_grad():
-        before, after = weights.load(first)(frame), grown.network(frame)
+        before, after = weights.load_network(first)(frame), grown.network(frame)
     assert before.flare.std() > 0
     torch.testing.assert_close(after.flare, before.flare, rtol=1e-3, atol=1e-6)  # a fused layout adds up otherwise
     grown_to = run.train(large, tmp_path / "second", backgrounds(), built_in_lenses(), start=first, processes=1)
@@ -511,7 +511,7 @@ def test_scores_have_those_of_the_untouched_input_beside_them(tmp_path: Path) ->
     worse = evaluation.evaluate(cases, lambda frame: frame + np.float32(0.05))
     assert worse["mean"]["made_worse"] == 1
     assert "real" in evaluation.format_table(worse)
-    sheet = evaluation.worst_sheet(cases, lambda frame: frame, worse, 40)
+    sheet = evaluation.draw_worst_sheet(cases, lambda frame: frame, worse, 40)
     assert sheet.shape == (4 * (LABEL_HEIGHT + 32), 4 * 40 + 3 * GAP, 3)
 
 
@@ -522,7 +522,7 @@ def test_extreme_aspects_are_squeezed_on_the_sheet(shape: tuple[int, int], heigh
         write_png(tmp_path / kind / "0.png", np.full((*shape, 3), level / 255))
     cases = evaluation.read_cases(tmp_path)
     scores = evaluation.evaluate(cases, lambda frame: frame)
-    assert evaluation.worst_sheet(cases, lambda frame: frame, scores, 40).shape[0] == LABEL_HEIGHT + height
+    assert evaluation.draw_worst_sheet(cases, lambda frame: frame, scores, 40).shape[0] == LABEL_HEIGHT + height
 
 
 def test_changing_a_clean_picture_counts_as_made_worse(tmp_path: Path) -> None:
@@ -535,7 +535,7 @@ def test_changing_a_clean_picture_counts_as_made_worse(tmp_path: Path) -> None:
     assert kept["result"]["psnr"] == kept["input"]["psnr"] == 100, "means are of the same pictures as gains"
     black = evaluation.evaluate(cases, np.zeros_like)
     assert black["mean"]["made_worse"] == 1 and black["mean"]["gain_db"] < -80
-    assert evaluation.worst_sheet(cases, np.zeros_like, black, 40).any()
+    assert evaluation.draw_worst_sheet(cases, np.zeros_like, black, 40).any()
 
 
 def test_masked_psnr_counts_the_mask_alone(tmp_path: Path) -> None:
@@ -641,5 +641,5 @@ def test_added_layers_are_interpolated_by_the_same_share(tmp_path: Path) -> None
     assert weights.read(grown)[0][name].any()
     frame = torch.rand(1, 3, 64, 64)
     with torch.no_grad():
-        before, after = weights.load(first)(frame).flare, weights.load(grown)(frame).flare
+        before, after = weights.load_network(first)(frame).flare, weights.load_network(grown)(frame).flare
     torch.testing.assert_close(after, before, rtol=1e-3, atol=1e-6)

@@ -20,7 +20,7 @@ from core.images.video import Video, VideoFrame
 from core.images.video_mastering import x265_options
 from core.images.video_writer import rewrite_video
 from core.images.write import write_png
-from core.removal.jobs.clean_video import check_request, frames_folder, write_clean_video
+from core.removal.jobs.clean_video import frames_folder, require_single_video, write_clean_video
 from core.removal.jobs.video_frames import expand_videos, extract_frames
 from core.system.progress import Progress
 from tests.core.recording_progress import RecordingProgress
@@ -196,7 +196,7 @@ def test_what_the_new_video_cannot_hold_is_said(tmp_path: Path) -> None:
 
 def test_a_clean_video_waits_for_its_frames_and_is_kept(tmp_path: Path) -> None:
     film, target, heard = clip_of(tmp_path / "film.mp4"), tmp_path / "out.mkv", RecordingProgress()
-    assert check_request([film], target, None) == film
+    assert require_single_video([film], target, None) == film
     folder = frames_folder(target)
     filmed = extract_frames(film, folder, Progress())
     for number in (1, 2):
@@ -252,4 +252,4 @@ def test_a_video_that_cannot_be_written_is_refused(given: list[str], name: str, 
                                                    tmp_path: Path) -> None:
     clip_of(tmp_path / "film.mp4")
     with pytest.raises(SettingsError, match=sentence):
-        check_request([tmp_path / path for path in given], tmp_path / name, codec)
+        require_single_video([tmp_path / path for path in given], tmp_path / name, codec)

@@ -178,7 +178,7 @@ def formats(base: Path) -> list[Format]:
         lambda folder: checkpoint.save(folder / "state.safetensors", state))
 
     def load_weights(folder: Path) -> None:
-        weights.load.__wrapped__(folder / "w.safetensors")
+        weights.load_network.__wrapped__(folder / "w.safetensors")
 
     add("weights", "w.safetensors", load_weights, lambda folder: network_file(folder / "w.safetensors"))
     add("recipe", "recipe.json", lambda folder: from_dict(read_json(folder / "recipe.json", FitFlareError)),
@@ -246,8 +246,8 @@ def read_removed(folder: Path) -> None:
     """Read remove.json as a job does."""
     manifest = Manifest(folder)
     manifest.is_up_to_date(Path("a.png"), "1", [folder / "a.png"])
-    list(manifest.unedited([Path("a.png")]))
-    manifest.results()
+    list(manifest.unedited_frames([Path("a.png")]))
+    manifest.result_paths()
 
 
 def read_video(path: Path) -> None:

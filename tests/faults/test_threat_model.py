@@ -65,7 +65,7 @@ def test_every_attempt_names_a_test_that_exists() -> None:
 def test_no_reader_unpickles(tmp_path: Path) -> None:
     mark, path = tmp_path / "mark", tmp_path / "a.flare"
     path.write_bytes(pickle.dumps(Trap(mark)))
-    for reader in (read, load_flare, checkpoint.load, weights.load):
+    for reader in (read, load_flare, checkpoint.load, weights.load_network):
         with pytest.raises(FitFlareError):
             reader(path)
     assert not mark.exists()

@@ -22,7 +22,7 @@ from ...images.plates import Plate
 from ...system.reading import read_bytes
 from ..model.image_formation import flare_to_linear
 from ..model.network import RemovalNetwork
-from ..model.weights import load
+from ..model.weights import load_network
 from ..model.weights_file import default_weights
 from .confidence import SENSITIVITIES, Sensitivity, gate_by_mean
 from .device import select_device
@@ -80,7 +80,7 @@ class Remover:
         if not 64 <= working_size <= 8192:
             raise SettingsError(f"A working size of {working_size} pixels is outside 64 to 8192.")
         weights = weights or default_weights()
-        self.network: RemovalNetwork = load(weights)
+        self.network: RemovalNetwork = load_network(weights)
         self.working_size, self.glow = working_size, glow
         self.cache_key = compute_cache_key("network", weights, working_size,
                                            _GLOW_IN_CACHE_KEY[glow])

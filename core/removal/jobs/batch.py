@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ def collect_plates(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) 
             excluded_paths = _excluded_paths(item, excluded)
             for manifest in item.rglob(MANIFEST):
                 if manifest.parent != item:
-                    excluded_paths.update(Manifest(manifest.parent).results())
+                    excluded_paths.update(Manifest(manifest.parent).result_paths())
             files = [(path, path.relative_to(item)) for path in pictures_below(item)
                      if excluded_paths.isdisjoint(_self_and_parents(path))]
             if not files:
@@ -65,16 +65,16 @@ def collect_plates(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) 
 
 
 def collect_with_neighbours(inputs: Sequence[Path], exclude: Iterable[Path | None] = ()) -> list[Path]:
-    """Return the plates of `collect_plates`, and all pictures in the folders of files among `inputs`.
+    """Return the plates of `collect_plates`, and all other pictures in the folders of those inputs that are files.
 
     With them as neighbours, a frame that is cleaned by itself gets the same result as with its whole shot.
     """
-    excluded = [other for other in exclude if other is not None]
-    plates = dict.fromkeys(path for path, _ in collect_plates(inputs, excluded))
+    excluded_inputs = [other for other in exclude if other is not None]
+    plates = dict.fromkeys(path for path, _ in collect_plates(inputs, excluded_inputs))
     for folder in dict.fromkeys(item.parent for item in inputs if not item.is_dir()):
-        others = _excluded_paths(folder, excluded)
+        excluded_paths = _excluded_paths(folder, excluded_inputs)
         with contextlib.suppress(OSError):  # a plate may be readable in a folder that is not
-            plates.update(dict.fromkeys(path for path in pictures_in(folder) if path.resolve() not in others))
+            plates.update(dict.fromkeys(path for path in pictures_in(folder) if path.resolve() not in excluded_paths))
     return list(plates)
 
 
@@ -82,7 +82,7 @@ def _excluded_paths(folder: Path, excluded: Iterable[Path]) -> set[Path]:
     """Return files and folders in `folder` that hold no plates: those of `excluded` that lie in it, and all results
     that manifests in `excluded` list."""
     excluded_paths = {other.resolve() for other in excluded if folder.resolve() in other.resolve().parents}
-    return excluded_paths.union(*(Manifest(other).results() for other in excluded))
+    return excluded_paths.union(*(Manifest(other).result_paths() for other in excluded))
 
 
 def _self_and_parents(path: Path) -> list[Path]:
@@ -91,35 +91,35 @@ def _self_and_parents(path: Path) -> list[Path]:
     return [resolved, *resolved.parents]
 
 
-def left_out(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) -> dict[str, list[str]]:
-    """Return the names of the files in those inputs that are folders, and that are no plates, by reason.
+def left_out_files(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) -> dict[str, list[str]]:
+    """Return the files without a plate in the folders among `inputs`: their names, by the reason.
 
     A name is the path below its input. exclude: as for `collect_plates`; these, manifests and hidden entries are not
     mentioned.
     """
-    skipped: dict[str, list[str]] = {}
+    names_by_reason: dict[str, list[str]] = {}
     for item in inputs:
         if not item.is_dir():
             continue
         excluded_paths = _excluded_paths(item, [other for other in exclude if other is not None])
         folders = [item, *(path for path in item.rglob("*") if path.is_dir())]
         for folder in folders:
-            inside = folder.relative_to(item)
-            if any(part.startswith(".") for part in inside.parts) or not excluded_paths.isdisjoint(
+            relative_folder = folder.relative_to(item)
+            if any(part.startswith(".") for part in relative_folder.parts) or not excluded_paths.isdisjoint(
                     _self_and_parents(folder)):
                 continue
             for reason, names in unlisted_entries(folder, subfolders=False):
-                skipped.setdefault(reason, []).extend(
-                    (inside / name).as_posix() for name in names
+                names_by_reason.setdefault(reason, []).extend(
+                    (relative_folder / name).as_posix() for name in names
                     if name not in (MANIFEST, VIDEO_MANIFEST) and real_path(folder / name) not in excluded_paths)
-    return {reason: names for reason, names in skipped.items() if names}
+    return {reason: names for reason, names in names_by_reason.items() if names}
 
 
 def _blocking_path(folder: Path) -> Path | None:
     """Return what prevents a folder from being created: a file or a dangling link in its place or in that of a parent;
     None if nothing does."""
-    first = next((path for path in (folder, *folder.parents) if os.path.lexists(path)), None)
-    return None if first is None or first.is_dir() else first
+    nearest = next((path for path in (folder, *folder.parents) if os.path.lexists(path)), None)
+    return None if nearest is None or nearest.is_dir() else nearest
 
 
 def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
@@ -140,9 +140,10 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     Raises SettingsError before anything is written, FrameError at once where the folder cannot be written to, and
     FrameError at the end with a list of the plates that failed.
     """
-    for place in (folder, flare_folder):
-        if place is not None and (other := _blocking_path(place)):
-            raise SettingsError(f"{other} is not a folder, so {place} cannot be written to; choose another folder.")
+    for output_folder in (folder, flare_folder):
+        if output_folder is not None and (blocking := _blocking_path(output_folder)):
+            raise SettingsError(f"{blocking} is not a folder, so {output_folder} cannot be written to; choose another "
+                                "folder.")
     excluded = [folder, flare_folder, mattes.source if mattes else None]
     plates = collect_plates(inputs, excluded)
     results = {name: [folder / clean_name(name), *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
@@ -183,9 +184,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         if isinstance(error, OSError) and manifest.is_write_error(error):
             raise FrameError(f"{folder} cannot be written to ({error.strerror}); choose another folder for the clean "
                              "frames, or get write permission for this one.") from error
-        failed.append(os_error_message(error) if isinstance(error, OSError)
-                      else str(error) if isinstance(error, FrameError)
-                      else f"{frame.source} does not fit into memory.")
+        failed.append(_failure_message(frame.source, error))
         failed_names.append(frame.name.as_posix())
         progress.say(f"Left out: {failed[-1]}")
 
@@ -194,18 +193,30 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     written, kept = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
                                        keep_finished=not overwrite, overwrite=overwrite, on_error=leave_out)
     manifest.report_kept(kept, progress)
-    tally = Tally("plate", "cleaned", written + kept.total(), left_out(inputs, excluded))
+    tally = Tally("plate", "cleaned", written + kept.total(), left_out_files(inputs, excluded))
     tally.skip("could not be cleaned", *failed_names)
     if failed:
         progress.say(tally.sentence())
         raise FrameError(f"{len(failed)} of {len(plates) + len(failed_inputs)} plates could not be cleaned: "
                          f"{join_failures(failed)}")
     confidence = manifest.confidence(name for _, name in plates)
-    unsure = [f"{name} ({value:.2f})" for name, value in confidence.items() if value < MIN_CONFIDENCE]
-    if unsure:
-        progress.say(f"In {len(unsure)} of them a possible flare was kept, because it may be part of the scene or of "
-                     f"its grade: {list_first(unsure)}. --sensitivity high or an all-white matte removes it.")
+    _report_low_confidence(confidence, progress)
     progress.say(f"{written + kept.total()} clean frames are in {folder}.")
     progress.say(tally.sentence())
     return {"plates": str(folder), "made": written, "kept": kept.total(), "confidence": confidence,
             **tally.as_result()}
+
+
+def _failure_message(path: Path, error: Exception) -> str:
+    """Return a sentence about a plate that cannot be cleaned. error: one that `is_plate_error` accepts."""
+    if isinstance(error, OSError):
+        return os_error_message(error)
+    return str(error) if isinstance(error, FrameError) else f"{path} does not fit into memory."
+
+
+def _report_low_confidence(confidence: Mapping[str, float], progress: Progress) -> None:
+    """Say in which plates a possible flare was kept. confidence: by name, 0..1."""
+    doubtful = [f"{name} ({value:.2f})" for name, value in confidence.items() if value < MIN_CONFIDENCE]
+    if doubtful:
+        progress.say(f"In {len(doubtful)} of them a possible flare was kept, because it may be part of the scene or of "
+                     f"its grade: {list_first(doubtful)}. --sensitivity high or an all-white matte removes it.")

@@ -37,7 +37,7 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress,
     Raises CaptureError where removed/ exists already, where the folder cannot be written to and where two frames would
     have one clean file; FrameError for a frame that cannot be read; Cancelled.
     """
-    target, work = capture.folder / REMOVED, capture.folder / UNFINISHED_FOLDER
+    target, unfinished = capture.folder / REMOVED, capture.folder / UNFINISHED_FOLDER
     if target.exists():
         raise CaptureError(f"{target} exists already; delete it to clean the frames again.")
     if capture.plate_space is not None:
@@ -46,18 +46,18 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress,
     progress.stage("remove", len(capture.views))
     predictor = ShotPredictor(remover, [capture.frame_path(view) for view in capture.views])
     frames = [CleanFrame(names[view.name], capture.frame_path(view),
-                         [safe_join(work, str(names[view.name]), CaptureError)])
+                         [safe_join(unfinished, str(names[view.name]), CaptureError)])
               for view in sorted(capture.views, key=lambda view: shot_sort_key(capture.frame_path(view)))]
 
-    with_flare = {names[name] for name in flared}
+    flared_names = {names[name] for name in flared}
 
     def digest(frame: CleanFrame) -> str:
-        settings = f"{remover.cache_key} flared" if frame.name in with_flare else remover.cache_key
+        settings = f"{remover.cache_key} flared" if frame.name in flared_names else remover.cache_key
         return digest_inputs(settings, [frame.source, *predictor.dependencies(frame.source)])
 
     def clean(frame: CleanFrame) -> PreparedResults:
         plate, prediction = predictor.predict(frame.source)
-        if frame.name in with_flare:
+        if frame.name in flared_names:
             prediction = prediction._replace(confidence=np.float32(1))
         (_, first), *others = split_views(plate)
         return PreparedResults(lambda: write_view_results(frame.results, plate, [
@@ -65,18 +65,18 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress,
             float(prediction.confidence))
 
     try:
-        write_clean_frames(frames, Manifest(work), progress, digest=digest, clean=clean, keep_finished=True,
+        write_clean_frames(frames, Manifest(unfinished), progress, digest=digest, clean=clean, keep_finished=True,
                            overwrite=True)
         # In this order: if another fit has just renamed the folder, `target` exists by the second test.
         if not all(frame.results[0].is_file() for frame in frames) and not target.exists():
             raise CaptureError(f"Another fit is cleaning the frames of {capture.folder} with other settings; wait "
                                "for it, and start this one again.")
-        retry_while_locked(work.rename, target)
+        retry_while_locked(unfinished.rename, target)
     except OSError as problem:
         if target.is_dir():  # another fit of this capture has finished first
-            shutil.rmtree(work, ignore_errors=True)
+            shutil.rmtree(unfinished, ignore_errors=True)
             return target
-        raise CaptureError(f"{work} cannot be written ({problem.strerror or problem}); copy the capture to a "
+        raise CaptureError(f"{unfinished} cannot be written ({problem.strerror or problem}); copy the capture to a "
                            "writable folder, or fit it without clean frames (--mode split).") from problem
     return target
 
@@ -84,14 +84,14 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress,
 def _clean_names(capture: Capture) -> dict[str, Path]:
     """Return each view's clean file below the folder, by view name. Raises CaptureError where two would be one file, on
     any file system."""
-    names: dict[str, Path] = {}
-    views: dict[str, str] = {}
+    clean_names: dict[str, Path] = {}
+    view_by_key: dict[str, str] = {}
     for view in capture.views:
         name = Path(view.name)
         name = name.with_suffix(".png") if name.suffix.lower() in JPEG_SUFFIXES else clean_name(name)
         key = name.as_posix().casefold()
-        if key in views:
-            raise CaptureError(f"The frames {views[key]} and {view.name} of {capture.folder} would both have "
+        if key in view_by_key:
+            raise CaptureError(f"The frames {view_by_key[key]} and {view.name} of {capture.folder} would both have "
                                f"{REMOVED}/{name.as_posix()}; give one of them another name, in the model too.")
-        names[view.name], views[key] = name, view.name
-    return names
+        clean_names[view.name], view_by_key[key] = name, view.name
+    return clean_names

@@ -25,8 +25,12 @@ RECORD = "clean_video.json"
 """The file beside the clean frames that says which video was written of them."""
 
 
-def check_request(inputs: Sequence[Path], target: Path, codec: str | None) -> Path:
-    """Return the video that is to be cleaned to another. Raises SettingsError for anything but one video."""
+def require_single_video(inputs: Sequence[Path], target: Path, codec: str | None) -> Path:
+    """Return the video among `inputs` that is to be cleaned to `target`.
+
+    codec: its name, None for one that suits. Raises SettingsError for anything but one video, and for a target that
+    cannot be written with this codec.
+    """
     check_target(target, codec)
     if len(inputs) != 1 or not is_video(inputs[0]) or not inputs[0].is_file():
         raise SettingsError(f"--out {target} is a video, so one video has to be cleaned; name a folder for the clean "
@@ -50,44 +54,45 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
     written.
     """
     folder = frames_folder(target)
-    filmed = {path.stem: path for path in pictures_in(folder / f"{source.name}.frames")}
-    clean = {stem: folder / path.name for stem, path in filmed.items()}
+    extracted = {path.stem: path for path in pictures_in(folder / f"{source.name}.frames")}
+    clean = {stem: folder / path.name for stem, path in extracted.items()}
     if missing := sum(not path.is_file() for path in clean.values()):
         progress.say(f"{missing} of {len(clean)} frames are not clean yet; {target} is written when all are.")
         return False
     with Video(source) as video:
-        name = choose_codec(target, video, codec)
-    digest = digest_inputs(name, [source, *clean.values()])
+        codec_name = choose_codec(target, video, codec)
+    digest = digest_inputs(codec_name, [source, *clean.values()])
     record = _read_record(folder / RECORD)
     if target.exists() and not overwrite:
-        present = content_hash(target)
-        if present not in (record.get("written"), record.get("replaced")):
+        existing_hash = content_hash(target)
+        if existing_hash not in (record.get("written"), record.get("replaced")):
             raise SettingsError(f"{target} exists and was not made from these frames, so it may be someone's work; "
                                 "choose another name, or replace it with --overwrite.")
-        if record.get("from") == digest and record.get("written") == present:
+        if record.get("from") == digest and record.get("written") == existing_hash:
             progress.say(f"{target} is up to date; --overwrite makes it again.")
             return True
 
-    def change(frame: VideoFrame) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    def changed_pixels(frame: VideoFrame) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Return a frame's pixels as extracted and as cleaned; None where they are the same."""
         stem = f"{source.stem}.{frame.number + 1:06d}"
-        if stem not in filmed:
+        if stem not in extracted:
             raise FrameError(f"{folder / stem} is missing among the frames of {source}; delete {folder} and clean it "
                              "again.")
-        before, after = read_picture(filmed[stem]), read_picture(clean[stem])
+        before, after = read_picture(extracted[stem]), read_picture(clean[stem])
         return None if np.array_equal(before.pixels, after.pixels) else (before.pixels, after.pixels)
 
-    def note(whole: Path) -> None:
+    def write_record(finished: Path) -> None:
         """Record the finished video and the one that it replaces.
 
         It is called before the video has its name: a process that is killed between the two must leave neither of them
         looking like someone's work.
         """
         replaced = {"replaced": content_hash(target)} if target.exists() else {}
-        write_json(folder / RECORD, {"from": digest, "written": content_hash(whole), **replaced})
+        write_json(folder / RECORD, {"from": digest, "written": content_hash(finished), **replaced})
 
     progress.stage(f"write {target.name}", len(clean))
-    for sentence in rewrite_video(source, target, name, change, on_frame=progress.advance, on_written=note):
+    for sentence in rewrite_video(source, target, codec_name, changed_pixels, on_frame=progress.advance,
+                                  on_written=write_record):
         progress.say(sentence)
     progress.say(f"The clean video is {target}.")
     return True

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,13 +62,13 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
         raise CaptureError(f"The frames of {capture.folder} are distorted by their lens, and the flare was fitted "
                            "without that; undistort them first (for instance with COLMAP's image_undistorter).")
     views_by_name = {Path(view.name): view for view in views}
-    frames = [CleanFrame(name, capture.frame_path(view), _results(view, folder, flare_folder))
+    frames = [CleanFrame(name, capture.frame_path(view), _result_paths(view, folder, flare_folder))
               for name, view in views_by_name.items()]
     check_no_overwrite([frame.source for frame in frames],
                        itertools.chain.from_iterable(frame.results for frame in frames))
     progress.stage("remove", len(views))
     manifest, lights = Manifest(folder), [tuple(light.numbers) for light in capture.lights]
-    dim = Counter[str]()
+    dim_counts = Counter[str]()
 
     def digest(frame: CleanFrame) -> str:
         camera = views_by_name[frame.name].camera
@@ -76,19 +76,19 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
 
     def clean(frame: CleanFrame) -> PreparedResults:
         """Compute a frame's results; frames with a dim flare are counted when they are written."""
-        plate, codes, flare, gains = _clean_view(renderer, capture, views_by_name[frame.name], above_white)
+        clean_view = _clean_view(renderer, capture, views_by_name[frame.name], above_white)
 
         def write() -> None:
-            write_results(frame.results, plate, codes, flare)
-            if plate.warning:
-                progress.say(plate.warning)
-            dim.update(light for light, gain in gains.items() if gain < DIM_FLARE)
+            write_results(frame.results, clean_view.plate, clean_view.codes, clean_view.flare)
+            if clean_view.plate.warning:
+                progress.say(clean_view.plate.warning)
+            dim_counts.update(light for light, gain in clean_view.gains.items() if gain < DIM_FLARE)
 
         return PreparedResults(write)
 
     written, kept = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
                                        keep_finished=not overwrite, overwrite=overwrite)
-    for light, count in dim.items():
+    for light, count in dim_counts.items():
         progress.say(f"{count} of {written} frames show less than half of the flare that {light!r} has in the fit; no "
                      "more than they show was removed.")
     manifest.report_kept(kept, progress)
@@ -96,7 +96,7 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
     return {"plates": str(folder), "made": written, "kept": kept.total()}
 
 
-def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
+def _result_paths(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
     """Return the path of the clean frame, then that of its flare where one is requested."""
     plate = safe_join(folder, str(clean_name(Path(view.name))), CaptureError)
     if flare_folder is None:
@@ -104,10 +104,18 @@ def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
     return [plate, safe_join(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)]
 
 
-def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
-                above_white: bool) -> tuple[Plate, NDArray[Any], Pixels, dict[str, float]]:
-    """Return a view's plate, the codes of its clean frame, the fitted flare in linear light (height, width, 3), and
-    each light's gain.
+class _CleanView(NamedTuple):
+    """plate: as its file stores it. codes: of the clean frame. flare: the removed one, linear light (height, width, 3).
+    gains: of each light's flare, 0..1."""
+
+    plate: Plate
+    codes: NDArray[Any]
+    flare: Pixels
+    gains: dict[str, float]
+
+
+def _clean_view(renderer: ViewRenderer, capture: Capture, view: View, above_white: bool) -> _CleanView:
+    """Subtract the fitted flare from a view's plate.
 
     Raises FrameError for a plate that the fit's cameras do not match: turned by Exif, or with several views.
     """
@@ -145,9 +153,9 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
     else:
         codes = subtract_fitted_flare(plate, np.where(light_discs[..., None], 0, flare), scene)
     if is_direct:
-        return stored, codes, flare, gains
+        return _CleanView(stored, codes, flare, gains)
     clean = replace(plate, codes=codes)
-    return stored, stored.without_light(_linear_light(plate) - _linear_light(clean)), flare, gains
+    return _CleanView(stored, stored.without_light(_linear_light(plate) - _linear_light(clean)), flare, gains)
 
 
 def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) -> dict[str, float]:
@@ -159,18 +167,18 @@ def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) 
     """
     if not flares:
         return {}
-    part = plate.picture_area.slices
-    step = max(round(math.sqrt(math.prod(plate.codes.shape[:2]) / MAX_SAMPLES)), 1)
-    observed, *layers = (pixels[part][::step, ::step] for pixels in (_linear_light(plate), scene, *flares.values()))
+    area = plate.picture_area.slices
+    stride = max(round(math.sqrt(math.prod(plate.codes.shape[:2]) / MAX_SAMPLES)), 1)
+    observed, *layers = (pixels[area][::stride, ::stride] for pixels in (_linear_light(plate), scene, *flares.values()))
     # Linear plates do not clip.
-    clipped = linear_from_srgb(np.array(CLIPPING_LEVEL)) if plate.encoding == "srgb" else np.inf
-    unclipped = (observed < clipped).all(-1)
-    light = observed[unclipped].ravel().astype(np.float64)
+    clipping_light = linear_from_srgb(np.array(CLIPPING_LEVEL)) if plate.encoding == "srgb" else np.inf
+    unclipped = (observed < clipping_light).all(-1)
+    unclipped_light = observed[unclipped].ravel().astype(np.float64)
     columns = np.stack([pixels[unclipped].ravel() for pixels in layers], 1).astype(np.float64)
     # Bounds of the scene's gain, then of each flare's.
-    low, high = np.array([[1 / MAX_SCENE_GAIN, MAX_SCENE_GAIN], *len(flares) * [[0.0, 1.0]]]).T
+    min_gains, max_gains = np.array([[1 / MAX_SCENE_GAIN, MAX_SCENE_GAIN], *len(flares) * [[0.0, 1.0]]]).T
     # The prior alone decides where the whole plate is clipped.
-    gains = robust_bounded_fit(columns, light, np.ones(len(layers)), low, high, PRIOR_WEIGHT)
+    gains = robust_bounded_fit(columns, unclipped_light, np.ones(len(layers)), min_gains, max_gains, PRIOR_WEIGHT)
     return dict(zip(flares, gains[1:].tolist(), strict=True))
 
 
@@ -190,23 +198,23 @@ def _display_values(plate: Plate) -> Pixels:
 
 
 def subtract_fitted_flare(plate: Plate, flare: Pixels, scene: Pixels,
-                          hidden: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+                          scene_mask: NDArray[np.bool_] | None = None) -> NDArray[Any]:
     """Return the plate's codes (height, width, 3) minus a flare; unchanged to the last bit where the flare is zero or
     the codes are not finite.
 
     flare, scene: linear light (height, width, 3). The scene replaces the result where the plate is clipped and where
-    `hidden` (height, width) is set, as far as it is brighter than the result, and no brighter than the plate.
+    `scene_mask` (height, width) is set, as far as it is brighter than the result, and no brighter than the plate.
     """
     light = _linear_light(plate)
-    clipped = np.zeros((*light.shape[:2], 1), bool)
+    filled_mask = np.zeros((*light.shape[:2], 1), bool)
     if plate.encoding == "srgb":
-        clipped = _display_values(plate).max(-1, keepdims=True) >= CLIPPING_LEVEL
-    if hidden is not None:
-        clipped = clipped | hidden[..., None]
+        filled_mask = _display_values(plate).max(-1, keepdims=True) >= CLIPPING_LEVEL
+    if scene_mask is not None:
+        filled_mask = filled_mask | scene_mask[..., None]
     difference = light - flare
-    filled = np.maximum(difference, np.minimum(scene, light))
+    filled_light = np.maximum(difference, np.minimum(scene, light))
     # No light becomes negative; what is negative in the plate, as outside a gamut, stays.
-    difference = np.maximum(np.where(clipped, filled, difference), np.minimum(light, 0))
+    difference = np.maximum(np.where(filled_mask, filled_light, difference), np.minimum(light, 0))
     if plate.encoding == "srgb":
         codes = (srgb_from_linear(difference) * np.float32(plate.max_code) + np.float32(0.5)).astype(plate.codes.dtype)
     else:

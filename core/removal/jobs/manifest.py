@@ -72,7 +72,7 @@ class Manifest:
                 with contextlib.suppress(OSError):  # a frame is kept in a read-only folder too
                     self.finish(results)
             return "up to date"
-        is_edited = (bool(self._edited(tables, results))
+        is_edited = (bool(self._edited_files(tables, results))
                      and tables["sources"].get(name.as_posix()) == content_hash(source))
         return "edited" if is_edited else None
 
@@ -97,7 +97,7 @@ class Manifest:
                 if not overwrite and not listed and path.exists():
                     raise FrameError(f"{path} exists and is not listed in {self._folder / MANIFEST}, so it may be "
                                      "someone's work; choose another folder, or replace it with --overwrite.")
-            if not overwrite and (changed := self._edited(old, results)):
+            if not overwrite and (changed := self._edited_files(old, results)):
                 raise FrameError(f"{changed[0]} was edited after it was made, from another {source.name} than there is "
                                  "now; choose another folder, or replace it with --overwrite.")
             for path in results:
@@ -138,11 +138,11 @@ class Manifest:
 
     def changed_sources(self, sources: Mapping[Path, Path]) -> list[Path]:
         """Return the names of those frames that were made from another content than `sources` (by name) has now."""
-        known = self._read()["sources"]
+        recorded = self._read()["sources"]
         return [name for name, source in sources.items()
-                if name.as_posix() in known and known[name.as_posix()] != content_hash(source)]
+                if name.as_posix() in recorded and recorded[name.as_posix()] != content_hash(source)]
 
-    def unedited(self, names: Iterable[Path]) -> Iterator[Path]:
+    def unedited_frames(self, names: Iterable[Path]) -> Iterator[Path]:
         """Yield those of the frames that `remove` made and nobody has edited since.
 
         Each one's file is read when its turn comes.
@@ -150,10 +150,10 @@ class Manifest:
         tables = self._read()
         for name in names:
             path = self._folder / name
-            if name.as_posix() in tables["plates"] and path.is_file() and not self._edited(tables, [path]):
+            if name.as_posix() in tables["plates"] and path.is_file() and not self._edited_files(tables, [path]):
                 yield name
 
-    def results(self) -> list[Path]:
+    def result_paths(self) -> list[Path]:
         """Return the paths of the clean frames and flares that are listed, whether they exist or not."""
         tables = self._read()
         return [(self._folder / name).resolve() for name in (*tables["plates"], *tables["flares"].values())]
@@ -171,7 +171,7 @@ class Manifest:
                       for table, value in self._entries(digest, results).items())
         return entered and all(path.is_file() and path.stat().st_size for path in results)
 
-    def _edited(self, tables: _Tables, results: Sequence[Path]) -> list[Path]:
+    def _edited_files(self, tables: _Tables, results: Sequence[Path]) -> list[Path]:
         """Return those files that hold something else than was written; one without an entry does not count."""
         written = tables["written"]
         return [path for path in results if path.is_file()

@@ -46,11 +46,12 @@ class Mattes:
             raise FrameError(f"{name} has no matte in {self.source}; add one, all black to remove nothing.")
         return matte
 
-    def read(self, name: Path, plate: DataWindow, orientation: int = UPRIGHT) -> NDArray[np.float32]:
+    def read(self, name: Path, plate_window: DataWindow, orientation: int = UPRIGHT) -> NDArray[np.float32]:
         """Return a plate's matte, 0..1, for the pixels that the plate's file stores, (height, width): its brightest
         channel times its alpha.
 
-        name: of the plate below its folder. plate: window of its stored pixels. orientation: its Exif orientation.
+        name: of the plate below its folder. plate_window: where its stored pixels lie in its frame. orientation: its
+        Exif orientation.
 
         The matte may have the size of the plate's frame, another size of the same aspect, or that of its stored pixels.
         Raises FrameError for a damaged matte, and for one of another aspect.
@@ -61,27 +62,27 @@ class Mattes:
         window, values = read_data_window(path), _read_matte_values(path)
         oriented = undo_orientation(apply_orientation(values, read_exif(path)[0]), orientation)
         size = oriented.shape[1], oriented.shape[0]
-        if window.is_frame and _is_same_aspect(size, plate.frame):
+        if window.is_frame and _is_same_aspect(size, plate_window.frame):
             # Painted on the plate as viewers show it; otherwise on its stored pixels, by a program that ignores Exif.
             window, values = DataWindow(size, (0, 0), size), oriented
-        if window.is_frame and window.size == plate.size:  # painted on the plate's stored pixels, with its overscan
+        if window.is_frame and window.size == plate_window.size:  # painted on the stored pixels, with their overscan
             return np.clip(values, 0, 1)
-        (columns, rows), (width, height) = window.frame, plate.frame
-        if not _is_same_aspect(window.frame, plate.frame):
-            raise FrameError(f"{path} is {columns} x {rows} pixels, another shape than its plate of {width} x "
-                             f"{height}; make it for that plate.")
+        (matte_width, matte_height), (width, height) = window.frame, plate_window.frame
+        if not _is_same_aspect(window.frame, plate_window.frame):
+            raise FrameError(f"{path} is {matte_width} x {matte_height} pixels, another shape than its plate of "
+                             f"{width} x {height}; make it for that plate.")
         values = crop_to_display_window(values, window)
-        if (columns, rows) != (width, height):
+        if (matte_width, matte_height) != (width, height):
             values = np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-        x, y = plate.origin
+        x, y = plate_window.origin
         # Crop the frame to the plate's stored pixels, which take the part of the display window here.
-        values = crop_to_display_window(values, DataWindow(plate.frame, (-x, -y), plate.size))
+        values = crop_to_display_window(values, DataWindow(plate_window.frame, (-x, -y), plate_window.size))
         return np.clip(values, 0, 1)
 
 
-def _is_same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+def _is_same_aspect(size: tuple[int, int], other_size: tuple[int, int]) -> bool:
     """Return whether two sizes (width, height) have the same aspect, within ASPECT_TOLERANCE."""
-    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= ASPECT_TOLERANCE
+    return abs(size[0] * other_size[1] / (size[1] * other_size[0]) - 1) <= ASPECT_TOLERANCE
 
 
 def _read_matte_values(path: Path) -> NDArray[np.float32]:
@@ -105,7 +106,8 @@ def _read_matte_values(path: Path) -> NDArray[np.float32]:
 
 
 def _index_by_name(folder: Path) -> dict[Path, Path]:
-    """Return every matte of the folder by its name there without the suffix."""
+    """Return every matte of the folder by its name there without the suffix. Raises SettingsError where two mattes have
+    one name."""
     mattes: dict[Path, Path] = {}
     for path in pictures_below(folder):
         name = path.relative_to(folder).with_suffix("")

@@ -20,7 +20,7 @@ def has_exact_clean_frames(capture: Capture) -> bool:
     """
     if not capture.has_removed:
         return capture.has_truth
-    return not any(Manifest(capture.folder / REMOVED).unedited(_frames_by_clean_name(capture)))
+    return not any(Manifest(capture.folder / REMOVED).unedited_frames(_frames_by_clean_name(capture)))
 
 
 def check_clean_frames_current(capture: Capture) -> None:

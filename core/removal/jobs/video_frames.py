@@ -47,26 +47,26 @@ def extract_frames(video: Path, folder: Path, progress: Progress, space: str | N
     if space is not None:
         with Video(video) as reader:
             reader.check_named_space(space)
-    frames, content = folder / f"{video.name}.frames", content_hash(video)
-    if not frames.exists():
+    frames_folder, video_hash = folder / f"{video.name}.frames", content_hash(video)
+    if not frames_folder.exists():
         try:
-            with atomic_folder(frames) as temporary:
-                problems = _decode_frames(video, temporary, progress)
-                write_json(temporary / VIDEO_MANIFEST, {"content": content, "problems": problems})
+            with atomic_folder(frames_folder) as temporary:
+                write_json(temporary / VIDEO_MANIFEST,
+                           {"content": video_hash, "problems": _decode_frames(video, temporary, progress)})
         except OSError:
-            if not frames.exists():  # another task of a farm may have extracted them meanwhile
+            if not frames_folder.exists():  # another task of a farm may have extracted them meanwhile
                 raise
-    manifest: Any = read_json(frames / VIDEO_MANIFEST, SettingsError)
-    notes = manifest.get("problems", []) if isinstance(manifest, dict) else None
-    if not isinstance(notes, list):
-        raise SettingsError(f"{frames / VIDEO_MANIFEST} is damaged; delete {frames}, and the frames are extracted "
-                            "again.")
-    if manifest.get("content") != content:
-        raise SettingsError(f"{frames} holds the frames of another video of that name; choose another folder for the "
-                            "clean frames, or delete it.")
-    for sentence in notes:
+    manifest: Any = read_json(frames_folder / VIDEO_MANIFEST, SettingsError)
+    problems = manifest.get("problems", []) if isinstance(manifest, dict) else None
+    if not isinstance(problems, list):
+        raise SettingsError(f"{frames_folder / VIDEO_MANIFEST} is damaged; delete {frames_folder}, and the frames are "
+                            "extracted again.")
+    if manifest.get("content") != video_hash:
+        raise SettingsError(f"{frames_folder} holds the frames of another video of that name; choose another folder "
+                            "for the clean frames, or delete it.")
+    for sentence in problems:
         progress.say(str(sentence))
-    return frames
+    return frames_folder
 
 
 def _decode_frames(video: Path, folder: Path, progress: Progress) -> list[str]:

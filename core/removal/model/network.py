@@ -162,11 +162,11 @@ class RemovalNetwork(nn.Module):
     def __init__(self, widths: tuple[int, ...], blocks: tuple[int, ...], attention: tuple[int, ...]) -> None:
         super().__init__()
         # The finest level has the frame's own pixels beside what every level has.
-        channels = (3 * SHUFFLE_FACTOR**2 + INPUT_CHANNELS, *(INPUT_CHANNELS for _ in widths[1:]))
-        self.input_convs = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1)
-                                         for a, b in zip(channels, widths, strict=True))
-        self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in pairwise(widths))
-        self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise(widths))
+        input_channels = (3 * SHUFFLE_FACTOR**2 + INPUT_CHANNELS, *(INPUT_CHANNELS for _ in widths[1:]))
+        self.input_convs = nn.ModuleList(nn.Conv2d(channels, width, 3, padding=1)
+                                         for channels, width in zip(input_channels, widths, strict=True))
+        self.down = nn.ModuleList(nn.Conv2d(finer, coarser, 2, stride=2) for finer, coarser in pairwise(widths))
+        self.up = nn.ModuleList(nn.Conv2d(coarser, finer, 1) for finer, coarser in pairwise(widths))
         self.encoder = nn.ModuleList(nn.Sequential(*(ResidualBlock(width) for _ in range(count)))
                                      for width, count in zip(widths, blocks, strict=True))
         self.decoder = nn.ModuleList(ResidualBlock(width) for width in widths)
@@ -200,9 +200,9 @@ class RemovalNetwork(nn.Module):
     def _encode_level(self, x: Tensor, level: int) -> Tensor:
         """Apply the encoder's residual blocks of a level, and its attention layers."""
         coarse = level - (LEVELS - 2)  # 0 and 1 on the levels with attention, below 0 on the others
-        inner = list(cast(nn.ModuleList, self.inner_attention[coarse])) if coarse >= 0 else []
-        for number, block in enumerate(cast(nn.Sequential, self.encoder[level])):
+        inner_layers = list(cast(nn.ModuleList, self.inner_attention[coarse])) if coarse >= 0 else []
+        for index, block in enumerate(cast(nn.Sequential, self.encoder[level])):
             x = block(x)
-            if number % 2 and number // 2 < len(inner):
-                x = inner[number // 2](x)
+            if index % 2 and index // 2 < len(inner_layers):
+                x = inner_layers[index // 2](x)
         return cast(Tensor, self.attention[coarse](x)) if coarse >= 0 else x

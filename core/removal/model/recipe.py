@@ -78,9 +78,9 @@ class Recipe:
             raise SettingsError(f"A recipe needs a learning_rate below 1, and widths and blocks of {LEVELS} levels.")
         if min(self.widths) < 1 or min(self.blocks) < 0:
             raise SettingsError("A recipe needs widths of one channel or more, and blocks of 0 or more.")
-        coarse = self.blocks[-len(self.attention):]
+        coarse_blocks = self.blocks[-len(self.attention):]
         if len(self.attention) != 2 or any(not 0 <= 2 * layers <= blocks
-                                           for layers, blocks in zip(self.attention, coarse, strict=True)):
+                                           for layers, blocks in zip(self.attention, coarse_blocks, strict=True)):
             raise SettingsError("A recipe needs attention for two levels, at most one layer for every two of their "
                                 "blocks.")
         if not self.size_stages or any(len(stage) != 3 or not 2 * SIZE_MULTIPLE <= stage[1] <= stage[2]

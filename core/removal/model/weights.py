@@ -83,7 +83,7 @@ def _not_weights(path: Path | str) -> RunError:
 
 
 @lru_cache(maxsize=2)
-def load(path: Path) -> RemovalNetwork:
+def load_network(path: Path) -> RemovalNetwork:
     """Load the network of a weights file on the CPU, in evaluation mode. Raises RunError."""
     tensors, metadata = read(path)
     if not all(bool(value.isfinite().all()) for value in tensors.values()):
@@ -92,8 +92,8 @@ def load(path: Path) -> RemovalNetwork:
     try:
         # Shapes are compared without data first: a damaged header might ask for more memory than there is.
         with torch.device("meta"):
-            described = RemovalNetwork(*architecture).state_dict()
-        if {name: value.shape for name, value in described.items()} != {
+            expected = RemovalNetwork(*architecture).state_dict()
+        if {name: value.shape for name, value in expected.items()} != {
                 name: value.shape for name, value in tensors.items()}:
             raise _not_weights(path)
         network = RemovalNetwork(*architecture)

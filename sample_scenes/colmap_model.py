@@ -18,10 +18,14 @@ MAX_REPROJECTION_ERROR = 1.5
 """Pixels; points with a larger mean error are left out."""
 MIN_TRACK_LENGTH = 3
 """Frames that have to show a point at least."""
+SIFT_PEAK_THRESHOLD = 0.004
+"""Contrast of a feature at least; lower than COLMAP's own, so that small frames have enough features."""
+MAX_FEATURES = 3000
+"""Features of a frame at most."""
 
 
 def write_model(scene: SceneDescription, out: Path, progress: Progress) -> None:
-    """Write sparse/0, binary, unless it exists.
+    """Match the frames, triangulate points and write sparse/0, binary, unless it exists.
 
     The features are SIFT of the frames as filmed, with flares and noise; the poses are the true ones.
     """
@@ -37,51 +41,51 @@ def write_model(scene: SceneDescription, out: Path, progress: Progress) -> None:
         database = Path(folder) / "database.db"
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = "PINHOLE"
-        reader.camera_params = ",".join(str(value) for value in _parameters(scene.camera))
+        reader.camera_params = ",".join(str(value) for value in _pinhole_parameters(scene.camera))
         features = pycolmap.FeatureExtractionOptions()
-        features.sift.peak_threshold = 0.004
-        features.sift.max_num_features = 3000
+        features.sift.peak_threshold = SIFT_PEAK_THRESHOLD
+        features.sift.max_num_features = MAX_FEATURES
         pycolmap.extract_features(database, out / "images", camera_mode=pycolmap.CameraMode.SINGLE,
                                   reader_options=reader, extraction_options=features)
         progress.advance()
         pycolmap.match_exhaustive(database)
         progress.advance()
-        true_cameras = _known_cameras(scene, database)
+        true_cameras = _posed_cameras(scene, database)
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = scene.seed
         reconstruction = pycolmap.triangulate_points(true_cameras, database, out / "images", folder, options=options)
         reconstruction.extract_colors_for_all_images(out / "images")
         result = _filter_points(reconstruction)
-        written = Path(folder) / "model"
-        written.mkdir()
-        result.write(written)
+        model_folder = Path(folder) / "model"
+        model_folder.mkdir()
+        result.write(model_folder)
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(target, ignore_errors=True)
-        shutil.copytree(written, target)
+        shutil.copytree(model_folder, target)
     progress.advance(points=result.num_points3D(), error_px=result.compute_mean_reprojection_error(),
                      track=result.compute_mean_track_length())
 
 
-def _parameters(camera: Pinhole) -> list[float]:
+def _pinhole_parameters(camera: Pinhole) -> list[float]:
     return [camera.fx, camera.fy, camera.cx, camera.cy]
 
 
-def _known_cameras(scene: SceneDescription, database: Path) -> Any:
-    """Return a reconstruction of the true cameras, numbered as in the database, without points."""
+def _posed_cameras(scene: SceneDescription, database: Path) -> Any:
+    """Return a reconstruction of the true cameras without points, with the database's numbers and keypoints."""
     import pycolmap
 
     true_cameras = pycolmap.Reconstruction()
     camera = pycolmap.Camera(model="PINHOLE", width=scene.camera.width, height=scene.camera.height,
-                             params=_parameters(scene.camera), camera_id=1)
+                             params=_pinhole_parameters(scene.camera), camera_id=1)
     true_cameras.add_camera_with_trivial_rig(camera)
     poses = dict(zip((f"{stem}{FRAME_SUFFIX}" for stem in scene.stems), scene.poses, strict=True))
-    with pycolmap.Database.open(database) as store:
-        images = store.read_all_images()
-        keypoints = {image.image_id: store.read_keypoints(image.image_id) for image in images}
+    with pycolmap.Database.open(database) as opened:
+        images = opened.read_all_images()
+        keypoints = {image.image_id: opened.read_keypoints(image.image_id) for image in images}
     for image in images:
-        placed = pycolmap.Image(name=image.name, keypoints=np.asarray(keypoints[image.image_id])[:, :2],
+        posed_image = pycolmap.Image(name=image.name, keypoints=np.asarray(keypoints[image.image_id])[:, :2],
                                 camera_id=1, image_id=image.image_id)
-        true_cameras.add_image_with_trivial_frame(placed, pycolmap.Rigid3d(poses[image.name][:3]))
+        true_cameras.add_image_with_trivial_frame(posed_image, pycolmap.Rigid3d(poses[image.name][:3]))
     return true_cameras
 
 

@@ -37,8 +37,9 @@ class LightSource:
     """A small bright sphere in the scene, and the strength of the flare that it causes.
 
     colour: linear RGB, about 1 at its largest. radius: of the sphere, scene units. emission: its radiance to a camera,
-    linear. power: of the lamp that lights the scene, watts (a sun: W/m^2). flare: strength of its flare at `reference`
-    units from the camera; it falls with the square of the distance, as light does, unless `distant` (a sun).
+    linear. power: of the lamp that lights the scene, watts (a sun: W/m^2). flare: strength of its flare at
+    `reference_distance` units from the camera; it falls with the square of the distance, as light does, unless
+    `distant` (a sun).
     """
 
     name: str
@@ -48,12 +49,12 @@ class LightSource:
     emission: float
     power: float
     flare: float
-    reference: float = 5.0
+    reference_distance: float = 5.0
     distant: bool = False
 
     def flare_strength(self, distance: float) -> float:
         """Return the strength of the flare at `distance` units."""
-        return self.flare if self.distant else self.flare * (self.reference / distance) ** 2
+        return self.flare if self.distant else self.flare * (self.reference_distance / distance) ** 2
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class SceneDescription:
     first_number: int
     views: int
     camera: Pinhole
-    path: Callable[[Array], Array]
+    camera_path: Callable[[Array], Array]
     """world_to_camera (n, 4, 4) for the numbers of n views."""
     build: Callable[[SceneDescription], None]
     lights: tuple[LightSource, ...]
@@ -88,7 +89,7 @@ class SceneDescription:
     @property
     def poses(self) -> Array:
         """world_to_camera (views, 4, 4)."""
-        return self.path(self.numbers.astype(float))
+        return self.camera_path(self.numbers.astype(float))
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:

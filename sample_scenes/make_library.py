@@ -52,6 +52,7 @@ class LibraryLook:
 
 def _streak(gain: float, turn: float, colour: tuple[float, float, float], *, length: float = 0.06, width: float = 0.004,
             power: float = 0.8, mirror: float = 0.0) -> dict[str, Any]:
+    """Return the settings of one streak. turn: degrees from the x axis."""
     return {"gain": gain, "length": length, "power": power, "width": width, "turn": turn, "colour": colour,
             "mirror": mirror}
 
@@ -146,12 +147,12 @@ def make_library(folder: Path, names: list[str], progress: Progress) -> None:
     for look in LOOKS:
         settings, file = look.settings, folder / f"{look.name}.flare"
         digest = _digest(settings)
-        present = read_index(folder).get(look.name, {}).get("settings") == digest and file.is_file()
-        if present or (names and look.name not in names):
+        is_current = read_index(folder).get(look.name, {}).get("settings") == digest and file.is_file()
+        if is_current or (names and look.name not in names):
             continue
         result = make_flare(settings, file, progress, notes=f"{look.text} {describe(settings)}", licence=LICENCE)
         write_png(file.with_suffix(".png"), draw_thumbnail(read(file), THUMBNAIL_SIZE, THUMBNAIL_SIZE))
-        entries = read_index(folder)  # another process may have added its own
+        entries = read_index(folder)  # another process may have added its looks meanwhile
         entries[look.name] = {"name": look.name, "text": look.text, "lens": settings.lens, "licence": LICENCE,
                               "error": round(result.error, 3), "settings": digest}
         write_json(folder / INDEX, {"looks": [entries[other.name] for other in LOOKS if other.name in entries]})

@@ -44,18 +44,18 @@ def add_flares(capture: Capture, out: Path, setup: LensSetup, light: NDArray[np.
     progress.stage("flares", len(capture.views))
     for view in capture.views:
         stem = Path(view.name).stem
-        frame, clean, layer = (out / "images" / f"{stem}.png", out / "removed" / f"{stem}.png",
+        frame_path, clean_path, layer_path = (out / "images" / f"{stem}.png", out / "removed" / f"{stem}.png",
                                out / "truth" / "flare" / f"{stem}.exr")
-        if not (frame.is_file() and clean.is_file() and layer.is_file()):
+        if not (frame_path.is_file() and clean_path.is_file() and layer_path.is_file()):
             camera = view.camera.scaled(width)
             photo = np.round(capture.frame(view, camera.size).display() * 255) / np.float32(255)  # as stored in 8 bits
             pose = view.camera.world_to_camera
             flare = render_flare(setup, camera, pose[:3, :3] @ light + pose[:3, 3], colour=colour,
                                  intensity=intensity * camera.exposure)
-            write_layer(layer, flare, FLARE_LEVEL)
-            flare = read_picture(layer).pixels  # as stored, so that the files agree
-            write_png(clean, photo)
-            write_png(frame, srgb_from_linear(np.clip(linear_from_srgb(photo) + flare, 0, 1)))
+            write_layer(layer_path, flare, FLARE_LEVEL)
+            flare = read_picture(layer_path).pixels  # as stored, so that the files agree
+            write_png(clean_path, photo)
+            write_png(frame_path, srgb_from_linear(np.clip(linear_from_srgb(photo) + flare, 0, 1)))
         progress.advance()
     write_json(out / LIGHTS, {"lights": [{"name": "light", "xyz": light.tolist()}]})
     _write_model(capture, out / "sparse" / "0", width)
@@ -73,7 +73,7 @@ def _write_model(capture: Capture, folder: Path, width: int) -> None:
 
 
 def main() -> int:
-    """Make the capture that the arguments ask for; return the exit status."""
+    """Make the capture that the arguments describe; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("capture", type=Path, help="folder with images/ and sparse/0")
     parser.add_argument("--out", type=Path, required=True, help="capture folder to write")

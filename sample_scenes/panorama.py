@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from .patterns import MOSS, PLUM, STONE, WARM, Texture, gradient, noise, random_colour
+from .patterns import MOSS, PLUM, STONE, WARM, Texture, gradient_map, noise, random_colour
 
 
 def panorama(rng: np.random.Generator, height: int, sun: tuple[float, float]) -> Texture:
@@ -25,11 +25,11 @@ def panorama(rng: np.random.Generator, height: int, sun: tuple[float, float]) ->
     # Two ridges of hills, the farther first: elevations (radians), noise cell (pixels), share of haze. Palettes are
     # display values, which ** 2.2 makes linear.
     for low, high, cell, haze in ((0.02, 0.13, 420, 0.75), (0.0, 0.075, 260, 0.45)):
-        ridge = low + (high - low) * _ring(rng, width, cell)
-        wood = gradient(noise(rng, height, width, 26, 4), ((30, 44, 34), (72, 92, 58), (124, 120, 84))) ** 2.2
+        ridge = low + (high - low) * _ridge_noise(rng, width, cell)
+        wood = gradient_map(noise(rng, height, width, 26, 4), ((30, 44, 34), (72, 92, 58), (124, 120, 84))) ** 2.2
         hill = wood * (1 - haze) + np.array((0.46, 0.40, 0.36), np.float32) * haze
         picture = np.where((elevation < ridge)[..., None], hill, picture)
-    field = _fields(rng, azimuth, elevation)
+    field = _linear_fields(rng, azimuth, elevation)
     picture = np.where((elevation < 0)[..., None], field, picture)
     _draw_skyline(rng, picture, pixel)
     _draw_trees(rng, picture, pixel)
@@ -41,8 +41,9 @@ def _linear_sky(rng: np.random.Generator, height: int, elevation: Texture, angle
 
     elevation: (height, 1), radians. angle: (height, 2 height, 1), of each direction to the sun, radians.
     """
-    up = (elevation.clip(0, None) / (np.pi / 2))[..., None] ** 0.5
-    clear = np.array((0.62, 0.44, 0.30), np.float32) * (1 - up) + np.array((0.06, 0.13, 0.34), np.float32) * up
+    # 0 at the horizon, 1 at the zenith.
+    rise = (elevation.clip(0, None) / (np.pi / 2))[..., None] ** 0.5
+    clear = np.array((0.62, 0.44, 0.30), np.float32) * (1 - rise) + np.array((0.06, 0.13, 0.34), np.float32) * rise
     warm = np.array((1.0, 0.72, 0.42), np.float32)
     halo = 1.6 * np.exp(-angle / 0.10) + 0.5 * np.exp(-angle / 0.45)
     streaks = noise(rng, height, 2 * height, height / 9, 6, stretch=3.0)
@@ -53,14 +54,14 @@ def _linear_sky(rng: np.random.Generator, height: int, elevation: Texture, angle
     return (clear + warm * halo) * (1 - 0.85 * cover) + cloud * cover * 0.9
 
 
-def _ring(rng: np.random.Generator, width: int, cell: float) -> Texture:
+def _ridge_noise(rng: np.random.Generator, width: int, cell: float) -> Texture:
     """Return (width,) noise 0..1 along a ridge: two stretches of noise, cross-faded. cell: pixels."""
     line = noise(rng, 4, 2 * width, cell, 6)[1]
     ramp = np.linspace(0, 1, width, dtype=np.float32)
     return line[:width] * (1 - ramp) + line[width:] * ramp
 
 
-def _fields(rng: np.random.Generator, azimuth: Texture, elevation: Texture) -> Texture:
+def _linear_fields(rng: np.random.Generator, azimuth: Texture, elevation: Texture) -> Texture:
     """Return linear light (height, width, 3) of flat land in perspective: patches with furrows.
 
     Only the part below the horizon is meaningful. azimuth: (1, width), elevation: (height, 1), radians.
@@ -69,7 +70,7 @@ def _fields(rng: np.random.Generator, azimuth: Texture, elevation: Texture) -> T
     distance = 1 / np.tan(np.maximum(-elevation, 0.012))
     x, y = distance * np.sin(azimuth), distance * np.cos(azimuth)
     side = 512
-    crops = gradient(noise(rng, side, side, 40, 4), MOSS) ** 2.2
+    crops = gradient_map(noise(rng, side, side, 40, 4), MOSS) ** 2.2
     plots = rng.random((64, 64, 3), np.float32) * 0.5 + 0.6
     columns, rows = np.floor(x * 1.7).astype(int) % 64, np.floor(y * 1.1).astype(int) % 64
     u, v = (x * 60).astype(int) % side, (y * 60).astype(int) % side
@@ -85,39 +86,41 @@ def _draw_skyline(rng: np.random.Generator, picture: Texture, pixel: float) -> N
     ground = height // 2 + int(0.008 / pixel)
     left = 0
     while left < width:
-        wide = int(rng.uniform(0.025, 0.07) / pixel)
+        columns = int(rng.uniform(0.025, 0.07) / pixel)
         if rng.random() < 0.4:
             left += int(rng.uniform(0.01, 0.06) / pixel)
             continue
-        tall = int(rng.uniform(0.035, 0.085) * (1.9 if rng.random() < 0.15 else 1) / pixel)
+        rows = int(rng.uniform(0.035, 0.085) * (1.9 if rng.random() < 0.15 else 1) / pixel)
         plaster = np.array(random_colour(rng, (WARM, STONE, PLUM)[rng.integers(3)]), np.float32) / 255
         wall = plaster**2.2 * 0.55 + 0.06
-        part = picture[ground - tall:ground, left:left + wide]
-        part[:] = wall * (0.8 + 0.4 * noise(rng, tall, wide, 12, 2)[: part.shape[0], : part.shape[1], None])
-        step = max(int(0.012 / pixel), 4)
-        for y in range(step // 2, tall - step // 2, step):
-            for x in range(step // 3, wide - step // 2, step):
-                part[y:y + step // 2, x:x + step // 2] = (0.9, 0.62, 0.3) if rng.random() < 0.12 else wall * 0.3
-        part[: max(2, step // 4)] *= 0.5
-        left += wide
+        front = picture[ground - rows:ground, left:left + columns]
+        front[:] = wall * (0.8 + 0.4 * noise(rng, rows, columns, 12, 2)[: front.shape[0], : front.shape[1], None])
+        spacing = max(int(0.012 / pixel), 4)
+        for y in range(spacing // 2, rows - spacing // 2, spacing):
+            for x in range(spacing // 3, columns - spacing // 2, spacing):
+                is_lit = rng.random() < 0.12
+                front[y:y + spacing // 2, x:x + spacing // 2] = (0.9, 0.62, 0.3) if is_lit else wall * 0.3
+        front[: max(2, spacing // 4)] *= 0.5
+        left += columns
 
 
 def _draw_trees(rng: np.random.Generator, picture: Texture, pixel: float) -> None:
     """Draw trees of different sizes before and below the horizon into a panorama; pixel: its size, radians."""
     height, width = picture.shape[:2]
-    leaves = gradient(noise(rng, height // 4, width, 9, 3), ((14, 26, 14), (52, 80, 34), (128, 140, 70))) ** 2.2
+    leaves = gradient_map(noise(rng, height // 4, width, 9, 3), ((14, 26, 14), (52, 80, 34), (128, 140, 70))) ** 2.2
     for _ in range(90):
         depth = rng.random()  # 0 far, 1 near: nearer trees are larger and stand lower
         size = (0.016 + 0.075 * depth**2) / pixel
         x, foot = int(rng.integers(width)), height / 2 + (0.012 + 0.12 * depth**2) / pixel
-        shape = np.zeros((height // 4, width), np.uint8)
-        top = height // 2 - height // 8  # first row of the band that trees are drawn into
+        mask = np.zeros((height // 4, width), np.uint8)
+        band_top = height // 2 - height // 8  # first row of the band that trees are drawn into
+        foot -= band_top
         trunk = int(max(size * 0.12, 2))
         for _ in range(12):
-            centre = (int(x + rng.normal() * size * 0.35), int(foot - top - size * (1.1 + rng.normal() * 0.32)))
-            cv2.circle(shape, centre, max(int(size * rng.uniform(0.15, 0.38)), 2), 255, -1, cv2.LINE_AA)
-        cv2.rectangle(shape, (x - trunk // 2, int(foot - top - size)), (x + trunk // 2, int(foot - top)), 255, -1)
-        cover = (shape.astype(np.float32) / 255)[..., None]
-        band = picture[top:top + height // 4]
+            centre = (int(x + rng.normal() * size * 0.35), int(foot - size * (1.1 + rng.normal() * 0.32)))
+            cv2.circle(mask, centre, max(int(size * rng.uniform(0.15, 0.38)), 2), 255, -1, cv2.LINE_AA)
+        cv2.rectangle(mask, (x - trunk // 2, int(foot - size)), (x + trunk // 2, int(foot)), 255, -1)
+        cover = (mask.astype(np.float32) / 255)[..., None]
+        band = picture[band_top:band_top + height // 4]
         shift = int(rng.integers(width))
         band[:] = band * (1 - cover) + np.roll(leaves, shift, 1) * (0.6 + 0.5 * rng.random()) * cover

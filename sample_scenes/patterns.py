@@ -41,13 +41,13 @@ def noise(rng: np.random.Generator, height: int, width: int, cell: float, octave
     return np.clip((total - low) / (high - low), 0, 1).astype(np.float32)
 
 
-def gradient(values: Texture, palette: Palette) -> Texture:
+def gradient_map(values: Texture, palette: Palette) -> Texture:
     """Map values (...), 0..1, to colours (..., 3), 0..1, along the palette."""
     colours = np.array(palette, np.float32) / 255
     positions = np.clip(values, 0, 1) * (len(colours) - 1)
     low = np.minimum(positions.astype(int), len(colours) - 2)
-    part = (positions - low)[..., None]
-    return colours[low] * (1 - part) + colours[low + 1] * part
+    fraction = (positions - low)[..., None]
+    return colours[low] * (1 - fraction) + colours[low + 1] * fraction
 
 
 def random_colour(rng: np.random.Generator, palette: Palette) -> tuple[int, int, int]:
@@ -92,20 +92,20 @@ def framed(picture: Texture, border: float = 0.07, colour: tuple[int, int, int] 
 
 
 def writing(rng: np.random.Generator, height: int, width: int, paper: tuple[int, int, int],
-            ink: tuple[int, int, int], line: int = 26) -> Texture:
-    """Draw a sheet with a heading bar and rows of marks of word length. line: height of a row, pixels."""
+            ink: tuple[int, int, int], spacing: int = 26) -> Texture:
+    """Draw a sheet with a heading bar and rows of marks as long as words. spacing: of the rows, pixels."""
     picture = np.full((height, width, 3), paper, np.uint8)
-    top = int(1.2 * line)
-    cv2.rectangle(picture, (line, line // 2), (int(width * 0.6), top), ink, -1)
-    y = top + line
-    while y < height - line:
-        x = line
-        while x < width - 2 * line:
-            word = int(rng.integers(line // 2, 3 * line))
+    heading_bottom = int(1.2 * spacing)
+    cv2.rectangle(picture, (spacing, spacing // 2), (int(width * 0.6), heading_bottom), ink, -1)
+    y = heading_bottom + spacing
+    while y < height - spacing:
+        x = spacing
+        while x < width - 2 * spacing:
+            length = int(rng.integers(spacing // 2, 3 * spacing))
             if rng.random() < 0.85:
-                cv2.line(picture, (x, y), (min(x + word, width - line), y), ink, max(2, line // 4), cv2.LINE_AA)
-            x += word + line // 2
-        y += line
+                cv2.line(picture, (x, y), (min(x + length, width - spacing), y), ink, max(2, spacing // 4), cv2.LINE_AA)
+            x += length + spacing // 2
+        y += spacing
     return picture.astype(np.float32) / 255
 
 
@@ -113,25 +113,25 @@ def planks(rng: np.random.Generator, height: int, width: int, palette: Palette, 
     """Draw `rows` boards along x with grain, growth rings, spots and dark gaps."""
     picture = np.zeros((height, width, 3), np.float32)
     edges = np.linspace(0, height, rows + 1).astype(int)
-    for low, high in pairwise(edges):
-        tall = high - low
-        grain = noise(rng, tall, width, tall / 3, 4, stretch=9.0)
+    for top, bottom in pairwise(edges):
+        board_height = bottom - top
+        grain = noise(rng, board_height, width, board_height / 3, 4, stretch=9.0)
         rings = 0.5 + 0.5 * np.sin(grain * 26 + rng.uniform(0, 6))
-        spots = noise(rng, tall, width, tall / 1.5, 3)
+        spots = noise(rng, board_height, width, board_height / 1.5, 3)
         tone = 0.45 * grain + 0.25 * rings + 0.3 * spots
-        board = gradient(np.clip(tone * 0.8 + rng.uniform(-0.1, 0.25), 0, 1), palette)
+        board = gradient_map(np.clip(tone * 0.8 + rng.uniform(-0.1, 0.25), 0, 1), palette)
         joint = int(rng.integers(width))
         board[:, joint:joint + max(3, width // 300)] *= 0.35
         board[: max(3, height // 260)] *= 0.35
-        picture[low:high] = board
+        picture[top:bottom] = board
     return picture
 
 
 def marble(rng: np.random.Generator, height: int, width: int, palette: Palette) -> Texture:
-    """Draw veined stone."""
+    """Draw veined stone: dark veins along the zeros of a warped sine."""
     warp = noise(rng, height, width, height / 3, 5)
     veins = 1 - np.abs(np.sin(warp * 14 + noise(rng, height, width, height / 6, 4) * 5))
-    return gradient(np.clip(0.25 + 0.75 * warp - 0.6 * veins**4, 0, 1), palette)
+    return gradient_map(np.clip(0.25 + 0.75 * warp - 0.6 * veins**4, 0, 1), palette)
 
 
 def map_of_islands(rng: np.random.Generator, height: int, width: int) -> Texture:
@@ -140,8 +140,8 @@ def map_of_islands(rng: np.random.Generator, height: int, width: int) -> Texture
     ramp = np.linspace(0, 1, width, dtype=np.float32)  # cross-fades the two halves
     field = field[:, :width] * (1 - ramp) + field[:, width:] * ramp
     field = (field - field.min()) / (field.max() - field.min())
-    sea = gradient(field / 0.5, ((8, 40, 80), (20, 84, 130), (70, 150, 180)))
-    land = gradient((field - 0.5) / 0.5, ((214, 190, 120), (110, 150, 70), (120, 90, 50), (240, 236, 228)))
+    sea = gradient_map(field / 0.5, ((8, 40, 80), (20, 84, 130), (70, 150, 180)))
+    land = gradient_map((field - 0.5) / 0.5, ((214, 190, 120), (110, 150, 70), (120, 90, 50), (240, 236, 228)))
     picture = np.where((field > 0.5)[..., None], land, sea).astype(np.float32)
     for index in range(12):
         x = int((index + 0.5) * width / 12)
@@ -157,13 +157,14 @@ def tiles(rng: np.random.Generator, height: int, width: int, palette: Palette, r
     """Draw tiles of different tones, some with a round mark. joint: colour between them. offset: lay them as bricks."""
     picture = np.full((height, width, 3), joint, np.float32) / 255
     grain = noise(rng, height, width, height / rows / 2, 4)
-    tall, wide = height / rows, width / columns
-    gap = max(2, int(0.04 * tall))
+    row_height, column_width = height / rows, width / columns
+    gap = max(2, int(0.04 * row_height))
     for row in range(rows):
         for column in range(-1 if offset else 0, columns):  # -1: the half tile at the left of a shifted row
             shift = 0.5 * (row % 2) if offset else 0.0
-            y0, y1 = int(row * tall) + gap, int((row + 1) * tall)
-            x0, x1 = max(int((column + shift) * wide) + gap, 0), min(int((column + shift + 1) * wide), width)
+            y0, y1 = int(row * row_height) + gap, int((row + 1) * row_height)
+            x0 = max(int((column + shift) * column_width) + gap, 0)
+            x1 = min(int((column + shift + 1) * column_width), width)
             if x1 <= x0:
                 continue
             tone = np.array(random_colour(rng, palette), np.float32) / 255
@@ -171,12 +172,12 @@ def tiles(rng: np.random.Generator, height: int, width: int, palette: Palette, r
             if rng.random() < 0.45:
                 centre = (int((x0 + x1) / 2), int((y0 + y1) / 2))
                 mark = tuple(value / 255 for value in random_colour(rng, palette))
-                cv2.circle(picture, centre, int(0.22 * min(tall, wide)), mark, -1, cv2.LINE_AA)
+                cv2.circle(picture, centre, int(0.22 * min(row_height, column_width)), mark, -1, cv2.LINE_AA)
     return np.clip(picture, 0, 1)
 
 
 def weave(rng: np.random.Generator, height: int, width: int, palette: Palette) -> Texture:
-    """Draw a rug: nested borders, lozenges and stripes, a little worn."""
+    """Draw a woven rug: nested borders, lozenges and stripes, a little worn."""
     picture = np.zeros((height, width, 3), np.uint8)
     border = min(height, width) // 14
     for ring in range(4):
@@ -189,49 +190,49 @@ def weave(rng: np.random.Generator, height: int, width: int, palette: Palette) -
     step = int(2.6 * border)
     for row, y in enumerate(range(5 * border, height - 4 * border, step)):
         for x in range(5 * border + (row % 2) * step // 2, width - 4 * border, step):
-            reach = step // 2 - 2
-            corners = np.array([(x - reach, y), (x, y - reach), (x + reach, y), (x, y + reach)], np.int32)
+            half = step // 2 - 2  # of a lozenge
+            corners = np.array([(x - half, y), (x, y - half), (x + half, y), (x, y + half)], np.int32)
             cv2.fillPoly(picture, [corners], random_colour(rng, palette), cv2.LINE_AA)
-            cv2.circle(picture, (x, y), reach // 3, random_colour(rng, palette), -1, cv2.LINE_AA)
-    worn = 0.75 + 0.35 * noise(rng, height, width, border, 3)[..., None]
-    return np.clip(picture.astype(np.float32) / 255 * worn, 0, 1)
+            cv2.circle(picture, (x, y), half // 3, random_colour(rng, palette), -1, cv2.LINE_AA)
+    wear = 0.75 + 0.35 * noise(rng, height, width, border, 3)[..., None]
+    return np.clip(picture.astype(np.float32) / 255 * wear, 0, 1)
 
 
 def facade(rng: np.random.Generator, height: int, width: int, palette: Palette, floors: int, bays: int) -> Texture:
     """Draw the front of a house: plaster, windows with shutters, some doors, a cornice. bays: windows in a row."""
     plaster = np.array(random_colour(rng, palette), np.float32) / 255
     picture = plaster * (0.75 + 0.35 * noise(rng, height, width, height / 5, 4)[..., None])
-    tall, wide = height / floors, width / bays
+    floor_height, bay_width = height / floors, width / bays
     shutter = np.array(random_colour(rng, palette), np.float32) / 255 * 0.8
     for floor in range(floors):
         for bay in range(bays):
-            top, left = int((floor + 0.22) * tall), int((bay + 0.3) * wide)
+            top, left = int((floor + 0.22) * floor_height), int((bay + 0.3) * bay_width)
             # On the ground floor some windows reach down as doors.
-            down = int((floor + (1.0 if floor == floors - 1 and rng.random() < 0.4 else 0.78)) * tall)
-            right = int((bay + 0.7) * wide)
-            edge = max(3, int(0.06 * wide))
-            picture[top - edge:down + edge, left - edge:right + edge] = (0.82, 0.78, 0.7)
-            picture[top:down, left:right] = np.array((0.10, 0.13, 0.17)) * rng.uniform(0.6, 2.4)
-            picture[top:down, (left + right) // 2 - 2:(left + right) // 2 + 2] = (0.75, 0.72, 0.66)
-            picture[(top + down) // 2 - 2:(top + down) // 2 + 2, left:right] = (0.75, 0.72, 0.66)
+            bottom = int((floor + (1.0 if floor == floors - 1 and rng.random() < 0.4 else 0.78)) * floor_height)
+            right = int((bay + 0.7) * bay_width)
+            edge = max(3, int(0.06 * bay_width))  # width of a window frame
+            picture[top - edge:bottom + edge, left - edge:right + edge] = (0.82, 0.78, 0.7)
+            picture[top:bottom, left:right] = np.array((0.10, 0.13, 0.17)) * rng.uniform(0.6, 2.4)
+            picture[top:bottom, (left + right) // 2 - 2:(left + right) // 2 + 2] = (0.75, 0.72, 0.66)
+            picture[(top + bottom) // 2 - 2:(top + bottom) // 2 + 2, left:right] = (0.75, 0.72, 0.66)
             if rng.random() < 0.7:
-                picture[top:down, left - 4 * edge:left - edge] = shutter
-                picture[top:down, right + edge:right + 4 * edge] = shutter
+                picture[top:bottom, left - 4 * edge:left - edge] = shutter
+                picture[top:bottom, right + edge:right + 4 * edge] = shutter
     picture[:int(0.05 * height)] = plaster * 0.6
     for floor in range(1, floors):
-        picture[int(floor * tall) - 4:int(floor * tall) + 4] = plaster * 0.7
+        picture[int(floor * floor_height) - 4:int(floor * floor_height) + 4] = plaster * 0.7
     return np.clip(picture, 0, 1).astype(np.float32)
 
 
-def sky(rng: np.random.Generator, height: int, width: int, low: tuple[int, int, int], high: tuple[int, int, int],
+def sky(rng: np.random.Generator, height: int, width: int, horizon: tuple[int, int, int], zenith: tuple[int, int, int],
         cloud: tuple[int, int, int]) -> Texture:
     """Draw an evening sky for the inside of a dome, with streaks of cloud.
 
-    low, high: colours at the horizon, which is the picture's middle row, and at the zenith; cloud: of the clouds.
+    horizon, zenith, cloud: their colours, R G B 0..255. The horizon is the picture's middle row.
     """
-    up = np.clip(1 - 2 * (np.arange(height, dtype=np.float32) + 0.5) / height, 0, 1)[:, None, None] ** 0.6
-    colours = [np.array(colour, np.float32) / 255 for colour in (low, high, cloud)]
+    height_share = np.clip(1 - 2 * (np.arange(height, dtype=np.float32) + 0.5) / height, 0, 1)[:, None, None] ** 0.6
+    colours = [np.array(colour, np.float32) / 255 for colour in (horizon, zenith, cloud)]
     clouds = noise(rng, height, width, height / 5, 5, stretch=5.0)
     clouds = np.clip((clouds - 0.5) * 2.2, 0, 0.8)[..., None]
-    clear = colours[0] * (1 - up) + colours[1] * up
+    clear = colours[0] * (1 - height_share) + colours[1] * height_share
     return (clear * (1 - clouds) + colours[2] * clouds).astype(np.float32)

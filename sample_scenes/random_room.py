@@ -66,38 +66,38 @@ class Room:
         """Light the world by a random environment map, or half of the indoor rooms evenly and dimly."""
         random = self.random
         if self.indoors and random.random() < 0.5:
-            stage.uniform_world(random_colour(random, 0.3), 0.01 if self.dark else 0.2)
+            stage.set_uniform_world(random_colour(random, 0.3), 0.01 if self.dark else 0.2)
             return
-        stage.uniform_world((0, 0, 0), 1)
+        stage.set_uniform_world((0, 0, 0), 1)
         nodes, links = self.scene.world.node_tree.nodes, self.scene.world.node_tree.links
         background = nodes["Background"]
-        picture = nodes.new("ShaderNodeTexEnvironment")
-        picture.image = load_image(random.choice(self.maps))
-        position, rotation = nodes.new("ShaderNodeTexCoord"), nodes.new("ShaderNodeMapping")
-        rotation.inputs["Rotation"].default_value[2] = random.uniform(0, 2 * math.pi)
-        links.new(position.outputs["Generated"], rotation.inputs["Vector"])
-        links.new(rotation.outputs["Vector"], picture.inputs["Vector"])
-        links.new(picture.outputs["Color"], background.inputs["Color"])
+        texture = nodes.new("ShaderNodeTexEnvironment")
+        texture.image = load_image(random.choice(self.maps))
+        coordinates, mapping = nodes.new("ShaderNodeTexCoord"), nodes.new("ShaderNodeMapping")
+        mapping.inputs["Rotation"].default_value[2] = random.uniform(0, 2 * math.pi)
+        links.new(coordinates.outputs["Generated"], mapping.inputs["Vector"])
+        links.new(mapping.outputs["Vector"], texture.inputs["Vector"])
+        links.new(texture.outputs["Color"], background.inputs["Color"])
         background.inputs["Strength"].default_value = random.uniform(0, 0.02) if self.dark else random.uniform(0.3, 1)
 
     def _add_walls(self) -> None:
         """Add a floor, and indoors most of the walls and the ceiling."""
         random, middle = self.random, self.depth / 2 - 1
         polished = random.random() < 0.65
-        reach = (self.width, self.depth + 2) if self.indoors else (60, 60)
+        floor_size = (self.width, self.depth + 2) if self.indoors else (60, 60)
         roughness = random.uniform(0.03, 0.28) if polished else random.uniform(0.3, 1)
-        stage.sheet("floor", *reach, (0, middle, 0), self._surface_material(roughness))
+        stage.add_sheet("floor", *floor_size, (0, middle, 0), self._surface_material(roughness))
         if not self.indoors:
             return
-        long, half, high = self.depth + 2, self.width / 2, self.height / 2
-        for name, length, position, rotation in (("left", long, (-half, middle, high), 90),
-                                                 ("right", long, (half, middle, high), -90),
-                                                 ("back", self.width, (0, self.depth, high), 0)):
+        side_length, half_width, half_height = self.depth + 2, self.width / 2, self.height / 2
+        for name, length, position, rotation in (("left", side_length, (-half_width, middle, half_height), 90),
+                                                 ("right", side_length, (half_width, middle, half_height), -90),
+                                                 ("back", self.width, (0, self.depth, half_height), 0)):
             if random.random() < 0.92:
                 material = self._surface_material(random.uniform(0.25, 1))
-                stage.sheet(name, length, self.height, position, material, rotation, (90, 0))
+                stage.add_sheet(name, length, self.height, position, material, rotation, (90, 0))
         if random.random() < 0.85:
-            stage.sheet("ceiling", self.width, long, (0, middle, self.height), self._surface_material(0.8),
+            stage.add_sheet("ceiling", self.width, side_length, (0, middle, self.height), self._surface_material(0.8),
                         tilt=(180, 0))
 
     def _add_object(self) -> None:
@@ -148,7 +148,7 @@ class Room:
                 width, height = size * random.uniform(1, (6, 4))
                 material = self._emissive_material(colour, power / (size * size * 6 + 0.05),
                                                    photo=random.random() < 0.5)
-                stage.sheet("screen", width, height, position, material, rotation, (90, 0))
+                stage.add_sheet("screen", width, height, position, material, rotation, (90, 0))
             case "tube":
                 bpy.ops.mesh.primitive_cylinder_add(radius=size / 5, depth=size * 8, location=position,
                                                     rotation=(*random.choice([0, math.pi / 2], 2), 0))
@@ -173,8 +173,8 @@ class Room:
             light.data.size = random.uniform(0.3, 3)
 
     def _random_position(self, height: float, min_distance: float = 0.0) -> Position:
-        across = self.random.uniform(-self.width / 2, self.width / 2) * 0.9
-        return across, self.random.uniform(min_distance, self.depth * 0.95), height
+        x = self.random.uniform(-self.width / 2, self.width / 2) * 0.9
+        return x, self.random.uniform(min_distance, self.depth * 0.95), height
 
     def _surface_material(self, roughness: float) -> Any:
         random = self.random
@@ -204,14 +204,15 @@ class Room:
         inputs["Base Color"].default_value = inputs["Emission Color"].default_value = (*colour, 1)
         inputs["Emission Strength"].default_value = strength
         if photo:
-            picture, position, size = (nodes.new(f"ShaderNode{name}") for name in ("TexImage", "TexCoord", "Mapping"))
-            picture.image = load_image(random.choice(self.photos))
-            picture.extension = "MIRROR"
-            size.inputs["Scale"].default_value = (repeat,) * 3
-            links.new(position.outputs["Generated"], size.inputs["Vector"])
-            links.new(size.outputs["Vector"], picture.inputs["Vector"])
+            texture, coordinates, mapping = (nodes.new(f"ShaderNode{name}")
+                                             for name in ("TexImage", "TexCoord", "Mapping"))
+            texture.image = load_image(random.choice(self.photos))
+            texture.extension = "MIRROR"
+            mapping.inputs["Scale"].default_value = (repeat,) * 3
+            links.new(coordinates.outputs["Generated"], mapping.inputs["Vector"])
+            links.new(mapping.outputs["Vector"], texture.inputs["Vector"])
             for name in ("Base Color", "Emission Color"):
-                links.new(picture.outputs["Color"], inputs[name])
+                links.new(texture.outputs["Color"], inputs[name])
         if random.random() < 0.5:
             noise, bump = nodes.new("ShaderNodeTexNoise"), nodes.new("ShaderNodeBump")
             noise.inputs["Scale"].default_value = math.exp(random.uniform(1, 5))
@@ -243,18 +244,22 @@ class Room:
         settings = self.scene.render.image_settings
         settings.media_type, settings.file_format = "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER"
         with silence_blender():
-            channels = shots.render_with(read_exr)
+            channels = shots.render_and_read(read_exr)
         light = np.stack([_channel_with_suffix(channels, f"Combined.{name}") for name in "RGB"], -1)
         if random.random() < 0.15:
-            depth = np.minimum(_channel_with_suffix(channels, ".Z"), self.depth * 6)
-            transmission = np.exp(depth * (-math.exp(random.uniform(-2.5, 0.5)) / self.depth))[..., None]
-            air = np.array(random_colour(random, random.random() * 0.4), np.float32)
-            # The mist has the brightness of a random percentile of the frame.
-            airlight = air * np.percentile(light.mean(-1), random.uniform(50, 97))
-            light = light * transmission + airlight * (1 - transmission)
+            light = self._add_mist(light, _channel_with_suffix(channels, ".Z"))
         return np.asarray(light, np.float32)
 
+    def _add_mist(self, light: Pixels, depth: Pixels) -> Pixels:
+        """Return the light (height, width, 3) through a mist of random density and colour. depth: (height, width)."""
+        random, depth = self.random, np.minimum(depth, self.depth * 6)
+        transmission = np.exp(depth * (-math.exp(random.uniform(-2.5, 0.5)) / self.depth))[..., None]
+        colour = np.array(random_colour(random, random.random() * 0.4), np.float32)
+        # The mist has the brightness of a random percentile of the frame.
+        airlight = colour * np.percentile(light.mean(-1), random.uniform(50, 97))
+        return light * transmission + airlight * (1 - transmission)
 
-def _channel_with_suffix(channels: dict[str, Pixels], end: str) -> Pixels:
-    """Return the channel whose name ends with `end`."""
-    return next(pixels for name, pixels in channels.items() if name.endswith(end))
+
+def _channel_with_suffix(channels: dict[str, Pixels], suffix: str) -> Pixels:
+    """Return the channel whose name ends with `suffix`; its layer and view stand before it."""
+    return next(pixels for name, pixels in channels.items() if name.endswith(suffix))

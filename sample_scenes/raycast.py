@@ -21,6 +21,8 @@ RAYS_PER_SIDE = 2
 """Rays along each side of a pixel."""
 SHARE_SAMPLES = 128
 """Points on a lamp's disc whose visibility is tested."""
+MAX_REMAP_ROWS = 32000
+"""Rows of a map that `cv2.remap` gets at once; it takes fewer than 32768."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,7 @@ def quad(corner: Sequence[float], u: Sequence[float], v: Sequence[float], textur
     return Quad(np.array(corner, float), np.array(u, float), np.array(v, float), texture, radiance)
 
 
-def box(low: Sequence[float], high: Sequence[float], texture: Pixels) -> list[Quad]:
+def box_sides(low: Sequence[float], high: Sequence[float], texture: Pixels) -> list[Quad]:
     """Return five sides of a box between the corners `low` and `high`: all but the bottom, which no camera sees.
 
     y grows downwards, so the bottom is at the y of `high`.
@@ -103,7 +105,7 @@ def camera_rays(camera: Pinhole, rotation: Array) -> Pixels:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True), np.float32)
 
 
-def cast(quads: Sequence[Quad], eye: Array, rays: Pixels) -> Hits:
+def cast_rays(quads: Sequence[Quad], eye: Array, rays: Pixels) -> Hits:
     """Return the nearest hits of unit rays (n, 3) from `eye`.
 
     Where nothing is hit, the distance is infinite and the rest 0. Normals face the eye. A rectangle that emits reflects
@@ -111,47 +113,48 @@ def cast(quads: Sequence[Quad], eye: Array, rays: Pixels) -> Hits:
     """
     count = len(rays)
     hits = Hits(np.full(count, np.inf, np.float32), *(np.zeros((count, 3), np.float32) for _ in range(3)))
-    for item in quads:
-        distance, a, b = _intersect(item, eye, rays)
-        index = np.flatnonzero((distance < hits.distance) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1))
+    for rectangle in quads:
+        distance, u, v = _intersect(rectangle, eye, rays)
+        index = np.flatnonzero((distance < hits.distance) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1))
         if not len(index):
             continue
-        height, width = item.texture.shape[:2]
-        columns, rows = a[index] * (width - 1), b[index] * (height - 1)
-        # OpenCV maps fewer than 32768 rows at once.
-        colour = cv2.remap(item.texture, columns.reshape(-1, 1), rows.reshape(-1, 1), cv2.INTER_LINEAR).reshape(-1, 3) \
-            if len(index) < 32000 else _sample(item.texture, columns, rows)
-        normal = np.cross(item.u, item.v)
+        height, width = rectangle.texture.shape[:2]
+        columns, rows = u[index] * (width - 1), v[index] * (height - 1)
+        colour = _sample_texture(rectangle.texture, columns, rows)
+        normal = np.cross(rectangle.u, rectangle.v)
         # Towards the eye; the sign is 0 for an eye in the plane.
-        normal = normal / np.linalg.norm(normal) * (-np.sign(normal @ (item.corner - eye)) or 1.0)
+        normal = normal / np.linalg.norm(normal) * (-np.sign(normal @ (rectangle.corner - eye)) or 1.0)
         hits.distance[index] = distance[index]
-        hits.albedo[index] = 0.0 if item.radiance else colour
-        hits.emission[index] = colour * np.float32(item.radiance)
+        hits.albedo[index] = 0.0 if rectangle.radiance else colour
+        hits.emission[index] = colour * np.float32(rectangle.radiance)
         hits.normal[index] = normal
     return hits
 
 
-def _sample(texture: Pixels, columns: Pixels, rows: Pixels) -> Pixels:
+def _sample_texture(texture: Pixels, columns: Pixels, rows: Pixels) -> Pixels:
     """Sample a texture bilinearly at (n,) columns and rows, in parts that OpenCV accepts; return (n, 3)."""
-    parts = [cv2.remap(texture, columns[start:start + 32000].reshape(-1, 1), rows[start:start + 32000].reshape(-1, 1),
-                       cv2.INTER_LINEAR).reshape(-1, 3) for start in range(0, len(columns), 32000)]
+    parts = []
+    for start in range(0, len(columns), MAX_REMAP_ROWS):
+        part = slice(start, start + MAX_REMAP_ROWS)
+        colours = cv2.remap(texture, columns[part].reshape(-1, 1), rows[part].reshape(-1, 1), cv2.INTER_LINEAR)
+        parts.append(colours.reshape(-1, 3))
     return np.concatenate(parts).astype(np.float32)
 
 
-def _intersect(item: Quad, eye: Array, rays: Pixels) -> tuple[Pixels, Pixels, Pixels]:
+def _intersect(rectangle: Quad, eye: Array, rays: Pixels) -> tuple[Pixels, Pixels, Pixels]:
     """Return where rays meet the plane of a rectangle: distances along them, and coordinates along u and v, each (n,).
 
     Behind the eye and on parallel rays the distance is infinite. Coordinates are 0..1 inside the rectangle.
     """
-    normal = np.cross(item.u, item.v)
-    # The rays are projected onto the edges, so that no hit points have to be stored.
-    along = rays @ normal.astype(np.float32)
+    normal = np.cross(rectangle.u, rectangle.v)
+    normal_component = rays @ normal.astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.float32((item.corner - eye) @ normal) / along
+        distance = np.float32((rectangle.corner - eye) @ normal) / normal_component
         distance = np.where(distance > 1e-4, distance, np.float32(np.inf))
+        # The rays are projected onto the edges, so that no hit points have to be stored.
         coordinates = [
             distance * (rays @ (edge / (edge @ edge)).astype(np.float32))
-            - np.float32((item.corner - eye) @ edge / (edge @ edge)) for edge in (item.u, item.v)]
+            - np.float32((rectangle.corner - eye) @ edge / (edge @ edge)) for edge in (rectangle.u, rectangle.v)]
     return distance, np.nan_to_num(coordinates[0], nan=-1), np.nan_to_num(coordinates[1], nan=-1)
 
 
@@ -160,38 +163,40 @@ def shade(hits: Hits, eye: Array, rays: Pixels, lamps: Sequence[Lamp], ambient: 
 
     Where a lamp's disc is nearer than the surface, the ray has the lamp's radiance. ambient: (3,).
     """
-    seen = np.isfinite(hits.distance)
-    points = eye.astype(np.float32) + np.where(seen, hits.distance, 0)[:, None] * rays
+    has_hit = np.isfinite(hits.distance)
+    points = eye.astype(np.float32) + np.where(has_hit, hits.distance, 0)[:, None] * rays
     light = np.broadcast_to(ambient.astype(np.float32), hits.albedo.shape).copy()
     for lamp in lamps:
         if not lamp.power:
             continue
-        towards = lamp.xyz.astype(np.float32) - points
-        squared = (towards * towards).sum(1) + np.float32(0.02)  # keeps the light finite close to the lamp
-        distance = np.sqrt(squared)
-        cosine = np.maximum((towards * hits.normal).sum(1) / distance, 0)
-        strength = lamp.power * cosine / squared
+        to_lamp = lamp.xyz.astype(np.float32) - points
+        squared_distance = (to_lamp * to_lamp).sum(1) + np.float32(0.02)  # keeps the light finite close to the lamp
+        distance = np.sqrt(squared_distance)
+        cosine = np.maximum((to_lamp * hits.normal).sum(1) / distance, 0)
+        strength = lamp.power * cosine / squared_distance
         if lamp.beam is not None:  # a headlight: the cube of the cosine to its beam
-            strength *= np.maximum(-(towards @ lamp.beam.astype(np.float32)) / distance, 0) ** 3
+            strength *= np.maximum(-(to_lamp @ lamp.beam.astype(np.float32)) / distance, 0) ** 3
         light += strength[:, None] * lamp.colour.astype(np.float32)
     radiance = hits.emission + hits.albedo * light
     for lamp in lamps:
         if lamp.radiance:
-            covered = _disc(lamp, eye, rays, hits.distance)
+            covered = _lamp_disc_mask(lamp, eye, rays, hits.distance)
             radiance[covered] = lamp.colour.astype(np.float32) * np.float32(lamp.radiance)
     return radiance
 
 
-def _disc(lamp: Lamp, eye: Array, rays: Pixels, distance: Pixels) -> NDArray[np.bool_]:
-    """Return (n,), which rays meet a lamp's sphere before the surfaces at these distances (n,)."""
-    towards = lamp.xyz - eye
-    along = rays @ towards.astype(np.float32)
+def _lamp_disc_mask(lamp: Lamp, eye: Array, rays: Pixels, distance: Pixels) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the rays that meet a lamp's sphere before the surfaces at these distances (n,)."""
+    to_lamp = lamp.xyz - eye
+    # The distance along the ray at which it is nearest to the sphere's centre.
+    centre_distance = rays @ to_lamp.astype(np.float32)
     # The squared distance of the sphere's centre from the ray.
-    off = np.float32(towards @ towards) - along * along
-    return np.asarray((along > 0) & (off < lamp.radius**2) & (along - lamp.radius < distance))
+    squared_offset = np.float32(to_lamp @ to_lamp) - centre_distance * centre_distance
+    is_nearer = centre_distance - lamp.radius < distance
+    return np.asarray((centre_distance > 0) & (squared_offset < lamp.radius**2) & is_nearer)
 
 
-def average(radiance: Pixels, camera: Pinhole) -> Pixels:
+def average_rays(radiance: Pixels, camera: Pinhole) -> Pixels:
     """Average the rays of each pixel, in the order of `camera_rays`: (n, 3) to (height, width, 3)."""
     side = RAYS_PER_SIDE
     grid = radiance.reshape(camera.height, side, camera.width, side, 3)
@@ -203,4 +208,4 @@ def visible_share(lamp: Lamp, eye: Array, quads: Sequence[Quad]) -> float:
     points = disc_points(lamp.xyz, eye, lamp.radius, SHARE_SAMPLES, up=(0.0, 1.0, 0.0))
     distance = float(np.linalg.norm(lamp.xyz - eye))
     rays = np.asarray((points - eye) / np.linalg.norm(points - eye, axis=1, keepdims=True), np.float32)
-    return float((cast(quads, eye, rays).distance >= distance - lamp.radius).mean())
+    return float((cast_rays(quads, eye, rays).distance >= distance - lamp.radius).mean())

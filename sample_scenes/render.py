@@ -31,23 +31,24 @@ CACHE = Path(__file__).resolve().parents[1] / "build" / "sample_scenes"
 
 def render_scene(scene: SceneDescription, out: Path, progress: Progress) -> None:
     """Render truth/scene and compute truth/visible_share.json in Blender; views that exist are kept."""
-    target, table = out / "truth" / "scene", out / "truth" / "visible_share.json"
+    layer_folder, share_file = out / "truth" / "scene", out / "truth" / "visible_share.json"
     names, poses = scene.stems, scene.poses
-    missing = [i for i, name in enumerate(names) if not (target / f"{name}.exr").is_file()]
-    if not missing and table.is_file():
+    missing = [i for i, name in enumerate(names) if not (layer_folder / f"{name}.exr").is_file()]
+    if not missing and share_file.is_file():
         return
     from sample_scenes import shots
 
     scene.build(scene)
     camera = shots.set_up_render(scene.camera, scene.samples)
     eyes = camera_positions(poses)
-    write_json(table, {f"{name}{FRAME_SUFFIX}": {light.name: shots.visible_share(light, eye) for light in scene.lights}
-                       for name, eye in zip(names, eyes, strict=True)})
+    shares = {f"{name}{FRAME_SUFFIX}": {light.name: shots.visible_share(light, eye) for light in scene.lights}
+              for name, eye in zip(names, eyes, strict=True)}
+    write_json(share_file, shares)
     progress.stage("render", len(names), len(names) - len(missing))
     for index in missing:
         with silence_blender():
             pixels = shots.render_view(camera, poses[index], scene.seed * 1000 + int(scene.numbers[index]))
-        write_layer(target / f"{names[index]}.exr", pixels, SCENE_LEVEL)
+        write_layer(layer_folder / f"{names[index]}.exr", pixels, SCENE_LEVEL)
         progress.advance()
 
 
@@ -61,25 +62,25 @@ def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
     setup = LENS_SETUPS[scene.lens]
     progress.stage("flares", len(names))
     for index, name in enumerate(names):
-        layer, frame, clean = (out / "truth" / "flare" / f"{name}.exr", out / "images" / f"{name}{FRAME_SUFFIX}",
-                               out / "removed" / f"{name}{FRAME_SUFFIX}")
-        if not (layer.is_file() and frame.is_file() and clean.is_file()):
+        layer_path = out / "truth" / "flare" / f"{name}.exr"
+        frame_path, clean_path = (out / folder / f"{name}{FRAME_SUFFIX}" for folder in ("images", "removed"))
+        if not (layer_path.is_file() and frame_path.is_file() and clean_path.is_file()):
             flare = np.zeros((scene.camera.height, scene.camera.width, 3), np.float32)
             for light in scene.lights:
-                position = poses[index][:3, :3] @ np.array(light.xyz) + poses[index][:3, 3]
-                flare += render_flare(setup, scene.camera, position, colour=light.colour,
-                                      intensity=light.flare_strength(float(np.linalg.norm(position))),
+                light_position = poses[index][:3, :3] @ np.array(light.xyz) + poses[index][:3, 3]
+                flare += render_flare(setup, scene.camera, light_position, colour=light.colour,
+                                      intensity=light.flare_strength(float(np.linalg.norm(light_position))),
                                       visible_share=shares[f"{name}{FRAME_SUFFIX}"][light.name])
-            write_layer(layer, flare, FLARE_LEVEL)
+            write_layer(layer_path, flare, FLARE_LEVEL)
             # The frames are made of the layers as stored, so that the files agree to the last bit.
-            flare = read_picture(layer).pixels
+            flare = read_picture(layer_path).pixels
             picture = read_picture(out / "truth" / "scene" / f"{name}.exr").pixels
-            write_frame(clean, picture, (scene.seed, int(scene.numbers[index])))
-            write_frame(frame, picture + flare, (scene.seed, int(scene.numbers[index])))
+            write_frame(clean_path, picture, (scene.seed, int(scene.numbers[index])))
+            write_frame(frame_path, picture + flare, (scene.seed, int(scene.numbers[index])))
         progress.advance()
 
 
-def write_lists(scene: SceneDescription, out: Path) -> None:
+def write_lights_and_split(scene: SceneDescription, out: Path) -> None:
     """Write lights.json, and split.json: every eighth view is held out, and those of `scene.held_out`."""
     write_json(out / LIGHTS, {"lights": [
         {"name": light.name, "xyz": list(light.xyz), "radius": light.radius, "colour": list(light.colour)}
@@ -94,7 +95,7 @@ def make_capture(scene: SceneDescription, out: Path, progress: Progress) -> None
 
     render_scene(scene, out, progress)
     add_flares(scene, out, progress)
-    write_lists(scene, out)
+    write_lights_and_split(scene, out)
     write_model(scene, out, progress)
 
 

@@ -16,7 +16,7 @@ import argparse
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from core.system.progress import Progress
 from sample_scenes.capture_files import FLARE_LEVEL, SCENE_LEVEL, expose, write_layer
 from sample_scenes.command import run_command
 from sample_scenes.flares import LENS_SETUPS, LensSetup, render_flare
-from sample_scenes.raycast import Hits, average, camera_rays, cast, shade, visible_share
+from sample_scenes.raycast import Hits, average_rays, camera_rays, cast_rays, shade, visible_share
 from sample_scenes.shot_scenes import FRAMES, SHOTS, FrameState, ShotScene
 
 CACHE = Path(__file__).resolve().parents[1] / "build" / "sample_shots"
@@ -42,33 +42,41 @@ def draft_setup(name: str) -> LensSetup:
     return replace(setup, ghosts=replace(setup.ghosts, count=12, grid=24, bands=5, supersample=1))
 
 
-def render_scene(scene: ShotScene, state: FrameState, standing: Hits | None) -> NDArray[np.float32]:
+def render_scene(scene: ShotScene, state: FrameState, fixed_hits: Hits | None) -> NDArray[np.float32]:
     """Return the scene layer of a frame, (height, width, 3), linear.
 
-    standing: hits of the rectangles that do not move, where the camera stands too; None to cast their rays here.
+    fixed_hits: hits of the rectangles that do not move, if the camera does not move either; None to cast rays here.
     """
     rays = camera_rays(scene.camera, state.rotation)
-    hits = standing if standing is not None else cast(scene.quads, state.eye, rays)
+    hits = fixed_hits if fixed_hits is not None else cast_rays(scene.quads, state.eye, rays)
     if state.moving:
-        hits = cast(state.moving, state.eye, rays).nearer(hits)
-    return average(shade(hits, state.eye, rays, list(state.lamps.values()), scene.ambient), scene.camera)
+        hits = cast_rays(state.moving, state.eye, rays).nearer(hits)
+    return average_rays(shade(hits, state.eye, rays, list(state.lamps.values()), scene.ambient), scene.camera)
 
 
-def light_values(scene: ShotScene, state: FrameState) -> dict[str, dict[str, Any]]:
-    """Return values of each light in a frame, by its name.
+class LightInFrame(NamedTuple):
+    """A light as one frame shows it."""
 
-    local: place (3,) in camera axes. xy: pixels. share: visible part of its disc, 0..1. strength: of its flare.
-    """
-    values = {}
+    camera_xyz: NDArray[np.float64]
+    """(3,), in the camera's axes."""
+    xy: tuple[float, float]
+    """Pixels."""
+    visible_share: float
+    """Share of its disc that nothing hides, 0..1."""
+    flare_strength: float
+
+
+def lights_in_frame(scene: ShotScene, state: FrameState) -> dict[str, LightInFrame]:
+    """Return the lights of a frame by name."""
+    lights, camera = {}, scene.camera
     for name, lamp in state.lamps.items():
-        local = state.rotation @ (lamp.xyz - state.eye)
-        camera = scene.camera
+        camera_xyz = state.rotation @ (lamp.xyz - state.eye)
+        x, y, z = camera_xyz
         share = visible_share(lamp, state.eye, [*scene.quads, *state.moving])
-        values[name] = {
-            "local": local, "share": share,
-            "xy": [camera.fx * local[0] / local[2] + camera.cx, camera.fy * local[1] / local[2] + camera.cy],
-            "strength": share * state.strengths[name] * (scene.reference / float(np.linalg.norm(local))) ** 2}
-    return values
+        falloff = (scene.reference_distance / float(np.linalg.norm(camera_xyz))) ** 2
+        lights[name] = LightInFrame(camera_xyz, (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), share,
+                                    share * state.strengths[name] * falloff)
+    return lights
 
 
 def make_shot(name: str, seed: int, out: Path, progress: Progress) -> None:
@@ -78,58 +86,56 @@ def make_shot(name: str, seed: int, out: Path, progress: Progress) -> None:
     """
     scene = SHOTS[name](seed)
     setup = draft_setup(scene.lens)
-    names = [f"{index + 1:04d}" for index in range(FRAMES)]
-    states = [scene.state(index) for index in range(FRAMES)]
-    values = [light_values(scene, state) for state in states]
-    write_truth(name, scene, states, values, out, names)
+    stems = [f"{index + 1:04d}" for index in range(FRAMES)]
+    states = [scene.frame_state(index) for index in range(FRAMES)]
+    lights_by_frame = [lights_in_frame(scene, state) for state in states]
+    write_truth(name, scene, states, lights_by_frame, out, stems)
     first_rays = camera_rays(scene.camera, states[0].rotation)
-    standing = cast(scene.quads, states[0].eye, first_rays) if scene.standing else None
+    fixed_hits = cast_rays(scene.quads, states[0].eye, first_rays) if scene.fixed_camera else None
     progress.stage("render", FRAMES)
-    for index, (stem, state) in enumerate(zip(names, states, strict=True)):
+    for index, (stem, state, lights) in enumerate(zip(stems, states, lights_by_frame, strict=True)):
         truth = out / "truth"
-        lights = {light: truth / f"flare_{light}" / f"{stem}.exr" for light in state.lamps}
-        files = [*lights.values(), truth / "scene" / f"{stem}.exr", truth / "flare" / f"{stem}.exr",
-                 truth / "clean" / f"{stem}.png", out / "images" / f"{stem}.png"]
-        if not all(path.is_file() for path in files):
-            write_layer(truth / "scene" / f"{stem}.exr", render_scene(scene, state, standing), SCENE_LEVEL)
+        layer_paths = {light: truth / f"flare_{light}" / f"{stem}.exr" for light in state.lamps}
+        scene_path, flare_path = truth / "scene" / f"{stem}.exr", truth / "flare" / f"{stem}.exr"
+        clean_path, frame_path = truth / "clean" / f"{stem}.png", out / "images" / f"{stem}.png"
+        if not all(path.is_file() for path in (*layer_paths.values(), scene_path, flare_path, clean_path, frame_path)):
+            write_layer(scene_path, render_scene(scene, state, fixed_hits), SCENE_LEVEL)
             layers = []
-            for light, path in lights.items():
-                value = values[index][light]
-                flare = render_flare(setup, scene.camera, value["local"], colour=tuple(state.lamps[light].colour),
-                                     intensity=value["strength"])
+            for light, path in layer_paths.items():
+                flare = render_flare(setup, scene.camera, lights[light].camera_xyz,
+                                     colour=tuple(state.lamps[light].colour), intensity=lights[light].flare_strength)
                 write_layer(path, flare, FLARE_LEVEL)
                 layers.append(read_picture(path).pixels)
-            flare = np.sum(layers, axis=0, dtype=np.float32)
-            write_layer(truth / "flare" / f"{stem}.exr", flare, FLARE_LEVEL)
+            write_layer(flare_path, np.sum(layers, axis=0, dtype=np.float32), FLARE_LEVEL)
             # The frames are made of the layers as stored, so that the files agree.
-            flare, picture = (read_picture(truth / layer / f"{stem}.exr").pixels for layer in ("flare", "scene"))
-            write_png(truth / "clean" / f"{stem}.png", expose(picture, np.random.default_rng((seed, index))))
-            write_png(out / "images" / f"{stem}.png", expose(picture + flare, np.random.default_rng((seed, index))))
+            flare, picture = (read_picture(path).pixels for path in (flare_path, scene_path))
+            write_png(clean_path, expose(picture, np.random.default_rng((seed, index))))
+            write_png(frame_path, expose(picture + flare, np.random.default_rng((seed, index))))
         progress.advance()
 
 
-def write_truth(name: str, scene: ShotScene, states: list[FrameState], values: list[dict[str, dict[str, Any]]],
-                out: Path, names: list[str]) -> None:
+def write_truth(shot: str, scene: ShotScene, states: list[FrameState],
+                lights_by_frame: list[dict[str, LightInFrame]], out: Path, stems: list[str]) -> None:
     """Write truth/lights.json, truth/camera.json and split.json.
 
-    values: of `light_values`, by frame. names: stems of the frames. "on" is the strength of a light's flare,
-    relative to its largest in the shot.
+    stems: of the frames' file names. "on" is the strength of a light's flare, relative to its largest in the shot.
     """
     lights = []
-    for light in states[0].lamps:
-        largest = max(value[light]["strength"] for value in values)
-        frames = {f"{stem}.png": {"xy": [round(float(x), 3) for x in value[light]["xy"]],
-                                  "on": round(value[light]["strength"] / largest, 5),
-                                  "visible": round(value[light]["share"], 4)}
-                  for stem, value in zip(names, values, strict=True)}
-        lights.append({"name": light, "frames": frames})
+    for name in states[0].lamps:
+        in_frames = [lights_of_frame[name] for lights_of_frame in lights_by_frame]
+        largest = max(light.flare_strength for light in in_frames)
+        frames = {f"{stem}.png": {"xy": [round(float(x), 3) for x in light.xy],
+                                  "on": round(light.flare_strength / largest, 5),
+                                  "visible": round(light.visible_share, 4)}
+                  for stem, light in zip(stems, in_frames, strict=True)}
+        lights.append({"name": name, "frames": frames})
     write_json(out / "truth" / "lights.json", {"lights": lights})
     camera: dict[str, Any] = {"focal_px": scene.camera.fx, "width": scene.camera.width, "height": scene.camera.height,
                               "cx": scene.camera.cx, "cy": scene.camera.cy}
-    if name == "pan":
+    if shot == "pan":
         camera["pan"] = [state.rotation.tolist() for state in states]
     write_json(out / "truth" / "camera.json", camera)
-    write_json(out / "split.json", {"test": [f"{stem}.png" for stem in names[4::8]]})
+    write_json(out / "split.json", {"test": [f"{stem}.png" for stem in stems[4::8]]})
 
 
 def main() -> int:

@@ -37,18 +37,19 @@ def develop(random: np.random.Generator, light: Pixels) -> Pixels:
     """
     grey = light.mean(-1)
     level = (np.percentile(grey, 60) + np.minimum(grey, np.percentile(grey, 95)).mean()) / 2
+    # A dark picture is brightened 500 times at most.
     light = light * min(math.exp(random.normal(math.log(0.13), 0.55)) / max(float(level), 1e-4), 500)
-    if random.random() < 0.5:  # a soft shoulder
+    if random.random() < 0.5:  # a soft shoulder: Reinhard's curve with white at 3
         light = light * (1 + light / 9) / (1 + light) * 1.2
     return np.asarray(np.clip(light, 0, 1) ** (1 / random.choice([1.8, 2.0, 2.2])), np.float32)
 
 
 def training_pictures(folder: Path, suffixes: Set[str]) -> list[Path]:
     """Return the pictures of a folder that trainings may see. Raises SettingsError where there are none."""
-    existing = list_pictures(folder, suffixes, "train")
-    if not existing:
+    pictures = list_pictures(folder, suffixes, "train")
+    if not pictures:
         raise SettingsError(f"{folder} holds none of {', '.join(sorted(suffixes))}; name a folder of clean pictures.")
-    return existing
+    return pictures
 
 
 def make_rooms(folder: Path, photos: Sequence[Path], maps: Sequence[Path], count: int, progress: Progress) -> None:
@@ -67,7 +68,7 @@ def make_rooms(folder: Path, photos: Sequence[Path], maps: Sequence[Path], count
 
 
 def main() -> int:
-    """Render the rooms that the arguments ask for; return the exit status."""
+    """Render the rooms that the arguments name; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder to write the pictures to")
     parser.add_argument("--photos", type=Path, required=True, help="folder of clean photographs")

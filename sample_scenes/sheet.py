@@ -28,24 +28,27 @@ def psnr_without_flare(frame: NDArray[np.float32], scene: NDArray[np.float32]) -
 
 
 def contact_sheet(capture: Path, columns: int, rows: int, width: int) -> NDArray[np.uint8]:
-    """Return the sheet, (height, width, 3) BGR, of columns x rows views spread evenly over the capture."""
+    """Return the sheet, (height, width, 3) BGR, of columns x rows views spread evenly over the capture.
+
+    width: of a picture, pixels.
+    """
     frames = sorted(path for path in (capture / "images").iterdir() if not path.name.startswith("."))
-    args = [frames[i] for i in np.linspace(0, len(frames) - 1, columns * rows).round().astype(int)]
-    tiles = []
-    for path in args:
+    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, columns * rows).round().astype(int)]
+    strips = []
+    for path in chosen:
         frame = read_picture(path)
         clean = capture / "removed" / path.name
         scene = read_picture(clean if clean.is_file() else capture / "truth" / "scene" / f"{path.stem}.exr")
         flare = read_picture(capture / "truth" / "flare" / f"{path.stem}.exr")
         print(f"{path.stem}  empty flare {psnr_without_flare(frame.display(), scene.display()):.2f} dB")
         height = round(width * frame.size[1] / frame.size[0])
-        tiles.append(np.vstack([picture.resized(width, height).display() for picture in (frame, scene, flare)]))
-    lines = [np.hstack(tiles[start:start + columns]) for start in range(0, len(tiles), columns)]
-    return np.round(np.clip(np.vstack(lines), 0, 1) * 255).astype(np.uint8)[..., ::-1]
+        strips.append(np.vstack([picture.resized(width, height).display() for picture in (frame, scene, flare)]))
+    sheet_rows = [np.hstack(strips[start:start + columns]) for start in range(0, len(strips), columns)]
+    return np.round(np.clip(np.vstack(sheet_rows), 0, 1) * 255).astype(np.uint8)[..., ::-1]
 
 
 def main() -> int:
-    """Write the sheet that the arguments ask for; return the exit status."""
+    """Write the sheet that the arguments describe; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("capture", type=Path)
     parser.add_argument("--out", type=Path, required=True)

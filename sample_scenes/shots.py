@@ -18,7 +18,7 @@ from .description import Array, LightSource, Pinhole, disc_points
 
 SHARE_SAMPLES = 512
 """Points on a light's disc whose visibility is tested."""
-Rendered = TypeVar("Layers")
+Rendered = TypeVar("Rendered")
 
 
 def set_up_render(camera: Pinhole, samples: int) -> Any:
@@ -67,13 +67,13 @@ def set_pose(camera: Any, world_to_camera: Array) -> None:
 
 
 def render_view(camera: Any, world_to_camera: Array, seed: int) -> NDArray[np.float32]:
-    """Return scene-linear Rec. 709 pixels (height, width, 3)."""
+    """Render the view from a pose (4, 4); return scene-linear Rec. 709 pixels (height, width, 3)."""
     set_pose(camera, world_to_camera)
     bpy.context.scene.cycles.seed = seed
-    return render_with(lambda path: read_picture(path).pixels)
+    return render_and_read(lambda path: read_picture(path).pixels)
 
 
-def render_with(read: Callable[[Path], Rendered]) -> Rendered:
+def render_and_read(read: Callable[[Path], Rendered]) -> Rendered:
     """Render the scene as it is set up and return what `read` returns for the file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "view.exr"
@@ -90,7 +90,7 @@ def visible_share(light: LightSource, eye: Array) -> float:
     scene, depsgraph = bpy.context.scene, bpy.context.evaluated_depsgraph_get()
     centre, origin = np.array(light.xyz), np.asarray(eye, float)
     points = disc_points(centre, origin, light.radius, SHARE_SAMPLES, up=(0.0, 0.0, 1.0))
-    bulbs = [camera_object for camera_object in scene.objects if camera_object.get("light_source")]
+    bulbs = [item for item in scene.objects if item.get("light_source")]
     for bulb in bulbs:
         bulb.hide_viewport = True
     depsgraph.update()

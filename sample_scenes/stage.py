@@ -37,9 +37,9 @@ def picture_material(name: str, texture: Texture, roughness: float = 0.7) -> Any
     shader = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")
     shader.inputs["Roughness"].default_value = roughness
     shader.inputs["Specular IOR Level"].default_value = 0.25
-    source = nodes.new("ShaderNodeTexImage")
-    source.image = image
-    links.new(source.outputs["Color"], shader.inputs["Base Color"])
+    texture_node = nodes.new("ShaderNodeTexImage")
+    texture_node.image = image
+    links.new(texture_node.outputs["Color"], shader.inputs["Base Color"])
     return material
 
 
@@ -54,7 +54,7 @@ def plain_material(name: str, colour: Vec, roughness: float = 0.5, metallic: flo
     return material
 
 
-def _add(name: str, mesh: bmesh.types.BMesh, materials: Sequence[Any], smooth: bool = False) -> Any:
+def _add_mesh(name: str, mesh: bmesh.types.BMesh, materials: Sequence[Any], smooth: bool = False) -> Any:
     """Add a mesh with these materials to the scene; return its object. smooth: shade its faces as one surface."""
     data = bpy.data.meshes.new(name)
     for face in mesh.faces:
@@ -75,20 +75,20 @@ def place(obj: Any, location: Vec, turn: float = 0.0, tilt: Vec = (0.0, 0.0)) ->
     return obj
 
 
-def box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: float = 0.0,
+def add_box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: float = 0.0,
         tilt: Vec = (0.0, 0.0), bevel: float = 0.0) -> Any:
     """Add a box of `size`, its base centre at `location`; turn and tilt as for `place`.
 
     materials: one for all faces, or one each for the sides (-y, +x, +y, -x) and top; the bottom has the last one. Each
     face shows its whole texture. bevel: width of the rounded edges, 0 for none.
     """
-    x, y, z = size[0] / 2, size[1] / 2, size[2]
+    half_x, half_y, height = size[0] / 2, size[1] / 2, size[2]
     mesh = bmesh.new()
     uv = mesh.loops.layers.uv.new("UVMap")
-    corners = [(-x, -y), (x, -y), (x, y), (-x, y)]
-    faces = [[(*corners[i], 0.0), (*corners[(i + 1) % 4], 0.0), (*corners[(i + 1) % 4], z), (*corners[i], z)]
+    corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
+    faces = [[(*corners[i], 0.0), (*corners[(i + 1) % 4], 0.0), (*corners[(i + 1) % 4], height), (*corners[i], height)]
              for i in range(4)]
-    faces.append([(*corner, z) for corner in corners])
+    faces.append([(*corner, height) for corner in corners])
     faces.append([(*corner, 0.0) for corner in corners[::-1]])
     for index, face in enumerate(faces):
         mesh_face = mesh.faces.new([mesh.verts.new(corner) for corner in face])
@@ -96,14 +96,14 @@ def box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: flo
         for loop, corner in zip(mesh_face.loops, ((0, 0), (1, 0), (1, 1), (0, 1)), strict=True):
             loop[uv].uv = corner
     bmesh.ops.remove_doubles(mesh, verts=mesh.verts, dist=1e-6)
-    obj = place(_add(name, mesh, materials), location, turn, tilt)
+    obj = place(_add_mesh(name, mesh, materials), location, turn, tilt)
     if bevel > 0:
         modifier = obj.modifiers.new("Bevel", "BEVEL")
         modifier.width, modifier.segments = bevel, 2
     return obj
 
 
-def sheet(name: str, width: float, height: float, location: Vec, material: Any, turn: float = 0.0,
+def add_sheet(name: str, width: float, height: float, location: Vec, material: Any, turn: float = 0.0,
           tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
     """Add a rectangle in x and y about its centre; tilt (90, 0) stands it up.
 
@@ -111,14 +111,14 @@ def sheet(name: str, width: float, height: float, location: Vec, material: Any, 
     """
     mesh = bmesh.new()
     uv = mesh.loops.layers.uv.new("UVMap")
-    x, y = width / 2, height / 2
-    face = mesh.faces.new([mesh.verts.new((a, b, 0.0)) for a, b in ((-x, -y), (x, -y), (x, y), (-x, y))])
+    face = mesh.faces.new([mesh.verts.new((sign_x * width / 2, sign_y * height / 2, 0.0))
+                           for sign_x, sign_y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
     for loop, corner in zip(face.loops, ((0, 0), (1, 0), (1, 1), (0, 1)), strict=True):
         loop[uv].uv = (corner[0] * repeat[0], corner[1] * repeat[1])
-    return place(_add(name, mesh, [material]), location, turn, tilt)
+    return place(_add_mesh(name, mesh, [material]), location, turn, tilt)
 
 
-def lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, material: Any,
+def add_lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, material: Any,
           segments: int = 48, turn: float = 0.0, tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
     """Add a surface of revolution about z: `profile` is (radius, height) from below to the top.
 
@@ -130,37 +130,37 @@ def lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, mate
     angles = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     rings = [[mesh.verts.new((r * np.cos(a), r * np.sin(a), h)) for a in angles] for r, h in profile]
     lengths = np.hypot(*np.diff(np.array(profile), axis=0).T)
-    along = np.concatenate([[0.0], np.cumsum(lengths)]) / max(lengths.sum(), 1e-9)
-    for low in range(len(profile) - 1):  # from the ring `low` to the next above
+    profile_v = np.concatenate([[0.0], np.cumsum(lengths)]) / max(lengths.sum(), 1e-9)
+    for low in range(len(profile) - 1):  # quads from the ring `low` to the next above
         for side in range(segments):
-            after = (side + 1) % segments
-            around = [rings[low][side], rings[low][after], rings[low + 1][after], rings[low + 1][side]]
-            face = mesh.faces.new(around)
-            at = ((side, low), (side + 1, low), (side + 1, low + 1), (side, low + 1))
-            for loop, (u, v) in zip(face.loops, at, strict=True):
-                loop[uv].uv = (u / segments * repeat[0], along[v] * repeat[1])
-    return place(_add(name, mesh, [material], smooth=True), location, turn, tilt)
+            next_side = (side + 1) % segments
+            corners = [rings[low][side], rings[low][next_side], rings[low + 1][next_side], rings[low + 1][side]]
+            face = mesh.faces.new(corners)
+            uv_indices = ((side, low), (side + 1, low), (side + 1, low + 1), (side, low + 1))
+            for loop, (u, v) in zip(face.loops, uv_indices, strict=True):
+                loop[uv].uv = (u / segments * repeat[0], profile_v[v] * repeat[1])
+    return place(_add_mesh(name, mesh, [material], smooth=True), location, turn, tilt)
 
 
-def ball(name: str, radius: float, location: Vec, material: Any, turn: float = 0.0,
+def add_ball(name: str, radius: float, location: Vec, material: Any, turn: float = 0.0,
          tilt: Vec = (0.0, 0.0)) -> Any:
     """Add a sphere about `location`."""
-    steps = np.linspace(-np.pi / 2, np.pi / 2, 33)
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 33)
     # At the poles a tiny radius keeps the vertices of a ring apart.
-    profile = [(max(radius * float(np.cos(a)), 1e-4), radius * float(np.sin(a))) for a in steps]
-    return lathe(name, profile, location, material, 64, turn, tilt)
+    profile = [(max(radius * float(np.cos(angle)), 1e-4), radius * float(np.sin(angle))) for angle in angles]
+    return add_lathe(name, profile, location, material, 64, turn, tilt)
 
 
-def rod(name: str, start: Vec, end: Vec, radius: float, material: Any) -> Any:
+def add_rod(name: str, start: Vec, end: Vec, radius: float, material: Any) -> Any:
     """Add a cylinder from `start` to `end`."""
     direction = Vector(end) - Vector(start)
-    obj = lathe(name, [(1e-4, 0.0), (radius, 0.0), (radius, direction.length), (1e-4, direction.length)],
+    obj = add_lathe(name, [(1e-4, 0.0), (radius, 0.0), (radius, direction.length), (1e-4, direction.length)],
                 (0, 0, 0), material, 24)
     obj.matrix_world = Matrix.Translation(Vector(start)) @ direction.to_track_quat("Z", "Y").to_matrix().to_4x4()
     return obj
 
 
-def monkey(name: str, size: float, location: Vec, material: Any, turn: float = 0.0) -> Any:
+def add_monkey(name: str, size: float, location: Vec, material: Any, turn: float = 0.0) -> Any:
     """Add Blender's monkey head, subdivided once. turn: degrees about z."""
     bpy.ops.mesh.primitive_monkey_add(size=size, location=location, rotation=(0, 0, np.radians(turn)))
     obj = bpy.context.object
@@ -173,7 +173,7 @@ def monkey(name: str, size: float, location: Vec, material: Any, turn: float = 0
     return obj
 
 
-def lamp(light: LightSource) -> Any:
+def add_lamp(light: LightSource) -> Any:
     """Add a light: a sphere that only the camera sees, and a lamp in its place (a sun, if distant).
 
     The sphere has the property `light_source`, so that the ray casts of the visible share can skip it.
@@ -186,26 +186,26 @@ def lamp(light: LightSource) -> Any:
     emission.inputs["Color"].default_value = (*light.colour, 1.0)
     emission.inputs["Strength"].default_value = light.emission
     links.new(emission.outputs[0], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
-    bulb = ball(light.name, light.radius, light.xyz, material)
+    bulb = add_ball(light.name, light.radius, light.xyz, material)
     bulb["light_source"] = True
     for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
         setattr(bulb, f"visible_{ray}", False)
     if light.power > 0:
         data = bpy.data.lights.new(light.name, "SUN" if light.distant else "POINT")
         data.energy, data.color = light.power, light.colour
-        source = bpy.data.objects.new(f"{light.name} lamp", data)
-        source.location = light.xyz
+        lamp_object = bpy.data.objects.new(f"{light.name} lamp", data)
+        lamp_object.location = light.xyz
         if light.distant:
             data.angle = 2 * np.arctan(light.radius / np.linalg.norm(light.xyz))  # the apparent diameter
-            source.rotation_euler = (-Vector(light.xyz)).to_track_quat("-Z", "Y").to_euler()
+            lamp_object.rotation_euler = (-Vector(light.xyz)).to_track_quat("-Z", "Y").to_euler()
         else:
             data.shadow_soft_size = light.radius
-        source.visible_camera = False
-        bpy.context.scene.collection.objects.link(source)
+        lamp_object.visible_camera = False
+        bpy.context.scene.collection.objects.link(lamp_object)
     return bulb
 
 
-def softbox(name: str, location: Vec, target: Vec, size: Vec, power: float, colour: Vec) -> Any:
+def add_softbox(name: str, location: Vec, target: Vec, size: Vec, power: float, colour: Vec) -> Any:
     """Add an area light that faces `target` and is invisible to cameras. size: width and height. power: watts."""
     data = bpy.data.lights.new(name, "AREA")
     data.shape, data.size, data.size_y = "RECTANGLE", size[0], size[1]
@@ -218,7 +218,7 @@ def softbox(name: str, location: Vec, target: Vec, size: Vec, power: float, colo
     return obj
 
 
-def uniform_world(colour: Vec, strength: float) -> None:
+def set_uniform_world(colour: Vec, strength: float) -> None:
     """Set a world of one linear colour, times `strength`, in all directions."""
     world = bpy.data.worlds.new("World")
     bpy.context.scene.world = world
@@ -228,7 +228,7 @@ def uniform_world(colour: Vec, strength: float) -> None:
     background.inputs["Strength"].default_value = strength
 
 
-def far_world(texture: Texture) -> None:
+def set_environment_map(texture: Texture) -> None:
     """Set a world that shows a panorama (h, 2 h, 3) in linear light (`panorama`) and lights the scene by it.
 
     It is infinitely far, so it has no parallax.
@@ -244,33 +244,36 @@ def far_world(texture: Texture) -> None:
     bpy.context.scene.world = world
     world.use_nodes = True
     nodes, links = world.node_tree.nodes, world.node_tree.links
-    source = nodes.new("ShaderNodeTexEnvironment")
-    source.image = image
+    map_node = nodes.new("ShaderNodeTexEnvironment")
+    map_node.image = image
     background = next(node for node in nodes if node.type == "BACKGROUND")
-    links.new(source.outputs["Color"], background.inputs["Color"])
+    links.new(map_node.outputs["Color"], background.inputs["Color"])
 
 
-def dome(radius: float, texture: Texture, strength: float) -> Any:
+def add_dome(radius: float, texture: Texture, strength: float) -> Any:
     """Add a sky: a sphere about the origin that emits `texture` times `strength`."""
     material = picture_material("sky", texture)
     nodes, links = material.node_tree.nodes, material.node_tree.links
     emission = nodes.new("ShaderNodeEmission")
     emission.inputs["Strength"].default_value = strength
-    source = next(node for node in nodes if node.type == "TEX_IMAGE")
-    links.new(source.outputs["Color"], emission.inputs["Color"])
+    texture_node = next(node for node in nodes if node.type == "TEX_IMAGE")
+    links.new(texture_node.outputs["Color"], emission.inputs["Color"])
     output = next(node for node in nodes if node.type == "OUTPUT_MATERIAL")
     links.new(emission.outputs[0], output.inputs["Surface"])
-    shell = ball("sky", radius, (0, 0, 0), material)
+    shell = add_ball("sky", radius, (0, 0, 0), material)
     shell.visible_shadow = False  # the light of a sun, which stands outside, passes
     return shell
 
 
-def poster_box(name: str, rng: np.random.Generator, size: Vec, location: Vec, palette: Palette,
+def add_poster_box(name: str, rng: np.random.Generator, size: Vec, location: Vec, palette: Palette,
                turn: float = 0.0) -> Any:
     """Add a box with a different drawing on each side, as crates, cubes and plinths have."""
     x, y, z = size
     sides = [(x, z), (y, z), (x, z), (y, z), (x, y)]
-    scale = 420 / max(size)  # the longest edge has a texture of 420 pixels
-    textures = [framed(poster(rng, max(int(scale * high), 60), max(int(scale * wide), 60), palette, 12), 0.08)
-                for wide, high in sides]
-    return box(name, size, location, [picture_material(f"{name} {i}", t, 0.75) for i, t in enumerate(textures)], turn)
+    pixels_per_unit = 420 / max(size)  # the longest edge has a texture of 420 pixels
+    textures = []
+    for width, height in sides:
+        rows, columns = (max(int(pixels_per_unit * length), 60) for length in (height, width))
+        textures.append(framed(poster(rng, rows, columns, palette, 12), 0.08))
+    materials = [picture_material(f"{name} {i}", texture, 0.75) for i, texture in enumerate(textures)]
+    return add_box(name, size, location, materials, turn)

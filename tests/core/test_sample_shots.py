@@ -20,19 +20,19 @@ from sample_scenes.shot_scenes import FRAMES, OUT_FRAMES, SHOTS
 @pytest.mark.parametrize("name", sorted(SHOTS))
 def test_lamps_are_seen_and_hidden(name: str, seed: int) -> None:
     scene = SHOTS[name](seed)
-    values = [render_shot.light_values(scene, scene.state(index)) for index in range(0, FRAMES, 2)]
+    values = [render_shot.lights_in_frame(scene, scene.frame_state(index)) for index in range(0, FRAMES, 2)]
     for light in values[0]:
-        pixels = np.array([value[light]["xy"] for value in values])
+        pixels = np.array([value[light].xy for value in values])
         inside = ((pixels > 0) & (pixels < (scene.camera.width, scene.camera.height))).all(axis=1)
-        strength = np.array([value[light]["strength"] for value in values])
+        strength = np.array([value[light].flare_strength for value in values])
         assert (inside & (strength > 0.05)).sum() >= 6
-        hidden = sum(value[light]["share"] < 0.05 for value in values)
+        hidden = sum(value[light].visible_share < 0.05 for value in values)
         assert hidden >= 1 if name != "drive" else hidden == 0
 
 
 def test_the_right_headlight_is_out_for_some_frames() -> None:
     scene = SHOTS["drive"](0)
-    strengths = [scene.state(index).strengths for index in range(FRAMES)]
+    strengths = [scene.frame_state(index).strengths for index in range(FRAMES)]
     assert sum(strength["right"] == 0 for strength in strengths) == OUT_FRAMES
     assert all(strength["left"] > 0 for strength in strengths)
 

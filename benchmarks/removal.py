@@ -128,11 +128,12 @@ def sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | No
     scores, flicker, rows = [], [], []
     paths = sorted((capture / "images").iterdir())
     results = _clean_by_network(paths, weights) if cleaned is None else _read_cleaned(paths, cleaned)
+    shown = sheet_frames(len(paths))
     for number, (path, codes) in enumerate(zip(paths, results, strict=True)):
         truth = read_picture(capture / "truth" / "scene" / f"{path.stem}.exr").display()
         frame, result = (part.astype(np.float32) / 255 for part in (read_plate(path).codes, codes))
         scores.append((psnr(frame, truth), psnr(result, truth)))
-        if number % max(len(paths) // SHOWN_FRAMES, 1) == 5:  # evenly spaced, from the sixth frame
+        if number in shown:
             rows.append(np.concatenate([frame, result, np.clip(truth, 0, 1)], 1))
         errors = (frame - truth, result - truth)
         if previous_errors is not None:
@@ -147,8 +148,17 @@ def sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | No
     if sheet:
         import cv2
 
-        picture = cv2.resize(np.concatenate(rows[:SHOWN_FRAMES]), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+        picture = cv2.resize(np.concatenate(rows), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(sheet), (picture[..., ::-1] * 255 + 0.5).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+def sheet_frames(count: int) -> list[int]:
+    """Return the indices of the frames on a sheet of a sample with `count` frames: up to SHOWN_FRAMES, evenly spaced.
+
+    They begin at the sixth frame where there are as many as that, else at the first.
+    """
+    step = max(count // SHOWN_FRAMES, 1)
+    return list(range(min(5, step - 1), count, step))[:SHOWN_FRAMES]
 
 
 def _clean_by_network(paths: list[Path], weights: Path | None) -> Iterator[Any]:

@@ -108,6 +108,11 @@ def point_in_capture(point: Any, root: Any, depsgraph: Any) -> Floats:
 
 def pose_in_capture(matrix: Any, root: Any, depsgraph: Any) -> Floats:
     """Return world_to_camera (4, 4) in the capture's coordinates for a camera's matrix_world. Raises CaptureError."""
-    placed = world_to_capture(root, depsgraph) @ camera_to_world(matrix)  # with the scale of the root
+    return transformed_pose(matrix, world_to_capture(root, depsgraph))
+
+
+def transformed_pose(matrix: Any, to_capture: Floats) -> Floats:
+    """Return world_to_camera (4, 4) for a camera's matrix_world, in coordinates to which `to_capture` (4, 4) leads."""
+    placed = to_capture @ camera_to_world(matrix)  # with the scale of the root
     placed[:3, :3] /= np.linalg.norm(placed[:3, :3], axis=0)
     return np.linalg.inv(placed)

@@ -12,7 +12,8 @@ the artist has placed has all of them, one at a light of the capture none: its f
 The reference of the power is the lamp's light in the first frame of the scene:
 
     keyed lamp     computed from its curves, so it follows them
-    driven lamp    measured at the first frame, when the flare gets the lamp or when a bake reads the scene
+    driven lamp    measured at the first frame, when the flare gets the lamp or when a bake reads the scene; a lamp
+                   with a keyed temperature counts as driven
     other lamp     measured when the flare gets the lamp, so that a change by hand dims the flare
 
 An empty or a mesh has no power; its factor is 1. The reference distance is the one from the camera to the object when
@@ -37,6 +38,7 @@ MIN_CHANNEL = 1e-3
 """Smallest reference of a colour channel relative to the largest: a red lamp that turns blue has a finite factor."""
 MAX_FACTOR = 1e6
 _PATHS = ("energy", "exposure", "color")
+_TEMPERATURE_PATHS = ("temperature", "use_temperature")
 SWITCHES = ("follow_power", "follow_visibility", "follow_direction", "follow_distance")
 """The switches of a flare."""
 DARK: Gain = (0.0, 0.0, 0.0)
@@ -168,12 +170,13 @@ def light_of(data: Any) -> NDArray[np.float64]:
 
 
 def keyed_reference(scene: Any, data: Any) -> NDArray[np.float64] | None:
-    """Return the light (3,) of a lamp in the first frame of the scene, by its curves; None for a lamp without curves.
+    """Return the light (3,) of a lamp in the first frame of the scene, by its curves; None for a lamp without curves,
+    and for one whose temperature they move.
 
     For a lamp that is off in the first frame it is its light at the brightest key.
     """
     curves = [curve for curve in _curves(data) if curve.data_path in _PATHS]
-    if not curves:
+    if not curves or _has_moving_temperature(data):
         return None
     frames = [float(scene.frame_start), *(float(key.co[0]) for curve in curves for key in curve.keyframe_points)]
     lights = [_light_at(data, curves, frame) for frame in frames]
@@ -202,9 +205,17 @@ def _light_at(data: Any, curves: list[Any], frame: float) -> NDArray[np.float64]
 
 
 def is_driven(target: Any) -> bool:
-    """Return whether drivers move the power or colour of a lamp."""
+    """Return whether the power or colour of a lamp is moved by drivers, or by keys of its temperature."""
     animation = target.data.animation_data if is_lamp(target) else None
-    return animation is not None and any(curve.data_path in _PATHS for curve in animation.drivers)
+    return animation is not None and (_has_moving_temperature(target.data)
+                                      or any(curve.data_path in _PATHS for curve in animation.drivers))
+
+
+def _has_moving_temperature(data: Any) -> bool:
+    """Return whether curves or drivers move the temperature of a lamp, whose colour only Blender computes."""
+    animation = data.animation_data
+    drivers = () if animation is None else animation.drivers
+    return any(curve.data_path in _TEMPERATURE_PATHS for curve in (*_curves(data), *drivers))
 
 
 def measure(scene: Any, item: Any) -> None:

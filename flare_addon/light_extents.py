@@ -49,6 +49,7 @@ def _of_lamp(data: Any, linear: Floats) -> LightExtent | None:
         wide = data.size
         high = data.size_y if data.shape in ("RECTANGLE", "ELLIPSE") else wide
         # Half axes in this order, since the core's light emits along their cross product, and Blender's along its -Z.
+        wide *= math.copysign(1, float(np.linalg.det(linear)))  # a mirrored lamp shines along its -Z, too
         axes = np.array([linear @ (wide / 2, 0, 0), linear @ (0, -high / 2, 0)])
         if not np.linalg.norm(axes, axis=1).all():
             return None

@@ -19,6 +19,7 @@ from ..core.capture.lights import DOUBTFUL
 from ..core.conventions.frame_numbers import number_views
 from ..core.errors import CaptureError
 from ..core.system.files import follow_link, read_json, round_for_text, write_json
+from . import lamp_drive
 from .paths import absolute
 
 STANDING = 1e-4
@@ -34,10 +35,10 @@ def frame_numbers(folder: Path) -> dict[str, int]:
 
 
 def moves(item: Any, root: Any) -> bool:
-    """Return whether an object may move: by animation, constraints, a vertex or bone as its parent, or a parent below
-    `root` that moves."""
+    """Return whether an object may move: by animation, constraints, physics, a vertex or bone as its parent, or a
+    parent below `root` that moves."""
     while item is not None and item != root:
-        if item.animation_data is not None or item.constraints or item.parent_type != "OBJECT":
+        if item.animation_data is not None or item.constraints or item.rigid_body or item.parent_type != "OBJECT":
             return True
         item = item.parent
     return False
@@ -48,16 +49,15 @@ def has_animated_light(item: Any) -> bool:
     return item.type == "LIGHT" and item.data.animation_data is not None
 
 
-def world_paths(scene: Any, items: Mapping[str, Any], folder: Path, place: Callable[[Any], Any]
+def world_paths(scene: Any, items: Mapping[str, Any], numbers: Mapping[str, int], place: Callable[[Any], Any]
                 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Return the keys of the lights that move or change, by name and by picture: {"xyz": [x, y, z], "on": 0..1}.
 
-    Each picture of the capture in `folder` is evaluated at its frame of the scene, which is restored afterwards. "on"
-    is the power relative to the light's largest one. A light that stands has keys without xyz, one that does not change
-    has keys without on. items: light objects by name. place: returns the place (3,) of an object at the scene's current
+    The scene goes to the frame of each picture, and back afterwards. "on" is the power relative to the light's largest
+    one. A light that stands has keys without xyz, one that does not change has keys without on. items: light objects by
+    name. numbers: frames of the scene by picture. place: returns the place (3,) of an object at the scene's current
     frame, in the capture's coordinates.
     """
-    numbers = frame_numbers(folder)
     animated = {name: item for name, item in items.items()
                 if moves(item, scene.fit_flare.root) or has_animated_light(item)}
     if not animated or not numbers:
@@ -77,13 +77,13 @@ def world_paths(scene: Any, items: Mapping[str, Any], folder: Path, place: Calla
 
 
 def _power(item: Any) -> float:
-    """Return the power of a lamp at the current frame, times its strongest colour channel.
+    """Return the light of a lamp at the current frame in its strongest colour channel (`lamp_drive.light_of`).
 
     It is 1 for other objects, and 0 for any object that is disabled in renders.
     """
     if item.hide_render:
         return 0.0
-    return float(item.data.energy * max(item.data.color)) if item.type == "LIGHT" else 1.0
+    return float(lamp_drive.light_of(item.data).max()) if item.type == "LIGHT" else 1.0
 
 
 def _keys(names: Sequence[str], places: Sequence[Any], powers: Sequence[float]) -> dict[str, dict[str, Any]]:

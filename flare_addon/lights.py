@@ -129,7 +129,8 @@ def write_to_capture(scene: Any, folder: Path) -> int:
         return cameras.point_in_capture(light_position(item, world_matrix(item, graph), eye), scene.fit_flare.root,
                                         graph)
 
-    paths = light_paths.world_paths(scene, dict(zip(names, objects, strict=True)), folder, place)
+    paths = light_paths.world_paths(scene, dict(zip(names, objects, strict=True)),
+                                    light_paths.frame_numbers(folder), place)
     for item, name in zip(objects, names, strict=True):
         xyz = [round_for_text(float(value)) for value in place(item)]
         lights.append(light_paths.merge_entry(known.get(name, {}), name, xyz, paths.get(name, {})))

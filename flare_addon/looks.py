@@ -301,12 +301,12 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
     if extent is None:
         visibility = occlusion.visibility(scene, depsgraph, eye, item) if hides else 1.0
         return PlacedLight(item.name, item.source, xyz, visibility, factor=gain, reference_distance=reference)
-    shares = None
+    extent, shares = extent.transformed(to_capture[:3, :3]), None
     if hides:
-        sampled = extent.sampled(np.array(position), np.linalg.inv(cameras.camera_to_world(camera)))
-        shares = tuple(sampled.shares(occlusion.visible_points(scene, depsgraph, eye, item, sampled.points)).tolist())
-    return PlacedLight(item.name, item.source, xyz, 1.0, extent.transformed(to_capture[:3, :3]), shares, gain,
-                       reference)
+        sampled = extent.sampled(xyz, cameras.transformed_pose(camera, to_capture))
+        points = (np.pad(sampled.points, ((0, 0), (0, 1)), constant_values=1) @ np.linalg.inv(to_capture).T)[:, :3]
+        shares = tuple(sampled.shares(occlusion.visible_points(scene, depsgraph, eye, item, points)).tolist())
+    return PlacedLight(item.name, item.source, xyz, 1.0, extent, shares, gain, reference)
 
 
 def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | None = None

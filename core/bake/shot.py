@@ -51,8 +51,10 @@ class ShotRenderer(ShotSource):
             scene, white = (None, 1.0) if self.run is None else (render_scene(self.run.gaussians, camera),
                                                                  self.run.gaussians.display_white)
             parts = linear_layers(dark if scene is None else scene.colour, flares, self.look.blend, white)
-        # Without a scene a layer is light alone, as `draw_layers` draws it: nothing negative.
-        layers = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()
+        # Without a scene an added layer is light alone, as `draw_layers` draws it. With the blend "over" a layer is
+        # negative where its light covers a brighter flare, since the layers sum to the picture.
+        is_light_alone = scene is None and self.look.blend == "add"
+        layers = {name: np.maximum(layer.numpy(), 0) if is_light_alone else layer.numpy()
                   for name, layer in parts.flares.items()}
         depth = dark[..., 0] if scene is None else scene.depth
         return ViewLayers(parts.scene.numpy(), {name: layers.get(name, dark.numpy()) for name in self.lights},

@@ -323,7 +323,7 @@ class Capture:
     @property
     def has_removed(self) -> bool:
         """True if every view has a clean frame."""
-        return bool(self._removed)
+        return len(self._removed) == len(self.views)
 
     @property
     def has_truth(self) -> bool:

@@ -148,11 +148,15 @@ class LightExtent:
     def transformed(self, matrix: ArrayLike) -> LightExtent:
         """Return the extent under a linear map (3, 3), such as the rotation and scale of another world.
 
-        A sphere stays one: its radius grows by the map's mean scale.
+        A sphere stays one: its radius grows by the map's mean scale. A one-sided extent emits to the image of its side.
+        Under a map that mirrors, its samples are in another order, so visible shares must be those of the result.
         """
         linear = np.asarray(matrix, np.float64)
-        scale = abs(float(np.linalg.det(linear))) ** (1 / 3)
-        return LightExtent(self.shape, self.axes @ linear.T, self.radius * scale, self.points @ linear.T,
+        determinant = float(np.linalg.det(linear))
+        scale, axes = abs(determinant) ** (1 / 3), self.axes @ linear.T
+        if self.one_sided and determinant < 0:
+            axes[0] *= -1  # a mirroring map turns the cross product of the axes to the other side
+        return LightExtent(self.shape, axes, self.radius * scale, self.points @ linear.T,
                            self.one_sided, self.factors)._checked()
 
     def sampled(self, xyz: ArrayLike, world_to_camera: ArrayLike) -> SampledExtent:

@@ -219,12 +219,13 @@ class Video:
         """Yield the frames from that of `seek`, else from the first one. `problems` is complete after the last one."""
         number, start = self._start, self._start
         self._start, self.problems = 0, []
-        damaged, colours = list[int](), dict[tuple[int, ...], VideoColour]()
+        damaged, colours, changes_size = list[int](), dict[tuple[int, ...], VideoColour](), False
         for raw in self._frames_from(start):
             if (raw.width, raw.height) != self.stored_size:
                 self.problems.append(f"{self.path} changes its size to {raw.width} x {raw.height} at frame {number + 1}"
                                      "; the frames from there on are left out, split the video there.")
-                return
+                changes_size = True
+                break
             tags = (raw.colorspace, raw.color_range, raw.color_trc, raw.color_primaries)
             if tags not in colours:
                 colours[tags] = _colour_of(self.path, raw, self.stream)
@@ -237,7 +238,7 @@ class Video:
             names = ", ".join(map(str, damaged[:MAX_NAMED_FRAMES])) + (", …" if damaged[MAX_NAMED_FRAMES:] else "")
             self.problems.append(f"{len(damaged)} of {number - start} frames of {self.path} are damaged ({names}); "
                                  "copy it again.")
-        if number < self.length and start == 0:
+        if number < self.length and start == 0 and not changes_size:
             self.problems.append(f"The header of {self.path} declares {self.length} frames, and {number} could be read"
                                  "; if it is cut off, copy it again.")
 

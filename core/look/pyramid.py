@@ -148,7 +148,7 @@ def draw_layers(look: Look, flares: Mapping[str, PlaneGaussians], intrinsics: Ar
     """Return the scene-linear light (height, width, 3) of each light's flare over black; the layers add up.
 
     With the blend "over" a light's layer is the increase of the picture when that light is put before those that follow
-    it, as in `core.flare.compositing.linear_layers`.
+    it, as in `core.flare.compositing.linear_layers`; it is negative where that light covers a brighter flare.
     """
     if look.blend == "add":
         return {name: draw_added(gaussians, look, intrinsics, width, height) for name, gaussians in flares.items()}
@@ -160,4 +160,4 @@ def draw_layers(look: Look, flares: Mapping[str, PlaneGaussians], intrinsics: Ar
         display = colour + transmittance[..., None] * display
         above = np.asarray(linear_from_srgb(np.maximum(display, 0)), np.float32)
         layers[name], below = above - below, above
-    return {name: np.maximum(layers[name], 0) for name in flares}
+    return {name: layers[name] for name in flares}

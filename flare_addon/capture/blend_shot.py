@@ -19,7 +19,7 @@ from ...core.errors import CaptureError
 from ...core.look import PlacedLight
 from ...core.look.shot import Shot, ShotFrame
 from ...core.system.files import write_json
-from .. import cameras, fcurves, lamp_drive, lights, looks, properties
+from .. import cameras, fcurves, lamp_drive, light_paths, lights, looks, properties
 from ..objects import enabled_collections, world_matrix
 from . import exporter
 
@@ -127,6 +127,19 @@ def _place_light(scene: Any, depsgraph: Any, item: Any, camera: Any, rendered: s
     return looks.place_light(scene, depsgraph, camera, np.eye(4), item, hides=True, rendered=rendered)
 
 
+def _light_entries(scene: Any, light_objects: Sequence[Any], numbers: Mapping[str, int]) -> list[dict[str, Any]]:
+    """Return the entries of lights.json for light objects, those that move as paths.
+
+    numbers: frames of the scene by the name of the capture's picture. Raises CaptureError as `_light_position` does.
+    """
+    def place(obj: Any) -> cameras.Floats:
+        return _light_position(bpy.context.evaluated_depsgraph_get(), obj, scene.camera.matrix_world.translation)
+
+    paths = light_paths.world_paths(scene, {obj.name: obj for obj in light_objects}, numbers, place)
+    return [light_paths.merge_entry({}, obj.name, place(obj).tolist(), paths.get(obj.name, {}))
+            for obj in light_objects]
+
+
 def _light_position(depsgraph: Any, obj: Any, eye: Any) -> cameras.Floats:
     """Return the position (3,) of a light in the world. Raises CaptureError where it is not finite."""
     position = np.array(lights.light_position(obj, world_matrix(obj, depsgraph), eye), np.float64)
@@ -147,16 +160,15 @@ def write_capture(scene: Any, plates: Mapping[int, Path], folder: Path, names: S
                   done: Callable[[], None] = lambda: None) -> int:
     """Write a capture of the scene's camera; return its number of frames.
 
-    lights.json is written where there are lights (`names`, or the scene's lamps), each at its place in the last frame.
-    plates: the picture of each frame. done: called after each frame. Raises CaptureError where the scene has no camera,
-    and as `exporter.write_frames` does.
+    lights.json is written where there are lights (`names`, or the scene's lamps): each at its place, or along its path
+    where it moves, with its brightness by frame where that changes. plates: the picture of each frame. done: called
+    after each frame. Raises CaptureError where the scene has no camera, and as `exporter.write_frames` does.
     """
     _active_camera(scene)
     light_objects = _find_lights(scene, names)
     entries = exporter.write_frames(scene, None, plates, folder, done)
     if light_objects:
-        eye, depsgraph = scene.camera.matrix_world.translation, bpy.context.evaluated_depsgraph_get()
-        write_json(folder / LIGHTS, {"lights": [
-            {"name": obj.name, "xyz": _light_position(depsgraph, obj, eye).tolist()} for obj in light_objects]})
+        numbers = {Path(entry["file_path"]).name: frame for entry, frame in zip(entries, sorted(plates), strict=True)}
+        write_json(folder / LIGHTS, {"lights": _light_entries(scene, light_objects, numbers)})
     exporter.write_cameras(folder, entries)
     return len(entries)

@@ -83,11 +83,11 @@ def export_capture(scene: Any, folder: Path) -> int:
     if len(pictures) < 3:
         raise CaptureError(f"Only {len(pictures)} of the frames in the scene's range have a picture beside "
                            f"{footage.first}; set the frame range to that of the footage.")
-    before = scene.frame_current
+    before, subframe = scene.frame_current, scene.frame_subframe
     try:
         entries = write_frames(scene, camera, pictures, folder)
     finally:
-        scene.frame_set(before)
+        scene.frame_set(before, subframe=subframe)
     write_cameras(folder, entries)
     state = scene.fit_flare
     state.capture, state.root, state.mode, state.footage = blend_relative(folder), None, "estimated", "images"

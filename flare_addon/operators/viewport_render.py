@@ -56,9 +56,12 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
         """Render all frames at once, for a script."""
         with report_errors(self) as outcome:
             self._begin(context)
-            for _ in self._frames:
-                pass
-            self._end(context)
+            try:
+                for _ in self._frames:
+                    pass
+                self._end(context)
+            finally:
+                self._restore(context.scene)
         return outcome.status
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -78,7 +81,7 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
 
     def cancel(self, context: bpy.types.Context) -> None:
         """End the timer, and move the timeline back."""
-        context.scene.frame_set(self._before)
+        self._restore(context.scene)
         if getattr(self, "_timer", None) is not None:
             context.window_manager.event_timer_remove(self._timer)
             context.workspace.status_text_set(None)
@@ -87,7 +90,8 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
         """Prepare the frames. Raises SettingsError."""
         scene = context.scene
         viewport_render.check(scene)
-        self._before, self._done, self._timer = scene.frame_current, 0, None
+        self._before = scene.frame_current, scene.frame_subframe
+        self._done, self._timer = 0, None
         numbers = (list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)) if self.animation
                    else [scene.frame_current])
         self._frames = self._render(context, numbers)
@@ -108,10 +112,16 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
             self._done += 1
             yield number
 
+    def _restore(self, scene: Any) -> None:
+        """Move the timeline back to where it was."""
+        frame, subframe = self._before
+        if (scene.frame_current, scene.frame_subframe) != (frame, subframe):
+            scene.frame_set(frame, subframe=subframe)
+
     def _end(self, context: bpy.types.Context) -> None:
         """Report what was rendered, and move the timeline back."""
         path = viewport_render.output_path(context.scene, context.scene.frame_current)
-        context.scene.frame_set(self._before)
+        self._restore(context.scene)
         what = f"{self._done} frames are" if self.animation else f"{path.name} is"
         self.report({"INFO"}, f"{what} in {path.parent}")
 

@@ -147,6 +147,12 @@ def test_a_viewport_render_is_saved_as_the_view_transform_shows_it(facts: Any) -
     assert "choose an image format" in video and "no camera" in camera and "need Blender's window" in window
 
 
+def test_a_viewport_render_that_fails_leaves_the_timeline_where_it_was(facts: Any) -> None:
+    """Block of flares.py: "a viewport render"."""
+    status, frame, subframe, sentence = facts["viewport render failed"]
+    assert status == ["CANCELLED"] and (frame, subframe) == (7, 0.5) and "3D viewport was closed" in sentence
+
+
 def test_look_and_bake_are_beside_the_compositor_and_the_picture(facts: Any) -> None:
     """Block of flares.py: "panels of other editors"."""
     assert facts["other editors"] == [True, True, [], True, True, ["fit_flare.shot_from_picture"], []]

@@ -62,6 +62,12 @@ def test_the_cone_of_a_spot_limits_its_flare(facts: Any) -> None:
     assert 0.1 < exact < 0.9 and measured == pytest.approx(exact, abs=1e-3)
     assert facts["keyed cone"] == [True, 0]
     assert facts["area as a point"] == pytest.approx(0.5, abs=1e-3)
+    assert facts["sides of a mirrored lamp"] == [True, False] * 2, "along its -Z"
+
+
+def test_a_mirrored_capture_shows_the_visible_half_of_an_area_light(facts: Any) -> None:
+    """Block of lamps.py: "lamps switch their flares"."""
+    assert facts["half a lamp in a mirrored capture"] == [[True, 0.5, True]] * 3
 
 
 def test_a_flare_dims_with_the_square_of_the_distance(facts: Any) -> None:

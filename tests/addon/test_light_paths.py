@@ -30,6 +30,17 @@ def test_the_brightness_of_a_dimmed_lamp_is_written(facts: Any) -> None:
     assert facts["dimmed"] == [1.0, 0.5]
 
 
+def test_exposure_and_temperature_of_a_lamp_are_its_brightness(facts: Any) -> None:
+    """Lamps have both from Blender 4.5 on.
+
+    Block of light_paths.py: "parented to something that moves, and dimmed".
+    """
+    assert facts["pushed by physics"]
+    if "keyed exposure" in facts:
+        assert facts["keyed exposure"] == [1.0, 0.25]
+        assert facts["keyed temperature"] and facts["temperature is measured"] == [True, True]
+
+
 def test_a_path_becomes_keys_that_an_artist_corrects(facts: Any) -> None:
     """Block of light_paths.py: "read back, and corrected"."""
     assert facts["keyed between"] == pytest.approx([0.2, 0, 0.5], abs=1e-4)

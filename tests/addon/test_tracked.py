@@ -57,6 +57,11 @@ def test_a_solve_needs_no_lights(facts: Any) -> None:
     assert facts["no lights"] == ["images", "points.ply", "transforms.json"]
 
 
+def test_a_capture_of_a_blend_has_the_paths_of_its_lamps(facts: Any) -> None:
+    """Block of tracked.py: "a sun, and what hides it"."""
+    assert facts["moving lamps"] == [[[0, 0, 0], 1], [[4, 0, 0], 0.5], [[0, 0, 2], None], [[0, 0, 2], None]]
+
+
 def test_a_shot_with_cuts_has_one_name_for_every_range(facts: Any) -> None:
     """Block of tracked.py: "a sun, and what hides it"."""
     whole, part, same = facts["cut"]

@@ -144,6 +144,20 @@ def test_a_one_sided_light_follows_the_cosine(tmp_path: Path) -> None:
     assert light(180) == 0
 
 
+@pytest.mark.parametrize("shape", ["rectangle", "ellipse"])
+def test_a_mirrored_extent_emits_to_the_image_of_its_side(shape: str) -> None:
+    extent = LightExtent.read({"shape": shape, "axes": [[0.5, 0, 0], [0, 0.3, 0]], "one_sided": True})
+    eye = np.array([0.1, 0.2, 2.0])
+    for mirror in (np.diag([-2.0, 2, 2]), np.diag([2.0, 2, -2]), -2 * np.eye(3)):
+        for side in (1, -1):
+            pose = np.eye(4)
+            pose[:3, 3] = -mirror @ (side * eye)
+            sampled = extent.transformed(mirror).sampled(np.zeros(3), pose)
+            assert (sampled.emission > 0) == (side > 0)
+            back = sampled.points @ np.linalg.inv(mirror).T
+            assert np.abs(back[:, :2]).max(0) == pytest.approx([0.5, 0.3], abs=0.01) and not back[:, 2].any()
+
+
 # ---- samples --------------------------------------------------------------------------------------
 
 

@@ -17,6 +17,7 @@ from core.capture import Camera, Capture
 from core.capture.ply import read_points
 from core.errors import CaptureError, FrameError
 from core.images.write import write_exr, write_png
+from core.removal.jobs.provenance import has_exact_clean_frames
 from tests.core.captures import SIZE, look_at, make_capture, make_transforms, orbit, picture
 
 
@@ -202,6 +203,15 @@ def test_clean_frames_and_truth_are_read(tmp_path: Path) -> None:
     assert scene.size == SIZE and np.abs(scene.pixels - removed.pixels).mean() < 0.03
     assert flare.encoding == "linear" and np.allclose(flare.pixels, 3.0)
     assert capture.truth_flare(capture.views[0]) is None
+
+
+def test_a_capture_has_clean_frames_only_if_every_view_has_one(tmp_path: Path) -> None:
+    folder = make_capture(tmp_path / "c")
+    (folder / "removed").mkdir()
+    for i in range(4):
+        cv2.imwrite(str(folder / "removed" / f"{i:04d}.png"), picture(i))
+        capture = Capture.open(folder, need_frames=False)  # as Blender opens it
+        assert capture.has_removed == has_exact_clean_frames(capture) == (i == 3)
 
 
 def test_clean_frames_may_have_another_suffix(tmp_path: Path) -> None:

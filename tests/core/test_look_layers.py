@@ -15,6 +15,7 @@ from core.bake.exr import read_description, read_layers
 from core.bake.shot import ShotRenderer
 from core.bake.shot_frames import LookRenderer, bake_shot_frames
 from core.choices import Blend
+from core.colour.srgb import linear_from_srgb
 from core.errors import SettingsError
 from core.fit.rendering import splat_look
 from core.flare.compositing import linear_layers
@@ -73,8 +74,24 @@ def test_layers_without_an_engine_are_those_of_the_engine(tmp_path: Path, blend:
     numpy = draw_layers(look, {name: one.with_exposure(1.5, blend) for name, one in seen.items()}, camera.intrinsics,
                         camera.width, camera.height)
     for name, layer in numpy.items():
-        np.testing.assert_allclose(layer, engine.flares[name].clamp_min(0).numpy(), atol=1e-3)
+        np.testing.assert_allclose(layer, engine.flares[name].numpy(), atol=1e-3)
         assert layer.max() > 0.01, "a flare is drawn"
+
+
+def test_a_flare_that_covers_a_brighter_one_has_a_negative_layer_in_every_bake(tmp_path: Path) -> None:
+    flare = a_look(tmp_path / "a.flare", "over")
+    look = read_look(flare)
+    camera = cameras(1)[0].scaled(96)
+    lights = (PlacedLight("red", look.names[0], np.array(LIGHT), factor=(1.0, 0.0, 0.0)),
+              PlacedLight("white", look.names[0], np.array(LIGHT)))
+    frame = ShotFrame(1, "Camera", camera, lights)
+    engine, numpy = (kind(Shot(flare, (frame,))).render(frame, camera) for kind in (ShotRenderer, LookRenderer))
+    seen = look.evaluate_lights(camera.world_to_camera, lights)
+    exact = linear_from_srgb(draw(seen.values(), camera.intrinsics, camera.width, camera.height, "over",
+                                  look.pixel_grid))
+    for layers in (engine, numpy):
+        assert layers.flare_by_light["red"][..., 1].min() < -0.005
+        np.testing.assert_allclose(sum(layers.flare_by_light.values()), exact, atol=1e-3)
 
 
 def test_a_shot_bakes_without_torch_and_opencv_and_openexr(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

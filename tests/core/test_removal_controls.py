@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from core.colour import colour_space
 from core.errors import SettingsError
 from core.images.plates import Plate
 from core.removal.inference.confidence import BIAS, FEATURE_WEIGHTS, FlareFeatures
@@ -51,6 +52,23 @@ def test_each_choice_makes_the_results_again(flare_everywhere: Path) -> None:
         remover.use_controls(amount, sensitivity)
         keys.add(remover.cache_key)
     assert len(keys) == 4 and Remover(flare_everywhere).cache_key in keys
+
+
+def test_the_last_choice_alone_decides_which_results_are_made_again(flare_everywhere: Path) -> None:
+    spaces = [colour_space("acescg"), colour_space("logc3")]
+    changed, direct, plain = (Remover(flare_everywhere) for _ in range(3))
+    for space in spaces:
+        changed.use_plate_space(space)
+    direct.use_plate_space(spaces[1])
+    assert changed.cache_key == direct.cache_key != plain.cache_key
+    changed.use_controls(0.5, "high")
+    changed.use_controls(0.5, "low")
+    direct.use_controls(0.5, "low")
+    assert changed.cache_key == direct.cache_key
+    plain.use_controls(0.5)
+    plain.use_controls()
+    plain.use_device("cpu")
+    assert plain.cache_key == Remover(flare_everywhere).cache_key
 
 
 def test_the_sensitivity_decides_on_a_doubtful_flare(flare_everywhere: Path) -> None:

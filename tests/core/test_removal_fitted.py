@@ -195,10 +195,14 @@ def test_a_light_disc_stays_as_filmed(capture: Capture, tmp_path: Path) -> None:
             filmed = capture.frame(view).linear()
             return RenderedLayers(np.zeros_like(filmed), {"lamp": filmed})
 
-    remove_fitted_flare(Bright(capture), capture, [view], tmp_path / "clean", Progress())
+    remove_fitted_flare(Bright(capture), capture, [view], tmp_path / "clean", Progress(),
+                        flare_folder=tmp_path / "flare")
     clean = cv2.imread(str(tmp_path / "clean" / view.name))
     assert (clean[int(y), int(x)] == 255).all()
     assert (clean[2, 3] == 0).all(), "white far from every light is flare"
+    written = read_exr(tmp_path / "flare" / Path(view.name).with_suffix(".exr"))
+    assert written["G"][int(y), int(x)] == 0, "a flare that was not subtracted is not written"
+    assert written["G"][2, 3] == pytest.approx(1, abs=1e-3)
 
 
 def test_a_light_above_white_keeps_its_brightness_and_loses_its_flare(tmp_path: Path) -> None:

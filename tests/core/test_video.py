@@ -281,6 +281,31 @@ def test_seeking_finds_the_frame_of_that_number(name: str, codec: str, options: 
         assert list(video) == []
 
 
+class DamagedFrame:
+    """A frame of PyAV that the decoder calls damaged, of another width if one is named."""
+
+    is_corrupt = True
+
+    def __init__(self, raw: Any, width: int = 0) -> None:
+        self._raw, self.width = raw, width or raw.width
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._raw, name)
+
+
+def test_damaged_frames_are_counted_before_the_size_changes(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.mkv", "ffv1", "yuv420p", [stripes(32)] * 4)
+    with Video(path) as video:
+        raws = [frame.raw for frame in video]
+        video._frames_from = lambda _start: iter(  # type: ignore[method-assign]
+            [raws[0], DamagedFrame(raws[1]), DamagedFrame(raws[2], 64), raws[3]])
+        video.length = 4
+        assert len(list(video)) == 2
+        assert len(video.problems) == 2
+        assert "changes its size to 64 x 32 at frame 3" in video.problems[0]
+        assert "1 of 2 frames" in video.problems[1] and "damaged (2)" in video.problems[1]
+
+
 def test_frames_hidden_by_an_edit_list_are_neither_shown_nor_missing(tmp_path: Path) -> None:
     path = write_video(tmp_path / "a.mp4", "libx264", "yuv420p", [np.full((64, 64, 3), n / 20) for n in range(10)],
                        options={"bf": "0", **LOSSLESS})

@@ -221,7 +221,7 @@ class DiffusionRemover(Remover):
         self.model = DiffusionRemoval(base, read_rank(lora))
         self.model.load(lora)
         self.model.eval()
-        self.cache_key = compute_cache_key("diffusion", lora, str(base), working_size)
+        self._model_key = compute_cache_key("diffusion", lora, str(base), working_size)
 
     @property
     def _module(self) -> nn.Module:

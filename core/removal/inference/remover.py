@@ -71,8 +71,10 @@ class Remover:
 
     min_mean_flare = MIN_MEAN_FLARE
     """Gate of the model's predictions; another model has another."""
-    cache_key: str
-    """Text that changes whenever results would."""
+    _model_key: str
+    """Text that changes with the model, its weights and its settings."""
+    _controls_key: str = ""
+    """The same of `use_controls`; "" for the default controls."""
 
     def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
                  glow: Glow = "keep at lights") -> None:
@@ -82,8 +84,7 @@ class Remover:
         weights = weights or default_weights()
         self.network: RemovalNetwork = load_network(weights)
         self.working_size, self.glow = working_size, glow
-        self.cache_key = compute_cache_key("network", weights, working_size,
-                                           _GLOW_IN_CACHE_KEY[glow])
+        self._model_key = compute_cache_key("network", weights, working_size, _GLOW_IN_CACHE_KEY[glow])
 
     plate_space: ColourSpace | None = None
     """Space of the plates, in place of what their files declare."""
@@ -91,6 +92,13 @@ class Remover:
     """Factor on the flare that is removed, 0..MAX_AMOUNT."""
     sensitivity: Sensitivity = SENSITIVITIES["normal"]
     """How much evidence the removal of a flare needs."""
+
+    @property
+    def cache_key(self) -> str:
+        """Text that changes whenever results would."""
+        device = "" if self.device.type == "cpu" else self.device.type
+        space = "" if self.plate_space is None else self.plate_space.fingerprint
+        return " ".join(filter(None, (self._model_key, device, self._controls_key, space)))
 
     def use_controls(self, amount: float = 1.0, sensitivity: str = "normal") -> None:
         """Set how much of a flare is removed, 0..MAX_AMOUNT, and how much evidence that needs, a key of
@@ -100,13 +108,10 @@ class Remover:
         if sensitivity not in SENSITIVITIES:
             raise SettingsError(f"There is no sensitivity {sensitivity}; choose one of {', '.join(SENSITIVITIES)}.")
         self.amount, self.sensitivity = amount, SENSITIVITIES[sensitivity]
-        if (amount, sensitivity) != (1, "normal"):
-            self.cache_key = f"{self.cache_key} {amount:g} {sensitivity}"
+        self._controls_key = "" if (amount, sensitivity) == (1, "normal") else f"{amount:g} {sensitivity}"
 
     def use_plate_space(self, space: ColourSpace) -> None:
         """Read plates in this space, in place of what their files declare; results of others are made again."""
-        if self.plate_space is None:
-            self.cache_key = f"{self.cache_key} {space.fingerprint}"
         self.plate_space = space
 
     device = torch.device("cpu")
@@ -122,8 +127,6 @@ class Remover:
         made again. Raises SettingsError where this machine has none of that name."""
         self.device = select_device(name)
         self._module.to(self.device)
-        if self.device.type != "cpu":
-            self.cache_key = f"{self.cache_key} {self.device.type}"
 
     def remove(self, plate: Plate, matte: Pixels | None = None, prediction: FlarePrediction | None = None
                ) -> tuple[NDArray[Any], NDArray[np.float16]]:

@@ -151,7 +151,8 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View, above_whit
     if above_white and plate.encoding == "linear":  # the scene knows the lights' own brightness
         codes = subtract_fitted_flare(plate, flare, scene, light_discs)
     else:
-        codes = subtract_fitted_flare(plate, np.where(light_discs[..., None], 0, flare), scene)
+        flare[light_discs] = 0
+        codes = subtract_fitted_flare(plate, flare, scene)
     if is_direct:
         return _CleanView(stored, codes, flare, gains)
     clean = replace(plate, codes=codes)

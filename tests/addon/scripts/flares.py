@@ -321,5 +321,18 @@ for gone in (False, True):
     except errors.SettingsError as problem:
         refusals.append(str(problem))
 facts["viewport render refused"] = [*refusals, refusal(ops.viewport_render)]
+renders = part("flare_addon.operators.viewport_render")
+kind, largest_view = renders.FITFLARE_OT_viewport_render, renders.largest_view
+renders.largest_view = lambda _context: None  # as after the view was closed
+reports: list[str] = []
+scene.camera = bpy.data.objects["Camera"]
+operator = type("Operator", (), {name: getattr(kind, name) for name in (
+    "execute", "_begin", "_render", "_restore", "_end")})()
+operator.animation, operator.report = True, lambda _kind, text: reports.append(text)
+scene.frame_start, scene.frame_end = 1, 3
+scene.frame_set(7, subframe=0.5)
+status = operator.execute(bpy.context)
+renders.largest_view = largest_view
+facts["viewport render failed"] = [sorted(status), scene.frame_current, scene.frame_subframe, *reports]
 
 leave(facts)

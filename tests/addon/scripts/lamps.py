@@ -196,6 +196,29 @@ item.extent = "point"
 lamp.rotation_euler = (-np.pi / 2, 0, np.pi / 3)
 bpy.context.view_layer.update()
 facts["area as a point"] = factor(scene)[0]
+item.extent = "auto"
+sides = []
+for scale in ((1, 1, 1), (-1, 1, 1)):
+    for turn in (-np.pi / 2, np.pi / 2):
+        lamp.scale, lamp.rotation_euler = scale, (turn, 0, 0)
+        sides.append(brightness(scene) > 0)
+facts["sides of a mirrored lamp"] = sides
+lamp.scale, lamp.data.size = (1, 1, 1), 2.0
+scene.fit_flare.occlusion = True
+wall = object_in(scene, "Wall", bpy.data.meshes.new("Wall"), (0, 0, 0))
+wall.data.from_pydata([(0, 4, -9), (9, 4, -9), (9, 4, 9), (0, 4, 9)], [], [(0, 1, 2, 3)])
+root = object_in(scene, "Root", None, (0, 0, 0))
+scene.fit_flare.root = root
+halves = []
+for scale in ((1, 1, 1), (-1, 1, 1), (2, 2, -2)):
+    root.scale, lamp.rotation_euler = scale, (-np.pi / 2, 0, 0)
+    placed = placed_light(scene)
+    pose = part("flare_addon.cameras").pose_in_capture(
+        scene.camera.matrix_world, root, bpy.context.evaluated_depsgraph_get())
+    sampled = placed.extent.sampled(placed.xyz, pose)
+    visible = [centre[0] * scale[0] for centre, share in zip(sampled.centres, placed.shares, strict=True) if share > 0]
+    halves.append([sampled.emission > 0.9, round(float(np.mean(placed.shares)), 1), bool(max(visible) < 0)])
+facts["half a lamp in a mirrored capture"] = halves
 
 scene, lamp, item = lit_scene()
 keyed(lamp, "location", (1, (0.4, 8, 0.3)), (9, (0.8, 16, 0.6)))

@@ -67,6 +67,37 @@ facts["panel"] = " ".join(str(call.kwargs.get("text", "")) for call in layout.mo
 facts["icons"] = [call.kwargs["icon"] for call in layout.mock_calls if call.args[1:] == ("light",)]
 facts["reads back"] = [json.loads(path.read_text())["lights"][-1]["name"]]
 
+lamp.data.animation_data_clear()
+lamp.data.energy = 100.0
+if hasattr(lamp.data, "exposure"):
+    for frame, stops in ((first, 0.0), (last, -2.0)):
+        lamp.data.exposure = stops
+        lamp.data.keyframe_insert("exposure", frame=frame)
+    lights.write_to_capture(scene, capture)
+    facts["keyed exposure"] = [round(state.on, 3) for state in (states("headlight")[0], states("headlight")[-1])]
+    lamp.data.animation_data_clear()
+    lamp.data.exposure, lamp.data.use_temperature = 0.0, True
+    drives = part("flare_addon.lamp_drive")
+    temperatures = []
+    for frame, kelvin in ((first, 3000.0), (last, 9000.0)):
+        lamp.data.temperature = kelvin
+        lamp.data.keyframe_insert("temperature", frame=frame)
+        temperatures.append(float(drives.light_of(lamp.data).max()))
+    lamp.data.keyframe_insert("energy", frame=first)
+    lights.write_to_capture(scene, capture)
+    on = [state.on for state in (states("headlight")[0], states("headlight")[-1])]
+    facts["keyed temperature"] = bool(np.allclose(np.divide(*on), np.divide(*temperatures), atol=1e-3)
+                                      and abs(on[0] - on[1]) > 0.1)
+    facts["temperature is measured"] = [drives.keyed_reference(scene, lamp.data) is None, drives.is_driven(lamp)]
+mover = add("pushed", None, None)
+scene.collection.objects.link(body := bpy.data.objects.new("Body", bpy.data.meshes.new("Body")))
+if bpy.ops.rigidbody.world_add.poll():
+    bpy.ops.rigidbody.world_add()
+    with bpy.context.temp_override(object=body, selected_objects=[body], active_object=body):
+        bpy.ops.rigidbody.object_add()
+    mover.parent = body
+    facts["pushed by physics"] = light_paths.moves(mover, None)
+
 # ---- read back, and corrected -----------------------------------------------------------------------
 data = json.loads(path.read_text())
 data["lights"] = [{"name": "torch", "frames": {

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import sys
 from pathlib import Path
 
@@ -147,6 +148,27 @@ cube = bpy.context.object
 plate = next((out / "clip").iterdir())
 blend_shot.write_capture(scene, {1: plate}, out / "no lights", [])
 facts["no lights"] = sorted(path.name for path in (out / "no lights").iterdir())
+lamp = bpy.data.objects.new("Torch", bpy.data.lights.new("Torch", "POINT"))
+scene.collection.objects.link(lamp)
+for frame, x, energy in ((1, 0.0, 10.0), (3, 4.0, 5.0)):
+    lamp.location.x, lamp.data.energy = x, energy
+    lamp.keyframe_insert("location", frame=frame)
+    lamp.data.keyframe_insert("energy", frame=frame)
+stands = bpy.data.objects.new("Stands", None)
+scene.collection.objects.link(stands)
+stands.location = (0, 0, 2)
+plates = {}
+for frame in (1, 3):
+    plates[frame] = out / "plates" / f"shot.{frame}{plate.suffix}"
+    plates[frame].parent.mkdir(exist_ok=True)
+    shutil.copy(plate, plates[frame])
+blend_shot.write_capture(scene, plates, out / "moving", ["Torch", "Stands"])
+written = part("core.capture").Capture.open(out / "moving")
+facts["moving lamps"] = [[np.round(written.light_state(light, view).xyz, 3).tolist(),
+                          written.light_state(light, view).on]
+                         for light in written.lights for view in written.views]
+bpy.data.objects.remove(lamp)
+bpy.data.objects.remove(stands)
 bpy.data.objects.remove(cube)
 sun.hide_render = False
 second = bpy.data.objects.new("Second", bpy.data.cameras.new("Second"))

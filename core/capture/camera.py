@@ -90,9 +90,9 @@ class Camera:
     def scaled(self, width: int, height: int | None = None) -> Camera:
         """Return the camera at another size in pixels; without a height the proportions stay."""
         height = height or max(round(self.height * width / self.width), 1)
-        x, y = width / self.width, height / self.height
+        scale_x, scale_y = width / self.width, height / self.height
         return replace(self, width=width, height=height,
-                       fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y)
+                       fx=self.fx * scale_x, cx=self.cx * scale_x, fy=self.fy * scale_y, cy=self.cy * scale_y)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """Return the camera of the part of its picture with this corner and size, pixels."""
@@ -119,8 +119,8 @@ class Camera:
         """(2, 3) derivative of the pixel of a world point (3,) in front of the camera by the point."""
         rotation = self.world_to_camera[:3, :3]
         x, y, z = rotation @ np.asarray(xyz, np.float64) + self.world_to_camera[:3, 3]
-        lens = np.array([[self.fx, 0, -self.fx * x / z], [0, self.fy, -self.fy * y / z]]) / z
-        return np.asarray(lens @ rotation)
+        projection = np.array([[self.fx, 0, -self.fx * x / z], [0, self.fy, -self.fy * y / z]]) / z
+        return np.asarray(projection @ rotation)
 
     def rays(self, pixels: ArrayLike) -> Floats:
         """Convert pixels (n, 2) to unit directions (n, 3) in world coordinates, from `position`."""
@@ -157,11 +157,11 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Floats:
     It is the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix (2000), without special cases.
     """
     r = np.asarray(rotation, np.float64)
-    key = np.array([
+    k_matrix = np.array([
         [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
         [r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
         [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
         [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1]],
     ])
-    vector = np.linalg.eigh(key)[1][:, -1]
+    vector = np.linalg.eigh(k_matrix)[1][:, -1]
     return vector if vector[0] >= 0 else -vector

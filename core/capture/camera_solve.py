@@ -70,33 +70,34 @@ def read_solve_in_steps(folder: Path, *, required: bool = True) -> Steps[CameraS
                                    f"{deeper.parent}, or move it to {folder / 'sparse' / '0'}."))
         frames, points = yield from read_model_in_steps(model)
         root = frames_folder(folder, model)
-        solve = CameraSolve(_names_below(root, frames), points, root)
+        solve = CameraSolve(_with_relative_names(root, frames), points, root)
         solve.sentences += [sentence] if sentence else []
     solve.frames.sort(key=lambda frame: natural_key(frame.name))
     return solve
 
 
-def _names_below(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
+def _with_relative_names(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
     """Return a model's frames with names that start from `root`, the folder of the frames.
 
     COLMAP's names start from the folder that it was started on: "images/1.png", "/data/shot/images/1.png" of another
-    machine. The first folders that all names share are left out, as few as lead to a picture; none where nothing does.
+    machine. As few leading folders as possible are left out until some name leads to a picture; only folders that all
+    names share. If nothing does, the names stay as they are.
     """
     parts = [PurePosixPath(frame.name.replace("\\", "/")).parts for frame in frames]
     shared = 0
-    while all(len(each) > shared + 1 and each[shared] == parts[0][shared] for each in parts):
+    while all(len(name_parts) > shared + 1 and name_parts[shared] == parts[0][shared] for name_parts in parts):
         shared += 1
     if not shared or not root.is_dir():
         return frames
     # Names stay as they are where one of them leads to a picture, by its own name or another form of it.
     is_below = parts[0][0] not in ("/", "..")
-    if is_below and any(root.joinpath(*each).exists() for each in parts):
+    if is_below and any(root.joinpath(*name_parts).exists() for name_parts in parts):
         return frames
     index = PictureIndex(root)
     if is_below and any(index.find(frame.name) for frame in frames):
         return frames
     for start in range(1, shared + 1):
-        names = ["/".join(each[start:]) for each in parts]
+        names = ["/".join(name_parts[start:]) for name_parts in parts]
         if any(index.find(name) for name in names):
             return [replace(frame, name=name) for frame, name in zip(frames, names, strict=True)]
     return frames
@@ -127,12 +128,12 @@ def match_frames_in_steps(solve: CameraSolve) -> Steps[MatchedFrames]:
         if path.exists() or path.is_symlink():
             files[frame.name] = path
     yield
-    index = _index(solve.root, [path.parent for path in paths.values()])
+    index = _index_pictures(solve.root, [path.parent for path in paths.values()])
     yield
     used = {path.relative_to(solve.root).as_posix() for path in files.values()}
     missing: list[str] = []
     renamed: list[str] = []
-    for name in paths:
+    for name in paths:  # the names without a picture of exactly that path
         if name in files:
             continue
         file = index.find(name)
@@ -144,10 +145,10 @@ def match_frames_in_steps(solve: CameraSolve) -> Steps[MatchedFrames]:
         if canonical_name(file) != canonical_name(name):
             renamed.append(f"{file} for {name}")
     unposed = [name for name in index.names if name not in used]
-    return MatchedFrames(files, missing, unposed, _describe(solve, files, missing, unposed, renamed))
+    return MatchedFrames(files, missing, unposed, _describe_matches(solve, files, missing, unposed, renamed))
 
 
-def _index(root: Path, folders: list[Path]) -> PictureIndex:
+def _index_pictures(root: Path, folders: list[Path]) -> PictureIndex:
     """Index the pictures below the folder of the frames; where names start from the capture, those of the frames'
     folders."""
     if root.name.casefold() == "images":
@@ -155,7 +156,7 @@ def _index(root: Path, folders: list[Path]) -> PictureIndex:
     return PictureIndex(root, list(dict.fromkeys(folders)))
 
 
-def _describe(solve: CameraSolve, files: dict[str, Path], missing: list[str], unposed: list[str],
+def _describe_matches(solve: CameraSolve, files: dict[str, Path], missing: list[str], unposed: list[str],
               renamed: list[str]) -> list[str]:
     """Return sentences for the user on frames without a pose, poses without a frame, and frames of another name.
 
@@ -188,37 +189,37 @@ def _check_points(solve: CameraSolve) -> list[str]:
     points = solve.points.xyz[::max(len(solve.points) // SAMPLED_POINTS, 1)].astype(np.float64)
     if not len(points):
         return []
-    is_seen = np.zeros(len(points), bool)
-    shares = []
+    is_in_view = np.zeros(len(points), bool)
+    shares_in_front = []
     for frame in solve.frames[::max(len(solve.frames) // SAMPLED_VIEWS, 1)]:
         local = points @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]
-        before = local[:, 2] > 0
+        in_front = local[:, 2] > 0
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             # Twice the field of view: room for distortion and for a principal point off centre.
             plane = np.abs(local[:, :2] / local[:, 2:])
-            reach = np.array([frame.lens.width, frame.lens.height]) / np.array(frame.lens.focal)
-        is_seen |= before & (plane <= reach).all(axis=1)
-        shares.append(before.mean())
-    share, before_share = float(is_seen.mean()), float(np.mean(shares))
-    if min(share, before_share) >= MIN_SHARE_IN_VIEW:
+            max_plane = np.array([frame.lens.width, frame.lens.height]) / np.array(frame.lens.focal)
+        is_in_view |= in_front & (plane <= max_plane).all(axis=1)
+        shares_in_front.append(in_front.mean())
+    share_in_view, share_in_front = float(is_in_view.mean()), float(np.mean(shares_in_front))
+    if min(share_in_view, share_in_front) >= MIN_SHARE_IN_VIEW:
         return []
-    return [f"Cameras and points do not fit each other: {100 * share:.0f} % of the points are in some view, and a "
-            f"camera has {100 * before_share:.0f} % of them before it. Export both in one coordinate system (scale, "
-            "axes, origin)."]
+    return [f"Cameras and points do not fit each other: {100 * share_in_view:.0f} % of the points are in some view, "
+            f"and a camera has {100 * share_in_front:.0f} % of them before it. Export both in one coordinate system "
+            "(scale, axes, origin)."]
 
 
 def _check_lenses(solve: CameraSolve) -> list[str]:
     """Return a sentence if a focal length gives a field of view that no lens has."""
-    wrong = []
+    impossible = []
     for frame in solve.frames:
         lens = frame.lens
-        long_side = max((lens.width, lens.focal[0]), (lens.height, lens.focal[1]))
-        angle = 2 * float(np.degrees(np.arctan(0.5 * long_side[0] / long_side[1])))
-        is_plain = lens.model != "EQUIRECTANGULAR" and "FISHEYE" not in lens.model
-        if is_plain and not MIN_FIELD_OF_VIEW <= angle <= MAX_FIELD_OF_VIEW:
-            wrong.append((frame.name, long_side[1], angle))
-    if not wrong:
+        side, focal = max((lens.width, lens.focal[0]), (lens.height, lens.focal[1]))
+        angle = 2 * float(np.degrees(np.arctan(0.5 * side / focal)))
+        is_perspective = lens.model != "EQUIRECTANGULAR" and "FISHEYE" not in lens.model
+        if is_perspective and not MIN_FIELD_OF_VIEW <= angle <= MAX_FIELD_OF_VIEW:
+            impossible.append((frame.name, focal, angle))
+    if not impossible:
         return []
-    name, focal, angle = wrong[0]
-    return [f"The focal length of {len(wrong)} of {len(solve.frames)} frames cannot be: {name} has {focal:.4g} pixels, "
-            f"a field of view of {angle:.3g} degrees. Export it in pixels of the frames."]
+    name, focal, angle = impossible[0]
+    return [f"The focal length of {len(impossible)} of {len(solve.frames)} frames cannot be: {name} has {focal:.4g} "
+            f"pixels, a field of view of {angle:.3g} degrees. Export it in pixels of the frames."]

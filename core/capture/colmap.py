@@ -30,6 +30,8 @@ MAX_MAGNITUDE = 1e12
 """Bound for the numbers of a pose or a lens, whatever the unit."""
 _MAX_COORDINATE = 1e30
 """Bound for coordinates and errors of points, with which float32 can still compute."""
+_MAX_QUATERNION_ERROR = 0.01
+"""Difference between a quaternion's length and 1 up to which rounding explains it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,37 +79,38 @@ def read_model_in_steps(folder: Path) -> Steps[tuple[list[PosedFrame], PointClou
     """Read a model as `read_model` does, in steps."""
     lenses = yield from _read_file(folder, "cameras", _read_cameras_bin, _read_cameras_txt)
     images = yield from _read_file(folder, "images", _read_images_bin, _read_images_txt)
-    points, known = ((yield from _read_file(folder, "points3D", _read_points_bin, _read_points_txt))
-                     or (PointCloud.empty(), np.zeros(0, np.int64)))
-    order = np.argsort(known, kind="stable")
+    points, point_ids = ((yield from _read_file(folder, "points3D", _read_points_bin, _read_points_txt))
+                         or (PointCloud.empty(), np.zeros(0, np.int64)))
+    order = np.argsort(point_ids, kind="stable")
     if not images:
         raise CaptureError(f"{_file_path(folder, 'images')} holds no images; the solve registered no frame.")
     posed: list[PosedFrame] = []
-    for name, camera, quaternion, translation, point_ids in images:
+    for name, camera_id, quaternion, translation, observed_ids in images:
         if len(posed) % FRAMES_PER_STEP == 0:
             yield
-        if camera not in lenses:
-            raise CaptureError(f"{_file_path(folder, 'images')} gives {name} the camera {camera}, which "
+        if camera_id not in lenses:
+            raise CaptureError(f"{_file_path(folder, 'images')} gives {name} the camera {camera_id}, which "
                                f"{_file_path(folder, 'cameras')} does not have; export the whole model again.")
         where = f"{_file_path(folder, 'images')}, {name}:"
         pose = np.eye(4)
-        length = math.sqrt(sum(q * q for q in quaternion))
+        norm = math.sqrt(sum(q * q for q in quaternion))
         if not all(abs(number) < MAX_MAGNITUDE for number in (*quaternion, *translation)):
             raise CaptureError(f"{where} the pose is not finite numbers of a sensible size; solve the cameras again.")
-        if abs(length - 1.0) > 0.01:
-            raise CaptureError(f"{where} the quaternion's length is {length:.4g}, so it is no rotation; "
+        if abs(norm - 1.0) > _MAX_QUATERNION_ERROR:
+            raise CaptureError(f"{where} the quaternion's length is {norm:.4g}, so it is no rotation; "
                                "solve the cameras again.")
         pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(quaternion), translation
-        posed.append(PosedFrame(name, lenses[camera], pose, _indices(point_ids, known, order)))
+        posed.append(PosedFrame(name, lenses[camera_id], pose, _point_indices(observed_ids, point_ids, order)))
     return posed, points
 
 
-def _indices(observed: NDArray[np.int64], known: NDArray[np.int64], order: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the indices of the ids `observed` among `known`, which `order` sorts; unknown ids are dropped."""
-    if not len(known):
+def _point_indices(observed_ids: NDArray[np.int64], point_ids: NDArray[np.int64],
+                   order: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the indices of `observed_ids` in `point_ids`, which `order` sorts; unknown ids are dropped."""
+    if not len(point_ids):
         return order  # empty as well
-    places = order[np.searchsorted(known, observed, sorter=order).clip(max=len(known) - 1)]
-    return np.unique(places[known[places] == observed])
+    indices = order[np.searchsorted(point_ids, observed_ids, sorter=order).clip(max=len(point_ids) - 1)]
+    return np.unique(indices[point_ids[indices] == observed_ids])
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +125,8 @@ class ObservedFrame:
 
 
 def write_model(folder: Path, frames: Sequence[ObservedFrame], cloud: PointCloud) -> None:
-    """Write cameras.bin, images.bin and points3D.bin; frames that share a Lens object share a camera."""
+    """Write cameras.bin, images.bin and points3D.bin, with ids from 1; frames that share a Lens object share a
+    camera."""
     lenses = list(dict.fromkeys(frame.lens for frame in frames))
     cameras = [struct.pack("<Q", len(lenses))]
     cameras += [struct.pack("<iiQQ", number, MODELS[lens.model][0], lens.width, lens.height)
@@ -148,7 +152,7 @@ def write_model(folder: Path, frames: Sequence[ObservedFrame], cloud: PointCloud
 
 
 def check_lens(lens: Lens, where: str) -> Lens:
-    """Return `lens`; raises CaptureError where its numbers cannot be a camera's."""
+    """Return `lens`. Raises CaptureError, whose message begins with `where`, if its numbers cannot be a camera's."""
     if lens.width <= 0 or lens.height <= 0 or lens.width * lens.height > MAX_PIXELS:
         raise CaptureError(f"{where} a size of {lens.width} x {lens.height} pixels makes no sense; solve the cameras "
                            "again.")
@@ -165,10 +169,10 @@ def _file_path(folder: Path, name: str) -> Path:
     return next((path for path in candidates if path is not None and path.is_file()), folder / f"{name}.txt")
 
 
-def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Steps[Any]:
+def _read_file(folder: Path, name: str, binary_reader: Any, text_reader: Any) -> Steps[Any]:
     """Read a part of a model by its binary or text reader, in steps; None without points3D. Raises CaptureError.
 
-    binary: takes a _ByteReader. text: takes the path and the lines.
+    binary_reader: takes a _ByteReader. text_reader: takes the path and the lines.
     """
     yield
     path = _file_path(folder, name)
@@ -178,9 +182,9 @@ def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Steps[Any]:
         raise CaptureError(f"{folder} has no {name}.bin or {name}.txt; export the whole COLMAP model.")
     try:
         if path.suffix.lower() == ".bin":
-            result = binary(_ByteReader(path))
+            result = binary_reader(_ByteReader(path))
             return (yield from result) if isinstance(result, Generator) else result
-        return text(path, read_text(path, MAX_MODEL_BYTES, UTF8_SIG).splitlines())
+        return text_reader(path, read_text(path, MAX_MODEL_BYTES, UTF8_SIG).splitlines())
     except OSError as problem:
         raise CaptureError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except UnicodeDecodeError as problem:
@@ -193,37 +197,37 @@ class _ByteReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.data = read_bytes(path, MAX_MODEL_BYTES)
-        self.at = 0
+        self.offset = 0
 
-    def take(self, layout: str) -> tuple[Any, ...]:
+    def unpack(self, layout: str) -> tuple[Any, ...]:
         """Unpack little-endian values by `struct` layout."""
         size = struct.calcsize("<" + layout)
-        self.need(size)
-        values = struct.unpack_from("<" + layout, self.data, self.at)
-        self.at += size
+        self.require(size)
+        values = struct.unpack_from("<" + layout, self.data, self.offset)
+        self.offset += size
         return values
 
-    def count(self, record_size: int) -> int:
+    def read_count(self, record_size: int) -> int:
         """Read a 64 bit count of records of at least `record_size` bytes each."""
-        number: int = self.take("Q")[0]
-        self.need(number * record_size)
+        number: int = self.unpack("Q")[0]
+        self.require(number * record_size)
         return number
 
     def skip(self, size: int) -> None:
-        self.need(size)
-        self.at += size
+        self.require(size)
+        self.offset += size
 
-    def name(self) -> str:
+    def read_name(self) -> str:
         """Read a name that a zero byte ends."""
-        end = self.data.find(b"\0", self.at)
+        end = self.data.find(b"\0", self.offset)
         if end < 0:
-            self.need(len(self.data) + 1)
-        text = self.data[self.at:end].decode("utf-8")
-        self.at = end + 1
+            self.require(len(self.data) + 1)
+        text = self.data[self.offset:end].decode("utf-8")
+        self.offset = end + 1
         return text
 
-    def need(self, size: int) -> None:
-        if self.at + size > len(self.data):
+    def require(self, size: int) -> None:
+        if self.offset + size > len(self.data):
             raise CaptureError(f"{self.path} is truncated or damaged (it ends after {len(self.data)} bytes); "
                                "copy or export it again.")
 
@@ -231,34 +235,34 @@ class _ByteReader:
 def _read_cameras_bin(file: _ByteReader) -> dict[int, Lens]:
     """Return the lenses of a cameras.bin by camera number. Raises CaptureError."""
     lenses: dict[int, Lens] = {}
-    for _ in range(file.count(24)):  # bytes of a camera without its parameters
-        camera, number, width, height = file.take("iiQQ")
-        if number not in MODEL_NAMES:
-            raise CaptureError(f"{file.path} has a camera of model {number}, which this program does not know; solve "
-                               "the cameras again with another model (OPENCV, for instance).")
-        model = MODEL_NAMES[number]
-        params = file.take("d" * len(MODELS[model][1]))
-        _add_lens(lenses, file.path, camera, Lens(model, params, width, height))
+    for _ in range(file.read_count(24)):  # bytes of a camera without its parameters
+        camera_id, model_number, width, height = file.unpack("iiQQ")
+        if model_number not in MODEL_NAMES:
+            raise CaptureError(f"{file.path} has a camera of model {model_number}, which this program does not know; "
+                               "solve the cameras again with another model (OPENCV, for instance).")
+        model = MODEL_NAMES[model_number]
+        params = file.unpack("d" * len(MODELS[model][1]))
+        _add_lens(lenses, file.path, camera_id, Lens(model, params, width, height))
     return lenses
 
 
 def _read_cameras_txt(path: Path, lines: list[str]) -> dict[int, Lens]:
     """Return the lenses of a cameras.txt by camera number. Raises CaptureError."""
     lenses: dict[int, Lens] = {}
-    for number, line in _data_lines(lines):
-        words = line.split()
-        model = words[1] if len(words) > 1 else ""
+    for line_number, line in _data_lines(lines):
+        fields = line.split()
+        model = fields[1] if len(fields) > 1 else ""
         if model not in MODELS:
-            raise CaptureError(f"{path}, line {number}: {model!r} is no camera model this program knows; solve the "
-                               "cameras again with another (OPENCV, for instance).")
-        if len(words) < 4:
-            raise CaptureError(f"{path}, line {number}: a camera takes at least four values (number, model, width, "
-                               f"height), not {len(words)}; export the model again.")
-        camera, width, height, *params = _parse_numbers(path, number, [words[0], *words[2:]], "iii")
+            raise CaptureError(f"{path}, line {line_number}: {model!r} is no camera model this program knows; solve "
+                               "the cameras again with another (OPENCV, for instance).")
+        if len(fields) < 4:
+            raise CaptureError(f"{path}, line {line_number}: a camera takes at least four values (number, model, "
+                               f"width, height), not {len(fields)}; export the model again.")
+        camera_id, width, height, *params = _parse_numbers(path, line_number, [fields[0], *fields[2:]], "iii")
         if len(params) != len(MODELS[model][1]):
-            raise CaptureError(f"{path}, line {number}: {model} takes {len(MODELS[model][1])} parameters "
+            raise CaptureError(f"{path}, line {line_number}: {model} takes {len(MODELS[model][1])} parameters "
                                f"({' '.join(MODELS[model][1])}), not {len(params)}; export the model again.")
-        _add_lens(lenses, path, camera, Lens(model, tuple(params), width, height))
+        _add_lens(lenses, path, camera_id, Lens(model, tuple(params), width, height))
     return lenses
 
 
@@ -280,26 +284,29 @@ _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 def _read_images_bin(file: _ByteReader) -> list[Image]:
     """Read an images.bin. Raises CaptureError."""
     images: list[Image] = []
-    for _ in range(file.count(73)):  # bytes of an image without its name and observations
-        values = file.take("idddddddi")
-        name = file.name()
-        count = file.count(_POINT2D.itemsize)
-        point_ids = np.frombuffer(file.data, _POINT2D, count, file.at)["point"]
+    for _ in range(file.read_count(73)):  # bytes of an image without its name and observations
+        _, *pose, camera_id = file.unpack("idddddddi")
+        name = file.read_name()
+        count = file.read_count(_POINT2D.itemsize)
+        point_ids = np.frombuffer(file.data, _POINT2D, count, file.offset)["point"]
         file.skip(count * _POINT2D.itemsize)
-        images.append((name, values[8], values[1:5], values[5:8], point_ids))
+        images.append((name, camera_id, tuple(pose[:4]), tuple(pose[4:]), point_ids))
     return images
 
 
 def _read_images_txt(path: Path, lines: list[str]) -> list[Image]:
-    """Read an image's line and the line of its 2D points, which may be empty or missing."""
+    """Read an images.txt: for each image its line, and the line of its 2D points, which may be empty or missing.
+
+    Raises CaptureError.
+    """
     images: list[Image] = []
-    for number, line, points in image_lines(lines):
-        words = line.split(maxsplit=9)
-        if len(words) < 10:
-            raise CaptureError(f"{path}, line {number}: an image takes ten values (number, quaternion, "
-                               f"translation, camera, name), not {len(words)}; export the model again.")
-        _, *pose, camera = _parse_numbers(path, number, words[:9], "iqqqqtttc")
-        images.append((words[9].strip(), camera, tuple(pose[:4]), tuple(pose[4:]), _parse_point_ids(points)))
+    for line_number, line, points_line in image_lines(lines):
+        fields = line.split(maxsplit=9)
+        if len(fields) < 10:
+            raise CaptureError(f"{path}, line {line_number}: an image takes ten values (number, quaternion, "
+                               f"translation, camera, name), not {len(fields)}; export the model again.")
+        _, *pose, camera_id = _parse_numbers(path, line_number, fields[:9], "iqqqqtttc")
+        images.append((fields[9].strip(), camera_id, tuple(pose[:4]), tuple(pose[4:]), _parse_point_ids(points_line)))
     announced = next((int(match[1]) for line in lines[:8] if (match := _ANNOUNCED.match(line))), len(images))
     if len(images) < announced:
         raise CaptureError(f"{path} is truncated: it announces {announced} images and has {len(images)}; export the "
@@ -308,40 +315,40 @@ def _read_images_txt(path: Path, lines: list[str]) -> list[Image]:
 
 
 def image_lines(lines: Sequence[str]) -> list[tuple[int, str, str]]:
-    """Return number, text, and line of 2D points ("" where there is none) of each image of an images.txt.
+    """Return (line number from 1, line, line of 2D points or "") of each image of an images.txt.
 
     COLMAP writes a line of points after each image, which is empty where there are none. Other programs leave these
     lines out; so does an editor that drops empty lines.
     """
     images: list[tuple[int, str, str]] = []
-    at = 0
-    while at < len(lines):
-        line = lines[at]
-        at += 1
+    index = 0
+    while index < len(lines):
+        line = lines[index]
+        index += 1
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        number, points = at, ""
-        if at < len(lines) and len(lines[at].split()) % 3 == 0 and not _is_image(lines[at]):
-            points = lines[at]
-            at += 1
-        images.append((number, line, points))
+        line_number, points_line = index, ""
+        if index < len(lines) and len(lines[index].split()) % 3 == 0 and not _is_image(lines[index]):
+            points_line = lines[index]
+            index += 1
+        images.append((line_number, line, points_line))
     return images
 
 
 def _is_image(line: str) -> bool:
-    """True for a line of ten fields of which the last is a name: 2D points are numbers in threes."""
-    words = line.split(maxsplit=9)
-    if len(words) < 10:
+    """True for a line of ten fields, the last of which is a name. A line of 2D points has numbers in threes."""
+    fields = line.split(maxsplit=9)
+    if len(fields) < 10:
         return False
-    name = words[9].split(maxsplit=_MAX_NAME_WORDS)
-    if not _are_numbers(words[:9]) or len(name) > _MAX_NAME_WORDS:
+    name_fields = fields[9].split(maxsplit=_MAX_NAME_WORDS)
+    if not _are_numbers(fields[:9]) or len(name_fields) > _MAX_NAME_WORDS:
         return False
-    return bool((len(name) + 9) % 3) or not _are_numbers(name)
+    return bool((len(name_fields) + 9) % 3) or not _are_numbers(name_fields)
 
 
-def _are_numbers(words: Sequence[str]) -> bool:
+def _are_numbers(fields: Sequence[str]) -> bool:
     try:
-        return all(math.isfinite(float(word)) for word in words)
+        return all(math.isfinite(float(text)) for text in fields)
     except ValueError:
         return False
 
@@ -349,7 +356,7 @@ def _are_numbers(words: Sequence[str]) -> bool:
 def _parse_point_ids(line: str) -> NDArray[np.int64]:
     """Parse the point ids of x, y, id, x, y, id, ...; none where the line is invalid: ids are optional."""
     try:
-        return np.array([int(word) for word in line.split()[2::3]], np.int64)
+        return np.array([int(text) for text in line.split()[2::3]], np.int64)
     except (ValueError, OverflowError):
         return np.zeros(0, np.int64)
 
@@ -372,44 +379,44 @@ def _read_points_bin(file: _ByteReader) -> Steps[Points]:
     Tracks make the points of different length, so the first pass finds where each starts. The second reads them in
     blocks.
     """
-    number = file.count(_POINT.itemsize)
-    data, at, last = file.data, file.at, len(file.data) - _POINT.itemsize
+    number = file.read_count(_POINT.itemsize)
+    data, offset, last_start = file.data, file.offset, len(file.data) - _POINT.itemsize
     starts = np.empty(number, np.int64)
     for i in range(number):
         if i % _POINTS_PER_STEP == 0:
             yield
-        if at > last:
-            file.need(len(data) + 1)  # raises
-        starts[i] = at
-        at += _POINT.itemsize + 8 * _TRACK_LENGTH.unpack_from(data, at + _TRACK_AT)[0]
-    file.at = min(at, len(data))
-    file.need(at - file.at)
-    points, raw = np.empty(number, _POINT), np.frombuffer(data, np.uint8)
+        if offset > last_start:
+            file.require(len(data) + 1)  # raises
+        starts[i] = offset
+        offset += _POINT.itemsize + 8 * _TRACK_LENGTH.unpack_from(data, offset + _TRACK_AT)[0]
+    file.offset = min(offset, len(data))
+    file.require(offset - file.offset)
+    points, data_bytes = np.empty(number, _POINT), np.frombuffer(data, np.uint8)
     for first in range(0, number, _POINTS_PER_STEP):
         yield
-        chosen = starts[first:first + _POINTS_PER_STEP, None] + np.arange(_POINT.itemsize)
-        points[first:first + len(chosen)] = raw[chosen].view(_POINT)[:, 0]
+        byte_indices = starts[first:first + _POINTS_PER_STEP, None] + np.arange(_POINT.itemsize)
+        points[first:first + len(byte_indices)] = data_bytes[byte_indices].view(_POINT)[:, 0]
     values = np.concatenate([points["xyz"], points["error"][:, None]], 1)
     return _to_cloud(file.path, values, points["rgb"].copy()), points["id"].copy()
 
 
 def _read_points_txt(path: Path, lines: list[str]) -> Points:
     """Read a points3D.txt. Raises CaptureError."""
-    values, rgb, numbers = [], [], []
-    for number, line in _data_lines(lines):
-        words = line.split(maxsplit=8)
-        if len(words) < 8:
-            raise CaptureError(f"{path}, line {number}: a point takes at least eight values, not {len(words)}; export "
-                               "the model again.")
-        point_id, x, y, z, *colour, error = _parse_numbers(path, number, words[:8], "ixyziiie")
+    values, rgb, point_ids = [], [], []
+    for line_number, line in _data_lines(lines):
+        fields = line.split(maxsplit=8)
+        if len(fields) < 8:
+            raise CaptureError(f"{path}, line {line_number}: a point takes at least eight values, not {len(fields)}; "
+                               "export the model again.")
+        point_id, x, y, z, *colour, error = _parse_numbers(path, line_number, fields[:8], "ixyziiie")
         if not all(0 <= c <= 255 for c in colour):
-            raise CaptureError(f"{path}, line {number}: the colour {colour} is not within 0 to 255; export the model "
-                               "again.")
+            raise CaptureError(f"{path}, line {line_number}: the colour {colour} is not within 0 to 255; export the "
+                               "model again.")
         values.append((x, y, z, error))
         rgb.append(colour)
-        numbers.append(point_id if abs(point_id) < 2**63 else 0)  # one beyond int64 loses its observations
+        point_ids.append(point_id if abs(point_id) < 2**63 else 0)  # one beyond int64 loses its observations
     cloud = _to_cloud(path, np.array(values, np.float64).reshape(-1, 4), np.array(rgb, np.uint8).reshape(-1, 3))
-    return cloud, np.array(numbers, np.int64)
+    return cloud, np.array(point_ids, np.int64)
 
 
 def _to_cloud(path: Path, values: Floats, rgb: NDArray[np.uint8]) -> PointCloud:
@@ -424,9 +431,12 @@ def _data_lines(lines: list[str]) -> list[tuple[int, str]]:
             if line.strip() and not line.lstrip().startswith("#")]
 
 
-def _parse_numbers(path: Path, line: int, words: list[str], kinds: str) -> list[Any]:
-    """Parse words: integers where `kinds` says i or c, floats elsewhere and past its end. Raises CaptureError."""
+def _parse_numbers(path: Path, line_number: int, fields: list[str], kinds: str) -> list[Any]:
+    """Parse fields of a line, for which `kinds` has a letter each: i and c are integers, all others floats.
+
+    Fields past the end of `kinds` are floats. Raises CaptureError.
+    """
     try:
-        return [int(word) if kinds[i:i + 1] in ("i", "c") else float(word) for i, word in enumerate(words)]
+        return [int(text) if kinds[i:i + 1] in ("i", "c") else float(text) for i, text in enumerate(fields)]
     except ValueError as problem:
-        raise CaptureError(f"{path}, line {line}: {problem}; export the model again.") from problem
+        raise CaptureError(f"{path}, line {line_number}: {problem}; export the model again.") from problem

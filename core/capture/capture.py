@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..colour import ColourSpace
 from ..errors import CaptureError, FrameError
-from ..images.formats.exif import SWAPS_SIDES, read_exif
+from ..images.formats.exif import SWAPS_SIDES
 from ..images.picture import Picture, same_aspect
 from ..images.read import has_float_pixels, read_picture
 from ..images.size import picture_size
@@ -35,13 +35,13 @@ from ..system.file_names import canonical_name, find_entry
 from ..system.files import read_json, safe_join
 from ..system.steps import FRAMES_PER_STEP, Steps, finish
 from .camera import Camera, Floats
-from .camera_solve import check_geometry, match_frames_in_steps, read_solve_in_steps
+from .camera_solve import CameraSolve, check_geometry, match_frames_in_steps, read_solve_in_steps
 from .colmap import PointCloud, PosedFrame
 from .frame_files import mask_pictures, matching_pictures, view_name
 from .frame_sizes import checked_size, size_or_model_size
 from .lens import PINHOLES, Lens
-from .lights import Light, LightState, check_places, paths_of, read_lights
-from .orientation import TurnedFrame, find_upright
+from .lights import Light, LightState, check_places, light_paths, read_lights
+from .orientation import TurnedFrame, exif_orientation, find_upright, turned_frame
 from .pictures import PictureCache, read_mask
 from .plate_space import read_plate_space
 from .unsolved import cameras_without_solve
@@ -93,9 +93,9 @@ class Capture:
         self._truth_flare = matching_pictures(folder / "truth" / "flare", names)
         self._masks = mask_pictures(folder / MASKS, names)
         self._order = {name: number for number, name in enumerate(names)}
-        self._paths = paths_of(self.lights, names)
+        self._paths = light_paths(self.lights, names)
         self._focal: float | None = None
-        self._lists: tuple[set[str] | None, ...] = (None, None)
+        self._split_lists: tuple[set[str] | None, ...] = (None, None)
         self.sentences: tuple[str, ...] = ()
         """What the user should know of the capture before it is used."""
         self.left_out: dict[str, tuple[str, ...]] = {}
@@ -130,45 +130,30 @@ class Capture:
         has_cameras = solve is not None
         if solve is None:
             solve, focal_source = cameras_without_solve(folder, focal)
-        posed, root = solve.frames, solve.root
-        names = [frame.name for frame in posed]
-        if len(set(names)) < len(names):
-            duplicate = next(name for name in names if names.count(name) > 1)
+        posed_names = [frame.name for frame in solve.frames]
+        if len(set(posed_names)) < len(posed_names):
+            duplicate = next(name for name in posed_names if posed_names.count(name) > 1)
             raise CaptureError(f"{folder}: the frame {duplicate} has two poses; remove one of them.")
         yield
         matched = yield from match_frames_in_steps(solve)
         yield
-        turned = [turned_frame for frame in posed if (turned_frame := _to_turned(frame, matched.files.get(frame.name)))]
+        turned = [each for frame in solve.frames if (each := turned_frame(frame, matched.files.get(frame.name)))]
         upright, sentences = (find_upright(turned, solve.points) if has_cameras
                               else ({frame.posed.name for frame in turned}, []))  # the one camera is made upright
         turned_by_name = {frame.posed.name: frame for frame in turned if frame.posed.name in upright}
-        views, frames, order, names_of = [], {}, {}, {}
         yield
-        for number, frame in enumerate(posed):
-            if number % FRAMES_PER_STEP == 0:
-                yield
-            path = matched.files.get(frame.name)
-            if path is None and need_frames and matched.files:
-                continue  # left out; if no pose has a picture, the check of the first size says so
-            path = path or safe_join(root, frame.name, CaptureError)
-            size_of = checked_size if need_frames else size_or_model_size
-            size = size_of(path, frame.lens, turned_by_name.get(frame.name))
-            name = view_name(frame.name, root == folder)
-            if name in frames:
-                raise CaptureError(f"{folder}: the frame {name} has two poses; remove one of them.")
-            views.append(_to_view(name, frame, size, frame.name in upright))
-            # The order counts poses without a picture as well, so that a missing one does not change the split.
-            frames[name], order[name], names_of[frame.name] = path, number, name
+        opened = yield from _open_views_in_steps(folder, solve, matched.files, upright, turned_by_name, need_frames)
+        names = opened.names
         lights = read_lights(find_entry(folder, LIGHTS) or folder / LIGHTS)
         yield
-        capture = cls(folder, views, solve.points, lights, frames=frames, cache_bytes=cache_bytes)
+        capture = cls(folder, opened.views, solve.points, lights, frames=opened.files, cache_bytes=cache_bytes)
         yield
-        capture._order, capture.has_cameras, capture.focal_source = order, has_cameras, focal_source
-        capture._focal = focal
-        check_places(capture.lights, capture.folder / LIGHTS, list(frames), has_cameras)
-        capture._lists = tuple(None if each is None else {names_of[name] for name in each if name in names_of}
-                               for each in (solve.training, solve.held_out))
-        capture._masks.update({names_of[name]: path for name, path in solve.masks.items() if name in names_of})
+        capture._order, capture.has_cameras = opened.order, has_cameras
+        capture._focal, capture.focal_source = focal, focal_source
+        check_places(capture.lights, capture.folder / LIGHTS, list(opened.files), has_cameras)
+        capture._split_lists = tuple(None if each is None else {names[name] for name in each if name in names}
+                                     for each in (solve.training, solve.held_out))
+        capture._masks.update({names[name]: path for name, path in solve.masks.items() if name in names})
         yield
         if need_frames:
             yield from capture._check_layer_sizes()
@@ -186,16 +171,16 @@ class Capture:
 
     def with_exposures(self, exposures: Mapping[str, float]) -> Capture:
         """Return a copy with the views' exposures, by name; 1 for views without."""
-        same = copy(self)
-        same.views = tuple(replace(view, camera=replace(view.camera, exposure=exposures.get(view.name, 1.0)))
+        result = copy(self)
+        result.views = tuple(replace(view, camera=replace(view.camera, exposure=exposures.get(view.name, 1.0)))
                            for view in self.views)
-        return same
+        return result
 
     def with_frame_names(self) -> Capture:
         """Return a copy whose cameras carry the names of their frames (`Camera.frame`)."""
-        same = copy(self)
-        same.views = tuple(replace(view, camera=replace(view.camera, frame=view.name)) for view in self.views)
-        return same
+        result = copy(self)
+        result.views = tuple(replace(view, camera=replace(view.camera, frame=view.name)) for view in self.views)
+        return result
 
     def with_lights_at(self, places: Mapping[str, Floats]) -> Capture:
         """Return a copy with the lights at these positions (3,), by name; those on a path stay on it."""
@@ -204,30 +189,30 @@ class Capture:
 
     def with_lights(self, lights: Sequence[Light]) -> Capture:
         """Return a copy with other lights."""
-        same = copy(self)
-        same.lights = tuple(lights)
-        same._paths = paths_of(same.lights, [view.name for view in same.views])
-        return same
+        result = copy(self)
+        result.lights = tuple(lights)
+        result._paths = light_paths(result.lights, [view.name for view in result.views])
+        return result
 
     def with_points(self, points: PointCloud, observed: Mapping[str, NDArray[np.int64]]) -> Capture:
         """Return a copy with other points, and the indices of those observed in each view, by the view's name."""
-        same = copy(self)
-        same.points = points
-        same.views = tuple(replace(view, points=observed.get(view.name, np.zeros(0, np.int64))) for view in self.views)
-        return same
+        result = copy(self)
+        result.points = points
+        none = np.zeros(0, np.int64)
+        result.views = tuple(replace(view, points=observed.get(view.name, none)) for view in self.views)
+        return result
 
     def with_frame_size(self, size: tuple[int, int]) -> Capture:
-        """Return a copy in which views without a frame have this size (width, height), where it is a uniform scale of
-        theirs.
+        """Return a copy in which views without a frame have this size (width, height), if it has their aspect.
 
         A model may have been solved from larger or smaller frames than those of the fit.
         """
-        same = copy(self)
-        same.views = tuple(
+        result = copy(self)
+        result.views = tuple(
             replace(view, camera=view.camera.scaled(*size))
             if not self.frame_path(view).is_file() and same_aspect(view.camera.size, size) else view
             for view in self.views)
-        return same
+        return result
 
     # Lights.
 
@@ -290,10 +275,10 @@ class Capture:
         return self._removed[view.name]
 
     def mask(self, view: View, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
-        """Return (height, width) which pixels of the view count; None without a mask.
+        """Return (height, width), True for the pixels of the view that count; None without a mask.
 
-        A mask is black, or transparent, where something moves or must not be learned from. Pixels that a black one
-        reaches count as black. Raises FrameError.
+        A mask is black, or transparent, where something moves or must not be learned from. A pixel that resampling
+        mixes with a black one counts as black. Raises FrameError.
         """
         if view.name not in self._masks:
             return None
@@ -389,7 +374,7 @@ class Capture:
             holdout = int(holdout)
         if holdout is None:
             default = self.folder / "split.json"
-            if not default.exists() and self._lists != (None, None):
+            if not default.exists() and self._split_lists != (None, None):
                 return self._split_by_lists()
             holdout = default if default.exists() else HOLDOUT_INTERVAL
         if isinstance(holdout, int):
@@ -409,7 +394,7 @@ class Capture:
 
     def _split_by_lists(self) -> tuple[tuple[View, ...], tuple[View, ...]]:
         """Return (training views, held-out views) by the lists of transforms.json; views in neither are left out."""
-        training, held_out = self._lists
+        training, held_out = self._split_lists
         names = {view.name for view in self.views}
         if training is None:
             training = names - (held_out or set())
@@ -421,7 +406,7 @@ class Capture:
                                "or choose with --holdout.")
         return train, tuple(view for view in self.views if view.name in held_out and view.name not in training)
 
-    # How the pictures are had.
+    # Reading.
 
     def _picture(self, path: Path, view: View, size: tuple[int, int] | None,
                  space: ColourSpace | None = None) -> Picture:
@@ -460,37 +445,56 @@ class Capture:
                     yield
                 if view.name in paths:
                     size = picture_size(paths[view.name])
-                    if view.upright and _orientation(paths[view.name]) in SWAPS_SIDES:
+                    if view.upright and exif_orientation(paths[view.name]) in SWAPS_SIDES:
                         size = size[::-1]
                     if not same_aspect(size, view.camera.size):
                         raise FrameError(f"{paths[view.name]} is {size[0]} x {size[1]} pixels and the frame "
                                          f"{view.camera.width} x {view.camera.height}; make them one shape.")
 
 
-def _orientation(path: Path) -> int:
-    """Return the Exif orientation of a picture; 1 where it cannot be read, which the check of its size reports."""
-    try:
-        return read_exif(path)[0]
-    except OSError:
-        return 1
+@dataclass(eq=False)
+class _OpenedViews:
+    """The views of a capture. By view name: the file, and the order among all poses. names: view name by pose name."""
+
+    views: list[View] = field(default_factory=list)
+    files: dict[str, Path] = field(default_factory=dict)
+    order: dict[str, int] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)
 
 
-def _to_turned(posed: PosedFrame, path: Path | None) -> TurnedFrame | None:
-    """Return a frame whose file has an Exif orientation; None for others."""
-    orientation = 1 if path is None else _orientation(path)
-    if path is None or orientation == 1:
-        return None
-    try:
-        return TurnedFrame(posed, path, orientation, picture_size(path))
-    except FrameError:  # the check of its size reports it
-        return None
+def _open_views_in_steps(folder: Path, solve: CameraSolve, files: Mapping[str, Path], upright: set[str],
+                         turned: Mapping[str, TurnedFrame], need_frames: bool) -> Steps[_OpenedViews]:
+    """Check the pictures of the poses, and make views of them. Raises CaptureError and FrameError.
+
+    By pose name: files, the pictures; upright, poses solved from pixels as shown; turned, those of them with an Exif
+    orientation. need_frames: as of `Capture.open`.
+    """
+    opened = _OpenedViews()
+    for number, frame in enumerate(solve.frames):
+        if number % FRAMES_PER_STEP == 0:
+            yield
+        path = files.get(frame.name)
+        if path is None and need_frames and files:
+            continue  # left out; if no pose has a picture, the check of the first size says so
+        path = path or safe_join(solve.root, frame.name, CaptureError)
+        read_size = checked_size if need_frames else size_or_model_size
+        size = read_size(path, frame.lens, turned.get(frame.name))
+        name = view_name(frame.name, solve.root == folder)
+        if name in opened.files:
+            raise CaptureError(f"{folder}: the frame {name} has two poses; remove one of them.")
+        opened.views.append(_to_view(name, frame, size, frame.name in upright))
+        # The order counts poses without a picture as well, so that a missing one does not change the split.
+        opened.files[name], opened.order[name], opened.names[frame.name] = path, number, name
+    return opened
 
 
 def _to_view(name: str, frame: PosedFrame, size: tuple[int, int], upright: bool) -> View:
-    """Return the view of a frame whose picture has this size; a lens without distortion becomes None."""
+    """Return the view of a frame whose picture has this size (width, height); a lens without distortion becomes None.
+
+    upright: as of `View`.
+    """
     lens = frame.lens
     fx, fy, cx, cy = lens.pinhole
     camera = Camera(lens.width, lens.height, fx, fy, cx, cy, frame.world_to_camera)
-    straight = lens.model in PINHOLES
-    return View(name, camera if size == camera.size else camera.scaled(*size), None if straight else lens, frame.points,
-                upright)
+    camera = camera if size == camera.size else camera.scaled(*size)
+    return View(name, camera, None if lens.model in PINHOLES else lens, frame.points, upright)

@@ -268,7 +268,7 @@ class LightPath:
         return result
 
 
-def paths_of(lights: Iterable[Light], names: Sequence[str]) -> dict[str, LightPath]:
+def light_paths(lights: Iterable[Light], names: Sequence[str]) -> dict[str, LightPath]:
     """Return the paths of lights by name, over the views of these names."""
     return {light.name: LightPath(light, names) for light in lights}
 

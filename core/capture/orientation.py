@@ -15,9 +15,10 @@ import numpy as np
 
 from ..colour.srgb import Pixels
 from ..errors import FrameError
-from ..images.formats.exif import SWAPS_SIDES, apply_orientation
+from ..images.formats.exif import SWAPS_SIDES, apply_orientation, read_exif
 from ..images.picture import same_aspect
 from ..images.read import read_picture
+from ..images.size import picture_size
 from .colmap import PointCloud, PosedFrame
 
 SAMPLED_FRAMES = 6
@@ -45,6 +46,25 @@ class TurnedFrame:
         return self.size[::-1] if self.orientation in SWAPS_SIDES else self.size
 
 
+def exif_orientation(path: Path) -> int:
+    """Return the Exif orientation of a picture; 1 where it cannot be read, which the check of its size reports."""
+    try:
+        return read_exif(path)[0]
+    except OSError:
+        return 1
+
+
+def turned_frame(posed: PosedFrame, path: Path | None) -> TurnedFrame | None:
+    """Return a frame whose file has an Exif orientation; None for others, and without a file."""
+    orientation = 1 if path is None else exif_orientation(path)
+    if path is None or orientation == 1:
+        return None
+    try:
+        return TurnedFrame(posed, path, orientation, picture_size(path))
+    except FrameError:  # the check of its size reports it
+        return None
+
+
 def find_upright(frames: Sequence[TurnedFrame], points: PointCloud) -> tuple[set[str], list[str]]:
     """Return the names of the frames that were solved as shown, and sentences for the user.
 
@@ -62,11 +82,11 @@ def find_upright(frames: Sequence[TurnedFrame], points: PointCloud) -> tuple[set
     sentences = [_describe(sorted(upright), "as shown, by the sizes of their cameras")] if upright else []
     for orientation, group in sorted(undecided.items()):
         names = [frame.posed.name for frame in group]
-        decision = _compare_colours(group, points)
-        if decision is None:
+        is_upright = _matches_upright(group, points)
+        if is_upright is None:
             sentences.append(_describe(names, f"as stored, though their Exif orientation is {orientation}: no coloured "
                                               "points show which. If the fit comes out turned, remove that tag"))
-        elif decision:
+        elif is_upright:
             upright.update(names)
             sentences.append(_describe(names, "as shown, by the colours of the points"))
     return upright, sentences
@@ -77,21 +97,24 @@ def _describe(names: Sequence[str], reading: str) -> str:
     return f"Photographs with an Exif orientation ({names[0]}{more}) are read {reading}."
 
 
-def _compare_colours(frames: Sequence[TurnedFrame], points: PointCloud) -> bool | None:
-    """Return True if the points' colours match the frames as shown, False as stored, None where they do not decide."""
+def _matches_upright(frames: Sequence[TurnedFrame], points: PointCloud) -> bool | None:
+    """Compare the points' colours with the frames as stored and as shown, turned by their Exif orientation.
+
+    Returns True if they match the frames as shown, False as stored, None where they do not decide.
+    """
     error_stored = error_upright = 0.0
-    number = 0
+    compared = 0
     for frame in frames[::max(len(frames) // SAMPLED_FRAMES, 1)][:SAMPLED_FRAMES]:
         try:
             picture = read_picture(frame.path).display()
         except (FrameError, ImportError):  # a damaged frame is reported by whoever decodes it; Blender has no OpenCV
             continue
-        errors = [_colour_error(reading, frame.posed, points)
-                  for reading in (picture, apply_orientation(picture, frame.orientation))]
+        errors = [_colour_error(pixels, frame.posed, points)
+                  for pixels in (picture, apply_orientation(picture, frame.orientation))]
         if None not in errors:
             error_stored, error_upright = error_stored + (errors[0] or 0), error_upright + (errors[1] or 0)
-            number += 1
-    if not number or min(error_stored, error_upright) > MAX_ERROR_RATIO * max(error_stored, error_upright):
+            compared += 1
+    if not compared or min(error_stored, error_upright) > MAX_ERROR_RATIO * max(error_stored, error_upright):
         return None
     return error_upright < error_stored
 
@@ -102,17 +125,17 @@ def _colour_error(picture: Pixels, posed: PosedFrame, points: PointCloud) -> flo
     picture: (height, width, 3), display values 0..1, of any size. Points that the frame observed are compared; without
     enough of them all points.
     """
-    chosen = posed.points if len(posed.points) >= MIN_POINTS else np.arange(len(points))
-    chosen = chosen[::max(len(chosen) // SAMPLED_POINTS, 1)]
-    local = points.xyz[chosen] @ posed.world_to_camera[:3, :3].T + posed.world_to_camera[:3, 3]
-    is_before = local[:, 2] > 0
+    point_indices = posed.points if len(posed.points) >= MIN_POINTS else np.arange(len(points))
+    point_indices = point_indices[::max(len(point_indices) // SAMPLED_POINTS, 1)]
+    local = points.xyz[point_indices] @ posed.world_to_camera[:3, :3].T + posed.world_to_camera[:3, 3]
+    is_in_front = local[:, 2] > 0
     height, width = picture.shape[:2]
     scale = np.array([width / posed.lens.width, height / posed.lens.height])
-    pixels = posed.lens.distort(local[is_before, :2] / local[is_before, 2:]) * scale
+    pixels = posed.lens.distort(local[is_in_front, :2] / local[is_in_front, 2:]) * scale
     with np.errstate(invalid="ignore"):
         is_inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
     if is_inside.sum() < MIN_POINTS:
         return None
-    colours = points.rgb[chosen][is_before][is_inside] / np.float32(255)
+    colours = points.rgb[point_indices][is_in_front][is_inside] / np.float32(255)
     x, y = pixels[is_inside].astype(int).T
     return float(np.median(np.abs(picture[y, x] - colours).mean(axis=1)))

@@ -55,6 +55,14 @@ PINHOLES = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 MAX_TAN_HALF_ANGLE = math.tan(math.radians(60.0))
 """Half diagonal that is kept of a fisheye, normalised coordinates; beyond it a plane stretches too far."""
 
+_MAX_START_ANGLE = 1.5
+"""Angle off the axis at which the search of `undistort` starts at most, radians: its tangent is finite."""
+_MAX_UNDISTORTED = 57.0
+"""Largest undistorted coordinate: the tangent of 89 degrees."""
+_MAX_NEWTON_STEPS = 40
+_MIN_ZOOM, _MAX_ZOOM = 0.05, 20.0
+"""Factors on the focal length within which the undistorted view is searched."""
+
 Parameters = dict[str, float]
 
 
@@ -101,18 +109,19 @@ class Lens:
         target = np.asarray(pixels, np.float64).reshape(-1, 2)
         plane = (target - self.centre) / self.focal
         if self.model in _FISHEYES or self.model == "EQUIRECTANGULAR":  # the radius is an angle here
-            angle = np.minimum(np.linalg.norm(plane, axis=1, keepdims=True), 1.5)  # below 90 degrees, for the tangent
+            angle = np.minimum(np.linalg.norm(plane, axis=1, keepdims=True), _MAX_START_ANGLE)
             plane = plane * np.tan(angle) / np.maximum(angle, 1e-12)
-        for _ in range(40):
+        for _ in range(_MAX_NEWTON_STEPS):
             error = self.distort(plane) - target
             step_size = 1e-6 * np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1.0)
-            slope_x, slope_y = (
+            # Derivatives (n, 2) of the pixels by the direction's x and y, by central differences.
+            by_x, by_y = (
                 (self.distort(plane + step_size * axis) - self.distort(plane - step_size * axis)) / (2 * step_size)
                 for axis in ((1, 0), (0, 1)))
-            determinant = slope_x[:, 0] * slope_y[:, 1] - slope_x[:, 1] * slope_y[:, 0]
+            determinant = by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0]
             with np.errstate(invalid="ignore", divide="ignore"):
-                step = np.stack([slope_y[:, 1] * error[:, 0] - slope_y[:, 0] * error[:, 1],
-                                 slope_x[:, 0] * error[:, 1] - slope_x[:, 1] * error[:, 0]], axis=1)
+                step = np.stack([by_y[:, 1] * error[:, 0] - by_y[:, 0] * error[:, 1],
+                                 by_x[:, 0] * error[:, 1] - by_x[:, 1] * error[:, 0]], axis=1)
                 step /= determinant[:, None]
             # A step longer than the place itself would throw the search over a fold of the polynomial.
             max_length = 0.5 * (1.0 + np.linalg.norm(plane, axis=1, keepdims=True))
@@ -122,7 +131,7 @@ class Lens:
             if not (np.abs(error) > 1e-9).any():
                 break
         converged = np.linalg.norm(self.distort(plane) - target, axis=1) < 1e-4
-        plane[~converged | (np.linalg.norm(plane, axis=1) > 57)] = np.nan  # the tangent of 89 degrees
+        plane[~converged | (np.linalg.norm(plane, axis=1) > _MAX_UNDISTORTED)] = np.nan
         return plane
 
     @cached_property
@@ -136,10 +145,10 @@ class Lens:
         if self.model in PINHOLES:
             return fx, fy, cx, cy
         border = self.border - (cx, cy)
-        # A zoom is a factor on the focal length. The smallest from 0.05 to 20 whose view the frame covers is sought; at
-        # zoom_cap the farthest corner is 60 degrees off the axis.
-        zoom_cap = float(np.linalg.norm(border / (fx, fy), axis=1).max()) / MAX_TAN_HALF_ANGLE
-        widest, narrowest = max(zoom_cap, 0.05), 20.0
+        # A zoom is a factor on the focal length. Bisection finds the smallest zoom whose view the frame covers; at
+        # corner_zoom the farthest corner is 60 degrees off the axis.
+        corner_zoom = float(np.linalg.norm(border / (fx, fy), axis=1).max()) / MAX_TAN_HALF_ANGLE
+        widest, narrowest = max(corner_zoom, _MIN_ZOOM), _MAX_ZOOM
         if not (fx > 0 and fy > 0) or not self._is_covered(border / (fx, fy) / narrowest):
             raise CaptureError(f"The lens parameters {self.params} ({self.model}) bend the picture until "
                                "nothing is left of it; solve the cameras again with a simpler model.")
@@ -185,15 +194,15 @@ class Lens:
     def _is_covered(self, border: Floats) -> bool:
         """True if the frame covers a view with this border (n, 2), as X/Z and Y/Z.
 
-        The distance from the centre must grow along the way to the border: a polynomial that folds back shows the frame
-        a second time, mirrored.
+        Along 16 points from the centre to each border point, the distorted radius must grow: a polynomial that folds
+        back shows the frame a second time, mirrored.
         """
-        steps = np.linspace(0.0, 1.0, 17)[1:, None, None]
-        pixels = self.distort((steps * border).reshape(-1, 2)).reshape(16, -1, 2)
-        reach = np.linalg.norm(pixels - self.distort(np.zeros((1, 2))), axis=2)
+        fractions = np.linspace(0.0, 1.0, 17)[1:, None, None]
+        pixels = self.distort((fractions * border).reshape(-1, 2)).reshape(16, -1, 2)
+        radius = np.linalg.norm(pixels - self.distort(np.zeros((1, 2))), axis=2)
         inside = (pixels[-1] >= -1e-6) & (pixels[-1] <= np.array([self.width, self.height]) + 1e-6)
-        is_outward = reach[-1] > 1e-9  # a border point on the principal point itself is not further out
-        return bool(inside.all() and (np.diff(reach, axis=0) > 0)[:, is_outward].all())
+        is_outward = radius[-1] > 1e-9  # a border point on the principal point itself is not further out
+        return bool(inside.all() and (np.diff(radius, axis=0) > 0)[:, is_outward].all())
 
 
 def undistort_picture(picture: Picture, maps: tuple[NDArray[np.float32], NDArray[np.float32]]) -> Picture:
@@ -201,28 +210,28 @@ def undistort_picture(picture: Picture, maps: tuple[NDArray[np.float32], NDArray
     import cv2
 
     # Cubic is sharper, but rings where linear light steps from 1 to 100.
-    how = cv2.INTER_CUBIC if picture.encoding == "srgb" else cv2.INTER_LINEAR
-    pixels = np.asarray(cv2.remap(picture.pixels, maps[0], maps[1], how, borderMode=cv2.BORDER_REPLICATE), np.float32)
+    interpolation = cv2.INTER_CUBIC if picture.encoding == "srgb" else cv2.INTER_LINEAR
+    pixels = np.asarray(cv2.remap(picture.pixels, *maps, interpolation, borderMode=cv2.BORDER_REPLICATE), np.float32)
     return Picture(np.clip(pixels, 0.0, 1.0) if picture.encoding == "srgb" else pixels, picture.encoding)
 
 
-def _brown(x: Floats, y: Floats, p: Parameters, numerator: str, denominator: str = "") -> tuple[Floats, Floats]:
+def _brown_conrady(x: Floats, y: Floats, p: Parameters, numerator: str, denominator: str = "") -> tuple[Floats, Floats]:
     """Distort coordinates by Brown and Conrady's terms: radial, tangential (p1, p2) and thin prism (sx, sy).
 
     numerator, denominator: names of the coefficients of the radial quotient of polynomials; "" for no denominator. A
     coefficient that the lens does not have is 0.
     """
     r2 = x * x + y * y
-    radial = _series(r2, [p.get(name, 0.0) for name in numerator.split()])
+    radial = _even_polynomial(r2, [p.get(name, 0.0) for name in numerator.split()])
     if denominator:
-        radial = radial / _series(r2, [p.get(name, 0.0) for name in denominator.split()])
+        radial = radial / _even_polynomial(r2, [p.get(name, 0.0) for name in denominator.split()])
     p1, p2, sx, sy = (p.get(name, 0.0) for name in ("p1", "p2", "sx", "sy"))
     return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + sx * r2,
             y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) + sy * r2)
 
 
-def _series(r2: Floats, coefficients: list[float]) -> Floats:
-    """1 + c1 r^2 + c2 r^4 + ..."""
+def _even_polynomial(r2: Floats, coefficients: list[float]) -> Floats:
+    """Return 1 + c1 r^2 + c2 r^4 + ..., from r^2."""
     total = np.zeros_like(r2)
     for coefficient in reversed(coefficients):
         total = (total + coefficient) * r2
@@ -234,7 +243,7 @@ def _pinhole(x: Floats, y: Floats, _p: Parameters) -> tuple[Floats, Floats]:
 
 
 def _perspective(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
-    return _brown(x, y, p, "k1 k2 k3", "k4 k5 k6")
+    return _brown_conrady(x, y, p, "k1 k2 k3", "k4 k5 k6")
 
 
 def _equidistant(x: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -245,13 +254,13 @@ def _equidistant(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def _fisheye(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
-    return _brown(*_equidistant(x, y), p, "k1 k2 k3 k4")
+    return _brown_conrady(*_equidistant(x, y), p, "k1 k2 k3 k4")
 
 
 def _project_aria(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
     """Apply radial terms first, then tangential and prism terms of the result ("FISHEYE624" of Project Aria)."""
     x, y = _equidistant(x, y)
-    radial = _series(x * x + y * y, [p[f"k{i}"] for i in range(1, 7)])
+    radial = _even_polynomial(x * x + y * y, [p[f"k{i}"] for i in range(1, 7)])
     x, y = x * radial, y * radial
     r2 = x * x + y * y
     return (x + 2 * p["p2"] * x * y + p["p1"] * (r2 + 2 * x * x) + p["s1"] * r2 + p["s2"] * r2 * r2,
@@ -263,8 +272,8 @@ def _fov(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
     omega, r = p["omega"], np.sqrt(x * x + y * y)
     if abs(omega) < 1e-6:
         return x, y
-    spread = 2 * math.tan(omega / 2)
-    ratio = np.where(r > 1e-8, np.arctan(r * spread) / (np.maximum(r, 1e-8) * omega), spread / omega)
+    scale = 2 * math.tan(omega / 2)
+    ratio = np.where(r > 1e-8, np.arctan(r * scale) / (np.maximum(r, 1e-8) * omega), scale / omega)
     return x * ratio, y * ratio
 
 
@@ -276,9 +285,9 @@ def _division(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
 
 def _eucm(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
     rho = np.sqrt(p["beta"] * (x * x + y * y) + 1.0)
-    below = p["alpha"] * rho + 1.0 - p["alpha"]
-    below = np.where(below > 0, below, np.nan)
-    return x / below, y / below
+    denominator = p["alpha"] * rho + 1.0 - p["alpha"]
+    denominator = np.where(denominator > 0, denominator, np.nan)
+    return x / denominator, y / denominator
 
 
 def _equirectangular(x: Floats, y: Floats, _p: Parameters) -> tuple[Floats, Floats]:

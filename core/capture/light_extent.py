@@ -164,17 +164,18 @@ class LightExtent:
         centre, pose = np.asarray(xyz, np.float64), np.asarray(world_to_camera, np.float64)
         eye = -pose[:3, :3].T @ pose[:3, 3]
         if self.shape == "points":
-            numbers = np.arange(len(self.points))  # neighbours are beside each other: cells are runs of points
-            return SampledExtent(centre + self.points, numbers * self.cell_count // len(numbers), 1.0, self.factors)
+            indices = np.arange(len(self.points))
+            cells = indices * self.cell_count // len(indices)  # neighbours are beside each other: cells are runs
+            return SampledExtent(centre + self.points, cells, 1.0, self.factors)
         axes, emission = self.axes, 1.0
         if self.shape == "sphere":
             axes = self.radius * _facing_axes(centre - eye, pose)
         elif self.one_sided:
             emission = _cosine(np.cross(*axes), eye - centre)
         width, height = (float(np.linalg.norm(axis)) for axis in axes)
-        square, cells = _samples(_columns(width / max(height, 1e-12)))
+        square, cells = _square_samples(_column_count(width / max(height, 1e-12)))
         if self.shape != "rectangle":
-            square = _disc_of_square(square)
+            square = _square_to_disc(square)
         return SampledExtent(centre + square @ axes, cells, emission)
 
     def _checked(self) -> LightExtent:
@@ -206,23 +207,23 @@ def sample_surface(vertices: ArrayLike, triangles: ArrayLike, count: int = SAMPL
     places choose the points, so that these stay on a surface that bends or moves; by default the vertices themselves.
     Raises ValueError for a surface without area.
     """
-    places, indices = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64).reshape(-1, 3)
-    rest = places if reference is None else np.asarray(reference, np.float64)
+    positions, indices = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64).reshape(-1, 3)
+    rest = positions if reference is None else np.asarray(reference, np.float64)  # the vertices at rest
     a, b, c = (rest[indices[:, corner]] for corner in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     if not len(indices) or not 0 < areas.sum() < math.inf:
         raise ValueError("the surface of the light has no area")
-    order = _spatial_order((a + b + c) / 3)
-    edges = np.cumsum(areas[order])
+    order = _morton_order((a + b + c) / 3)
+    cumulative_areas = np.cumsum(areas[order])
     # Equal steps of area choose the triangles, in an order in which neighbours are near each other.
-    numbers = np.arange(count)
-    rows = np.searchsorted(edges, (numbers + 0.5) / count * edges[-1], side="right")
-    chosen = order[np.minimum(rows, len(order) - 1)]
-    u, v = _radical_inverse(numbers + 1, 2), _radical_inverse(numbers + 1, 3)
-    root = np.sqrt(u)  # uniform over a triangle (Osada et al. 2002)
-    barycentric = np.stack([1 - root, root * (1 - v), root * v], -1)[:, :, None]
+    sample_numbers = np.arange(count)
+    ranks = np.searchsorted(cumulative_areas, (sample_numbers + 0.5) / count * cumulative_areas[-1], side="right")
+    chosen = order[np.minimum(ranks, len(order) - 1)]
+    u, v = _radical_inverse(sample_numbers + 1, 2), _radical_inverse(sample_numbers + 1, 3)
+    sqrt_u = np.sqrt(u)  # uniform over a triangle (Osada et al. 2002)
+    barycentric = np.stack([1 - sqrt_u, sqrt_u * (1 - v), sqrt_u * v], -1)[:, :, None]
     at_rest = (barycentric * rest[indices[chosen]]).sum(1)
-    return np.asarray((barycentric * places[indices[chosen]]).sum(1)[_spatial_order(at_rest)], np.float64)
+    return np.asarray((barycentric * positions[indices[chosen]]).sum(1)[_morton_order(at_rest)], np.float64)
 
 
 def sample_curve(points: ArrayLike, count: int = SAMPLES) -> Floats:
@@ -230,25 +231,25 @@ def sample_curve(points: ArrayLike, count: int = SAMPLES) -> Floats:
 
     Raises ValueError for a curve without length."""
     corners = np.asarray(points, np.float64).reshape(-1, 3)
-    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    if len(corners) < 2 or not 0 < lengths[-1] < math.inf:
+    arc_lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    if len(corners) < 2 or not 0 < arc_lengths[-1] < math.inf:
         raise ValueError("the curve of the light has no length")
-    at = (np.arange(count) + 0.5) / count * lengths[-1]
-    return np.stack([np.interp(at, lengths, column) for column in corners.T], -1)
+    distances = (np.arange(count) + 0.5) / count * arc_lengths[-1]
+    return np.stack([np.interp(distances, arc_lengths, column) for column in corners.T], -1)
 
 
-def _spatial_order(places: Floats) -> NDArray[np.int64]:
+def _morton_order(points: Floats) -> NDArray[np.int64]:
     """Return an order of points (n, 3) in which neighbours are near each other: that of Morton codes."""
-    low, size = places.min(0), float(np.ptp(places, axis=0).max()) or 1.0
-    grid = np.minimum((places - low) / size * 1024, 1023).astype(np.int64)
-    code = np.zeros(len(places), np.int64)
+    low, size = points.min(0), float(np.ptp(points, axis=0).max()) or 1.0
+    grid = np.minimum((points - low) / size * 1024, 1023).astype(np.int64)
+    morton_code = np.zeros(len(points), np.int64)
     for bit in range(10):
         for axis in range(3):
-            code |= (grid[:, axis] >> bit & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
+            morton_code |= (grid[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(morton_code, kind="stable")
 
 
-def _columns(aspect: float) -> int:
+def _column_count(aspect: float) -> int:
     """Return the number of cells along the first axis, so that cells are about as wide as high.
 
     It is the power of two next to sqrt(CELLS aspect), from 1 to CELLS. aspect: width of the extent over its height.
@@ -258,13 +259,13 @@ def _columns(aspect: float) -> int:
 
 
 @lru_cache(maxsize=8)
-def _samples(columns: int) -> tuple[Floats, NDArray[np.int64]]:
+def _square_samples(columns: int) -> tuple[Floats, NDArray[np.int64]]:
     """Return samples (m, 2) of the square -1..1, cell by cell, and their cells (m,), for `columns` cells in a row.
 
     Hammersley's points: each cell of any such grid has the same number, and each of SAMPLES columns or rows has one,
     so that the visible share of a light behind bars is accurate."""
-    numbers = np.arange(SAMPLES)
-    unit = np.stack([(numbers + 0.5) / SAMPLES, _radical_inverse(numbers, 2) + 0.5 / SAMPLES], -1)
+    sample_numbers = np.arange(SAMPLES)
+    unit = np.stack([(sample_numbers + 0.5) / SAMPLES, _radical_inverse(sample_numbers, 2) + 0.5 / SAMPLES], -1)
     cells = (unit[:, 1] * (CELLS // columns)).astype(np.int64) * columns + (unit[:, 0] * columns).astype(np.int64)
     order = np.argsort(cells, kind="stable")
     return 2 * unit[order] - 1, cells[order]
@@ -280,7 +281,7 @@ def _radical_inverse(numbers: NDArray[Any], base: int) -> Floats:
     return values
 
 
-def _disc_of_square(square: Floats) -> Floats:
+def _square_to_disc(square: Floats) -> Floats:
     """Return points (n, 2) of the unit disc from points of the square -1..1, with equal areas (Shirley and Chiu
     1997)."""
     x, y = square.T

@@ -138,14 +138,14 @@ def _parse_light(entry: Mapping[str, Any], name: str, where: str) -> Light:
     if frames is not None and not (isinstance(frames, dict) and frames):
         raise CaptureError(f'{where}: frames should read {{"0001.png": {{"xy": [x, y]}}, …}}.')
     keys = {frame: _parse_key(key, f"{where}, frame {frame!r}") for frame, key in (frames or {}).items()}
-    kinds = {"xyz" if key.xyz is not None else "xy" for key in keys.values() if key.place is not None}
-    kinds |= {kind for kind in ("xyz", "xy") if entry.get(kind) is not None}
-    if len(kinds) > 1:
+    place_kinds = {"xyz" if key.xyz is not None else "xy" for key in keys.values() if key.place is not None}
+    place_kinds |= {label for label in ("xyz", "xy") if entry.get(label) is not None}
+    if len(place_kinds) > 1:
         raise CaptureError(f"{where}: some places are in the world (xyz) and some on the picture (xy); give one kind.")
     if entry.get("xyz") is None and entry.get("xy") is None:
-        if not kinds and not frames:
+        if not place_kinds and not frames:
             raise CaptureError(f"{where}: xyz should be three finite numbers.")
-        if not kinds:
+        if not place_kinds:
             raise CaptureError(f"{where}: no frame has a place; add xyz or xy to the light or to its frames.")
     elif any(key.place is not None for key in keys.values()):
         raise CaptureError(f"{where}: it has one place and a path; remove one of them.")
@@ -200,25 +200,26 @@ class LightPath:
                       if _canonical(name) in views_by_name}
         self.unknown = [name for name in light.keys if _canonical(name) not in views_by_name]
         """Names of frames in the file that are not among the views."""
-        self._places = sorted((self._times[name], name) for name, key in self._keys.items() if key.place is not None)
-        self._brightness = sorted((self._times[name], key.on) for name, key in self._keys.items() if key.on is not None)
+        keys = self._keys.items()
+        self._place_keys = sorted((self._times[name], name) for name, key in keys if key.place is not None)
+        self._brightness_keys = sorted((self._times[name], key.on) for name, key in keys if key.on is not None)
 
     @property
     def has_place(self) -> bool:
         """True if the light's place is known in some view."""
-        return bool(self._places) or not self.light.moves or self.light.xy is not None
+        return bool(self._place_keys) or not self.light.moves or self.light.xy is not None
 
     def missing(self) -> list[str]:
         """Return the names of the views whose place is interpolated."""
-        listed = {name for _, name in self._places}
-        return [name for name in self._times if name not in listed] if listed else []
+        placed = {name for _, name in self._place_keys}
+        return [name for name in self._times if name not in placed] if placed else []
 
     def state(self, name: str, camera: Camera, distance: float = 1.0) -> LightState:
         """Return the light in the view of that name. distance: depth of a light that is known on the picture alone.
 
         Raises CaptureError for a light whose place is known in none of the views.
         """
-        place, confidence, interpolated = self._place(name)
+        place, confidence, interpolated = self._place_in_view(name)
         if len(place) == 3:
             xyz = place
             local = camera.world_to_camera[:3, :3] @ xyz + camera.world_to_camera[:3, 3]
@@ -227,12 +228,12 @@ class LightPath:
             pixel = place
             local = distance * np.array([(pixel[0] - camera.cx) / camera.fx, (pixel[1] - camera.cy) / camera.fy, 1.0])
             xyz = camera.world_to_camera[:3, :3].T @ (local - camera.world_to_camera[:3, 3])
-        return LightState(self.light.name, xyz, local, pixel, self._on(name), confidence, interpolated)
+        return LightState(self.light.name, xyz, local, pixel, self._brightness_in_view(name), confidence, interpolated)
 
-    def _place(self, name: str) -> tuple[Floats, float, bool]:
-        """Return place (3,) or (2,), confidence, and whether it is interpolated."""
+    def _place_in_view(self, name: str) -> tuple[Floats, float, bool]:
+        """Return place (3,) or (2,), confidence, and whether the place is interpolated. Raises CaptureError."""
         key = self._keys.get(name)
-        if not self._places:
+        if not self._place_keys:
             constant = self.light.xyz if self.light.xy is None else self.light.xy
             if not np.isfinite(constant).all():
                 raise CaptureError(f"The light {self.light.name!r} has a place in none of the frames; correct the "
@@ -240,20 +241,21 @@ class LightPath:
             return constant, 1.0 if key is None else key.confidence, False
         if key is not None and key.place is not None:
             return key.place, key.confidence, False
-        # Between the entries before and after; beyond the ends both are the nearest entry.
-        times = np.array([time for time, _ in self._places])
+        # Between the keys before and after; beyond the ends both are the nearest key.
+        times = np.array([time for time, _ in self._place_keys])
         after = int(np.searchsorted(times, self._times[name]))
-        ends = [self._keys[self._places[min(max(index, 0), len(times) - 1)][1]] for index in (after - 1, after)]
-        first, second = times[max(after - 1, 0)], times[min(after, len(times) - 1)]
-        part = 0.0 if second == first else (self._times[name] - first) / (second - first)
-        low, high = (end.place for end in ends)
-        assert low is not None and high is not None
-        return (1 - part) * low + part * high, min(end.confidence for end in ends), True
+        (time_before, name_before), (time_after, name_after) = (
+            self._place_keys[min(max(index, 0), len(times) - 1)] for index in (after - 1, after))
+        fraction = 0.0 if time_after == time_before else (self._times[name] - time_before) / (time_after - time_before)
+        previous_key, next_key = self._keys[name_before], self._keys[name_after]
+        assert previous_key.place is not None and next_key.place is not None
+        place = (1 - fraction) * previous_key.place + fraction * next_key.place
+        return place, min(previous_key.confidence, next_key.confidence), True
 
-    def _on(self, name: str) -> float | None:
-        if not self._brightness:
+    def _brightness_in_view(self, name: str) -> float | None:
+        if not self._brightness_keys:
             return None
-        times, values = zip(*self._brightness, strict=True)
+        times, values = zip(*self._brightness_keys, strict=True)
         return float(np.interp(self._times[name], times, values))
 
     def sentences(self) -> list[str]:

@@ -94,8 +94,8 @@ def write_nuke_capture(camera: NukeCamera, plates: Mapping[int, Path], folder: P
     numbers = sorted(set(plates) & set(camera.poses))
     tally.skip("the camera has no key there", *(plates[number].name for number in sorted(set(plates) - set(numbers))))
     if not numbers:
-        known = sorted(camera.poses)
-        raise CaptureError(f"None of the plates has a pose: the camera has the frames {known[0]} to {known[-1]}, and "
+        keyed = sorted(camera.poses)
+        raise CaptureError(f"None of the plates has a pose: the camera has the frames {keyed[0]} to {keyed[-1]}, and "
                            f"the plates {min(plates)} to {max(plates)}.")
     lenses: dict[Lens, Lens] = {}
     frames = []
@@ -106,9 +106,9 @@ def write_nuke_capture(camera: NukeCamera, plates: Mapping[int, Path], folder: P
         pose = np.linalg.inv(_TO_Z_UP @ camera.poses[number] @ _FROM_OPENCV)
         frames.append(ObservedFrame(plate.name, lenses.setdefault(lens, lens), pose, np.zeros((0, 2)),
                                     np.zeros(0, np.int64)))
-        target = folder / "images" / plate.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(target) as temporary:
+        copy_path = folder / "images" / plate.name
+        copy_path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(copy_path) as temporary:
             shutil.copyfile(plate, temporary)
         progress.advance()
     (folder / "sparse" / "0").mkdir(parents=True, exist_ok=True)
@@ -122,18 +122,18 @@ def _read_chan(path: Path, text: str) -> NukeCamera:
     poses: dict[int, Floats] = {}
     focal: dict[int, float] = {}
     for line in text.splitlines():
-        words = line.split("#")[0].split()
-        if not words:
+        fields = line.split("#")[0].split()
+        if not fields:
             continue
         try:
-            numbers = [_finite(word) for word in words]
+            numbers = [_parse_finite(field) for field in fields]
             frame = int(numbers[0])
         except (ValueError, OverflowError) as problem:
             raise CaptureError(f"{path} is not a .chan file: {line.strip()!r:.60}.") from problem
         if len(numbers) < 8 or frame != numbers[0] or not 0 < numbers[7] < 180:
             raise CaptureError(f"{path}, {line.strip()!r:.60}: a line has a frame number, three of translation, three "
                                "of rotation and the vertical field of view; export the camera as a Nuke script (.nk).")
-        poses[frame] = _pose(numbers[1:4], numbers[4:7], DEFAULT_ORDER)
+        poses[frame] = _compose_pose(numbers[1:4], numbers[4:7], DEFAULT_ORDER)
         focal[frame] = 0.5 / math.tan(math.radians(numbers[7]) / 2)
     if not poses:
         raise CaptureError(f"{path} holds no frames; export the camera again.")
@@ -142,18 +142,18 @@ def _read_chan(path: Path, text: str) -> NukeCamera:
 
 def _read_script(path: Path, text: str) -> NukeCamera:
     """Return the one camera in the text of a script, or its one animated camera. Raises CaptureError."""
-    nodes = [_Node(path, words[1]) for words in _commands(text)
-             if len(words) > 1 and _CAMERA_NODE.fullmatch(words[0])]
+    nodes = [_CameraNode(path, command[1]) for command in _commands(text)
+             if len(command) > 1 and _CAMERA_NODE.fullmatch(command[0])]
     nodes = [node for node in nodes if node.is_animated] or nodes
     if len(nodes) != 1:
         names = ", ".join(node.name for node in nodes)
         raise CaptureError(f"{path} holds {f'the cameras {names}' if nodes else 'no Camera node'}; export one camera "
                            "into a script of its own.")
-    return nodes[0].camera()
+    return nodes[0].to_camera()
 
 
 @dataclass
-class _Node:
+class _CameraNode:
     """The knobs of a Camera node, as text."""
 
     path: Path
@@ -161,9 +161,9 @@ class _Node:
     knobs: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for words in _commands(self.body):
-            if len(words) > 1:
-                self.knobs[words[0]] = words[1]
+        for command in _commands(self.body):
+            if len(command) > 1:
+                self.knobs[command[0]] = command[1]
 
     @property
     def name(self) -> str:
@@ -173,93 +173,102 @@ class _Node:
     def is_animated(self) -> bool:
         return any("curve" in value for value in self.knobs.values())
 
-    def camera(self) -> NukeCamera:
-        """Return the camera. Raises CaptureError for what is not read."""
+    def to_camera(self) -> NukeCamera:
+        """Return the camera at the frames that have keys. Raises CaptureError for knobs that are not read."""
         for name, neutral in _NEUTRAL.items():
-            if name in self.knobs and any(value != neutral for curve in self._curves(name) for value in curve.values()):
-                raise self._problem(f"{name} is not {neutral:g}")
+            curves = self._read_curves(name) if name in self.knobs else []
+            if any(value != neutral for curve in curves for value in curve.values()):
+                raise self._unsupported(f"{name} is not {neutral:g}")
         if self.knobs.get("projection_mode", "perspective") != "perspective":
-            raise self._problem(f"its projection is {self.knobs['projection_mode']}")
+            raise self._unsupported(f"its projection is {self.knobs['projection_mode']}")
         if self.knobs.get("xform_order", "SRT") != "SRT":
-            raise self._problem(f"its transform order is {self.knobs['xform_order']}")
-        focal, aperture = self._one("focal", DEFAULT_FOCAL), self._one("haperture", DEFAULT_APERTURE)
+            raise self._unsupported(f"its transform order is {self.knobs['xform_order']}")
+        focal, aperture = self._single_curve("focal", DEFAULT_FOCAL), self._single_curve("haperture", DEFAULT_APERTURE)
         if self.knobs.get("useMatrix") == "true":
-            curves = self._curves("matrix", 16)
+            curves = self._read_curves("matrix", 16)
             numbers, is_still = _common_frames(*curves, focal, aperture)
-            poses = {number: np.array([_at(curve, number) for curve in curves]).reshape(4, 4) for number in numbers}
+            poses = {number: np.reshape([_value_at(curve, number) for curve in curves], (4, 4)) for number in numbers}
             if any(not is_rotation(pose[:3, :3]) or (pose[3] != (0, 0, 0, 1)).any() for pose in poses.values()):
-                raise self._problem("its matrix is no rotation with a translation")
+                raise self._unsupported("its matrix is no rotation with a translation")
         else:
             order = self.knobs.get("rot_order", DEFAULT_ORDER)
             if order not in ROTATION_ORDERS:
-                raise self._problem(f"its rotation order is {order}")
-            translation, rotation = (self._curves(name, 3) for name in ("translate", "rotate"))
+                raise self._unsupported(f"its rotation order is {order}")
+            translation, rotation = (self._read_curves(name, 3) for name in ("translate", "rotate"))
             numbers, is_still = _common_frames(*translation, *rotation, focal, aperture)
-            poses = {number: _pose([_at(curve, number) for curve in translation],
-                                   [_at(curve, number) for curve in rotation], order) for number in numbers}
+            poses = {number: _compose_pose([_value_at(curve, number) for curve in translation],
+                                           [_value_at(curve, number) for curve in rotation], order)
+                     for number in numbers}
         if not poses:
-            raise self._problem("its curves have no frame in common")
+            raise self._unsupported("its curves have no frame in common")
         # An aperture of 0 gives NaN, which `read_nuke_camera` refuses.
-        return NukeCamera(poses, {number: _at(focal, number) / (_at(aperture, number) or math.nan) for number in poses},
-                          is_still=is_still)
+        relative_focal = {number: _value_at(focal, number) / (_value_at(aperture, number) or math.nan)
+                          for number in poses}
+        return NukeCamera(poses, relative_focal, is_still=is_still)
 
-    def _one(self, name: str, default: float) -> Curve:
-        return self._curves(name, 1)[0] if name in self.knobs else {0: default}
+    def _single_curve(self, name: str, default: float) -> Curve:
+        return self._read_curves(name, 1)[0] if name in self.knobs else {0: default}
 
-    def _curves(self, name: str, number: int | None = None) -> list[Curve]:
-        """Return the curves of a knob; zeros where it is not in the script. number: of its values; None for any."""
+    def _read_curves(self, name: str, number: int | None = None) -> list[Curve]:
+        """Return the curves of a knob; zeros where it is not in the script.
+
+        number: values that the knob must have; None for any number. Raises CaptureError.
+        """
         if name not in self.knobs and number is not None:
             return [{0: 0.0}] * number
-        curves = [self._curve(name, word) for word in _words(self.knobs[name])]
+        curves = [self._parse_curve(name, text) for text in _split_words(self.knobs[name])]
         if number is not None and len(curves) != number:
-            raise self._problem(f"{name} has {len(curves)} values and not {number}")
+            raise self._unsupported(f"{name} has {len(curves)} values and not {number}")
         return curves
 
-    def _curve(self, name: str, word: str) -> Curve:
-        """Parse a number, or "curve i x1001 1.5 1.6": values of consecutive frames, from that of the last x on."""
-        tokens = word.split()
+    def _parse_curve(self, name: str, text: str) -> Curve:
+        """Parse a number, or an animation curve such as "curve i x1001 1.5 1.6 x1010 2.0".
+
+        x1001 states the frame of the next value; a value without one is of the next frame. Raises CaptureError.
+        """
+        tokens = text.split()
         is_curve = tokens[:1] == ["curve"]
         values: dict[int, float] = {}
         keys: list[int] = []
-        stated: int | None = None
+        stated_frame: int | None = None
         try:
             for token in tokens[1:] if is_curve else tokens:
                 if is_curve and token[0] == "x":
-                    stated = int(token[1:])
+                    stated_frame = int(token[1:])
                 elif not (is_curve and token[0].isalpha()):  # letters are interpolation and slopes
-                    if stated is None and len(keys) > 1 and keys[-1] - keys[-2] != 1:
+                    if stated_frame is None and len(keys) > 1 and keys[-1] - keys[-2] != 1:
                         raise ValueError  # a value without a frame, behind keys that are not consecutive
-                    keys.append(stated if stated is not None else keys[-1] + 1 if keys else 1)
-                    values[keys[-1]], stated = _finite(token), None
+                    keys.append(stated_frame if stated_frame is not None else keys[-1] + 1 if keys else 1)
+                    values[keys[-1]], stated_frame = _parse_finite(token), None
         except (ValueError, OverflowError) as problem:
-            raise self._problem(f"{name} is an expression or damaged ({word:.40})") from problem
+            raise self._unsupported(f"{name} is an expression or damaged ({text:.40})") from problem
         if not values or (not is_curve and len(values) > 1):
-            raise self._problem(f"{name} is an expression or damaged ({word:.40})")
+            raise self._unsupported(f"{name} is an expression or damaged ({text:.40})")
         return values
 
-    def _problem(self, what: str) -> CaptureError:
-        return CaptureError(f"{self.path}, {self.name}: {what}, which this program does not read; bake the camera's "
+    def _unsupported(self, reason: str) -> CaptureError:
+        return CaptureError(f"{self.path}, {self.name}: {reason}, which this program does not read; bake the camera's "
                             "animation into translate, rotate, focal and haperture, and export it again.")
 
 
-def _pose(translation: Sequence[float], degrees: Sequence[float], order: str) -> Floats:
+def _compose_pose(translation: Sequence[float], degrees: Sequence[float], order: str) -> Floats:
     """Return camera to world (4, 4); the rotations are about the axes of `order`, the first one first."""
     pose = np.eye(4)
     for axis in order:  # each turns from the axis after it to the next one: y to z about x
         index = "XYZ".index(axis)
         first, second = (index + 1) % 3, (index + 2) % 3
         angle = math.radians(degrees[index])
-        turn = np.eye(3)
-        turn[first, first] = turn[second, second] = math.cos(angle)
-        turn[second, first], turn[first, second] = math.sin(angle), -math.sin(angle)
-        pose[:3, :3] = turn @ pose[:3, :3]
+        rotation = np.eye(3)
+        rotation[first, first] = rotation[second, second] = math.cos(angle)
+        rotation[second, first], rotation[first, second] = math.sin(angle), -math.sin(angle)
+        pose[:3, :3] = rotation @ pose[:3, :3]
     pose[:3, 3] = translation
     return pose
 
 
-def _finite(word: str) -> float:
+def _parse_finite(text: str) -> float:
     """Parse a number of a sensible size. Raises ValueError."""
-    number = float(word)
+    number = float(text)
     if not abs(number) < MAX_MAGNITUDE:
         raise ValueError
     return number
@@ -271,36 +280,36 @@ def _common_frames(*curves: Curve) -> tuple[set[int], bool]:
     return (set.intersection(*animated), False) if animated else ({0}, True)
 
 
-def _at(curve: Curve, number: int) -> float:
+def _value_at(curve: Curve, number: int) -> float:
     return next(iter(curve.values())) if len(curve) == 1 else curve[number]
 
 
 def _commands(text: str) -> Iterator[list[str]]:
     """Yield the words of each command of a Tcl script, without braces and quotes around them."""
-    for line in _split(text, "\n;"):
-        words = _words(line)
-        if words and not words[0].startswith("#"):
-            yield words
+    for line in _split_outside_quotes(text, "\n;"):
+        command = _split_words(line)
+        if command and not command[0].startswith("#"):
+            yield command
 
 
-def _words(text: str) -> list[str]:
-    return [word[1:-1] if len(word) > 1 and word[0] + word[-1] in ("{}", '""') else word
-            for word in _split(text, " \t\n") if word]
+def _split_words(text: str) -> list[str]:
+    return [piece[1:-1] if len(piece) > 1 and piece[0] + piece[-1] in ("{}", '""') else piece
+            for piece in _split_outside_quotes(text, " \t\n") if piece]
 
 
-def _split(text: str, separators: str) -> Iterator[str]:
+def _split_outside_quotes(text: str, separators: str) -> Iterator[str]:
     """Yield the pieces of a text between separators that are outside of braces and quotes."""
-    depth, is_quoted, start, at = 0, False, 0, 0
-    while at < len(text):
-        character = text[at]
+    depth, is_quoted, start, index = 0, False, 0, 0
+    while index < len(text):
+        character = text[index]
         if character == "\\":
-            at += 1
+            index += 1
         elif character == '"' and not depth:
             is_quoted = not is_quoted
         elif not is_quoted and character in "{}":
             depth = max(depth + (1 if character == "{" else -1), 0)
         elif not depth and not is_quoted and character in separators:
-            yield text[start:at]
-            start = at + 1
-        at += 1
+            yield text[start:index]
+            start = index + 1
+        index += 1
     yield text[start:]

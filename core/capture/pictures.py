@@ -22,6 +22,9 @@ from .lens import undistort_picture
 if TYPE_CHECKING:
     from .capture import View
 
+MAX_CACHED_MAPS = 4
+"""Number of undistortion maps in memory."""
+
 
 def read_mask(path: Path) -> Picture:
     """Read a mask as 0 and 1: 1 where it is light and opaque; one that is painted in black on transparent ground is 1
@@ -36,18 +39,20 @@ def read_mask(path: Path) -> Picture:
 
 
 class PictureCache:
-    """Decoded, undistorted, resized pictures; evicts the least recently used above its capacity, `room` bytes."""
+    """Decoded, undistorted, resized pictures; evicts the least recently used above `capacity`, bytes."""
 
-    def __init__(self, room: int) -> None:
-        self._capacity = room
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
         self._used = 0
         self._pictures: OrderedDict[tuple[Path, tuple[int, int]], Picture] = OrderedDict()
         self._maps: OrderedDict[tuple[int, tuple[int, int], float], Any] = OrderedDict()
         self._lock = threading.Lock()
 
     def get(self, path: Path, view: View, size: tuple[int, int], space: ColourSpace | None = None) -> Picture:
-        """Return a view's picture at a size, over black where it is transparent. space: in place of what the file
-        declares."""
+        """Return a view's picture at `size` (width, height), over black where it is transparent; read-only pixels.
+
+        space: in place of what the file declares. Raises FrameError.
+        """
         key = (path, size)
         with self._lock:
             if key in self._pictures:
@@ -78,7 +83,7 @@ class PictureCache:
     def undistorted(self, picture: Picture, view: View, path: Path) -> Picture:
         """Undistort a picture of a view's file, whose lens is distorted. Raises FrameError.
 
-        The maps of the last four lenses and sizes are kept: the frames of a capture share few.
+        The maps of the last MAX_CACHED_MAPS lenses and sizes are cached: the frames of a capture share few.
         """
         assert view.lens is not None
         if not same_aspect(picture.size, view.camera.size):
@@ -92,7 +97,7 @@ class PictureCache:
             maps = view.lens.maps(camera)
             with self._lock:
                 self._maps[key] = maps
-                while len(self._maps) > 4:
+                while len(self._maps) > MAX_CACHED_MAPS:
                     self._maps.popitem(last=False)
         return undistort_picture(picture, maps)
 

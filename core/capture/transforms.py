@@ -60,9 +60,9 @@ class Transforms:
 
 def transforms_files(folder: Path) -> list[Path]:
     """Return the transforms.json of a capture, else the files of its parts; none where it has neither."""
-    whole = find_entry(folder, FILE)
-    if whole is not None:
-        return [whole]
+    single_file = find_entry(folder, FILE)
+    if single_file is not None:
+        return [single_file]
     return [path for name in PARTS if (path := find_entry(folder, name)) is not None]
 
 
@@ -83,7 +83,7 @@ def read_transforms(folder: Path) -> Transforms:
         if len(files) > 1 and path.name.casefold() != PARTS[0]:
             result.held_out = (result.held_out or set()) | set(names)
         else:
-            _read_lists(path, meta, result)
+            _read_split_lists(path, meta, result)
         if not len(result.points):
             result.points = _read_points(path, meta, result)
     if not result.frames:
@@ -128,8 +128,11 @@ def _merge_lens_values(meta: dict[str, Any], frame: dict[str, Any]) -> dict[str,
     return {**shared, **frame}
 
 
-def _read_lists(path: Path, meta: dict[str, Any], result: Transforms) -> None:
-    """Read nerfstudio's lists of training and held-out frames; its validation frames are held out too."""
+def _read_split_lists(path: Path, meta: dict[str, Any], result: Transforms) -> None:
+    """Read nerfstudio's lists of training and held-out frames of `meta` into `result`, which has the frames.
+
+    Validation frames are held out too. Raises CaptureError.
+    """
     lists: dict[str, set[str]] = {}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         names = meta.get(key)
@@ -186,19 +189,19 @@ def _read_lens(meta: dict[str, Any], folder: Path, name: str, where: str) -> Len
         fy = _focal_length(_parse_number(meta, "camera_angle_y", where), height, where) if has_angle else fx
     cx, cy = _parse_number(meta, "cx", where, width / 2), _parse_number(meta, "cy", where, height / 2)
     k1, k2, k3, k4, p1, p2 = _read_distortion(meta, where)
-    kind = meta.get("camera_model", "OPENCV")
-    if kind in ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE") or meta.get("is_fisheye"):
+    model = meta.get("camera_model", "OPENCV")
+    if model in ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE") or meta.get("is_fisheye"):
         # The fisheye polynomial with every coefficient.
         lens = Lens("THIN_PRISM_FISHEYE", (fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, 0.0, 0.0), width, height)
-    elif kind in ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"):
+    elif model in ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"):
         if k4:
-            raise CaptureError(f"{where} k4 of a {kind} camera has no agreed meaning; undistort the frames.")
+            raise CaptureError(f"{where} k4 of a {model} camera has no agreed meaning; undistort the frames.")
         if any((k1, k2, k3, p1, p2)):
             lens = Lens("FULL_OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0), width, height)
         else:
             lens = Lens("PINHOLE", (fx, fy, cx, cy), width, height)
     else:
-        raise CaptureError(f"{where} the camera model {kind!r} is not one this program reads; use OPENCV, "
+        raise CaptureError(f"{where} the camera model {model!r} is not one this program reads; use OPENCV, "
                            "OPENCV_FISHEYE or PINHOLE, or a COLMAP model.")
     return check_lens(lens, where)
 
@@ -221,21 +224,21 @@ def _focal_length(angle: float, size: int, where: str) -> float:
     return 0.5 * size / math.tan(0.5 * angle)
 
 
-def _parse_matrix(value: Any, where: str, what: str) -> Floats:
+def _parse_matrix(value: Any, where: str, label: str) -> Floats:
     """Parse (4, 4) from nested lists of 3 or 4 rows of 4 numbers.
 
-    Raises CaptureError, whose message begins with `where` and names the value as `what`.
+    Raises CaptureError, whose message begins with `where` and names the value as `label`.
     """
     try:
         matrix = np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)) or not (np.abs(matrix) < MAX_MAGNITUDE).all():
-        raise CaptureError(f"{where} {what} should be 4 rows of 4 finite numbers of a sensible size; export the file "
+        raise CaptureError(f"{where} {label} should be 4 rows of 4 finite numbers of a sensible size; export the file "
                            "again.")
-    full = np.eye(4)
-    full[:len(matrix)] = matrix
-    return full
+    pose = np.eye(4)
+    pose[:len(matrix)] = matrix
+    return pose
 
 
 def _read_pose(frame: dict[str, Any], where: str) -> Floats:
@@ -244,8 +247,8 @@ def _read_pose(frame: dict[str, Any], where: str) -> Floats:
     rotation = pose[:3, :3]
     if not is_rotation(rotation):
         raise CaptureError(f"{where} transform_matrix is not a rotation and a translation; export the file again.")
-    left, _, right = np.linalg.svd(rotation)  # the nearest rotation: files round their numbers
-    rotation = left @ right @ np.diag([1.0, -1.0, -1.0])
+    u, _, vt = np.linalg.svd(rotation)  # the nearest rotation: files round their numbers
+    rotation = u @ vt @ np.diag([1.0, -1.0, -1.0])
     inverse = np.eye(4)
     inverse[:3, :3] = rotation.T
     inverse[:3, 3] = -rotation.T @ pose[:3, 3]
@@ -269,18 +272,18 @@ def _read_points(path: Path, meta: dict[str, Any], result: Transforms) -> PointC
         return PointCloud.empty()
     posed, points = read_model(model)
     result.sentences += [sentence] if sentence else []
-    to_world = _applied(path, meta)
-    solved = _similarity(posed, result.frames)
-    if solved is not None and not _moves_alike(to_world, solved, points.xyz):
+    to_world = _read_applied_transform(path, meta)
+    from_cameras = _fit_similarity(posed, result.frames)
+    if from_cameras is not None and not _move_alike(to_world, from_cameras, points.xyz):
         result.sentences.append(f"The points of {model} are moved as their cameras are in {path.name}: "
                                 + ("applied_transform and applied_scale say otherwise." if "applied_transform" in meta
                                    else "it has no applied_transform."))
-        to_world = solved
-    moved = points.xyz.astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
-    return PointCloud(moved.astype(np.float32), points.rgb, points.error)
+        to_world = from_cameras
+    xyz = points.xyz.astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
+    return PointCloud(xyz.astype(np.float32), points.rgb, points.error)
 
 
-def _applied(path: Path, meta: dict[str, Any]) -> Floats:
+def _read_applied_transform(path: Path, meta: dict[str, Any]) -> Floats:
     """Return (4, 4): nerfstudio's motion and scale from the world of its COLMAP model to that of the file."""
     applied = _parse_matrix(meta.get("applied_transform", OLD_APPLIED_TRANSFORM), f"{path}:", "applied_transform")
     scale = _parse_number(meta, "applied_scale", f"{path}:", 1.0)
@@ -289,10 +292,11 @@ def _applied(path: Path, meta: dict[str, Any]) -> Floats:
     return np.diag([scale, scale, scale, 1.0]) @ applied
 
 
-def _similarity(model: Sequence[PosedFrame], frames: Sequence[PosedFrame]) -> Floats | None:
+def _fit_similarity(model: Sequence[PosedFrame], frames: Sequence[PosedFrame]) -> Floats | None:
     """Return (4, 4), the similarity that takes the cameras of a COLMAP model to those of the same names in the file.
 
-    None where fewer than three share a name, lie in one place, or do not match within 1 % of their extent.
+    None where fewer than three share a name, where all lie in one place, or where they do not match within
+    MAX_MISMATCH of their extent.
     """
     model_frames = {PurePosixPath(canonical_name(frame.name)).name: frame for frame in model}
     pairs = [(model_frames[name], frame) for frame in frames
@@ -302,17 +306,17 @@ def _similarity(model: Sequence[PosedFrame], frames: Sequence[PosedFrame]) -> Fl
     # Each pair gives the rotation between the worlds; the nearest rotation to their mean is taken.
     rotations = np.array([in_file.world_to_camera[:3, :3].T @ in_model.world_to_camera[:3, :3]
                           for in_model, in_file in pairs])
-    left, _, right = np.linalg.svd(rotations.mean(axis=0))
-    rotation = left @ right
+    u, _, vt = np.linalg.svd(rotations.mean(axis=0))
+    rotation = u @ vt
     model_centres, file_centres = (
-        np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in (frame.world_to_camera for frame in side)])
-        for side in zip(*pairs, strict=True))
+        np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in (frame.world_to_camera for frame in side_frames)])
+        for side_frames in zip(*pairs, strict=True))
     model_mean, file_mean = model_centres.mean(axis=0), file_centres.mean(axis=0)
     centred, target_centred = (model_centres - model_mean) @ rotation.T, file_centres - file_mean
     # Sums of squares: the scale is that of least squares, and the mismatch is compared as a square.
-    extent, size = float(np.square(centred).sum()), float(np.square(target_centred).sum())
-    scale = float((centred * target_centred).sum()) / extent if extent > 0 else 0.0
-    if scale <= 0 or np.square(scale * centred - target_centred).sum() > MAX_MISMATCH**2 * size:
+    centred_square, target_square = float(np.square(centred).sum()), float(np.square(target_centred).sum())
+    scale = float((centred * target_centred).sum()) / centred_square if centred_square > 0 else 0.0
+    if scale <= 0 or np.square(scale * centred - target_centred).sum() > MAX_MISMATCH**2 * target_square:
         return None
     similarity = np.eye(4)
     similarity[:3, :3] = scale * rotation
@@ -320,11 +324,11 @@ def _similarity(model: Sequence[PosedFrame], frames: Sequence[PosedFrame]) -> Fl
     return similarity
 
 
-def _moves_alike(first: Floats, second: Floats, xyz: NDArray[np.float32]) -> bool:
-    """True if two similarities take points (n, 3) to the same places, within 2 % of the points' extent."""
-    sample = xyz[::max(len(xyz) // 1000, 1)].astype(np.float64)
-    if not len(sample):
+def _move_alike(first: Floats, second: Floats, xyz: NDArray[np.float32]) -> bool:
+    """True if two similarities (4, 4) move points (n, 3) to the same places, within 2 MAX_MISMATCH of their extent."""
+    sampled = xyz[::max(len(xyz) // 1000, 1)].astype(np.float64)
+    if not len(sampled):
         return True
-    ends = [sample @ motion[:3, :3].T + motion[:3, 3] for motion in (first, second)]
-    extent = float(np.median(np.linalg.norm(ends[1] - ends[1].mean(axis=0), axis=1)))
-    return float(np.median(np.linalg.norm(ends[0] - ends[1], axis=1))) <= 2 * MAX_MISMATCH * max(extent, 1e-12)
+    results = [sampled @ motion[:3, :3].T + motion[:3, 3] for motion in (first, second)]
+    extent = float(np.median(np.linalg.norm(results[1] - results[1].mean(axis=0), axis=1)))
+    return float(np.median(np.linalg.norm(results[0] - results[1], axis=1))) <= 2 * MAX_MISMATCH * max(extent, 1e-12)

@@ -48,8 +48,8 @@ def cameras_without_solve(folder: Path, focal: float | None = None) -> tuple[Cam
     multiple, source = _focal_multiple(folder, paths[0], sizes[0], focal)
     frames = []
     for path, (width, height) in zip(paths, sizes, strict=True):
-        pixels = multiple * max(width, height)
-        lens = Lens("SIMPLE_PINHOLE", (pixels, width / 2, height / 2), width, height)
+        focal_px = multiple * max(width, height)
+        lens = Lens("SIMPLE_PINHOLE", (focal_px, width / 2, height / 2), width, height)
         frames.append(PosedFrame(path.relative_to(root).as_posix(), lens, np.eye(4)))
     return CameraSolve(frames, PointCloud.empty(), root), source
 
@@ -59,19 +59,19 @@ def _focal_multiple(folder: Path, first: Path, size: tuple[int, int], focal: flo
 
     first, size: file of the first frame and its (width, height). focal: as of `cameras_without_solve`.
     """
-    recorded = find_entry(folder, CAMERA)
+    record_path = find_entry(folder, CAMERA)
     if focal is not None:
         multiple, source = focal / max(size), "as given"
-    elif recorded is not None and recorded.is_file():
-        data = read_json(recorded, CaptureError)
-        pixels, width = (data.get(key) if isinstance(data, dict) else None for key in ("focal_px", "width"))
-        if pixels is None or width is None or not (is_finite(pixels) and is_finite(width) and width > 0):
-            raise CaptureError(f'{recorded} should read {{"focal_px": 400.0, "width": 480}}; correct or remove it.')
-        multiple, source = pixels / width * size[0] / max(size), f"from {CAMERA}"
+    elif record_path is not None and record_path.is_file():
+        data = read_json(record_path, CaptureError)
+        focal_px, width = (data.get(key) if isinstance(data, dict) else None for key in ("focal_px", "width"))
+        if focal_px is None or width is None or not (is_finite(focal_px) and is_finite(width) and width > 0):
+            raise CaptureError(f'{record_path} should read {{"focal_px": 400.0, "width": 480}}; correct or remove it.')
+        multiple, source = focal_px / width * size[0] / max(size), f"from {CAMERA}"
     else:
-        exif = _exif_focal(first)
-        multiple = USUAL_FOCAL if exif is None else exif
-        source = "a usual one" if exif is None else f"from the Exif data of {first.name}"
+        exif_focal = _exif_focal(first)
+        multiple = USUAL_FOCAL if exif_focal is None else exif_focal
+        source = "a usual one" if exif_focal is None else f"from the Exif data of {first.name}"
     if not MIN_FOCAL <= multiple <= MAX_FOCAL:
         raise CaptureError(f"A focal length of {multiple * max(size):.4g} pixels ({source}) is none that a lens has "
                            f"for frames of {size[0]} x {size[1]}; give it in pixels.")

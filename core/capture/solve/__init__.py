@@ -66,8 +66,8 @@ class SolveSettings:
         if self.lens not in MODELS or self.lens == "EQUIRECTANGULAR":
             raise SettingsError(f"{self.lens!r} is not a camera model to solve with; take one of "
                                f"{', '.join(name for name in MODELS if name != 'EQUIRECTANGULAR')}.")
-        if self.matching not in (ways := get_args(Matching)):
-            raise SettingsError(f"{self.matching!r} is not a way of matching; take one of {', '.join(ways)}.")
+        if self.matching not in (choices := get_args(Matching)):
+            raise SettingsError(f"{self.matching!r} is not a way of matching; take one of {', '.join(choices)}.")
         if self.frames < 0 or self.output_size < 0:
             raise SettingsError("Neither the number of frames nor their size can be negative; leave out what is to be "
                                 "as it is.")
@@ -108,7 +108,7 @@ def _solve(source: Path, out: Path, request: dict[str, Any], settings: SolveSett
     """Carry out `solve` in the locked folder `out`; return the report."""
     from . import develop, mapping, report, source_frames, world
 
-    began = time.monotonic()
+    start = time.monotonic()
     _prepare_output(source, out, request, progress)
     work = out / WORK_FOLDER
     chosen, left_out = source_frames.prepare_frames(source, work, settings.frames, settings.size, progress,
@@ -125,7 +125,7 @@ def _solve(source: Path, out: Path, request: dict[str, Any], settings: SolveSett
         progress.say(f"{len(missing)} of {len(chosen)} frames found no place in the model and are left out: {names}.")
     remove_file(out / REPORT)  # describes the capture that is about to be replaced
     develop.write_capture(chosen, solved, out, work, settings.output_size, progress)
-    data = report.make_report(chosen, solved, left_out, request, time.monotonic() - began)
+    data = report.make_report(chosen, solved, left_out, request, time.monotonic() - start)
     report.draw_model(solved, out / PICTURE)
     write_json(out / REPORT, data)
     shutil.rmtree(work, ignore_errors=True)
@@ -133,7 +133,7 @@ def _solve(source: Path, out: Path, request: dict[str, Any], settings: SolveSett
 
 
 def _fingerprint(source: Path) -> list[Any]:
-    """Identify a source by names, lengths and times of its files."""
+    """Return a JSON-able identity of a source: its path, and names, lengths and times of its files."""
     files = pictures_in(source) if source.is_dir() else [source]
     stats = [(path.name, path.stat()) for path in files]
     return [str(source.resolve()), *([name, stat.st_size, stat.st_mtime_ns] for name, stat in stats)]
@@ -150,18 +150,21 @@ def _read_report(out: Path) -> dict[str, Any] | None:
 
 
 def _prepare_output(source: Path, out: Path, request: dict[str, Any], progress: Progress) -> None:
-    """Prepare `out` for this solve. Raises CaptureError where it holds another capture or the source frames."""
+    """Check `out`, and keep or replace the work folder of an interrupted solve in it.
+
+    Raises CaptureError where `out` holds another capture or the source frames.
+    """
     if source.resolve() in (out.resolve(), (out / "images").resolve()):
         raise CaptureError(f"The frames in {source} would be overwritten by their undistorted selves; give another "
                            "folder for the capture.")
-    theirs = [name for name in ("images", "sparse", "transforms.json") if (out / name).exists()]
+    capture_parts = [name for name in ("images", "sparse", "transforms.json") if (out / name).exists()]
     if (out / REPORT).is_file():
-        belongs = [name for name in (LIGHTS, REMOVED, "split.json", "truth") if (out / name).exists()]
-        if belongs:
-            raise CaptureError(f"{out} holds {' and '.join(belongs)} of an earlier solve, which fit no other; choose "
-                               "another folder for the capture, or remove them.")
-    elif theirs and not (out / WORK_FOLDER).is_dir():
-        raise CaptureError(f"{out} holds {theirs[0]} that did not come from a solve; give another folder.")
+        dependents = [name for name in (LIGHTS, REMOVED, "split.json", "truth") if (out / name).exists()]
+        if dependents:
+            raise CaptureError(f"{out} holds {' and '.join(dependents)} of an earlier solve, which fit no other; "
+                               "choose another folder for the capture, or remove them.")
+    elif capture_parts and not (out / WORK_FOLDER).is_dir():
+        raise CaptureError(f"{out} holds {capture_parts[0]} that did not come from a solve; give another folder.")
     if _can_resume(out / WORK_FOLDER, request, progress):
         remove_partials_below(out / WORK_FOLDER)
         progress.say("The interrupted solve is resumed.")

@@ -33,28 +33,28 @@ def write_capture(sources: Sequence[SourceFrame], solved: Solved, out: Path, wor
     names = _file_names(sources)
     undistorted: dict[Lens, Camera] = {}
     lenses: dict[tuple[Lens, tuple[int, int]], Lens] = {}
-    written = []
+    observed_frames = []
     for frame in solved.frames:
         source = sources[frame.index]
         scale = min(1.0, size / max(source.width, source.height)) if size else 1.0
-        target = (round(source.width * scale), round(source.height * scale))
+        size_px = (round(source.width * scale), round(source.height * scale))
         if frame.lens not in undistorted:
             undistorted[frame.lens] = _undistorted_camera(frame.lens)
-        camera = undistorted[frame.lens].scaled(*target)
+        camera = undistorted[frame.lens].scaled(*size_px)
         _write_frame(source, frame, camera, work / "images" / names[frame.index])
         # One object for all frames of a lens and size: the model then has one camera for them.
-        lens = lenses.setdefault((frame.lens, target), Lens("PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy),
-                                                            *target))
+        lens = lenses.setdefault((frame.lens, size_px), Lens("PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy),
+                                                            *size_px))
         pixels = frame.lens.undistort(frame.pixels) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         valid = np.isfinite(pixels).all(axis=1)
-        written.append(ObservedFrame(names[frame.index], lens, frame.world_to_camera, pixels[valid],
+        observed_frames.append(ObservedFrame(names[frame.index], lens, frame.world_to_camera, pixels[valid],
                                      frame.points[valid]))
         progress.advance()
     # Errors are in pixels of the small pictures; the model has them in pixels of the frames.
-    scale = sum(frame.lens.width for frame in written) / sum(frame.lens.width for frame in solved.frames)
+    scale = sum(frame.lens.width for frame in observed_frames) / sum(frame.lens.width for frame in solved.frames)
     model = solved.model
     cloud = PointCloud(model.xyz.astype(np.float32), model.rgb, (model.error * scale).astype(np.float32))
-    write_model(work / "sparse" / "0", written, cloud)
+    write_model(work / "sparse" / "0", observed_frames, cloud)
     for name in ("images", "sparse"):
         shutil.rmtree(out / name, ignore_errors=True)
         retry_while_locked((work / name).rename, out / name)

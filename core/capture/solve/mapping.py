@@ -92,7 +92,11 @@ class Solved:
 
 def solve(sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, video: bool,
           progress: Progress) -> Solved:
-    """Reconstruct the largest model from small pictures and masks below `work`. See `core.capture.solve.solve`."""
+    """Reconstruct the largest model from small pictures and masks below `work`, where a stopped solve resumes.
+
+    video: the frames are of a video, which decides which of them are matched. Raises what `core.capture.solve.solve`
+    raises.
+    """
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     pycolmap.set_random_seed(settings.seed)
@@ -102,7 +106,7 @@ def solve(sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, v
 
 def _solve(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, video: bool,
            progress: Progress) -> Solved:
-    """Carry out `solve`. video: the frames are of a video, which decides which of them are matched."""
+    """Carry out `solve`, with pycolmap's errors as they are raised."""
     database = work / DATABASE
     _check_frames_differ(sources, work)
     _extract_features(pycolmap, sources, work, database, settings, progress)
@@ -194,23 +198,24 @@ def _check_frames_differ(sources: Sequence[SourceFrame], work: Path) -> None:
 
 def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, database: Path,
                       settings: SolveSettings, progress: Progress) -> None:
-    """Extract features of every frame that has none yet; one camera for all frames of one size and focal length."""
+    """Extract features of every frame that has none in the database; one camera for all frames of one size and focal
+    length."""
     with _open_database(pycolmap, database) as db:
         extracted = {image.name for image in db.read_all_images()
                      if db.num_keypoints_for_image(image.image_id) or db.exists_descriptors(image.image_id)}
         cameras: dict[tuple[int, int, float | None], int] = {}
-        known = {(c.width, c.height, round(c.params[0], 6)): c.camera_id for c in db.read_all_cameras()}
-        groups: dict[tuple[int, bool], list[str]] = {}
+        camera_ids = {(c.width, c.height, round(c.params[0], 6)): c.camera_id for c in db.read_all_cameras()}
+        names_by_group: dict[tuple[int, bool], list[str]] = {}
         for source in sources:
             key = (source.width, source.height, source.focal)
             if key not in cameras:
                 camera = _make_camera(pycolmap, picture_size(work / "small" / source.name), source.focal, settings.lens)
                 parameters = (camera.width, camera.height, round(camera.params[0], 6))
-                cameras[key] = known.get(parameters) or db.write_camera(camera)
-                known[parameters] = cameras[key]
+                cameras[key] = camera_ids.get(parameters) or db.write_camera(camera)
+                camera_ids[parameters] = cameras[key]
             if source.name not in extracted:
                 group = (cameras[key], _has_little_texture(work / "small" / source.name))
-                groups.setdefault(group, []).append(source.name)
+                names_by_group.setdefault(group, []).append(source.name)
     progress.stage("find features", len(sources), len(extracted))
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = settings.features
@@ -219,7 +224,7 @@ def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path,
     if settings.mask:
         reader.mask_path = str(work / "masks")
     default_threshold = options.sift.peak_threshold
-    for (camera_id, has_little_texture), names in groups.items():
+    for (camera_id, has_little_texture), names in names_by_group.items():
         reader.existing_camera_id = camera_id
         # Walls and skies: weak features are better than none.
         options.sift.peak_threshold = 0.4 * default_threshold if has_little_texture else default_threshold
@@ -257,7 +262,7 @@ def _make_camera(pycolmap: Any, size: tuple[int, int], focal: float | None, mode
 
 def _match_frames(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, database: Path, matching: Any,
                   settings: SolveSettings, progress: Progress) -> int:
-    """Match and verify the chosen pairs that are missing in the database; returns how many were chosen."""
+    """Match and verify the chosen pairs that are missing in the database; return the number of chosen pairs."""
     with _open_database(pycolmap, database) as db:
         ids = [db.read_image_with_name(source.name).image_id for source in sources]
         pairs = choose_pairs(matching, len(sources), lambda i: np.asarray(db.read_descriptors(ids[i]).data),
@@ -270,8 +275,8 @@ def _match_frames(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, dat
     verification.ransac.random_seed = settings.seed
     listing = pycolmap.ImportedPairingOptions()
     listing.match_list_path = str(work / "pairs.txt")
-    for at in range(0, len(missing_pairs), 100):  # in batches: a stop waits for one of them
-        batch = missing_pairs[at:at + 100]
+    for start in range(0, len(missing_pairs), 100):  # in batches: a stop waits for one of them
+        batch = missing_pairs[start:start + 100]
         write_text(work / "pairs.txt", "".join(f"{sources[i].name} {sources[j].name}\n" for i, j in batch))
         pycolmap.match_image_pairs(database, matching_options=options, pairing_options=listing,
                                    verification_options=verification, device=pycolmap.Device.cpu)
@@ -281,7 +286,10 @@ def _match_frames(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, dat
 
 def _run_mapper(pycolmap: Any, work: Path, database: Path, frames: int, settings: SolveSettings,
                 progress: Progress) -> list[Any]:
-    """Run incremental mapping; returns all models, of this run or an earlier one. frames: number of frames."""
+    """Run incremental mapping; return all pycolmap reconstructions, of this run or an earlier one that finished.
+
+    frames: number of source frames. Raises Cancelled on a stop request.
+    """
     finished = _model_folders(work)
     if finished is not None:
         return [pycolmap.Reconstruction(str(model)) for model in finished]
@@ -297,7 +305,7 @@ def _run_mapper(pycolmap: Any, work: Path, database: Path, frames: int, settings
     placed = 0
     failures: list[Exception] = []
 
-    def step(count: int) -> None:
+    def report_placed(count: int) -> None:
         """Report `count` placed frames; on a requested stop cancel the mapping."""
         # pycolmap cannot pass an exception on: the token ends the mapping, and the exception is raised afterwards.
         nonlocal placed
@@ -312,8 +320,8 @@ def _run_mapper(pycolmap: Any, work: Path, database: Path, frames: int, settings
     folder.mkdir()
     try:
         models = pycolmap.incremental_mapping(
-            database, work / "small", folder, options, initial_image_pair_callback=lambda: step(2),
-            next_image_callback=lambda: step(1), cancellation_token=token)
+            database, work / "small", folder, options, initial_image_pair_callback=lambda: report_placed(2),
+            next_image_callback=lambda: report_placed(1), cancellation_token=token)
     except InterruptedError:
         if failures:
             raise failures[0] from None
@@ -342,27 +350,27 @@ def _model_folders(work: Path) -> list[Path] | None:
 
 
 def _refine_principal_point(pycolmap: Any, model: Any) -> Any:
-    """Run bundle adjustment with free principal points; returns the old model where one of them moves too far off
-    centre.
+    """Return the model after bundle adjustment with free principal points.
 
-    No real lens is that far off: the views do not determine it.
+    Returns the old model if a principal point moves too far off centre: no real lens is that far off, so the views do
+    not determine it.
     """
-    moved = pycolmap.Reconstruction(model)
+    refined = pycolmap.Reconstruction(model)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
     options.print_summary = False
     # Not pycolmap.bundle_adjustment, which writes to standard error whatever the log level.
     config = pycolmap.BundleAdjustmentConfig()
-    for image in moved.reg_image_ids():
+    for image in refined.reg_image_ids():
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, moved).solve()
-    moved.update_point_3d_errors()
-    for camera in moved.cameras.values():
-        off = np.hypot(camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2)
-        if not off < MAX_PRINCIPAL_POINT_OFFSET * max(camera.width, camera.height):
+    pycolmap.create_default_bundle_adjuster(options, config, refined).solve()
+    refined.update_point_3d_errors()
+    for camera in refined.cameras.values():
+        offset = np.hypot(camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2)
+        if not offset < MAX_PRINCIPAL_POINT_OFFSET * max(camera.width, camera.height):
             return model
-    return moved
+    return refined
 
 
 def _check_parallax(pycolmap: Any, database: Path, size: int) -> None:
@@ -373,7 +381,7 @@ def _check_parallax(pycolmap: Any, database: Path, size: int) -> None:
     """
     configuration = pycolmap.TwoViewGeometryConfiguration
     without_parallax = (configuration.PLANAR_OR_PANORAMIC, configuration.PANORAMIC)
-    motions, parallax = [], 0
+    motions, with_parallax = [], 0
     with _open_database(pycolmap, database) as db:
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
             matches = np.asarray(geometry.inlier_matches)
@@ -382,14 +390,14 @@ def _check_parallax(pycolmap: Any, database: Path, size: int) -> None:
             first, second = (np.asarray(db.read_keypoints(image), np.float64)[:, :2]
                              for image in pycolmap.pair_id_to_image_pair(pair_id))
             motions.append(float(np.median(np.linalg.norm(first[matches[:, 0]] - second[matches[:, 1]], axis=1))))
-            parallax += geometry.config not in without_parallax
+            with_parallax += geometry.config not in without_parallax
     if not motions:
         raise CaptureError("The frames share too few features to place a camera; film with more overlap, more texture "
                            "or less blur.")
     if np.median(motions) < MIN_MOTION_PX:
         raise CaptureError(f"The camera hardly moves: matched features shift by {np.median(motions):.2f} pixels at "
                            f"{size}; a solve needs a camera that travels.")
-    if parallax < 0.02 * len(motions):
+    if with_parallax < 0.02 * len(motions):
         raise CaptureError("The camera turns but does not travel, or sees one flat surface only: there is no parallax "
                            "to measure depth by.")
 

@@ -21,10 +21,15 @@ SEQUENCE_OVERLAP = 8
 """Number of neighbours matched with each frame of a video; beyond them distances double."""
 VOCABULARY_SIZE = 64
 """Words of the vocabulary of descriptors."""
+MAX_DESCRIPTORS = 2000
+"""Descriptors of a frame that its VLAD vector sums."""
+FRAME_SAMPLE, VOCABULARY_SAMPLE = 200, 12000
+"""Descriptors of a frame, and of all frames, from which the vocabulary is learned."""
+K_MEANS_ROUNDS = 12
 
 
 def choose_matching(matching: Matching, frames: int, video: bool) -> Matching:
-    """Resolve "auto"."""
+    """Return how to match that many frames; resolves "auto". video: they are of a video."""
     if matching != "auto":
         return matching
     if video:
@@ -34,7 +39,7 @@ def choose_matching(matching: Matching, frames: int, video: bool) -> Matching:
 
 def choose_pairs(matching: Matching, frames: int, descriptors: Callable[[int], NDArray[np.uint8]],
                  seed: int = 0) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, of frame indices.
+    """Return pairs (i, j), i < j, of frame indices below `frames`, in an order that is fast to match.
 
     "sequential" pairs each frame with its neighbours and, to close loops, with the 5 most similar frames farther away.
     "similar" pairs it with the 24 most similar frames, and with the next two, as many folders are in the order of
@@ -48,40 +53,41 @@ def choose_pairs(matching: Matching, frames: int, descriptors: Callable[[int], N
         pairs = {(i, i + step) for i in range(frames) for step in steps if i + step < frames}
         if frames > 2 * SEQUENCE_OVERLAP:
             number, min_distance = (5, 2 * SEQUENCE_OVERLAP) if matching == "sequential" else (24, 1)
-            pairs |= most_similar(similarity(descriptors, frames, seed), number, min_distance)
-    # By blocks: a batch of pairs then names few frames, and the matcher indexes each once.
+            pairs |= most_similar_pairs(vlad_similarity(descriptors, frames, seed), number, min_distance)
+    # By blocks of 12 x 12 frames: a batch of pairs then names few frames, and the matcher indexes each once.
     return sorted(pairs, key=lambda pair: (pair[0] // 12, pair[1] // 12, pair))
 
 
-def most_similar(similarity: NDArray[Any], number: int, min_distance: int) -> set[tuple[int, int]]:
+def most_similar_pairs(similarity: NDArray[Any], number: int, min_distance: int) -> set[tuple[int, int]]:
     """Pair each frame with the `number` most similar frames at least `min_distance` away."""
     frames = len(similarity)
-    away = np.abs(np.subtract.outer(np.arange(frames), np.arange(frames))) >= min_distance
-    ranked = np.argsort(-np.where(away, similarity, -np.inf), axis=1)[:, :number]
-    return {(min(i, int(j)), max(i, int(j))) for i in range(frames) for j in ranked[i] if away[i, j]}
+    is_far = np.abs(np.subtract.outer(np.arange(frames), np.arange(frames))) >= min_distance
+    ranked = np.argsort(-np.where(is_far, similarity, -np.inf), axis=1)[:, :number]
+    return {(min(i, int(j)), max(i, int(j))) for i in range(frames) for j in ranked[i] if is_far[i, j]}
 
 
-def similarity(descriptors: Callable[[int], NDArray[np.uint8]], frames: int, seed: int = 0) -> NDArray[np.float32]:
+def vlad_similarity(descriptors: Callable[[int], NDArray[np.uint8]], frames: int, seed: int = 0) -> NDArray[np.float32]:
     """(frames, frames) cosine of the frames' VLAD vectors.
 
     The vocabulary is learned from a sample of all descriptors. A frame without descriptors is similar to none. With too
     few descriptors for a vocabulary, each frame is similar to itself alone.
     """
     rng = np.random.default_rng(seed)
-    sample = np.concatenate([_random_rows(descriptors(i), 200, rng) for i in range(frames)]).astype(np.float32)
-    if len(sample) < VOCABULARY_SIZE:
+    frame_samples = [_random_rows(descriptors(i), FRAME_SAMPLE, rng) for i in range(frames)]
+    samples = np.concatenate(frame_samples).astype(np.float32)
+    if len(samples) < VOCABULARY_SIZE:
         return np.eye(frames, dtype=np.float32)
-    vocabulary = _k_means(_random_rows(sample, 12000, rng), VOCABULARY_SIZE, rng)
-    vectors = np.zeros((frames, VOCABULARY_SIZE * sample.shape[1]), np.float32)
+    vocabulary = _k_means(_random_rows(samples, VOCABULARY_SAMPLE, rng), VOCABULARY_SIZE, rng)
+    vectors = np.zeros((frames, VOCABULARY_SIZE * samples.shape[1]), np.float32)
     for i in range(frames):
-        rows = _random_rows(descriptors(i), 2000, rng).astype(np.float32)
-        if not len(rows):
+        frame_rows = _random_rows(descriptors(i), MAX_DESCRIPTORS, rng).astype(np.float32)
+        if not len(frame_rows):
             continue
-        nearest = _nearest_centre(rows, vocabulary)
-        summed = _sum_by_group(rows - vocabulary[nearest], nearest, VOCABULARY_SIZE)
-        # Each word counts alike, so that a repeated texture does not outweigh the rest.
-        summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-9)
-        vectors[i] = summed.ravel() / max(float(np.linalg.norm(summed)), 1e-9)
+        nearest = _nearest_centre(frame_rows, vocabulary)
+        residuals = _sum_by_group(frame_rows - vocabulary[nearest], nearest, VOCABULARY_SIZE)
+        # Each word of the vocabulary counts alike, so that a repeated texture does not outweigh the rest.
+        residuals /= np.maximum(np.linalg.norm(residuals, axis=1, keepdims=True), 1e-9)
+        vectors[i] = residuals.ravel() / max(float(np.linalg.norm(residuals)), 1e-9)
     return np.asarray(vectors @ vectors.T)
 
 
@@ -99,11 +105,11 @@ def _sum_by_group(rows: NDArray[np.float32], group: NDArray[np.intp], groups: in
     return np.asarray((np.arange(groups)[:, None] == group).astype(np.float32) @ rows)
 
 
-def _k_means(rows: NDArray[np.float32], words: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return centres (words, d) of rows (n, d) by 12 rounds of Lloyd's algorithm; one without rows stays in place."""
-    centres = _random_rows(rows, words, rng).copy()
-    for _ in range(12):
+def _k_means(rows: NDArray[np.float32], number: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return centres (number, d) of rows (n, d) by Lloyd's algorithm; one without rows stays in place."""
+    centres = _random_rows(rows, number, rng).copy()
+    for _ in range(K_MEANS_ROUNDS):
         nearest = _nearest_centre(rows, centres)
-        count = np.bincount(nearest, minlength=words)[:, None]
-        centres = np.where(count > 0, _sum_by_group(rows, nearest, words) / np.maximum(count, 1), centres)
+        count = np.bincount(nearest, minlength=number)[:, None]
+        centres = np.where(count > 0, _sum_by_group(rows, nearest, number) / np.maximum(count, 1), centres)
     return np.asarray(centres, np.float32)

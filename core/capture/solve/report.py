@@ -52,31 +52,31 @@ def draw_model(solved: Solved, path: Path) -> None:
     positions = np.array([-frame.world_to_camera[:3, :3].T @ frame.world_to_camera[:3, 3] for frame in solved.frames])
     ahead = np.array([frame.world_to_camera[2, :3] for frame in solved.frames])
     # Points in two views only are inaccurate; a few points are all drawn.
-    good = model.tracks >= 3 if (model.tracks >= 3).sum() > 50 else np.ones(len(model.xyz), bool)
-    xyz, rgb = model.xyz[good], model.rgb[good]
+    is_reliable = model.tracks >= 3 if (model.tracks >= 3).sum() > 50 else np.ones(len(model.xyz), bool)
+    xyz, rgb = model.xyz[is_reliable], model.rgb[is_reliable]
     # The pictures hold all cameras and most points, with a margin of a tenth.
     low, high = np.percentile(xyz, (2, 98), axis=0)
     low, high = np.minimum(low, positions.min(axis=0)), np.maximum(high, positions.max(axis=0))
-    middle, reach = (low + high) / 2, 0.55 * float((high - low).max())
+    centre, reach = (low + high) / 2, 0.55 * float((high - low).max())
     sheet = np.full((PANEL, 2 * PANEL + 8, 3), PAPER, np.float32)
     for left, axes, title in ((0, (0, 1), "from above"), (PANEL + 8, (0, 2), "from the front")):
         panel = np.full((PANEL, PANEL, 3), PAPER, np.float32)
 
-        def place(points: Floats, axes: tuple[int, int] = axes) -> Any:
+        def to_pixels(points: Floats, axes: tuple[int, int] = axes) -> Any:
             """Return the pixels (n, 2) of points (n, 3) on the panel."""
-            flat = (points[:, axes] - middle[list(axes)]) / reach * (1, -1)
+            flat = (points[:, axes] - centre[list(axes)]) / reach * (1, -1)
             return (0.5 * PANEL * (1 + flat)).round().astype(int)
 
-        spots = place(xyz)
-        inside = ((spots >= 1) & (spots < PANEL - 1)).all(axis=1)
-        for (x, y), colour in zip(spots[inside], rgb[inside] / 255.0, strict=True):
+        pixels = to_pixels(xyz)
+        is_inside = ((pixels >= 1) & (pixels < PANEL - 1)).all(axis=1)
+        for (x, y), colour in zip(pixels[is_inside], rgb[is_inside] / 255.0, strict=True):
             panel[y - 1:y + 1, x - 1:x + 1] = colour
-        cameras = place(positions)
-        if len(cameras) > 1:
-            cv2.polylines(panel, [cameras.reshape(-1, 1, 2)], False, PATH, 1, cv2.LINE_AA)
-        for spot, tip in zip(cameras, place(positions + 0.06 * reach * ahead), strict=True):
-            cv2.line(panel, tuple(map(int, spot)), tuple(map(int, tip)), INK, 1, cv2.LINE_AA)
-            cv2.circle(panel, tuple(map(int, spot)), 3, INK, -1, cv2.LINE_AA)
+        camera_pixels = to_pixels(positions)
+        if len(camera_pixels) > 1:
+            cv2.polylines(panel, [camera_pixels.reshape(-1, 1, 2)], False, PATH, 1, cv2.LINE_AA)
+        for pixel, tip in zip(camera_pixels, to_pixels(positions + 0.06 * reach * ahead), strict=True):
+            cv2.line(panel, tuple(map(int, pixel)), tuple(map(int, tip)), INK, 1, cv2.LINE_AA)
+            cv2.circle(panel, tuple(map(int, pixel)), 3, INK, -1, cv2.LINE_AA)
         cv2.putText(panel, title, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.6, INK, 1, cv2.LINE_AA)
         sheet[:, left:left + PANEL] = panel
     write_png(path, sheet)

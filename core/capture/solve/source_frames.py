@@ -38,6 +38,13 @@ COMB_RATIO, MIN_COMBED_SHARE = 1.1, 0.25
 
 Photographs have ratios of 0.6 to 0.8, moving fields 1.5 to 2.3.
 """
+DEFAULT_VIDEO_FRAMES = 150
+"""Number of frames that are chosen from a video by default."""
+SHARPNESS_SIDE = 480
+"""Long side at which sharpness is measured, pixels."""
+GHOST_LINE_WIDTH, BLOOM_RADIUS = 0.015, 0.008
+"""Width of the lines of ghosts and reach of bloom beyond clipped pixels, relative to the frame's diagonal."""
+MAX_GHOST_LINES = 4
 CLIP_LEVEL = 0.98
 """Display value at or above which the sensor says nothing about the surface."""
 
@@ -76,10 +83,10 @@ def choose_sharpest(sharpness: Sequence[float], number: int) -> list[int]:
 
 
 def sharpness(grey: Pixels) -> float:
-    """Variance of the Laplacian at about 480 pixels: high where edges are sharp."""
+    """Return the variance of the Laplacian of a grey picture (height, width): high where edges are sharp."""
     import cv2
 
-    scale = 480 / max(grey.shape)
+    scale = SHARPNESS_SIDE / max(grey.shape)
     if scale < 1:
         grey = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.float32)
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
@@ -111,16 +118,16 @@ def prepare_frames(source: Path, work: Path, number: int, size: int,
     if earlier is not None:
         return earlier
     if source.is_dir():
-        frames, left_out = _from_folder(source, work, number, size, progress, space)
+        frames, left_out = _prepare_folder(source, work, number, size, progress, space)
     elif source.is_file() and is_video(source):
-        frames, left_out = _from_video(source, work, number or 150, size, progress, space)
+        frames, left_out = _prepare_video(source, work, number or DEFAULT_VIDEO_FRAMES, size, progress, space)
     else:
         reason = misnamed_reason(source) if source.is_file() else ""
         raise CaptureError(f"{source} is neither a folder of frames nor a video{f': it {reason}' if reason else ''}.")
     if len(frames) < 3:
-        why = f"; {left_out[0]}" if left_out else ""
+        first_problem = f"; {left_out[0]}" if left_out else ""
         raise CaptureError(f"{source} gives {len(frames)} usable frames, and a solve needs at least 3 that see "
-                           f"the scene from different places{why}".rstrip(".") + ".")
+                           f"the scene from different places{first_problem}".rstrip(".") + ".")
     write_json(work / RECORD_FILE, {"stills": [asdict(frame) for frame in frames], "left_out": left_out})
     return frames, left_out
 
@@ -146,10 +153,10 @@ def _to_upright(picture: Picture, orientation: int) -> Picture:
     return Picture(apply_orientation(picture.pixels, orientation), picture.encoding)
 
 
-def _from_folder(source: Path, work: Path, number: int, size: int,
+def _prepare_folder(source: Path, work: Path, number: int, size: int,
                  progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
     """Prepare the frames of a folder; see `prepare_frames`."""
-    named = colour_space(*space) if space[0] else None
+    named_space = colour_space(*space) if space[0] else None
     files = pictures_in(source)
     if not files:
         names = [name for reason, names in unlisted_entries(source) if reason.startswith(("a subfolder", "a video"))
@@ -164,7 +171,7 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
         scores = []
         for file in files:
             try:
-                scores.append(sharpness(read_picture(file, space=named, over_black=True).display().mean(axis=2)))
+                scores.append(sharpness(read_picture(file, space=named_space, over_black=True).display().mean(axis=2)))
             except FrameError:
                 scores.append(-1.0)  # chosen only where its stretch has no other; it is then left out
             progress.advance()
@@ -175,7 +182,7 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
         try:
             picture_size(file)
             orientation, focal = read_exif(file)
-            picture = _to_upright(read_picture(file, space=named, over_black=True), orientation)
+            picture = _to_upright(read_picture(file, space=named_space, over_black=True), orientation)
             aspect = read_data_window(file).aspect
         except FrameError as problem:
             left_out.append(str(problem))
@@ -192,13 +199,16 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
     return frames, left_out
 
 
-def _from_video(source: Path, work: Path, number: int, size: int,
+def _prepare_video(source: Path, work: Path, number: int, size: int,
                 progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
-    """Read the video twice: for the sharpness of every frame, then for the chosen ones."""
-    named = colour_space(*space) if space[0] else None
+    """Prepare the frames of a video; see `prepare_frames`.
+
+    It is read twice: for the sharpness of every frame, then for the chosen ones.
+    """
+    named_space = colour_space(*space) if space[0] else None
     with Video(source) as video:
-        if named is not None:
-            video.check_named_space(named.name)
+        if named_space is not None:
+            video.check_named_space(named_space.name)
         progress.stage("choose frames", video.estimated_length)
         scores = []
         for frame in video:
@@ -215,7 +225,7 @@ def _from_video(source: Path, work: Path, number: int, size: int,
         for frame in video:
             if frame.number in chosen:
                 file = write_frame(work / "full" / f"{frame.number:06d}", frame)
-                picture = frame.picture() if named is None else read_picture(file, space=named)
+                picture = frame.picture() if named_space is None else read_picture(file, space=named_space)
                 frames.append(SourceFrame(f"{file.stem}.png", str(file.resolve()), *picture.size, None, 1, *space))
                 _write_small(picture, video.aspect, work, frames[-1].name, size)
                 interlaced.append(is_interlaced(picture))
@@ -230,9 +240,9 @@ def _write_small(picture: Picture, aspect: float, work: Path, name: str, size: i
     aspect: pixel aspect ratio of the picture. size: long side of the small one, which is never enlarged. A solve has
     one focal length; `develop` stretches its camera to the frame's pixels.
     """
-    wide = picture.size[0] * aspect
-    scale = min(1.0, size / max(wide, picture.size[1]))
-    width, height = (max(1, round(side * scale)) for side in (wide, picture.size[1]))
+    square_width = picture.size[0] * aspect
+    scale = min(1.0, size / max(square_width, picture.size[1]))
+    width, height = (max(1, round(side * scale)) for side in (square_width, picture.size[1]))
     small = picture.resized(width, height)
     write_png(work / "small" / name, _to_display(small))
     write_png(work / "masks" / f"{name}.png", feature_mask(small).astype(np.float32))
@@ -241,14 +251,14 @@ def _write_small(picture: Picture, aspect: float, work: Path, name: str, size: i
 def _to_display(picture: Picture) -> Pixels:
     """Convert to display values; EXR frames, which have no set exposure, are scaled to a middle grey first."""
     if picture.encoding == "linear":
-        middle = float(np.median(picture.pixels.mean(axis=2)))
-        gain = np.float32(0.18 / middle) if middle > 1e-6 else np.float32(1.0)
+        median = float(np.median(picture.pixels.mean(axis=2)))
+        gain = np.float32(0.18 / median) if median > 1e-6 else np.float32(1.0)
         return Picture(picture.pixels * gain, "linear").display()
     return picture.display()
 
 
 def feature_mask(picture: Picture) -> NDArray[np.bool_]:
-    """(h, w) where features may be taken: not on clipped pixels, their bloom, or the lines of ghosts.
+    """Return (h, w), True where features may be extracted: not on clipped pixels, their bloom, or the lines of ghosts.
 
     The rim of a bloom moves with exposure and flare. The ghosts of a light lie on the line from its clipped spot
     through the centre of the frame, and move with the lens. Linear light is clipped at the exposure of the small
@@ -260,34 +270,34 @@ def feature_mask(picture: Picture) -> NDArray[np.bool_]:
     # Lone pixels are sparkle on a texture, and good features.
     clipped = cv2.morphologyEx(clipped, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     diagonal = float(np.hypot(*picture.size))
-    lines = _ghost_lines(np.asarray(clipped, np.uint8), max(3, round(0.015 * diagonal)))
-    reach = max(2, round(0.008 * diagonal))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    lines = _ghost_lines(np.asarray(clipped, np.uint8), max(3, round(GHOST_LINE_WIDTH * diagonal)))
+    bloom_radius = max(2, round(BLOOM_RADIUS * diagonal))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * bloom_radius + 1, 2 * bloom_radius + 1))
     return (np.asarray(cv2.dilate(clipped, disc)) == 0) & ~lines
 
 
 def _ghost_lines(clipped: NDArray[np.uint8], thickness: int) -> NDArray[np.bool_]:
-    """Return the mask (h, w) of lines through the frame's centre and the four largest compact spots at most.
+    """Return the mask (h, w) of lines through the frame's centre and the largest compact spots of a mask (h, w).
 
     Ghosts lie on these lines. thickness: of the lines, pixels.
     """
     import cv2
 
     height, width = clipped.shape
-    drawn = np.zeros((height, width), np.uint8)
+    lines = np.zeros((height, width), np.uint8)
     number, _, boxes, centres = cv2.connectedComponentsWithStats(clipped, connectivity=8)
-    middle = np.array([width, height]) / 2
+    centre = np.array([width, height]) / 2
     spots = []
     for label in range(1, number):
         _, _, wide, high, area = map(int, boxes[label])
         # A disc fills 0.79 of its box; a spot with spikes less, a window frame or a text far less.
         if 9 <= area <= 0.01 * width * height and area >= 0.4 * wide * high and max(wide, high) <= 3 * min(wide, high):
             spots.append((area, label))
-    for _, label in sorted(spots, reverse=True)[:4]:
-        direction = middle - centres[label]
+    for _, label in sorted(spots, reverse=True)[:MAX_GHOST_LINES]:
+        direction = centre - centres[label]
         length = float(np.linalg.norm(direction))
         if length > 2 * thickness:
             half = float(np.hypot(width, height)) * direction / length
-            start, end = (middle - half).astype(int), (middle + half).astype(int)
-            cv2.line(drawn, tuple(map(int, start)), tuple(map(int, end)), (1.0,), thickness)
-    return drawn > 0
+            start, end = (centre - half).astype(int), (centre + half).astype(int)
+            cv2.line(lines, tuple(map(int, start)), tuple(map(int, end)), (1.0,), thickness)
+    return lines > 0

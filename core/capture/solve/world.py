@@ -19,7 +19,7 @@ MEDIAN_DISTANCE = 5.0
 
 
 def up_direction(rotations: Sequence[Floats]) -> Floats:
-    """(3,) unit up vector from world-to-camera rotations (3, 3).
+    """Return the unit up vector (3,) of the world, from world-to-camera rotations (3, 3).
 
     Minimises sum (x_i . u)^2 - n/5 (y . u)^2, with y the mean of the frames' up: where all cameras look one way their x
     axes alone leave up undecided.
@@ -37,18 +37,18 @@ def align(model: Model) -> None:
     The points' median is then at x = y = 0. Their lowest 2 % are below z = 0: outliers below the floor.
     """
     up = up_direction([frame.world_to_camera[:3, :3] for frame in model.frames])
-    ahead = np.mean([frame.world_to_camera[2, :3] for frame in model.frames], axis=0)
-    ahead = ahead - (ahead @ up) * up
-    if np.linalg.norm(ahead) < 1e-3:  # the views cancel out: any heading will do
-        ahead = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    ahead /= np.linalg.norm(ahead)
-    turn = np.stack([np.cross(ahead, up), ahead, up])  # Blender's front view: x right, y ahead, z up
+    heading = np.mean([frame.world_to_camera[2, :3] for frame in model.frames], axis=0)
+    heading = heading - (heading @ up) * up
+    if np.linalg.norm(heading) < 1e-3:  # the views cancel out: any heading will do
+        heading = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    heading /= np.linalg.norm(heading)
+    to_world = np.stack([np.cross(heading, up), heading, up])  # Blender's front view: x right, y ahead, z up
     scale = MEDIAN_DISTANCE / _median_distance(model)
-    xyz = scale * model.xyz @ turn.T
+    xyz = scale * model.xyz @ to_world.T
     shift = -np.array([*np.median(xyz[:, :2], axis=0), np.percentile(xyz[:, 2], 2)])
     model.xyz = xyz + shift
     for frame in model.frames:
-        rotation = frame.world_to_camera[:3, :3] @ turn.T
+        rotation = frame.world_to_camera[:3, :3] @ to_world.T
         pose = np.eye(4)
         pose[:3, :3] = rotation
         pose[:3, 3] = scale * frame.world_to_camera[:3, 3] - rotation @ shift
@@ -56,9 +56,9 @@ def align(model: Model) -> None:
 
 
 def _median_distance(model: Model) -> float:
-    """Median distance of points from the cameras that see them."""
-    each = []
+    """Return the median distance of points from the cameras that see them."""
+    distances = []
     for frame in model.frames:
         local = model.xyz[frame.points] @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]
-        each.append(np.linalg.norm(local, axis=1))
-    return float(np.median(np.concatenate(each)))
+        distances.append(np.linalg.norm(local, axis=1))
+    return float(np.median(np.concatenate(distances)))

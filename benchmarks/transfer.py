@@ -33,7 +33,7 @@ from core.conventions.run_files import FLARE
 from core.errors import CaptureError
 from core.fit.run import Run
 from core.images.write import write_png
-from core.look import Look, PlacedLight, ViewOfLight, read
+from core.look import Look, PlacedLight, ViewOfLight, read_look
 from core.look.shot import Shot, ShotFrame
 from core.metrics.evaluation import displayed_flare
 from core.system.files import read_json, write_json
@@ -158,7 +158,7 @@ def main() -> None:
     args = parser.parse_args()
 
     run = Run.open(args.run)
-    look = read(args.run / FLARE)
+    look = read_look(args.run / FLARE)
     capture = Capture.open(run.capture_folder if run.capture_folder.is_dir() else "sample_scenes/desk",
                            need_frames=False)
     training = [view.camera.world_to_camera for view in capture.split(run.settings.holdout)[0]]

@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import FitFlareError, FlareFileError
-from ..core.look import read
+from ..core.look import read_look
 from ..core.system.files import atomic_path, write_text
 from . import library, looks, overlay
 
@@ -94,7 +94,7 @@ def write() -> int:
 def _is_usable(path: Path) -> bool:
     """Return whether a look can be read and has a thumbnail."""
     try:
-        read(path)
+        read_look(path)
     except FitFlareError:
         return False
     return path.with_suffix(".png").is_file()

@@ -14,7 +14,7 @@ from ..core.conventions import exposures
 from ..core.conventions.run_files import CONFIG, FLARE, SMALL_PREVIEW
 from ..core.errors import CaptureError, FitFlareError, RunError
 from ..core.images.video import is_video
-from ..core.look import Look, read
+from ..core.look import Look, read_look
 from ..core.system.reading import MAX_PATH_BYTES, read_text
 from . import engine, jobs, lights, looks, plate_space, weights
 from .capture.importer import set_exposures
@@ -188,7 +188,7 @@ def show_result(scene: Any, folder: Path) -> Look:
     """
     path = folder / FLARE
     # Before show_look, which compares the positions of the lights.
-    lights.move_to_fit(scene, {light.name: light.xyz for light in read(path).lights}, capture_folder(scene))
+    lights.move_to_fit(scene, {light.name: light.xyz for light in read_look(path).lights}, capture_folder(scene))
     look = looks.show_look(scene, path)
     expose_cameras(scene, folder)
     return look

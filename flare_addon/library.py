@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.colour.srgb import linear_from_srgb, srgb_from_linear
 from ..core.errors import FitFlareError, FlareFileError
-from ..core.look import Look, LookEdits, draw, read
+from ..core.look import Look, LookEdits, draw, read_look
 from ..core.look.look import ViewOfLight, write_annotated
 from ..core.system.files import atomic_path, avoid_device_name
 from .user_settings import library_path
@@ -68,7 +68,7 @@ def save(look: Look, edits: LookEdits, name: str, notes: str, licence: str) -> P
     """
     path = free_path(name)
     write_annotated(look.path, path, notes=notes, licence=licence, edits=edits)
-    write_png(path.with_suffix(".png"), thumbnail(read(path)))
+    write_png(path.with_suffix(".png"), thumbnail(read_look(path)))
     return path
 
 
@@ -144,7 +144,7 @@ def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, 
         number = zlib.crc32(name.encode("utf-8", "surrogateescape")) & 0x7FFFFFFF  # does not depend on the other files
         path = Path(name)
         try:
-            look = read(path)
+            look = read_look(path)
             if not path.with_suffix(".png").is_file() and path.parent != BOX:
                 write_png(path.with_suffix(".png"), thumbnail(look))
             icon = _previews.load(name, str(path.with_suffix(".png")), "IMAGE").icon_id

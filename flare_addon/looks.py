@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, FlareFileError
-from ..core.look import Edit, LightLook, Look, LookEdits, PlacedLight, PlaneGaussians, read
+from ..core.look import Edit, LightLook, Look, LookEdits, PlacedLight, PlaneGaussians, read_look
 from ..core.look.look import Query
 from . import cameras, fcurves, lamp_drive, light_extents, occlusion
 from .compositor import drivers
@@ -40,7 +40,7 @@ def look_of(scene: Any) -> Look:
     known = _cache.get(str(path))
     if known is None or known[0] != stamp:
         try:
-            result: Look | str = read(path)
+            result: Look | str = read_look(path)
         except FlareFileError as problem:
             result = str(problem)  # kept too, so that a panel does not read a bad file at each redraw
         known = _cache[str(path)] = (stamp, result)
@@ -66,7 +66,7 @@ def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add:
     own. A target that has a flare gets no second one.
     """
     path = Path(path)
-    look = read(path)
+    look = read_look(path)
     state = scene.fit_flare
     is_first = not state.lights
     _change_look(scene, _stored_edits(scene), look)

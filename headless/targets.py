@@ -148,14 +148,14 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
     from ..core.fit.run import Run
     from ..core.lights.detection import Detector
     from ..core.lights.exposure import ExposureDetector
-    from ..core.look import read
+    from ..core.look import read_look
     from ..core.look.shot import Shot
     from ..core.transfer.highlights import NAME
     from ..core.transfer.query import training_views
     from ..core.transfer.sources import parse_assignments
     from ..core.transfer.target import capture_target, picture_target, shot_target
 
-    look, to, sources = read(flare), list(options.to), parse_assignments(options.use)
+    look, to, sources = read_look(flare), list(options.to), parse_assignments(options.use)
     if len(to) > 1 and not all(path.suffix.lower() in SUFFIXES for path in to):
         raise SettingsError("Several targets at once have to be pictures.")
     if missing := next((path for path in to if not path.exists()), None):

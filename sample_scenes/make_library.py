@@ -23,7 +23,7 @@ from core.fit.traced_flare import describe, make_flare
 from core.fit.traced_settings import TracedFlareSettings
 from core.images.contact_sheet import add_label, side_by_side
 from core.images.write import write_png
-from core.look import read
+from core.look import read_look
 from core.look.thumbnail import draw_thumbnail
 from core.system.files import write_json
 from core.system.progress import Progress
@@ -151,7 +151,7 @@ def make_library(folder: Path, names: list[str], progress: Progress) -> None:
         if is_current or (names and look.name not in names):
             continue
         result = make_flare(settings, file, progress, notes=f"{look.text} {describe(settings)}", licence=LICENCE)
-        write_png(file.with_suffix(".png"), draw_thumbnail(read(file), THUMBNAIL_SIZE, THUMBNAIL_SIZE))
+        write_png(file.with_suffix(".png"), draw_thumbnail(read_look(file), THUMBNAIL_SIZE, THUMBNAIL_SIZE))
         entries = read_index(folder)  # another process may have added its looks meanwhile
         entries[look.name] = {"name": look.name, "text": look.text, "lens": settings.lens, "licence": LICENCE,
                               "error": round(result.error, 3), "settings": digest}
@@ -164,7 +164,8 @@ def write_sheet(folder: Path, file: Path) -> None:
     import cv2
 
     looks = [look for look in LOOKS if (folder / f"{look.name}.flare").is_file()]
-    cells = [add_label(look.name, draw_thumbnail(read(folder / f"{look.name}.flare"), *SHEET_SIZE)) for look in looks]
+    cells = [add_label(look.name, draw_thumbnail(read_look(folder / f"{look.name}.flare"), *SHEET_SIZE))
+             for look in looks]
     cells += [np.zeros_like(cells[0])] * (-len(cells) % SHEET_COLUMNS)
     rows = [side_by_side(cells[start:start + SHEET_COLUMNS]) for start in range(0, len(cells), SHEET_COLUMNS)]
     sheet = (np.clip(np.concatenate(rows), 0, 1)[..., ::-1] * 255 + 0.5).astype(np.uint8)

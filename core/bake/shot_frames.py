@@ -20,7 +20,7 @@ from ..capture.renderer import RenderedLayers
 from ..colour.srgb import Pixels
 from ..conventions.frame_numbers import NumberedFrame, layers_file
 from ..errors import SettingsError
-from ..look import LookEdits, read
+from ..look import LookEdits, read_look
 from ..look.pyramid import draw_layers
 from ..look.shot import Shot, ShotFrame
 from ..system.progress import Progress
@@ -41,7 +41,7 @@ class ShotSource(ABC):
     """A shot with its look, as a source of frames for `bake_frames`; subclasses render."""
 
     def __init__(self, shot: Shot) -> None:
-        self.shot, self.look = shot, read(shot.flare)
+        self.shot, self.look = shot, read_look(shot.flare)
         self.lights = shot.lights
 
     @property

@@ -28,8 +28,7 @@ from ..flare import file as flare_file
 from ..flare.file import FlareFile
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
-from ..look import Look, LookEdits
-from ..look import read as read_look
+from ..look import Look, LookEdits, read_look
 from ..system.files import hash_files, remove_file, write_json, write_text
 from ..system.progress import Progress
 from ..system.reading import MAX_PATH_BYTES, read_text

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Reads a .flare with numpy alone, without torch, and evaluates, edits and draws it for any camera and lights.
 
-    look = read("lamp.flare")
-    seen = look.evaluate(world_to_camera, edits=LookEdits.parse(["lamp.intensity=2"], look.names))
-    picture = draw(seen.values(), intrinsics, 960, 540, look.blend, look.pixel_grid)
+    look = read_look("lamp.flare")
+    flares = look.evaluate(world_to_camera, edits=LookEdits.parse(["lamp.intensity=2"], look.names))
+    picture = draw(flares.values(), intrinsics, 960, 540, look.blend, look.pixel_grid)
 
     form.py        the switches and sizes of a flare model
     container.py   the safetensors file
@@ -23,8 +23,8 @@ from .drawing import draw
 from .edits import Edit, LookEdits
 from .elements import Element
 from .keyed import KeyedEdits
-from .look import LightLook, Look, PlacedLight, TrainedCamera, ViewOfLight, read, store_elements
+from .look import LightLook, Look, PlacedLight, TrainedCamera, ViewOfLight, read_look, store_elements
 from .plane import PlaneGaussians, to_pixels
 
 __all__ = ["Edit", "Element", "KeyedEdits", "LightLook", "Look", "LookEdits", "PlacedLight", "PlaneGaussians",
-           "TrainedCamera", "ViewOfLight", "draw", "read", "store_elements", "to_pixels"]
+           "TrainedCamera", "ViewOfLight", "draw", "read_look", "store_elements", "to_pixels"]

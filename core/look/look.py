@@ -74,7 +74,7 @@ class TrainedCamera:
 
 
 class LightLook:
-    """The flare of one light; created by `read`."""
+    """The flare of one light; created by `read_look`."""
 
     def __init__(self, name: str, xyz: NDArray[np.float64], form: FlareForm, query_range: QueryRange,
                  rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: Blend,
@@ -162,7 +162,7 @@ class LightLook:
 
 
 class Look:
-    """The lights of a .flare; created by `read`."""
+    """The lights of a .flare; created by `read_look`."""
 
     def __init__(self, path: Path, lights: tuple[LightLook, ...], blend: Blend, camera: TrainedCamera,
                  licence: str = "", notes: str = "", pixel_grid: PixelGrid | None = None,
@@ -277,7 +277,7 @@ def read_description(path: Path | str) -> dict[str, Any]:
 
 def store_elements(path: Path | str) -> None:
     """Write the elements of each light into a .flare without elements, so that later versions group them alike."""
-    look = read(path)
+    look = read_look(path)
     _, metadata = container.read_tensors(path)
     listed = [element.to_json(light.name) for light in look.lights for element in light.elements]
     description = {**_parse_json(Path(path), metadata), "elements": listed}
@@ -357,7 +357,7 @@ def _check_light(path: Path, entry: Mapping[str, Any], listed: Any) -> str:
     return name
 
 
-def read(path: Path | str) -> Look:
+def read_look(path: Path | str) -> Look:
     """Read a .flare. Raises FlareFileError for a file that is missing, damaged, of a newer version, or not a flare."""
     path = Path(path)
     tensors, metadata = container.read_tensors(path)

@@ -34,7 +34,7 @@ from ..gaussians import Splats
 from ..images.picture import Picture
 from ..images.window import crop_to_display_window, move_to_window
 from ..lights.highlights import find_highlights
-from ..look import LightLook, LookEdits, PlacedLight, PlaneGaussians, ViewOfLight, read
+from ..look import LightLook, LookEdits, PlacedLight, PlaneGaussians, ViewOfLight, read_look
 from ..look.placed_light import evaluate_placed
 from ..system.files import check_no_overwrite
 from ..system.progress import Progress
@@ -82,7 +82,7 @@ class Transfer:
     def __init__(self, flare: Path, target: Target, settings: TransferSettings | None = None,
                  training: Sequence[ArrayLike] | None = None, config: str | None = None) -> None:
         self.flare, self.target, self.settings, self.config = flare, target, settings or TransferSettings(), config
-        self.look = read(flare)
+        self.look = read_look(flare)
         self.sources = {light.name: light for light in self.look.lights}
         self.training_views = queries.training_views(flare, self.look.lights, training)
         self._visibilities: dict[tuple[int, str], tuple[float, tuple[float, ...] | None]] = {}

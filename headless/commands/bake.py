@@ -93,7 +93,7 @@ def read_blend(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 def run_flare(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Bake a .flare: for the cameras of a capture, with the lights where the .flare has them, or for a .blend."""
     from ...core.capture import Capture
-    from ...core.look import read
+    from ...core.look import read_look
     from ...core.transfer.target import cameras_target
 
     if args.blend is None and args.capture is None:
@@ -105,7 +105,7 @@ def run_flare(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.blend is not None:
         target = targets.open_target(options, args.run)
     else:
-        target = cameras_target(Capture.open(args.capture, need_frames=False), read(args.run), args.scene)
+        target = cameras_target(Capture.open(args.capture, need_frames=False), read_look(args.run), args.scene)
     return transfer.make_layers(args, options, "bake", target, args.run, None, progress)
 
 

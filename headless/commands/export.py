@@ -37,7 +37,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.conventions.frame_numbers import number_views
     from ...core.conventions.run_files import FLARE
     from ...core.fit.run import Run
-    from ...core.look import LookEdits, ViewOfLight, read
+    from ...core.look import LookEdits, ViewOfLight, read_look
     from ...core.transfer.export import write_flare_ply, write_preset
 
     folder = args.capture
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise SettingsError(f"{args.flare} has no cameras; name a capture with --capture.")
     source = args.flare / FLARE if args.flare.is_dir() else args.flare
     check_no_overwrite([source], [args.out])
-    look = read(source)
+    look = read_look(source)
     edits = LookEdits.parse([*look.edits.texts(), *args.edit_texts], look.names, look.element_names)
     capture = Capture.open(folder, need_frames=False)
     if args.flare.is_dir():

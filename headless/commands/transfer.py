@@ -98,7 +98,7 @@ def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, pr
     """
     from ...core.conventions.frame_numbers import NumberedFrame, select_task_frames
     from ...core.conventions.run_files import FLARE
-    from ...core.look import read
+    from ...core.look import read_look
     from ...flare_addon.capture.blend_shot import open_blend, read_shot
 
     if len(options.to) > 1:
@@ -109,7 +109,7 @@ def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, pr
     flare = flare.resolve()
     if flare.is_dir():
         flare /= FLARE
-    read(flare)
+    read_look(flare)
     scene = open_blend(options.to[0])
     every = range(scene.frame_start, scene.frame_end + 1)
     selected = {frame.number for frame in select_task_frames([NumberedFrame("", number, "") for number in every],

@@ -18,7 +18,7 @@ from core.flare import file as flare_file
 from core.flare.deformation import QueryRange
 from core.flare.file import FlareFile
 from core.flare.model import OURS, FlareModel, LightFlare
-from core.look import LookEdits, TrainedCamera, draw, read
+from core.look import LookEdits, TrainedCamera, draw, read_look
 from core.look.shot import Shot
 from tests.core.flared import HEIGHT, LIGHT, WIDTH, cameras, flared_capture
 
@@ -317,7 +317,7 @@ def test_the_overlay_shows_what_is_baked(made: tuple[Any, Path], tmp_path: Path)
     shot = Shot.read(base / "shot.json")
     bake_shot(shot, tmp_path, half=False)
     frame = shot.frames[0]
-    shown = read(shot.flare).evaluate_lights(frame.camera.world_to_camera, frame.lights,
+    shown = read_look(shot.flare).evaluate_lights(frame.camera.world_to_camera, frame.lights,
                      LookEdits.parse(frame.edits, shot.lights, None), shot.query)
     picture = draw(shown.values(), frame.camera.intrinsics, *frame.camera.size)
     assert picture.max() > 0.05

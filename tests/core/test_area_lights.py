@@ -16,7 +16,7 @@ from core.capture.light_extent import CELLS, SAMPLES
 from core.errors import CaptureError, SettingsError
 from core.flare.model import PAPER
 from core.flare.visibility import VisibilitySettings, visibility_behind
-from core.look import Look, LookEdits, PlacedLight, PlaneGaussians, draw, read
+from core.look import Look, LookEdits, PlacedLight, PlaneGaussians, draw, read_look
 from core.look.shot import Shot, ShotFrame
 from core.transfer.target import shot_target
 from core.transfer.transfer import Transfer, TransferSettings
@@ -37,7 +37,7 @@ def total(flare: PlaneGaussians | None) -> float:
 
 def one_light(tmp_path: Path, form: object = None) -> Look:
     saved(tmp_path / "a.flare", form or replace(PAPER, levels=6), 1)  # type: ignore[arg-type]
-    return read(tmp_path / "a.flare")
+    return read_look(tmp_path / "a.flare")
 
 
 def flare_of(look: Look, light: PlacedLight) -> PlaneGaussians | None:
@@ -300,7 +300,7 @@ def test_a_transfer_and_a_bake_show_the_same_extended_light(tmp_path: Path) -> N
     light = placed(RECTANGLE, factor=(1.0, 0.5, 0.2), reference_distance=3.0)
     shot = Shot(tmp_path / "a.flare", (ShotFrame(1, "Camera", camera, (replace(light, shares=shares),)),), "target")
     baked = ShotRenderer(shot).render(shot.frames[0], camera).flare_by_light["a"]
-    look = read(tmp_path / "a.flare")
+    look = read_look(tmp_path / "a.flare")
     transfer = Transfer(tmp_path / "a.flare", shot_target(shot, look, {}), TransferSettings("target"))
     frame = transfer.target.frames[0]
     moved = transfer.frame_renderer(frame.frame).render(camera).flare_by_light["a"]
@@ -313,7 +313,7 @@ def test_a_transfer_and_a_bake_show_the_same_extended_light(tmp_path: Path) -> N
 
 def test_fall_off_of_a_transfer_starts_at_the_distance_of_the_first_frame(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", SMALL, 1)
-    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     away = replace(camera, world_to_camera=camera.world_to_camera + np.outer([0, 0, 4, 0], [0, 0, 0, 1]))
     frames = tuple(ShotFrame(number, "Camera", each, (placed(),)) for number, each in ((1, camera), (2, away)))
     target = shot_target(Shot(tmp_path / "a.flare", frames), look, {})

@@ -20,8 +20,7 @@ from core.fit import fit
 from core.fit.run import Run
 from core.fit.settings import preset
 from core.gaussians.ply import read_ply
-from core.look import LookEdits
-from core.look import read as read_look
+from core.look import LookEdits, read_look
 from core.look.shot import Shot
 from core.optics.prescription import built_in_lenses
 from core.removal.inference.remover import Remover

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from core.images.read import read_picture
-from core.look import ViewOfLight, read
+from core.look import ViewOfLight, read_look
 from sample_scenes import make_library
 from sample_scenes.make_library import INDEX, LIBRARY, LOOKS, LibraryLook
 
@@ -26,7 +26,7 @@ def test_the_library_is_whole_and_small() -> None:
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry["name"])
 def test_a_look_of_the_library_can_be_used(entry: dict[str, str]) -> None:
-    look = read(LIBRARY / f"{entry['name']}.flare")
+    look = read_look(LIBRARY / f"{entry['name']}.flare")
     assert look.licence == entry["licence"] == "CC0-1.0"
     assert look.notes.startswith(entry["text"]) and "Traced through" in look.notes
     assert look.blend == "add" and look.pixel_grid is not None and len(look.lights) == 1

@@ -28,7 +28,7 @@ from core.look import (
     TrainedCamera,
     ViewOfLight,
     draw,
-    read,
+    read_look,
     store_elements,
 )
 from core.look import elements as grouping
@@ -56,7 +56,7 @@ def saved(path: Path, form: FlareForm = SMALL, lights: int = 2, blend: str = "ad
 @pytest.mark.parametrize("name", FORMS)
 def test_the_look_evaluates_as_the_torch_model(name: str, tmp_path: Path) -> None:
     model = saved(tmp_path / "a.flare", FORMS[name])
-    look = read(tmp_path / "a.flare")
+    look = read_look(tmp_path / "a.flare")
     assert look.names == model.names
     for number in range(3):
         with torch.no_grad():
@@ -82,7 +82,7 @@ def test_draw_equals_the_rasterizer(form: str, blend: str, tmp_path: Path) -> No
     with torch.no_grad():
         expected = splat_flare(next(iter(model(pose(1)).values())), torch.from_numpy(camera.intrinsics).float(), 64, 40,
                                blend, kernels="torch").colour.numpy()  # type: ignore[arg-type]
-    look = read(tmp_path / "a.flare")
+    look = read_look(tmp_path / "a.flare")
     picture = draw(look.evaluate(camera.world_to_camera).values(), camera.intrinsics, 64, 40, look.blend)
     assert expected.max() > 0.05
     np.testing.assert_allclose(picture, expected, atol=2e-5)
@@ -91,12 +91,12 @@ def test_draw_equals_the_rasterizer(form: str, blend: str, tmp_path: Path) -> No
 def test_a_light_behind_the_camera_has_no_flare(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare")
     behind = np.diag([1.0, -1.0, -1.0, 1.0])
-    assert read(tmp_path / "a.flare").evaluate(behind) == {}
+    assert read_look(tmp_path / "a.flare").evaluate(behind) == {}
 
 
 def test_lights_can_be_placed_omitted_and_hidden(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare")
-    look, view = read(tmp_path / "a.flare"), cameras(3)[0].world_to_camera
+    look, view = read_look(tmp_path / "a.flare"), cameras(3)[0].world_to_camera
     moved = look.evaluate(view, lights={"lamp 1": look.lights[0].xyz})
     assert list(moved) == ["lamp 1"]
     half = look.evaluate(view, visibilities={"lamp 0": 0.25})
@@ -105,7 +105,7 @@ def test_lights_can_be_placed_omitted_and_hidden(tmp_path: Path) -> None:
 
 def test_a_query_can_be_clipped_to_the_trained_range(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", replace(PAPER, levels=6), 1)
-    look = read(tmp_path / "a.flare")
+    look = read_look(tmp_path / "a.flare")
     inside, far = cameras(3)[1].world_to_camera, cameras(3)[1].world_to_camera.copy()
     far[0, 3] += 3
     for view, same in ((inside, True), (far, False)):
@@ -124,7 +124,7 @@ def test_a_query_can_be_clipped_to_the_trained_range(tmp_path: Path) -> None:
 
 def test_notes_and_licence_are_read(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare")
-    look = read(tmp_path / "a.flare")
+    look = read_look(tmp_path / "a.flare")
     assert (look.licence, look.notes, look.camera.width, look.count) == ("CC0", "some notes", 64, 80)
 
 
@@ -152,12 +152,12 @@ def test_bad_files_raise_in_one_line(tmp_path: Path) -> None:
     for name, content in bad.items():
         (tmp_path / f"{name}.flare").write_bytes(content)
         with pytest.raises(FlareFileError, match=name):
-            read(tmp_path / f"{name}.flare")
+            read_look(tmp_path / f"{name}.flare")
     for name in ("newer", "form"):
         with pytest.raises(FlareFileError, match="newer Fit Flare"):
-            read(tmp_path / f"{name}.flare")
+            read_look(tmp_path / f"{name}.flare")
     with pytest.raises(FlareFileError, match="missing"):
-        read(tmp_path / "absent.flare")
+        read_look(tmp_path / "absent.flare")
 
 
 def test_the_container_equals_safetensors(tmp_path: Path) -> None:
@@ -230,9 +230,9 @@ def test_elements_have_their_extent_and_colour() -> None:
 def test_stored_elements_are_not_regrouped(tmp_path: Path) -> None:
     path = tmp_path / "a.flare"
     flare_file.save(path, FlareFile(some_flare(SMALL, 40, 2), "add", CAMERA))
-    found = read(path)
+    found = read_look(path)
     store_elements(path)
-    again = read(path)
+    again = read_look(path)
     assert len(flare_file.load(path).elements) == sum(len(light.elements) for light in found.lights)
     for before, after_ in zip(found.lights, again.lights, strict=True):
         assert [element.name for element in before.elements] == [element.name for element in after_.elements]
@@ -248,7 +248,7 @@ def test_elements_in_the_file_take_precedence(tmp_path: Path) -> None:
     model = some_flare(SMALL, 6, 1)
     listed = [{"light": "lamp 0", "name": "iris", "kind": "ring", "members": [0, 2], "mu": 0.5, "energy": 0.7}]
     flare_file.save(tmp_path / "a.flare", FlareFile(model, "add", CAMERA, elements=listed))
-    elements = read(tmp_path / "a.flare").lights[0].elements
+    elements = read_look(tmp_path / "a.flare").lights[0].elements
     assert [(element.name, element.members.tolist()) for element in elements] == [
         ("iris", [0, 2]), ("rest", [1, 3, 4, 5])]
 
@@ -323,7 +323,7 @@ def test_arcs_need_rings(tmp_path: Path) -> None:
     description = json.loads(metadata["fit_flare"])
     description["lights"][0]["form"]["rings"] = False
     rewrite_metadata(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
-    for reader in (read, flare_file.load):
+    for reader in (read_look, flare_file.load):
         with pytest.raises(FlareFileError, match="is damaged"):
             reader(tmp_path / "b.flare")
 
@@ -336,7 +336,7 @@ def test_a_form_out_of_bounds_raises_in_all_readers(name: str, tmp_path: Path) -
     for value in (FORM_BOUNDS[name].minimum - 1, FORM_BOUNDS[name].maximum + 1):
         description["lights"][0]["form"][name] = value
         rewrite_metadata(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
-        for reader in (read, flare_file.load):
+        for reader in (read_look, flare_file.load):
             with pytest.raises(FlareFileError, match="form is not valid"):
                 reader(tmp_path / "b.flare")
 
@@ -350,7 +350,7 @@ def test_a_network_that_does_not_fit_its_form_raises_on_reading(changed: dict[st
     description = json.loads(metadata["fit_flare"])
     description["lights"][0]["form"].update(changed)
     rewrite_metadata(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
-    for reader in (read, flare_file.load):
+    for reader in (read_look, flare_file.load):
         with pytest.raises(FlareFileError, match="is damaged"):
             reader(tmp_path / "b.flare")
 
@@ -385,7 +385,7 @@ def test_both_readers_raise_the_same_errors(what: str, said: str, tmp_path: Path
         case _:
             second["count"] = math.inf
     rewrite_metadata(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
-    for reader in (read, flare_file.load):
+    for reader in (read_look, flare_file.load):
         reader(tmp_path / "a.flare")
         with pytest.raises(FlareFileError, match=rf"b\.flare.*{said}"):
             reader(tmp_path / "b.flare")
@@ -471,7 +471,7 @@ def test_keyed_edits_are_interpolated_between_keyframes(tmp_path: Path) -> None:
 
 def test_a_rotated_light_flare_is_finite_everywhere(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", SMALL, 1)
-    look = read(tmp_path / "a.flare")
+    look = read_look(tmp_path / "a.flare")
     edits = LookEdits(Edit(scale=0.0, spread=0.0, rotation=720.0, streak=0.0, intensity=0.0))
     for gaussians in look.evaluate(cameras(3)[0].world_to_camera, edits=edits).values():
         assert np.isfinite(gaussians.means).all()
@@ -487,7 +487,7 @@ def test_the_rasterizer_draws_edits_as_the_look(tmp_path: Path) -> None:
     from core.gaussians.scene import SceneGaussians
 
     model = saved(tmp_path / "a.flare")
-    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     part = look.lights[1].elements[0].name
     edits = LookEdits.parse(["*.scale=1.4", "lamp 0.spread=0.7", f"lamp 1/{part}.intensity=3", "lamp 1.rotation=40"],
                             look.names, look.element_names)
@@ -542,7 +542,7 @@ def test_a_shot_bake_equals_the_overlay(tmp_path: Path) -> None:
     shot = a_shot(tmp_path, "second.intensity=2", "*.scale=1.2")
     record = bake_shot(shot, tmp_path / "layers", half=False)
     assert [entry["file"] for entry in record["frames"]] == [f"layers.000{number}.exr" for number in (1, 2, 3)]
-    look, frame = read(shot.flare), shot.frames[2]
+    look, frame = read_look(shot.flare), shot.frames[2]
     edits = LookEdits.parse(frame.edits, shot.lights)
     shown = look.evaluate_lights(frame.camera.world_to_camera, frame.lights, edits)
     layers = read_layers(tmp_path / "layers" / "layers.0003.exr")
@@ -585,10 +585,10 @@ def test_annotated_flares_are_read_by_both_readers(tmp_path: Path) -> None:
 
     saved(tmp_path / "a.flare")
     write_annotated(tmp_path / "a.flare", tmp_path / "b.flare", notes="Zeiss, wide open: ö", licence="CC BY 4.0")
-    look, engine = read(tmp_path / "b.flare"), flare_file.load(tmp_path / "b.flare")
+    look, engine = read_look(tmp_path / "b.flare"), flare_file.load(tmp_path / "b.flare")
     assert (look.notes, look.licence) == (engine.notes, engine.licence) == ("Zeiss, wide open: ö", "CC BY 4.0")
     view = cameras(3)[0].world_to_camera
-    before, after_ = (read(tmp_path / name).evaluate(view) for name in ("a.flare", "b.flare"))
+    before, after_ = (read_look(tmp_path / name).evaluate(view) for name in ("a.flare", "b.flare"))
     np.testing.assert_array_equal(before["lamp 1"].means, after_["lamp 1"].means)
 
 
@@ -612,7 +612,7 @@ def test_the_layers_of_a_shot_scale_with_intensity(blend: str, tmp_path: Path) -
     from core.bake.shot import bake_shot
 
     saved(tmp_path / "a.flare", lights=1, blend=blend)
-    light = read(tmp_path / "a.flare").lights[0]
+    light = read_look(tmp_path / "a.flare").lights[0]
     layers = {}
     for words in ((), ("lamp.intensity=0.25",), ("lamp.tint=0,1,0.5",)):
         one = ShotFrame(1, "Camera", cameras(3)[1], (PlacedLight("lamp", light.name, light.xyz, 1.0),), words)
@@ -655,7 +655,7 @@ def test_a_shot_bake_uses_its_query_and_its_run(tmp_path: Path, monkeypatch: pyt
 
 def test_the_source_query_lies_within_the_trained_range(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
-    light = read(tmp_path / "a.flare").lights[0]
+    light = read_look(tmp_path / "a.flare").lights[0]
     far = ViewOfLight(np.zeros(3, np.float32), np.eye(3, dtype=np.float32), np.array([3, 4], np.float32), 1.0)
     found, reach = network_query(light, far, "source").light, light.query_range.light_high
     assert np.linalg.norm(found) <= reach[2] + 1e-5
@@ -666,13 +666,13 @@ def test_a_flare_stores_edits_of_its_lights(tmp_path: Path) -> None:
     from core.look.look import write_annotated
 
     saved(tmp_path / "a.flare")
-    plain = read(tmp_path / "a.flare")
+    plain = read_look(tmp_path / "a.flare")
     first, second = plain.names
     part = plain.lights[0].elements[0].name
     edits = LookEdits.parse(["*.intensity=2", f"{first}.rotation=30", f"{second}.mute=1", f"{first}/{part}.scale=1.5"],
                             plain.names, plain.element_names)
     write_annotated(tmp_path / "a.flare", tmp_path / "b.flare", notes="", licence="", edits=edits)
-    look = read(tmp_path / "b.flare")
+    look = read_look(tmp_path / "b.flare")
     assert plain.edits.is_neutral
     assert sorted(look.edits.texts()) == sorted(edits.texts())
     placed = look.edits.placed({"key": first, "rim": first, "moon": second})
@@ -683,5 +683,5 @@ def test_a_flare_stores_edits_of_its_lights(tmp_path: Path) -> None:
         stored = json.loads(metadata["fit_flare"]) | {"edits": json.loads(wrong)}
         rewrite_metadata(tmp_path / "b.flare", tmp_path / "c.flare", {"fit_flare": json.dumps(stored)})
         with pytest.raises(FlareFileError, match="damaged"):
-            _ = read(tmp_path / "c.flare").edits
+            _ = read_look(tmp_path / "c.flare").edits
     assert len(tensors) > 2

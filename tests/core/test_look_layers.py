@@ -21,8 +21,7 @@ from core.fit.rendering import splat_look
 from core.flare.compositing import linear_layers
 from core.images.exr import read_exr, read_exr_header
 from core.images.formats.exr_writer import write_scanlines
-from core.look import PlacedLight, PlaneGaussians, draw
-from core.look import read as read_look
+from core.look import PlacedLight, PlaneGaussians, draw, read_look
 from core.look.pyramid import draw_added, draw_layers
 from core.look.shot import Shot, ShotFrame
 from tests.core.flared import LIGHT, cameras

@@ -26,7 +26,7 @@ from core.flare.compositing import splat_flare
 from core.flare.placement import PlaneGaussians
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import read_ply, write_ply
-from core.look import PlacedLight, draw, read, to_pixels
+from core.look import PlacedLight, draw, read_look, to_pixels
 from core.look import PlaneGaussians as LookGaussians
 from core.look.container import read_tensors, rewrite_metadata
 from core.look.shot import Shot, ShotFrame
@@ -220,11 +220,11 @@ def test_a_flare_with_a_damaged_grid_is_refused(run: Run, tmp_path: Path) -> Non
     for entry in ({"least": 0, "most": 1}, {"least": 5}, [1, 2], "far", {"least": "a", "most": "b"}, 7):
         rewrite_metadata(run.folder / FLARE, tmp_path / "a.flare",
                   {**metadata, "fit_flare": json.dumps({**description, "sampling": entry})})
-        for reader in (read, flare_file.load):
+        for reader in (read_look, flare_file.load):
             with pytest.raises(FlareFileError, match=r"a\.flare is damaged"):
                 reader(tmp_path / "a.flare")
     del description["sampling"]  # as fits wrote it before
     rewrite_metadata(run.folder / FLARE, tmp_path / "a.flare", {**metadata, "fit_flare": json.dumps(description)})
-    assert read(tmp_path / "a.flare").pixel_grid is None
+    assert read_look(tmp_path / "a.flare").pixel_grid is None
     assert flare_file.load(tmp_path / "a.flare").pixel_grid is None
     assert replace(GRID, min_focal_length=1.0).pixel_ratio(2.0) == 1

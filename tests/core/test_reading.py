@@ -23,7 +23,7 @@ from core.fit.run import Run
 from core.images.plates import read_plate
 from core.images.read import read_picture
 from core.images.video import Video
-from core.look import read
+from core.look import read_look
 from core.look.keyed import KeyedEdits
 from core.system import reading, tensor_files
 from core.system.files import atomic_path, file_lock, read_json, write_text
@@ -86,7 +86,8 @@ def test_a_special_file_is_refused_by_name(tmp_path: Path, kind: str) -> None:
 def test_every_reader_refuses_a_special_file(tmp_path: Path, kind: str) -> None:
     readers: dict[str, Callable[[Path], Any]] = {
         "a.png": read_plate, "b.tif": read_plate, "c.exr": read_picture, "d.mp4": Video,
-        "lights.json": read_lights, "look.flare": read, "edits.toml": KeyedEdits.read, "edits.json": KeyedEdits.read,
+        "lights.json": read_lights, "look.flare": read_look, "edits.toml": KeyedEdits.read,
+        "edits.json": KeyedEdits.read,
         "config.ocio": lambda path: ocio_space("linear", path), "exposures.json": lambda path: exposures.read(
             path.parent), "bake.json": lambda path: read_manifest(path.parent)}
     for name, reader in readers.items():

@@ -12,7 +12,7 @@ from core.errors import Cancelled, SettingsError
 from core.fit import traced_flare
 from core.fit.traced_flare import make_flare
 from core.fit.traced_settings import REFERENCE_REACH, TracedFlareSettings
-from core.look import ViewOfLight, draw, read
+from core.look import ViewOfLight, draw, read_look
 from core.optics.flare import build_optics
 from core.optics.ghosts import draw_ghosts, limited
 from core.optics.lenses import find_lens, lens_names
@@ -45,7 +45,7 @@ def test_a_long_lens_is_fitted_as_well_as_a_short_one(made: tuple[Path, traced_f
 
 
 def test_a_made_flare_is_a_look_as_any_other(made: tuple[Path, traced_flare.TracedResult]) -> None:
-    look = read(made[0])
+    look = read_look(made[0])
     assert (look.blend, look.notes, look.licence, look.names) == ("add", "n", "CC0-1.0", ("light",))
     assert look.pixel_grid is not None and look.pixel_grid.min_focal_length == pytest.approx(look.camera.fx)
     names = [element.name for element in look.lights[0].elements]
@@ -54,7 +54,7 @@ def test_a_made_flare_is_a_look_as_any_other(made: tuple[Path, traced_flare.Trac
 
 
 def test_the_place_of_the_camera_changes_nothing(made: tuple[Path, traced_flare.TracedResult]) -> None:
-    look = read(made[0])
+    look = read_look(made[0])
     place = np.array([0.1, -0.05], np.float32)
 
     def drawn(camera: tuple[float, float, float]) -> np.ndarray:

@@ -27,7 +27,7 @@ from core.images.exr import read_data_window, read_exr
 from core.images.plates import Plate
 from core.images.window import DataWindow, move_to_window, union_window
 from core.images.write import write_exr, write_png
-from core.look import KeyedEdits, Look, PlacedLight, TrainedCamera, ViewOfLight, read
+from core.look import KeyedEdits, Look, PlacedLight, TrainedCamera, ViewOfLight, read_look
 from core.look.shot import Shot, ShotFrame
 from core.system.files import write_json
 from core.transfer import query as queries
@@ -69,7 +69,7 @@ def flare(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def look(flare: Path) -> Look:
-    return read(flare)
+    return read_look(flare)
 
 
 def name(look: Look) -> str:
@@ -193,7 +193,7 @@ def test_visibility_is_not_smoothed_across_stills(flare: Path, look: Look) -> No
 def test_the_scene_of_the_fit_hides_lights_as_in_the_fit(flare: Path, tmp_path: Path) -> None:
     """If splats leave a third of an unoccluded light, a third counts as full visibility."""
     flare_file.save(tmp_path / "veiled.flare", replace(flare_file.load(flare), model=veiled(flare, 1 / 3)))
-    look, camera = read(tmp_path / "veiled.flare"), cameras(3)[1]
+    look, camera = read_look(tmp_path / "veiled.flare"), cameras(3)[1]
     middle = camera.position + 0.5 * (look.lights[0].xyz - camera.position)
     haze = SceneGaussians(torch.tensor(middle[None], dtype=torch.float32), torch.full((1, 3), 1.0),
                           torch.tensor([[1.0, 0, 0, 0]]), torch.logit(torch.tensor([2 / 3])), torch.zeros(1, 16, 3))

@@ -17,7 +17,7 @@ from core.gaussians import rasterization
 from core.gaussians.ply import read_ply
 from core.gaussians.projection import rotation_matrices
 from core.gaussians.rendering import ALPHA_MIN
-from core.look import LookEdits, PlaneGaussians, ViewOfLight, draw, read
+from core.look import LookEdits, PlaneGaussians, ViewOfLight, draw, read_look
 from core.transfer.export import _part, flare_scene, preset, write_flare_ply, write_preset
 from tests.core.flared import cameras
 from tests.core.test_look import saved
@@ -29,7 +29,7 @@ def test_the_ply_of_a_frame_renders_as_the_flare(blend: str, pixel_grid: PixelGr
     """Without rings, which 3DGS has no word for; "over", which is what a 3DGS renderer does."""
     form = replace(PAPER if blend == "over" else OURS, rings=False)
     saved(tmp_path / "a.flare", form, 2, blend)
-    look, camera = read(tmp_path / "a.flare"), cameras(3)[0]
+    look, camera = read_look(tmp_path / "a.flare"), cameras(3)[0]
     seen = look.evaluate(camera.world_to_camera)
     write_flare_ply(tmp_path / "flare.ply", seen, camera, blend, pixel_grid)
     scene = read_ply(tmp_path / "flare.ply")
@@ -48,7 +48,7 @@ def test_the_ply_of_a_frame_renders_as_the_flare(blend: str, pixel_grid: PixelGr
 
 def test_rings_are_extra_properties_of_the_ply(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", OURS, 1)
-    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     seen = look.evaluate(camera.world_to_camera)
     write_flare_ply(tmp_path / "flare.ply", seen, camera, look.blend)
     head, body = (tmp_path / "flare.ply").read_bytes().split(b"end_header\n")
@@ -61,7 +61,7 @@ def test_rings_are_extra_properties_of_the_ply(tmp_path: Path) -> None:
 def test_arcs_are_extra_properties_of_the_ply(tmp_path: Path) -> None:
     """In the Gaussians' own axes: exp(arc_0 u + arc_1 v) of the PLY's u and v is exp(b·d) of the plane's d."""
     saved(tmp_path / "a.flare", replace(OURS, arcs=True), 1)
-    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     seen = next(iter(look.evaluate(camera.world_to_camera).values()))
     scene, more = flare_scene({"lamp": seen}, camera)
     assert list(more) == ["ring_r0", "ring_w", "arc_0", "arc_1"]
@@ -80,7 +80,7 @@ def test_an_invisible_flare_is_an_empty_ply(tmp_path: Path) -> None:
 
 def test_a_light_name_with_line_breaks_stays_in_one_comment(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", OURS, 1)
-    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     seen = next(iter(look.evaluate(camera.world_to_camera).values()))
     write_flare_ply(tmp_path / "flare.ply", {"left\nelement lamp\r": seen, "right": seen}, camera, look.blend)
     assert len(read_ply(tmp_path / "flare.ply")) == 2 * look.count
@@ -90,7 +90,7 @@ def test_a_light_name_with_line_breaks_stays_in_one_comment(tmp_path: Path) -> N
 def test_a_preset_has_position_and_intensity(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One Gaussian of each kind at a known place."""
     saved(tmp_path / "a.flare", OURS, 1, count=4)
-    look = read(tmp_path / "a.flare")
+    look = read_look(tmp_path / "a.flare")
     light = np.array([0.3, 0.4], np.float32)
     along = np.array([0.6, 0.8])
     means = np.stack([light, 0 * light, -light, light / 2]).astype(np.float32)
@@ -125,7 +125,7 @@ def test_a_preset_has_position_and_intensity(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.parametrize("blend", ["over", "add"])
 def test_a_preset_has_the_visible_lights_at_the_frame_s_exposure(blend: str, tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", OURS, 2, blend)
-    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
     edits = LookEdits.parse(["lamp 0.mute=1"], look.names)
     usual, exposed = (preset(look, view, edits, replace(camera, exposure=times)) for times in (1.0, 0.5))
@@ -139,7 +139,7 @@ def test_a_preset_has_the_visible_lights_at_the_frame_s_exposure(blend: str, tmp
 @pytest.mark.parametrize("word", ["mute", "solo"])
 def test_a_preset_omits_exactly_the_hidden_elements(word: str, tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", OURS, 1)
-    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     light = look.lights[0]
     view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz)}
     everything = {one["name"]: one for one in preset(look, view)["lights"][0]["elements"]}
@@ -155,7 +155,7 @@ def test_a_preset_omits_exactly_the_hidden_elements(word: str, tmp_path: Path) -
 def test_a_preset_is_in_picture_widths(tmp_path: Path) -> None:
     """Not of the footage the flare was trained on."""
     saved(tmp_path / "a.flare", OURS, 1)
-    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
     wide, tele = (preset(look, view, camera=replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom))["lights"][0]
                   for zoom in (1, 2))

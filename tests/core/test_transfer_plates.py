@@ -14,7 +14,7 @@ from core.colour.srgb import linear_from_srgb
 from core.images.exr import read_exr
 from core.images.formats.exif import apply_orientation, read_exif, undo_orientation
 from core.images.write import write_exr
-from core.look import Look, read
+from core.look import Look, read_look
 from core.transfer.plates import upright_picture
 from core.transfer.target import Target, picture_target
 from core.transfer.transfer import Transfer
@@ -134,4 +134,4 @@ def test_a_sequence_with_the_number_inside_is_in_order(flare: Path, look: Look, 
     frames = target(paths, look).frames
     assert [(frame.plate.name, frame.frame.number) for frame in frames if frame.plate] == [
         ("sh_9_comp.png", 9), ("sh_10_comp.png", 10), ("sh_11_comp.png", 11)]
-    assert read(flare).names == look.names
+    assert read_look(flare).names == look.names

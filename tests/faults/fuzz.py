@@ -58,7 +58,7 @@ from core.images.plates import read_plate
 from core.images.read import read_picture
 from core.images.video import Video
 from core.images.write import write_exr
-from core.look import TrainedCamera, read
+from core.look import TrainedCamera, read_look
 from core.look.keyed import KeyedEdits
 from core.look.shot import Shot, ShotFrame
 from core.removal.jobs.manifest import Manifest
@@ -95,7 +95,7 @@ class Format(NamedTuple):
     name: str
     folder: Path
     file: str
-    read: Callable[[Path], Any]
+    read_look: Callable[[Path], Any]
 
 
 def formats(base: Path) -> list[Format]:
@@ -162,7 +162,7 @@ def formats(base: Path) -> list[Format]:
         {"frame": 1, "file": "layers.0001.exr", "width": 64, "height": 48, "rest": []}]}
     add("bake.json", "bake.json", read_manifest, file("bake.json", json.dumps(manifest)))
     look = FlareFile(some_flare(count=6), "over", TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5))
-    for name, load in (("flare, look", read), ("flare, model", load_flare)):
+    for name, load in (("flare, look", read_look), ("flare, model", load_flare)):
         add(name, "look.flare", lambda folder, load=load: load(folder / "look.flare"),  # type: ignore[misc]
             lambda folder: save_flare(folder / "look.flare", look))
 

@@ -32,7 +32,7 @@ from core.images.plates import read_plate
 from core.images.read import read_picture
 from core.images.size import picture_size
 from core.images.write import write_exr
-from core.look import read
+from core.look import read_look
 from core.metrics import lpips
 from core.removal.jobs.manifest import Manifest
 from core.removal.model import weights
@@ -65,7 +65,7 @@ def test_every_attempt_names_a_test_that_exists() -> None:
 def test_no_reader_unpickles(tmp_path: Path) -> None:
     mark, path = tmp_path / "mark", tmp_path / "a.flare"
     path.write_bytes(pickle.dumps(Trap(mark)))
-    for reader in (read, load_flare, checkpoint.load, weights.load_network):
+    for reader in (read_look, load_flare, checkpoint.load, weights.load_network):
         with pytest.raises(FitFlareError):
             reader(path)
     assert not mark.exists()

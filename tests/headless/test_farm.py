@@ -23,7 +23,7 @@ from core.bake.bake import read_manifest
 from core.capture import Capture
 from core.fit import fit, preset
 from core.fit.settings import override_settings
-from core.look import PlacedLight, read
+from core.look import PlacedLight, read_look
 from core.look.shot import Shot, ShotFrame
 from core.removal.jobs.manifest import MANIFEST
 from core.removal.model.weights_file import IN_THE_BOX
@@ -153,10 +153,11 @@ def test_every_capture_of_a_list_is_fitted(capture: Path, tmp_path: Path, capfd:
 def test_a_transfer_runs_in_chunks(capture: Path, made: Path, tmp_path: Path) -> None:
     """On to a shot: two tasks and the record."""
     flare = made / "flare.flare"
-    name = read(flare).names[0]
+    name = read_look(flare).names[0]
     views = Capture.open(capture).views[:4]
     shot = Shot(flare, tuple(ShotFrame(number, "Camera", view.camera, (
-        PlacedLight("sun", name, read(flare).lights[0].xyz + 3.0 * number),)) for number, view in enumerate(views, 1)))
+        PlacedLight("sun", name, read_look(flare).lights[0].xyz + 3.0 * number),))
+        for number, view in enumerate(views, 1)))
     shot.write(tmp_path / "shot.json")
     job("transfer.yaml", "Record", "--run-dependencies", Flare=flare, To=tmp_path / "shot.json", Out=tmp_path / "out",
         Frames="1-4", FramesPerTask=2, Query="blend", Set="")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from fit_flare.headless import cli
 
-from core.look import read
+from core.look import read_look
 
 TINY = ("tracing.width=48", "tracing.positions=4", "tracing.bands=1", "ghosts.count=3", "fit.iterations=10",
         "fit.gaussians=60")
@@ -25,7 +25,7 @@ def test_make_flare_writes_a_flare_and_its_error(tmp_path: Path, capsys: pytest.
     changes = [part for change in TINY for part in ("--set", change)]
     assert run(lens, "--out", out, "--settings", settings, "--blades", 6, "--streak", 0.8, "--colour", "1,0.8,0.5",
                "--coating", "520,0", "--dispersion", "off", "--notes", "mine", *changes) == 0
-    look = read(out)
+    look = read_look(out)
     assert look.notes == "mine" and look.camera.width == 48
     text = capsys.readouterr()
     assert "relative L2 in linear light" in text.out + text.err

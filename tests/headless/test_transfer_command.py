@@ -25,7 +25,7 @@ from core.gaussians.ply import read_ply
 from core.images.formats import jpeg
 from core.images.read import read_picture
 from core.images.write import write_png
-from core.look import TrainedCamera, read
+from core.look import TrainedCamera, read_look
 from core.look.shot import Shot
 from tests.core.captures import make_transforms
 from tests.core.test_flare import some_flare
@@ -120,11 +120,11 @@ def test_a_bare_flare_is_baked_as_its_run_is(run: Run, made: Path, capture: Path
 
 def test_splats_and_preset_have_every_gaussian_of_the_flare(run: Run, made: Path, tmp_path: Path) -> None:
     run("export", made, "--as", "ply", "--out", tmp_path / "ply", "--frames", "2")
-    assert len(read_ply(tmp_path / "ply" / "flare.0002.ply")) == read(made / "flare.flare").count
+    assert len(read_ply(tmp_path / "ply" / "flare.0002.ply")) == read_look(made / "flare.flare").count
     run("export", made, "--as", "preset", "--out", tmp_path / "lamp.json", "--frames", "2")
     preset_made = json.loads((tmp_path / "lamp.json").read_text())
     parts = [part for element in preset_made["lights"][0]["elements"] for part in element["parts"]]
-    assert len(parts) == read(made / "flare.flare").count
+    assert len(parts) == read_look(made / "flare.flare").count
     assert {"offset", "size", "colour", "shape"} <= set(parts[0])
 
 
@@ -274,7 +274,7 @@ def test_edits_that_a_flare_stores_are_applied_and_named(run: Run, tmp_path: Pat
 
     save_flare(tmp_path / "plain.flare", FlareFile(some_flare(count=20, lights=1), "add",
                                                    TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5)))
-    look = read(tmp_path / "plain.flare")
+    look = read_look(tmp_path / "plain.flare")
     write_annotated(tmp_path / "plain.flare", tmp_path / "edited.flare", notes="", licence="",
                     edits=LookEdits.parse([f"{look.names[0]}.intensity=0.25"], look.names))
     write_png(tmp_path / "plate.png", np.zeros((40, 64, 3), np.float32))

@@ -97,7 +97,7 @@ class Ours:
         for panel in module("panels")._CLASSES:
             timed_draw(panel, self._of(f"panel {panel.bl_label}"))
         timed(module("looks"), "show_look", self._of("take the flare in"))
-        timed(module("looks"), "read", self._of("read a .flare"))
+        timed(module("looks"), "read_look", self._of("read a .flare"))
         for name in ("overlay", "points"):
             drawn = module(name)
             drawn.unregister()

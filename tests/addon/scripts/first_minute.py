@@ -118,8 +118,8 @@ ops.apply_flare(filepath=str(saved))
 facts["chosen"] = [state.master.intensity, state.lights[1].mute, state.lights[0].spread]
 ops.apply_flare(filepath=two)
 facts["as fitted"] = [state.master.intensity, state.lights[0].spread, state.lights[0].elements[0].tint[1]]
-neutral = library.thumbnail(core_look.read(two))
-facts["thumbnail differs"] = float(np.abs(library.thumbnail(core_look.read(saved)) - neutral).max()) > 0.01
+neutral = library.thumbnail(core_look.read_look(two))
+facts["thumbnail differs"] = float(np.abs(library.thumbnail(core_look.read_look(saved)) - neutral).max()) > 0.01
 
 # ---- the asset browser ----------------------------------------------------------------------------------
 browser = part("flare_addon.asset_browser")

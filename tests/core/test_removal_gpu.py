@@ -147,7 +147,7 @@ def test_a_second_flare_is_added_to_the_first_frames_alone() -> None:
     random = np.random.default_rng(2)
     filmed = composition.draw_frame_parameters(random, 3, NOTHING).to(CPU)
     how = composition.draw_flare_placements(random, 3, CANVAS, WIDTH, HEIGHT).to(CPU)
-    second = composition.draw_flare_placements(random, 1, CANVAS, WIDTH, HEIGHT, second=True).to(CPU)
+    second = composition.draw_flare_placements(random, 1, CANVAS, WIDTH, HEIGHT, is_second=True).to(CPU)
     shown = []
     for over in ([(flares, how)], [(flares, how), (composition.FlareBatch(*(part[:1] for part in flares)), second)]):
         torch.manual_seed(1)
@@ -173,7 +173,7 @@ def test_pools_are_filled_by_processes_and_trained_on() -> None:
     shapes = pools.frame_shapes(RECIPE, SIZE_MULTIPLE)
     assert sum(shape.share for shape in shapes) == pytest.approx(1)
     assert {(shape.width, shape.height) for shape in shapes} == {(96, 64), (64, 64), (64, 96)}
-    filled = pools.Pools(shapes, CANVAS, CPU, scenes=100, flares=6)
+    filled = pools.Pools(shapes, CANVAS, CPU, scene_count=100, flare_count=6)
     trainer = RemovalTrainer(RECIPE)
     with pools.filled_pools(filled, RECIPE, flat(), built_in_lenses(), None, 2):
         assert len(multiprocessing.active_children()) == 2
@@ -209,7 +209,7 @@ def test_pool_sizes_fit_the_free_memory_of_a_gpu() -> None:
 
 
 def test_drawing_processes_that_end_raise_an_error() -> None:
-    filled = pools.Pools(pools.frame_shapes(RECIPE, SIZE_MULTIPLE), CANVAS, CPU, scenes=8, flares=2)
+    filled = pools.Pools(pools.frame_shapes(RECIPE, SIZE_MULTIPLE), CANVAS, CPU, scene_count=8, flare_count=2)
     with pytest.raises(RunError, match="draw pictures for the training ended"), \
             pools.filled_pools(filled, RECIPE, Backgrounds([], []), built_in_lenses(), None, 2):
         pass

@@ -155,7 +155,7 @@ def test_workers_reduce_and_gather_tensors() -> None:
 def test_shared_buffers_are_never_truncated(tmp_path: Path) -> None:
     """Windows refuses that where another has it mapped."""
     (tmp_path / "2x3").write_bytes(b"\1" * 64)
-    rows = SharedBuffers(str(tmp_path), multiprocessing.get_context("spawn").Barrier(1)).rows(2, 3)
+    rows = SharedBuffers(str(tmp_path), multiprocessing.get_context("spawn").Barrier(1)).shared_rows(2, 3)
     assert (tmp_path / "2x3").stat().st_size == 64 and rows.shape == (2, 3)
     assert (rows != 0).all(), "what is there stays"
 
@@ -368,7 +368,7 @@ def test_added_blocks_leave_the_prediction_unchanged(tmp_path: Path) -> None:
     small = replace(RECIPE, blocks=(0, 1, 1, 1, 1), attention=(0, 0))
     large = replace(RECIPE, blocks=(1, 0, 2, 1, 3), attention=(0, 1))
     first = run.train(small, tmp_path / "first", backgrounds(), built_in_lenses(), processes=1)
-    grown = run.TrainingSetup(large, first, False, backgrounds(), built_in_lenses(), None).trainer(SINGLE_WORKER)
+    grown = run.TrainingSetup(large, first, False, backgrounds(), built_in_lenses(), None).create_trainer(SINGLE_WORKER)
     assert [len(level) for level in grown.network.encoder] == [1, 1, 2, 1, 3]  # type: ignore[arg-type]
     frame = torch.rand(1, 3, 64, 64)
     with torch.no_grad():

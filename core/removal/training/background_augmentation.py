@@ -46,7 +46,7 @@ def augment(random: Random, draw_view: DrawView, width: int, height: int) -> Pix
     if random.random() < 0.35:
         scene = _add_dead_leaves(random, scene, draw_view)
     elif random.random() < 0.2:
-        scene = _join(random, scene, _random_pose(random, draw_view, width, height))
+        scene = _combine_scenes(random, scene, _random_pose(random, draw_view, width, height))
     if random.random() < 0.4:
         scene = _grade(random, scene)
     if random.random() < 0.15:
@@ -60,10 +60,10 @@ def _random_pose(random: Random, draw_view: DrawView, width: int, height: int) -
     """Return a view: upright in six of ten, else on its side, or rolled by some degrees and seen in perspective."""
     import cv2
 
-    choice = random.random()
-    if choice < 0.6:
+    pose_draw = random.random()
+    if pose_draw < 0.6:
         return draw_view(random, width, height)
-    if choice < 0.75:  # on its side
+    if pose_draw < 0.75:  # on its side
         return np.ascontiguousarray(draw_view(random, height, width).swapaxes(0, 1))
     piece_width, piece_height = math.ceil(width * WARP_MARGIN), math.ceil(height * WARP_MARGIN)
     scene = draw_view(random, piece_width, piece_height)
@@ -101,17 +101,18 @@ def _add_dead_leaves(random: Random, scene: Pixels, draw_view: DrawView) -> Pixe
     height, width = scene.shape[:2]
     scene = scene.copy()
     for _ in range(int(random.integers(1, 9))):
-        size = math.hypot(width, height) * log_uniform(random, 0.1, 0.8)
+        piece_size = math.hypot(width, height) * log_uniform(random, 0.1, 0.8)
         aspect = math.exp(random.normal(0, 0.5))
-        piece_width, piece_height = (max(int(size * part), 8) for part in (math.sqrt(aspect), 1 / math.sqrt(aspect)))
+        piece_width, piece_height = (max(int(piece_size * stretch), 8)
+                                     for stretch in (math.sqrt(aspect), 1 / math.sqrt(aspect)))
         left = int(random.uniform(-piece_width / 2, width - piece_width / 2))
         top = int(random.uniform(-piece_height / 2, height - piece_height / 2))
-        shape = _draw_leaf(random, piece_width, piece_height)[..., None]
+        mask = _draw_leaf(random, piece_width, piece_height)[..., None]
         piece = draw_view(random, piece_width, piece_height) * np.float32(math.exp(random.normal(0, 0.5)))
         # The part of the piece that lies in the frame, and its place there.
         piece_window = np.s_[max(-top, 0):height - top, max(-left, 0):width - left]
         scene_window = np.s_[max(top, 0):top + piece_height, max(left, 0):left + piece_width]
-        scene[scene_window] = _blend(scene[scene_window], piece[piece_window], shape[piece_window])
+        scene[scene_window] = _blend(scene[scene_window], piece[piece_window], mask[piece_window])
     return scene
 
 
@@ -124,19 +125,23 @@ def _draw_leaf(random: Random, width: int, height: int) -> Pixels:
     """Return the mask (height, width) 0..1 of a blob, a polygon or an ellipse, sharp in two of three."""
     import cv2
 
-    kind = random.integers(3)
-    if kind == 0:
-        shape = _draw_blob(random, width, height)
+    shape = ("blob", "polygon", "ellipse")[random.integers(3)]
+    if shape == "blob":
+        mask = _draw_blob(random, width, height)
     else:
-        corners = int(random.integers(3, 8)) if kind == 1 else 48  # enough to look round
-        angles = np.sort(random.uniform(0, 2 * math.pi, corners)) if kind == 1 else np.linspace(0, 2 * math.pi, corners)
-        radius = random.uniform(0.5, 1, (corners, 1)) if kind == 1 else 0.95
+        if shape == "polygon":
+            corners = int(random.integers(3, 8))
+            angles = np.sort(random.uniform(0, 2 * math.pi, corners))
+            radius = random.uniform(0.5, 1, (corners, 1))
+        else:
+            angles = np.linspace(0, 2 * math.pi, 48)  # enough to look round
+            radius = np.array(0.95)
         points = (np.stack([np.cos(angles), np.sin(angles)], -1) * radius + 1) / 2 * (width, height)
-        shape = _draw_polygon(points, width, height)
+        mask = _draw_polygon(points, width, height)
     if random.random() < 1 / 3:
         softness = max(width, height) * log_uniform(random, 0.005, 0.08)
-        return np.asarray(cv2.GaussianBlur(shape, (0, 0), softness, borderType=cv2.BORDER_CONSTANT), np.float32)
-    return shape
+        return np.asarray(cv2.GaussianBlur(mask, (0, 0), softness, borderType=cv2.BORDER_CONSTANT), np.float32)
+    return mask
 
 
 def _draw_blob(random: Random, width: int, height: int) -> Pixels:
@@ -153,9 +158,9 @@ def _draw_polygon(corners: NDArray[np.float64], width: int, height: int) -> Pixe
     """Return an anti-aliased mask (height, width) 0..1. corners: (n, 2) in pixels."""
     import cv2
 
-    shape = np.zeros((height, width), np.float32)
-    cv2.fillPoly(shape, [(corners * 16).astype(np.int32)], (1.0,), cv2.LINE_AA, 4)  # in sixteenths of a pixel
-    return shape
+    mask = np.zeros((height, width), np.float32)
+    cv2.fillPoly(mask, [(corners * 16).astype(np.int32)], (1.0,), cv2.LINE_AA, 4)  # in sixteenths of a pixel
+    return mask
 
 
 def _grade(random: Random, scene: Pixels) -> Pixels:
@@ -173,9 +178,9 @@ def _grade(random: Random, scene: Pixels) -> Pixels:
     return np.asarray(scene, np.float32)
 
 
-def _join(random: Random, scene: Pixels, second: Pixels) -> Pixels:
-    """Put one scene beside the other, with a sharp or soft edge between them, or mix them as a reflection in a pane of
-    glass."""
+def _combine_scenes(random: Random, scene: Pixels, second: Pixels) -> Pixels:
+    """Return one scene beside the other, with a sharp or soft edge between them, or both mixed as by a reflection in a
+    pane of glass."""
     height, width = scene.shape[:2]
     if random.random() < 0.3:
         share = np.float32(random.uniform(0.2, 0.8))
@@ -194,19 +199,19 @@ def _add_haze(random: Random, scene: Pixels) -> Pixels:
     Koschmieder's law; He, Sun and Tang 2009, "Single image haze removal using dark channel prior", invert it.
     """
     height, width = scene.shape[:2]
-    across = math.hypot(width, height)
+    diagonal = math.hypot(width, height)
     # x and y from the sun, which is on the horizon; y is below the horizon too.
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) - random.uniform(-0.3, 1.3) * width,
                        np.arange(height, dtype=np.float32) - random.uniform(0, 0.7) * height)
     opacity = np.float32(1) - np.exp(-_optical_depth(random, scene, y / height))[..., None]
     colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
     # The light that distance fades to: bright, but as a part of this scene may be.
-    air = np.float32(np.quantile(scene.mean(-1), 0.9) * log_uniform(random, 0.5, 1.5)) * colour
+    airlight = np.float32(np.quantile(scene.mean(-1), 0.9) * log_uniform(random, 0.5, 1.5)) * colour
     if random.random() < 0.5:
         warm = np.exp(random.normal((0.2, 0, -0.3), 0.2)).astype(np.float32)
-        near_sun = np.exp(-np.hypot(x, y) / np.float32(across * log_uniform(random, 0.15, 0.8)))[..., None]
-        air = air * (1 + near_sun * warm * np.float32(log_uniform(random, 0.5, 6)))
-    return _blend(scene, air, opacity)
+        near_sun = np.exp(-np.hypot(x, y) / np.float32(diagonal * log_uniform(random, 0.15, 0.8)))[..., None]
+        airlight = airlight * (1 + near_sun * warm * np.float32(log_uniform(random, 0.5, 6)))
+    return _blend(scene, airlight, opacity)
 
 
 def _optical_depth(random: Random, scene: Pixels, below_horizon: Pixels) -> Pixels:
@@ -217,11 +222,11 @@ def _optical_depth(random: Random, scene: Pixels, below_horizon: Pixels) -> Pixe
     """
     import cv2
 
-    grey = np.log(scene.mean(-1) + np.float32(0.01))
-    grey = (grey - grey.mean()) / max(float(grey.std()), 1e-2)
-    up = np.float32(random.uniform(0.5, 4)) * np.minimum(-below_horizon, 0)
+    log_grey = np.log(scene.mean(-1) + np.float32(0.01))
+    log_grey = (log_grey - log_grey.mean()) / max(float(log_grey.std()), 1e-2)
+    elevation = np.float32(random.uniform(0.5, 4)) * np.minimum(-below_horizon, 0)
     radius = max(round(math.hypot(*scene.shape[:2]) * log_uniform(random, 0.01, 0.05)), 2)
-    distance = cv2.ximgproc.guidedFilter(grey, up + grey, radius, 0.02)
+    distance = cv2.ximgproc.guidedFilter(log_grey, elevation + log_grey, radius, 0.02)
     # The nearest part of the picture, 15 to 50 %, is without haze.
     distance -= np.quantile(distance, random.uniform(0.15, 0.5))
     density = log_uniform(random, 0.4, 4) / max(float(distance.max()), 1e-3)
@@ -245,10 +250,10 @@ def _draw_reflection(random: Random, height: int, width: int) -> Pixels:
     """Return the mask (height, width) 0..1 of a lamp's reflection on a floor: long, upright, broken up by `waves`."""
     import cv2
 
-    across = math.hypot(width, height) * log_uniform(random, 0.004, 0.03)
-    along = across * log_uniform(random, 2, 12)
-    x = (np.arange(width, dtype=np.float32)[None, :] - random.uniform(0, width)) / across
-    y = (np.arange(height, dtype=np.float32)[:, None] - random.uniform(0, height)) / along
+    half_width = math.hypot(width, height) * log_uniform(random, 0.004, 0.03)
+    half_length = half_width * log_uniform(random, 2, 12)
+    x = (np.arange(width, dtype=np.float32)[None, :] - random.uniform(0, width)) / half_width
+    y = (np.arange(height, dtype=np.float32)[:, None] - random.uniform(0, height)) / half_length
     waves = random.random((max(height // int(random.integers(2, 12)), 1), 3)).astype(np.float32)
     waves = np.asarray(cv2.resize(waves, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
     return np.asarray(np.exp(-(x**2) - y**2) * (1 - random.uniform(0.4, 1) * waves), np.float32)
@@ -259,8 +264,9 @@ def _draw_panel(random: Random, height: int, width: int) -> Pixels:
     perspective."""
     import cv2
 
-    half = math.hypot(width, height) * np.array([log_uniform(random, 0.01, 0.15), log_uniform(random, 0.01, 0.15)])
-    corners = random.uniform(0, (width, height)) + UNIT_SQUARE * half * np.exp(random.normal(0, 0.15, (4, 2)))
+    half_sides = math.hypot(width, height) * np.array([log_uniform(random, 0.01, 0.15),
+                                                       log_uniform(random, 0.01, 0.15)])
+    corners = random.uniform(0, (width, height)) + UNIT_SQUARE * half_sides * np.exp(random.normal(0, 0.15, (4, 2)))
     mask = _draw_polygon(corners, width, height)
     if random.random() < 0.5:
         panes = random.uniform(random.random(), 1, tuple(random.integers(1, 8, 2))).astype(np.float32)

@@ -85,13 +85,15 @@ def describe_unusable(paths: Sequence[Path]) -> str | None:
             f"{MIN_SIDE} pixels, or is .hdr or .exr and not twice as wide as high.")
 
 
-def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest: int = 720, *,
+def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", max_side: int = 720, *,
                      augmented: bool = False) -> Backgrounds:
-    """Read every photograph and environment map below the folders; photographs are reduced to `longest` pixels.
+    """Read every photograph and environment map below the folders.
 
-    Environment maps are .hdr, or .exr twice as wide as high. part: which pictures, by name. Pictures that cannot be
-    used are listed in `unusable`. Raises SettingsError for a path that is no folder and where no picture is found;
-    EngineError where `augmented` is set and OpenCV lacks a module for it.
+    part: which pictures, by name. max_side: long side in pixels that larger photographs are reduced to. Environment
+    maps are .hdr, or .exr twice as wide as high. Pictures that cannot be used are listed in `unusable`.
+
+    Raises SettingsError for a path that is no folder and where no picture is found; EngineError where `augmented` is
+    set and OpenCV lacks a module for it.
     """
     import cv2
 
@@ -107,7 +109,7 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest:
                 if picture is None or min(picture.shape[:2]) < MIN_SIDE:
                     unusable.append(path)
                     continue
-                scale = longest / max(picture.shape[:2])
+                scale = max_side / max(picture.shape[:2])
                 if scale < 1:
                     picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
                 photos.append(np.ascontiguousarray(picture[..., ::-1]))
@@ -124,12 +126,12 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest:
 
 
 @contextmanager
-def shared_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest: int = 720, *,
+def shared_backgrounds(folders: Iterable[Path | str], part: Part = "all", max_side: int = 720, *,
                        augmented: bool = False) -> Iterator[Backgrounds]:
     """Read as `read_backgrounds` does, into temporary files that all processes map: one copy in memory. Raises RunError
     where they cannot be written."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        backgrounds = read_backgrounds(folders, part, longest, augmented=augmented)
+        backgrounds = read_backgrounds(folders, part, max_side, augmented=augmented)
         try:
             photos = SharedArrays(Path(folder) / "photos", backgrounds.photos)
             maps = SharedArrays(Path(folder) / "maps", backgrounds.maps)
@@ -171,10 +173,10 @@ def _read_environment_map(path: Path) -> NDArray[np.float16] | None:
             return None
         light: NDArray[Any] = np.stack([channels[name] for name in "RGB"], -1)
     else:
-        backgrounds = decode(path, cv2.IMREAD_UNCHANGED)
-        if backgrounds is None:
+        pixels = decode(path, cv2.IMREAD_UNCHANGED)
+        if pixels is None:
             return None
-        light = backgrounds[..., ::-1]
+        light = pixels[..., ::-1]
     if light.shape[1] != 2 * light.shape[0]:
         return None
     if light.shape[1] > 1024:
@@ -188,18 +190,18 @@ def _crop_photo(random: Random, photo: NDArray[np.uint8], width: int, height: in
     the photograph's display values."""
     import cv2
 
-    h, w = photo.shape[:2]
+    photo_height, photo_width = photo.shape[:2]
     # scale: pixels of the photograph for each of the result. One that is much too small is not cropped further.
-    fit = min(w / width, h / height)
+    fit = min(photo_width / width, photo_height / height)
     scale = fit * random.uniform(0.3, 1.0) if fit > 0.7 else fit
-    cw, ch = min(int(width * scale), w), min(int(height * scale), h)
-    x, y = int(random.integers(w - cw + 1)), int(random.integers(h - ch + 1))
+    crop_width, crop_height = min(int(width * scale), photo_width), min(int(height * scale), photo_height)
+    x, y = int(random.integers(photo_width - crop_width + 1)), int(random.integers(photo_height - crop_height + 1))
     interpolation = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
-    window = cv2.resize(photo[y:y + ch, x:x + cw], (width, height), interpolation=interpolation)
+    crop = cv2.resize(photo[y:y + crop_height, x:x + crop_width], (width, height), interpolation=interpolation)
     if random.random() < 0.5:
-        window = window[:, ::-1]
-    table = np.power(np.arange(256, dtype=np.float32) / 255, np.float32(gamma))
-    return table[window]
+        crop = crop[:, ::-1]
+    linear_of_code = np.power(np.arange(256, dtype=np.float32) / 255, np.float32(gamma))
+    return linear_of_code[crop]
 
 
 def _perspective_view(random: Random, light: NDArray[np.float16], width: int, height: int) -> Pixels:
@@ -207,17 +209,17 @@ def _perspective_view(random: Random, light: NDArray[np.float16], width: int, he
     exposed to a random median about 0.18. light: an equirectangular map, (h, w, 3)."""
     import cv2
 
-    # Directions of the pixels: x to the right, y down, at a distance of 1.
-    field = math.tan(math.radians(random.uniform(35, 100)) / 2)
-    x = (np.arange(width, dtype=np.float32) + 0.5 - width / 2) / (width / 2) * field
-    y = (np.arange(height, dtype=np.float32) + 0.5 - height / 2) / (width / 2) * field
+    # Directions of the pixels: x to the right, y down, on a plane at a distance of 1.
+    half_field = math.tan(math.radians(random.uniform(35, 100)) / 2)
+    x = (np.arange(width, dtype=np.float32) + 0.5 - width / 2) / (width / 2) * half_field
+    y = (np.arange(height, dtype=np.float32) + 0.5 - height / 2) / (width / 2) * half_field
     yaw, pitch = random.uniform(0, 2 * math.pi), math.radians(random.normal(0, 15))
-    dx, dy = np.meshgrid(x, y)
-    up = dy * math.cos(pitch) + math.sin(pitch)
-    forward = math.cos(pitch) - dy * math.sin(pitch)
+    right, down_on_plane = np.meshgrid(x, y)
+    down = down_on_plane * math.cos(pitch) + math.sin(pitch)
+    forward = math.cos(pitch) - down_on_plane * math.sin(pitch)
     rows, columns = light.shape[:2]
-    u = ((np.arctan2(dx, forward) + yaw) / (2 * math.pi) % 1) * columns
-    v = (np.arctan2(up, np.hypot(dx, forward)) / math.pi + 0.5) * rows
+    u = ((np.arctan2(right, forward) + yaw) / (2 * math.pi) % 1) * columns
+    v = (np.arctan2(down, np.hypot(right, forward)) / math.pi + 0.5) * rows
     pixels = cv2.remap(light.astype(np.float32), u.astype(np.float32) - 0.5, v.astype(np.float32) - 0.5,
                        cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     exposure = math.exp(random.normal(math.log(0.18), 0.5)) / max(float(np.median(pixels)), 1e-4)

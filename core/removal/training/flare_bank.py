@@ -32,6 +32,8 @@ from .pairs import WHITE, FlareLayers, FlareSource
 Random = np.random.Generator
 PROBED_FLARES = 50
 """Approximate number of the user's flares that are read before a training, to report unreadable ones."""
+MIN_LIGHT_LEVEL = 0.3
+"""Linear light above which a picture of a light shows one."""
 MAX_UNREADABLE_DRAWS = 20
 """Number of successive unreadable flares of the user after which the training fails."""
 
@@ -40,16 +42,18 @@ class SynthesisBank:
     """`count` synthesised flares, each made when it is first drawn; `renew` replaces the oldest.
 
     The content is a function of the seed and of how far the bank was renewed, so a resumed training sees the same
-    flares. The bank has parts, and `draw` uses one of them at a time. A share `coloured` of the flares are of lights of
-    a saturated colour (traffic lights, tail lamps, neon), and a share `aspheric` have the ghosts of moulded lenses too;
-    no flare class has either.
+    flares. The bank has parts, and `draw` uses one of them at a time.
     """
 
-    def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription], coloured: float = 0,
-                 aspheric: float = 0, part_count: int = 1) -> None:
-        """count: number of flares. size: side of the canvas, pixels. part_count: number of parts of the bank."""
+    def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription], coloured_share: float = 0,
+                 aspheric_share: float = 0, part_count: int = 1) -> None:
+        """count: number of flares. size: side of the canvas, pixels. part_count: number of parts of the bank.
+
+        coloured_share: of the flares, those of lights of a saturated colour (traffic lights, tail lamps, neon).
+        aspheric_share: those that have the ghosts of moulded lenses too. No flare class has either.
+        """
         self._seed, self._size, self._lenses = seed, size, lenses
-        self._coloured, self._aspheric = coloured, aspheric
+        self._coloured_share, self._aspheric_share = coloured_share, aspheric_share
         self._entries: list[tuple[int, FlareLayers] | None] = [None] * count
         self._end_serial, self._part, self._part_count = count, 0, min(part_count, count)
 
@@ -78,8 +82,8 @@ class SynthesisBank:
         """Synthesise the flare of a serial number, in half precision, by chance coloured or with ghosts of aspheres."""
         synthesised = synthesise_flare((self._seed, serial), self._size, self._lenses)
         random = np.random.default_rng((self._seed, serial, 2))
-        colour = draw_saturated_colour(random) if random.random() < self._coloured else WHITE
-        if random.random() < self._aspheric:
+        colour = draw_saturated_colour(random) if random.random() < self._coloured_share else WHITE
+        if random.random() < self._aspheric_share:
             synthesised = add_aspheric_ghosts(synthesised, (self._seed, serial, 3))
         rest, glow, light = (np.minimum(layer, 6e4).astype(np.float16)
                              for layer in (synthesised.rest, synthesised.glow, synthesised.light))
@@ -120,16 +124,16 @@ class UserFlares:
         none that can be read."""
         folder = Path(folder)
         # By the folder beside it, as in Flare7K++: another set may have flares of the same names.
-        lights = {(path.parent.parent, path.stem): path for path in folder.glob("**/Light_Source/*")
+        light_paths = {(path.parent.parent, path.stem): path for path in folder.glob("**/Light_Source/*")
                   if path.suffix.lower() in SUFFIXES}
         self._size = size
-        self._files: list[tuple[Path, Path | None]] = []
+        self._files: list[tuple[Path, Path | None]] = []  # the flare, and its light alone if there is a picture of it
         for path in sorted(folder.rglob("*")):
             if "Light_Source" in path.parts or path.suffix.lower() not in SUFFIXES | VIDEOS:
                 continue
             if not path.is_file() or path.name.startswith("."):
                 continue
-            self._files.append((path, lights.get((path.parent.parent, path.stem))))
+            self._files.append((path, light_paths.get((path.parent.parent, path.stem))))
         if not self._files:
             raise SettingsError(f"{folder} holds no flare layers; give pictures or videos of flares on black.")
         self.unreadable: list[str] = []
@@ -137,8 +141,9 @@ class UserFlares:
         self._drop_unreadable()
         if not self._files:
             raise SettingsError(f"None of the flares in {folder} can be read; {self.unreadable[0]}")
-        compound = {beside for beside, _ in lights}
-        self.missing_light = [path for path, light in self._files if light is None and path.parent.parent in compound]
+        folders_with_lights = {folder_of_light for folder_of_light, _ in light_paths}
+        self.missing_light = [path for path, light in self._files
+                              if light is None and path.parent.parent in folders_with_lights]
         """Flares without a light's picture in a folder whose other flares have one: their lights count as flare."""
 
     def __len__(self) -> int:
@@ -173,7 +178,7 @@ class UserFlares:
         flare, light = map(self._fit_to_canvas, self._read(file, random))
         light = np.minimum(light, flare)
         lights: tuple[tuple[float, float], ...] = ()
-        if float(light.max()) > 0.3:
+        if float(light.max()) > MIN_LIGHT_LEVEL:
             y, x = np.unravel_index(int(light.sum(-1).argmax()), light.shape[:2])
             lights = (((float(x) + 0.5) / self._size * 2 - 1, (float(y) + 0.5) / self._size * 2 - 1),)
         # Pictures clip a light at white; in the scene it is brighter.
@@ -194,10 +199,10 @@ class UserFlares:
         height, width = pixels.shape[:2]
         scale = self._size / float(np.hypot(height, width))
         size = (max(round(width * scale), 1), max(round(height * scale), 1))
-        small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+        scaled = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
         canvas = np.zeros((self._size, self._size, 3), np.float32)
         y, x = (self._size - size[1]) // 2, (self._size - size[0]) // 2
-        canvas[y:y + size[1], x:x + size[0]] = np.maximum(small, 0)
+        canvas[y:y + size[1], x:x + size[0]] = np.maximum(scaled, 0)
         return canvas
 
 

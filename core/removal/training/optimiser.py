@@ -28,10 +28,10 @@ NEWTON_SCHULZ_STEPS, NEWTON_SCHULZ_COEFFICIENTS = 5, (3.4445, -4.7750, 2.0315)
 class MuonAdamW:
     """Optimises all parameters of a network in place, without moving them in memory."""
 
-    def __init__(self, network: nn.Module, decay: float) -> None:
-        """decay: weight decay per step, relative to the learning rate. Raises ValueError where the weights are not
-        channels last in memory."""
-        self._decay = decay
+    def __init__(self, network: nn.Module, weight_decay: float) -> None:
+        """weight_decay: per step, relative to the learning rate. Raises ValueError where the weights are not channels
+        last in memory."""
+        self._weight_decay = weight_decay
         self._parameters = dict(network.named_parameters())
         self._matrices = {name: _as_matrix(weight.detach()) for name, weight in self._parameters.items()
                           if weight.ndim > 1 and not any(part in name for part in INPUT_AND_OUTPUT_LAYERS)}
@@ -39,12 +39,12 @@ class MuonAdamW:
             raise ValueError("The network's weights are not channels last in memory.")
         self._momenta = {name: torch.zeros_like(rows) for name, rows in self._matrices.items()}
         others = [weight for name, weight in self._parameters.items() if name not in self._matrices]
-        self._adam = torch.optim.AdamW(others, weight_decay=decay, fused=True)
+        self._adam = torch.optim.AdamW(others, weight_decay=weight_decay, fused=True)
 
     @torch.no_grad()
-    def step(self, rate: float, worker: Worker = SINGLE_WORKER) -> None:
-        """Take one step of learning rate `rate` with the parameters' gradients, and clear them. Workers have the same
-        gradients and share the work of Muon's steps, nearly a third of an iteration's."""
+    def step(self, learning_rate: float, worker: Worker = SINGLE_WORKER) -> None:
+        """Take one step with the parameters' gradients, and clear them. Workers have the same gradients and share the
+        work of Muon's steps, nearly a third of an iteration's."""
         matrices_to_step = {name: matrix for name, matrix in self._matrices.items()
                             if self._parameters[name].grad is not None}
         gradients = [_as_matrix(cast(Tensor, self._parameters[name].grad)) for name in matrices_to_step]
@@ -57,13 +57,14 @@ class MuonAdamW:
             for number, direction in zip(group, orthogonal.contiguous().unbind(), strict=True):
                 directions[number] = direction
         worker.all_gather(directions)
-        rows = list(matrices_to_step.values())
-        torch._foreach_mul_(rows, 1 - rate * self._decay)
+        weights = list(matrices_to_step.values())
+        torch._foreach_mul_(weights, 1 - learning_rate * self._weight_decay)
         # An orthogonal matrix has a root mean square of 1 / sqrt(longer side).
-        torch._foreach_mul_(directions, [rate * MUON_UPDATE_RMS * math.sqrt(max(matrix.shape)) for matrix in rows])
-        torch._foreach_sub_(rows, directions)
+        torch._foreach_mul_(directions, [learning_rate * MUON_UPDATE_RMS * math.sqrt(max(matrix.shape))
+                                         for matrix in weights])
+        torch._foreach_sub_(weights, directions)
         for param_group in self._adam.param_groups:
-            param_group["lr"] = rate
+            param_group["lr"] = learning_rate
         self._adam.step()
         for parameter in self._parameters.values():
             parameter.grad = None
@@ -96,11 +97,11 @@ class MuonAdamW:
 def _group_same_shapes(matrices: Sequence[Tensor], numbers: Iterable[int]) -> Iterable[list[int]]:
     """Group the numbers of the matrices to compute together: each alone on a CPU; on a GPU, which a single matrix does
     not keep busy, those of the same shape."""
-    result: dict[object, list[int]] = {}
+    groups: dict[object, list[int]] = {}
     for number in numbers:
         matrix = matrices[number]
-        result.setdefault(matrix.shape if matrix.is_cuda else number, []).append(number)
-    return result.values()
+        groups.setdefault(matrix.shape if matrix.is_cuda else number, []).append(number)
+    return groups.values()
 
 
 def orthogonalise(matrices: Tensor) -> Tensor:

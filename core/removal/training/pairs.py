@@ -26,6 +26,8 @@ LIGHT_RADIUS = 0.35
 """Distance from a light, in halves of the frame's diagonal, within which saturated glow counts as the light itself."""
 CLIP_START, CLIP_RANGE = 0.5, 0.4
 """Light of a glow from which on a camera begins to clip it, and the range over which it comes to clip completely."""
+BRIGHTNESS_CELL = 16
+"""About the side in pixels of the cells over which the brightness of a scene is averaged, to place a light in it."""
 WHITE: NDArray[np.float32] = np.ones(3, np.float32)
 """The colour of lights whose colour is in their layers."""
 
@@ -82,20 +84,20 @@ def make_pair(random: Random, bank: FlareSource, backgrounds: Backgrounds, width
         strength = 1.0 if number == 0 else random_cameras.draw_second_strength(random)
         matrix = random_cameras.draw_placement(random, layers.size, width, height)
         if faces_light and layers.lights:
-            matrix, bright = _place_against_bright_scene(random, layers, matrix, scene)
-            if number == 0 and (aim := random_cameras.draw_target_light(random)):
-                scene = scene * np.float32(np.clip(aim / max(bright, 1e-3), *random_cameras.EXPOSURE_LIMITS))
-        r, g, li = _warp_to_frame(layers, random_cameras.draw_appearance(random, strength), matrix, width, height)
-        rest, glow, light = rest + r, glow + g, np.maximum(light, li)
+            matrix, light_level = _place_against_bright_scene(random, layers, matrix, scene)
+            if number == 0 and (target_light := random_cameras.draw_target_light(random)):
+                exposure = np.clip(target_light / max(light_level, 1e-3), *random_cameras.EXPOSURE_LIMITS)
+                scene = scene * np.float32(exposure)
+        appearance = random_cameras.draw_appearance(random, strength)
+        warped_rest, warped_glow, warped_light = _warp_to_frame(layers, appearance, matrix, width, height)
+        rest, glow, light = rest + warped_rest, glow + warped_glow, np.maximum(light, warped_light)
     if without_flare:  # half of these frames still show the lights
         rest, glow, light = rest * 0, glow * 0, light * float(random.random() < 0.5)
     scene = scene + light
-    if graininess := random_cameras.draw_grain(random):  # the same in all pictures, since removal does not denoise
-        grain = np.sqrt(np.maximum(scene, 0) * SHOT_NOISE + READ_NOISE).astype(np.float32) * graininess * GRAIN
-        scene = np.maximum(scene + grain * random.standard_normal(scene.shape, np.float32), 0)
+    scene = _add_grain(random, scene)  # the same in all pictures, since removal does not denoise
     if shoulder_share > 0 and random.random() < shoulder_share:
-        bend = random_cameras.draw_shoulder(random)
-        exposed = [add_under_shoulder(scene, rest + glow, bend), scene, add_under_shoulder(scene, glow, bend)]
+        shoulder = random_cameras.draw_shoulder(random)
+        exposed = [add_under_shoulder(scene, rest + glow, shoulder), scene, add_under_shoulder(scene, glow, shoulder)]
     else:
         exposed = [scene + rest + glow, scene, scene + glow]
     displayed = [to_display(linear, gamma) for linear in exposed]
@@ -108,6 +110,16 @@ def make_pair(random: Random, bank: FlareSource, backgrounds: Backgrounds, width
     if without_flare:  # not quantised: frame and scene are equal, so that the flare to predict is exactly 0
         return Pair(frame, clean_scene, scene_with_glow)
     return Pair(_quantise(random, frame), clean_scene, scene_with_glow)
+
+
+def _add_grain(random: Random, scene: Pixels) -> Pixels:
+    """Return linear light with a sensor's noise, of a random strength; in half of the frames without noise."""
+    graininess = random_cameras.draw_grain(random)
+    if not graininess:
+        return scene
+    deviation = np.sqrt(np.maximum(scene, 0) * SHOT_NOISE + READ_NOISE).astype(np.float32) * graininess * GRAIN
+    noisy: Pixels = np.maximum(scene + deviation * random.standard_normal(scene.shape, np.float32), 0)
+    return noisy
 
 
 def to_grey(pair: Pair, channel: int) -> Pair:
@@ -123,23 +135,23 @@ def _place_against_bright_scene(random: Random, layers: FlareLayers, matrix: NDA
     import cv2
 
     height, width = scene.shape[:2]
-    columns, rows = max(width // 16, 1), max(height // 16, 1)  # mean over about 16 x 16 pixels
+    columns, rows = max(width // BRIGHTNESS_CELL, 1), max(height // BRIGHTNESS_CELL, 1)
     brightness = cv2.resize(scene, (columns, rows), interpolation=cv2.INTER_AREA).mean(-1)
-    best = -1.0
-    others = (random_cameras.draw_placement(random, layers.size, width, height)
+    best_level = -1.0
+    other_placements = (random_cameras.draw_placement(random, layers.size, width, height)
               for _ in range(random_cameras.PLACEMENTS - 1))
-    for other in [matrix, *others]:
-        x, y = _canvas_to_frame(other, layers, layers.lights[0])
+    for candidate in [matrix, *other_placements]:
+        x, y = _canvas_to_frame(candidate, layers, layers.lights[0])
         light_level = float(brightness[int(np.clip(y / height * rows, 0, rows - 1)),
                                        int(np.clip(x / width * columns, 0, columns - 1))])
-        if light_level > best:
-            matrix, best = other, light_level
-    return matrix, best
+        if light_level > best_level:
+            matrix, best_level = candidate, light_level
+    return matrix, best_level
 
 
-def _canvas_to_frame(matrix: NDArray[Any], layers: FlareLayers, place: tuple[float, float]) -> NDArray[Any]:
+def _canvas_to_frame(matrix: NDArray[Any], layers: FlareLayers, position: tuple[float, float]) -> NDArray[Any]:
     """Return (x, y) in pixels of the frame of a position on the canvas, -1..1."""
-    return matrix[:, :2] @ ((np.array(place) + 1) * layers.size / 2) + matrix[:, 2]
+    return matrix[:, :2] @ ((np.array(position) + 1) * layers.size / 2) + matrix[:, 2]
 
 
 def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearance, matrix: NDArray[Any], width: int,
@@ -148,7 +160,7 @@ def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearan
     added to the light."""
     import cv2
 
-    half = math.hypot(width, height) / 2
+    half_diagonal = math.hypot(width, height) / 2
     rest, glow, light = (cv2.warpAffine(layer, matrix, (width, height),
                                         flags=cv2.INTER_LINEAR)
                          for layer in (layers.rest, layers.glow, layers.light))
@@ -157,17 +169,18 @@ def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearan
     mean = float(np.minimum((rest[::4, ::4] + glow[::4, ::4]) * appearance.gain, 1).mean())
     gain = appearance.gain * np.float32(min(appearance.max_mean / max(mean, 1e-6), 1))
     rest, glow = rest * (appearance.colour * gain), glow * (appearance.colour * gain)
-    near = np.zeros((height, width), np.float32)
+    light_proximity = np.zeros((height, width), np.float32)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    for place in layers.lights:
-        position = _canvas_to_frame(matrix, layers, place)
-        squared_distance = (x - position[0]) ** 2 + (y - position[1]) ** 2
-        near = np.maximum(near, np.exp(-squared_distance / np.float32((LIGHT_RADIUS * half) ** 2)))
+    for light_position in layers.lights:
+        frame_position = _canvas_to_frame(matrix, layers, light_position)
+        squared_distance = (x - frame_position[0]) ** 2 + (y - frame_position[1]) ** 2
+        falloff = np.exp(-squared_distance / np.float32((LIGHT_RADIUS * half_diagonal) ** 2))
+        light_proximity = np.maximum(light_proximity, falloff)
     red, green, blue = np.moveaxis(rest + glow, -1, 0)
     min_channel = np.minimum(np.minimum(red, green), blue)
     # What a camera clips, even in one channel of a coloured light, is clipped with flare and without.
-    clipped = np.clip((min_channel * near - CLIP_START) / CLIP_RANGE, 0, 1)[..., None]
-    clipped = clipped * clipped * (3 - 2 * clipped)
+    clipped = np.clip((min_channel * light_proximity - CLIP_START) / CLIP_RANGE, 0, 1)[..., None]
+    clipped = clipped * clipped * (3 - 2 * clipped)  # smoothstep
     clipped_light: Pixels = np.maximum(light, (rest + glow) * clipped)
     rest, glow, light = (part * layers.colour for part in (rest * (1 - clipped), glow * (1 - clipped), clipped_light))
     return rest, glow, light

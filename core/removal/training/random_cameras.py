@@ -108,25 +108,26 @@ def draw_appearance(random: Random, strength: float) -> FlareAppearance:
     return FlareAppearance(blur, colour, gain, random.uniform(0.02, 0.18))
 
 
-def draw_placement(random: Random, canvas: int, width: int, height: int,
+def draw_placement(random: Random, canvas_size: int, width: int, height: int,
                    count_shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-    """Draw affine matrices (*count_shape, 2, 3) from a square canvas with sides of `canvas` pixels to a frame in
+    """Draw affine matrices (*count_shape, 2, 3) from a square canvas with sides of `canvas_size` pixels to a frame in
     pixels.
 
     The canvas is rotated, mirrored, sheared a little, and scaled by 0.85 to 1.5 times what lets its inner circle pass
     through the frame's corners. Its middle is within about a hundredth of the half diagonal of the frame's in four of
     five, and within about a quarter in the others.
     """
-    half = math.hypot(width, height) / 2
+    half_diagonal = math.hypot(width, height) / 2
     zoom, roll = random.uniform(0.85, 1.5, count_shape), random.uniform(0, 2 * math.pi, count_shape)
     mirror = random.choice([-1.0, 1.0], count_shape)
     stretch_x, shear = np.exp(random.normal(0, 0.05, count_shape)), random.normal(0, 0.05, count_shape)
-    off_middle = np.where(random.random(count_shape) < 0.8, 0.01, 0.25)[..., None]
-    shift = random.normal(0, off_middle, (*count_shape, 2))
+    shift_deviation = np.where(random.random(count_shape) < 0.8, 0.01, 0.25)[..., None]
+    shift = random.normal(0, shift_deviation, (*count_shape, 2))
     stretch = _matrix(stretch_x, shear, np.zeros(count_shape), np.ones(count_shape))
     rotation = _matrix(np.cos(roll) * mirror, -np.sin(roll), np.sin(roll) * mirror, np.cos(roll))
-    linear = (half / (canvas / 2) * zoom)[..., None, None] * rotation @ stretch
-    offset = np.array([width / 2, height / 2]) + shift * half - linear @ np.array([canvas / 2, canvas / 2])
+    linear = (half_diagonal / (canvas_size / 2) * zoom)[..., None, None] * rotation @ stretch
+    frame_middle, canvas_middle = np.array([width / 2, height / 2]), np.array([canvas_size / 2, canvas_size / 2])
+    offset = frame_middle + shift * half_diagonal - linear @ canvas_middle
     return np.concatenate([linear, offset[..., None]], -1)
 
 

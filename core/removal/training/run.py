@@ -52,14 +52,14 @@ def default_process_count() -> int:
 
 def make_validation_pairs(backgrounds: Backgrounds, lenses: Sequence[Prescription],
                           count: int = VALIDATION_PAIRS) -> dict[str, list[Pair]]:
-    """Return pairs that no training sees, by flare class: other flares, lenses and backgrounds."""
-    def bank(kind: str, number: int) -> SingleFlareBank:
-        return SingleFlareBank((VALIDATION_SEED, number), VALIDATION_CANVAS, lenses, kind)
+    """Return about `count` pairs that no training sees, by flare class: other flares, lenses and backgrounds."""
+    def bank(flare_class: str, number: int) -> SingleFlareBank:
+        return SingleFlareBank((VALIDATION_SEED, number), VALIDATION_CANVAS, lenses, flare_class)
 
-    return {kind: [make_pair(np.random.default_rng((VALIDATION_SEED, index, k)), bank(kind, k), backgrounds,
-                             *VALIDATION_SIZE, clean_share=0)
-                   for k in range(max(count // len(FLARE_CLASSES), 1))]
-            for index, kind in enumerate(FLARE_CLASSES)}
+    return {flare_class: [make_pair(np.random.default_rng((VALIDATION_SEED, index, number)), bank(flare_class, number),
+                                    backgrounds, *VALIDATION_SIZE, clean_share=0)
+                          for number in range(max(count // len(FLARE_CLASSES), 1))]
+            for index, flare_class in enumerate(FLARE_CLASSES)}
 
 
 def read_recipe(folder: Path | str) -> Recipe | None:
@@ -93,15 +93,16 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     if processes < 1:
         raise SettingsError(f"A training has at least one process, not {processes}.")
     with folder_lock(folder):
-        path = folder / CHECKPOINT
-        if path.exists() and not resume:
+        checkpoint = folder / CHECKPOINT
+        if checkpoint.exists() and not resume:
             raise RunError(f"{folder} holds a training already; resume it with --resume, or choose another folder.")
-        setup = TrainingSetup(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, user_flares)
-        trainer = setup.trainer(SINGLE_WORKER)  # before other processes start: it may raise
+        resumes = checkpoint.exists()
+        setup = TrainingSetup(recipe, checkpoint if resumes else start, resumes, backgrounds, lenses, user_flares)
+        trainer = setup.create_trainer(SINGLE_WORKER)  # before other processes start: it may raise
         with worker_group(processes if trainer.device.type == "cpu" else 1, _run_worker, setup) as worker:
             trainer.worker = worker
             pairs = make_validation_pairs(*validation) if validation else {}
-            with setup.batches(trainer, processes - 1) as batches:
+            with setup.open_batches(trainer, processes - 1) as batches:
                 _run_to_end(trainer, batches, folder, pairs, bool(pairs) and user_flares is None, save_every_s,
                             progress)
     return folder / WEIGHTS
@@ -117,30 +118,31 @@ class TrainingSetup(NamedTuple):
     lenses: Sequence[Prescription]
     user_flares: UserFlares | None
 
-    def trainer(self, worker: Worker) -> RemovalTrainer:
+    def create_trainer(self, worker: Worker) -> RemovalTrainer:
         """Return the trainer of a worker: its network is as wide as the weights' and at least as deep. Raises RunError.
         """
         if self.source is None:
             return RemovalTrainer(self.recipe, worker)
         state, metadata = weights.read(self.source)
-        form = weights.read_architecture(self.source, metadata)
-        recipe = replace(self.recipe, widths=form.widths, blocks=tuple(map(max, self.recipe.blocks, form.blocks)),
-                         attention=tuple(map(max, self.recipe.attention, form.attention)))
+        architecture = weights.read_architecture(self.source, metadata)
+        recipe = replace(self.recipe, widths=architecture.widths,
+                         blocks=tuple(map(max, self.recipe.blocks, architecture.blocks)),
+                         attention=tuple(map(max, self.recipe.attention, architecture.attention)))
         iteration = 0
-        if self.resumes:  # the state fits a network of exactly its form, and the flares follow from its seed
-            recipe = replace(recipe, **form._asdict(), seed=parse_json(metadata["recipe"])["seed"])
+        if self.resumes:  # the state fits this architecture alone, and the flares follow from its seed
+            recipe = replace(recipe, **architecture._asdict(), seed=parse_json(metadata["recipe"])["seed"])
             iteration = int(metadata["iteration"])
         trainer = RemovalTrainer(recipe, worker)
         trainer.load_state(state, iteration)
         return trainer
 
     @contextmanager
-    def batches(self, trainer: RemovalTrainer, drawing_processes: int = 0) -> Iterator[Iterator[Batch]]:
+    def open_batches(self, trainer: RemovalTrainer, drawing_processes: int = 0) -> Iterator[Iterator[Batch]]:
         """Yield the batches of the trainer's worker from its iteration on; on a GPU, `drawing_processes` draw what they
         are composed of."""
         if trainer.device.type == "cpu":
-            drawn = Batches(trainer.recipe, self.backgrounds, self.lenses, self.user_flares, trainer.worker)
-            yield (drawn[iteration] for iteration in range(trainer.iteration, trainer.recipe.iterations))
+            all_batches = Batches(trainer.recipe, self.backgrounds, self.lenses, self.user_flares, trainer.worker)
+            yield (all_batches[iteration] for iteration in range(trainer.iteration, trainer.recipe.iterations))
         else:
             with gpu_batches(trainer.recipe, trainer.iteration, self.backgrounds, self.lenses, self.user_flares,
                              trainer.device, max(drawing_processes, 2)) as batches:
@@ -149,8 +151,8 @@ class TrainingSetup(NamedTuple):
 
 def _run_worker(worker: Worker, setup: TrainingSetup) -> None:
     """Run a worker other than the first."""
-    trainer = setup.trainer(worker)
-    with setup.batches(trainer) as batches:
+    trainer = setup.create_trainer(worker)
+    with setup.open_batches(trainer) as batches:
         for batch in batches:
             trainer.step(batch)
 
@@ -165,9 +167,9 @@ def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
     """
     iterations = trainer.recipe.iterations
     progress.stage("train", iterations, trainer.iteration)
-    saved, started, first_iteration = time.monotonic(), time.monotonic(), trainer.iteration
+    last_saved, started, first_iteration = time.monotonic(), time.monotonic(), trainer.iteration
     last_logged, sums = first_iteration, dict.fromkeys(METRICS, 0.0)
-    best = _best_gain(folder) if keeps_best and first_iteration else None
+    best = _read_best_gain(folder) if keeps_best and first_iteration else None
     log = _read_log(folder / LOG, first_iteration)
     try:
         while trainer.iteration < iterations:
@@ -178,20 +180,21 @@ def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
             sums = {name: value + metrics[name] for name, value in sums.items()}
             iteration = trainer.iteration
             if iteration % VALIDATE_EVERY == 0 or iteration == iterations:
-                count = iteration - last_logged
-                line: dict[str, Any] = {"iteration": iteration, "seconds": round(time.monotonic() - started, 1),
-                                        "pace": round((time.monotonic() - started) / (iteration - first_iteration), 3),
-                                        **{name: round(value / count, 5) for name, value in sums.items()}}
+                iteration_count = iteration - last_logged
+                log_entry: dict[str, Any] = {
+                    "iteration": iteration, "seconds": round(time.monotonic() - started, 1),
+                    "pace": round((time.monotonic() - started) / (iteration - first_iteration), 3),
+                    **{name: round(value / iteration_count, 5) for name, value in sums.items()}}
                 last_logged, sums = iteration, dict.fromkeys(METRICS, 0.0)
                 if pairs:
-                    line[GAIN] = trainer.validate(pairs)
+                    log_entry[GAIN] = trainer.validate(pairs)
                     if keeps_best:
-                        best = _write_weights_if_better(trainer, folder, line[GAIN]["mean"], best)
-                log.append(line)
-                write_text(folder / LOG, "".join(json.dumps(entry) + "\n" for entry in log))
-            if time.monotonic() - saved > save_every_s:
+                        best = _write_weights_if_better(trainer, folder, log_entry[GAIN]["mean"], best)
+                log.append(log_entry)
+                write_text(folder / LOG, "".join(json.dumps(logged) + "\n" for logged in log))
+            if time.monotonic() - last_saved > save_every_s:
                 _save_checkpoint(trainer, folder, best)
-                saved = time.monotonic()
+                last_saved = time.monotonic()
             progress.advance(1, **metrics)
     except Cancelled:
         _save_checkpoint(trainer, folder, best)
@@ -226,7 +229,7 @@ def _read_log(path: Path, iteration: int) -> list[dict[str, Any]]:
             if isinstance(line, dict) and is_finite_number(line.get("iteration")) and line["iteration"] <= iteration]
 
 
-def _best_gain(folder: Path) -> float | None:
+def _read_best_gain(folder: Path) -> float | None:
     """Return the validation gain of the weights in the folder, dB; None if there are none, or they were not validated.
     """
     path = folder / WEIGHTS

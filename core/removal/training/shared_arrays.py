@@ -41,15 +41,15 @@ class SharedArrays(Sequence[NDArray[Any]]):
         return len(self._spans)
 
     @overload
-    def __getitem__(self, at: int) -> NDArray[Any]: ...
+    def __getitem__(self, index: int) -> NDArray[Any]: ...
     @overload
-    def __getitem__(self, at: slice) -> Sequence[NDArray[Any]]: ...
+    def __getitem__(self, index: slice) -> Sequence[NDArray[Any]]: ...
 
-    def __getitem__(self, at: int | slice) -> NDArray[Any] | Sequence[NDArray[Any]]:
+    def __getitem__(self, index: int | slice) -> NDArray[Any] | Sequence[NDArray[Any]]:
         """Return a read-only array, or a list of them."""
-        if isinstance(at, slice):
-            return [self[number] for number in range(*at.indices(len(self)))]
-        first, shape, dtype = self._spans[at]
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        first, shape, dtype = self._spans[index]
         if self._bytes is None:
             self._bytes = np.memmap(self._path, np.uint8, "r").view(np.ndarray)
         size = math.prod(shape) * np.dtype(dtype).itemsize

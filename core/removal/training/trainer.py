@@ -107,8 +107,8 @@ class RemovalTrainer:
                                                                   schedule)
         for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
             parameter.grad = gradient
-        before, self._pending_metrics = self._pending_metrics, AsyncCopy(metrics)
-        return dict(zip(METRICS, (before or self._pending_metrics).wait(), strict=True))
+        previous_metrics, self._pending_metrics = self._pending_metrics, AsyncCopy(metrics)
+        return dict(zip(METRICS, (previous_metrics or self._pending_metrics).wait(), strict=True))
 
     def _gradients(self, psnr_phase: bool, frame: Tensor, scene: Tensor, scene_with_glow: Tensor,
                    schedule: Tensor) -> list[Tensor]:
@@ -159,8 +159,8 @@ class RemovalTrainer:
         if psnr_phase:
             error_term = _log_error_ratio(error, mean_flare, error_floor)
             if self.recipe.patch_loss_share:
-                in_patches = _log_error_ratio(_patch_means(errors), _patch_means(flares), error_floor).mean((2, 3))
-                error_term = torch.lerp(error_term, in_patches, self.recipe.patch_loss_share)
+                patch_term = _log_error_ratio(_patch_means(errors), _patch_means(flares), error_floor).mean((2, 3))
+                error_term = torch.lerp(error_term, patch_term, self.recipe.patch_loss_share)
         else:
             error_term = error / (mean_flare[0] + faint_mse) ** power
         loss = error_term[0].mean() + 0.5 * error_term[1].mean()
@@ -176,7 +176,7 @@ class RemovalTrainer:
         network.load_state_dict(self.final_weights())
         network.to(self.device)
         gains: dict[str, float] = {}
-        for kind, class_pairs in pairs.items():
+        for flare_class, class_pairs in pairs.items():
             values = []
             for pair in class_pairs:
                 frame, scene = (torch.from_numpy(part).permute(2, 0, 1)[None].to(self.device)
@@ -186,7 +186,7 @@ class RemovalTrainer:
                 input_error = (frame - scene).square().mean()
                 # 1e-6 limits what a perfect prediction counts: a PSNR of 60 dB.
                 values.append(float(10 * torch.log10((input_error + 1e-6) / (error + 1e-6))))
-            gains[kind] = round(float(np.mean(values)), 3)
+            gains[flare_class] = round(float(np.mean(values)), 3)
         gains["mean"] = round(float(np.mean(list(gains.values()))), 3)
         return gains
 
@@ -254,5 +254,6 @@ def _patch_means(squared: Tensor) -> Tensor:
 
 
 def _autocast(on: torch.device) -> Any:
+    """Return the context of the forward pass: bfloat16 where the device is fast at it."""
     # A cache would hold the weights of the step that was captured as a graph, not of the one that replays it.
     return torch.autocast(on.type, dtype=torch.bfloat16, cache_enabled=False) if has_bfloat16(on) else nullcontext()

@@ -43,7 +43,7 @@ class SharedBuffers:
         self._folder, self._barrier = folder, barrier
         self._mapped: dict[tuple[int, int], Tensor] = {}
 
-    def rows(self, count: int, length: int) -> Tensor:
+    def shared_rows(self, count: int, length: int) -> Tensor:
         """Return (count, length) float32, the same memory in all workers for the same arguments: later calls return it
         again, with what it holds."""
         if (count, length) not in self._mapped:
@@ -82,7 +82,7 @@ class Worker:
         """Replace each tensor by the sum over all workers, identical to the last bit in each. Raises RunError."""
         if self.buffers is None:
             return
-        rows = self.buffers.rows(self.count, sum(tensor.numel() for tensor in tensors))
+        rows = self.buffers.shared_rows(self.count, sum(tensor.numel() for tensor in tensors))
         for tensor, buffer in _buffer_slices(tensors, rows[self.rank]):
             buffer.copy_(tensor)
         self.buffers.wait()
@@ -103,7 +103,7 @@ class Worker:
         Raises RunError."""
         if self.buffers is None:
             return
-        row = self.buffers.rows(1, sum(tensor.numel() for tensor in tensors))[0]
+        row = self.buffers.shared_rows(1, sum(tensor.numel() for tensor in tensors))[0]
         for number, (tensor, part) in enumerate(_buffer_slices(tensors, row)):
             if self.is_responsible_for(number):
                 part.copy_(tensor)

@@ -20,9 +20,9 @@ from .pools import Pools, filled_pools, frame_shapes, pool_sizes
 
 
 @contextmanager
-def gpu_batches(recipe: Recipe, first: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
-                user_flares: UserFlares | None, device: torch.device, processes: int) -> Iterator[Iterator[Batch]]:
-    """Yield endless batches from iteration `first` on; `processes` draw the scenes and flares.
+def gpu_batches(recipe: Recipe, start_iteration: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
+                user_flares: UserFlares | None, device: torch.device, process_count: int) -> Iterator[Iterator[Batch]]:
+    """Yield endless batches from `start_iteration` on; `process_count` processes draw the scenes and flares.
 
     Unlike those on a CPU they are no function of the recipe: what is in the pools depends on how fast it was drawn.
     Raises RunError where nothing is drawn.
@@ -30,22 +30,22 @@ def gpu_batches(recipe: Recipe, first: int, backgrounds: Backgrounds, lenses: Se
     shapes = frame_shapes(recipe, SIZE_MULTIPLE)
     sizes = pool_sizes(torch.cuda.mem_get_info(device)[0], shapes, recipe.canvas_size)
     pools = Pools(shapes, recipe.canvas_size, device, *sizes)
-    with filled_pools(pools, recipe, backgrounds, lenses, user_flares, processes):
-        yield compose_batches(pools, recipe, np.random.default_rng((recipe.seed, first)))
+    with filled_pools(pools, recipe, backgrounds, lenses, user_flares, process_count):
+        yield compose_batches(pools, recipe, np.random.default_rng((recipe.seed, start_iteration)))
 
 
 def compose_batches(pools: Pools, recipe: Recipe, random: np.random.Generator) -> Iterator[Batch]:
     """Yield batches without end: scenes of one shape of the pools each, with flares of the pools. The first frames of a
     batch, SECOND_FLARE_SHARE of them, get a second flare."""
     while True:
-        number = int(random.choice(len(pools.shapes), p=[shape.share for shape in pools.shapes]))
-        width, height, count, _ = pools.shapes[number]
-        scenes, gammas = pools.sample_scenes(random, number)
+        shape_index = int(random.choice(len(pools.shapes), p=[shape.share for shape in pools.shapes]))
+        width, height, count, _ = pools.shapes[shape_index]
+        scenes, gammas = pools.sample_scenes(random, shape_index)
         device = scenes.device
         second_count = max(round(random_cameras.SECOND_FLARE_SHARE * count), 1)
-        flares = [(pools.sample_flares(random, number_of_flares),
-                   draw_flare_placements(random, number_of_flares, recipe.canvas_size, width, height,
-                                         second=second).to(device))
-                  for number_of_flares, second in ((count, False), (second_count, True))]
+        flares = [(pools.sample_flares(random, flare_count),
+                   draw_flare_placements(random, flare_count, recipe.canvas_size, width, height,
+                                         is_second=is_second).to(device))
+                  for flare_count, is_second in ((count, False), (second_count, True))]
         frames = draw_frame_parameters(random, count, recipe).to(device)
         yield Batch(*compose(scenes, gammas, frames, flares), 1.0)  # share: all of the iteration's frames

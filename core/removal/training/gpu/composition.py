@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ...model.recipe import Recipe
 from .. import random_cameras
-from ..pairs import CLIP_RANGE, CLIP_START, GRAIN, LIGHT_RADIUS, READ_NOISE, SHOT_NOISE
+from ..pairs import BRIGHTNESS_CELL, CLIP_RANGE, CLIP_START, GRAIN, LIGHT_RADIUS, READ_NOISE, SHOT_NOISE
 from . import jpeg
 
 Random = np.random.Generator
@@ -96,38 +96,40 @@ def draw_frame_parameters(random: Random, count: int, recipe: Recipe) -> FramePa
     def draw_mask(share: float) -> NDArray[np.bool_]:
         return random.random(count) < share
 
-    def each(draw: Callable[[Random], float]) -> NDArray[Any]:
+    def draw_each(draw: Callable[[Random], float]) -> NDArray[Any]:
         return _per_frame(np.array([draw(random) for _ in range(count)]))
 
     without_flare, faces_light = draw_mask(recipe.clean_share), draw_mask(recipe.against_light_share)
-    developed = np.array([random_cameras.draw_development(random) if does else random_cameras.NEUTRAL_DEVELOPMENT
-                          for does in draw_mask(random_cameras.DEVELOPED_SHARE)])
-    unchanged = np.zeros(3), np.ones(3)
-    faded = np.array([random_cameras.draw_fade(random) if does else unchanged
-                      for does in draw_mask(recipe.lifted_black_share)])
+    developed = np.array([
+        random_cameras.draw_development(random) if is_developed else random_cameras.NEUTRAL_DEVELOPMENT
+        for is_developed in draw_mask(random_cameras.DEVELOPED_SHARE)])
+    not_faded = np.zeros(3), np.ones(3)
+    faded = np.array([random_cameras.draw_fade(random) if is_faded else not_faded
+                      for is_faded in draw_mask(recipe.lifted_black_share)])
     channels = np.tile(np.eye(3), (count, 1, 1))
-    grey = np.nonzero(draw_mask(recipe.grey_share))[0]
-    channels[grey] = np.eye(3)[random.integers(0, 3, len(grey))][:, None]
+    grey_frames = np.nonzero(draw_mask(recipe.grey_share))[0]
+    channels[grey_frames] = np.eye(3)[random.integers(0, 3, len(grey_frames))][:, None]
     return FrameParameters(
         exposure=np.array([random_cameras.draw_exposure(random) for _ in range(count)])[..., None, None],
         mirrored=_per_frame(draw_mask(0.5)), has_flare=_per_frame(~without_flare),
         has_lights=_per_frame(~without_flare | draw_mask(0.5)), faces_light=faces_light,
-        target_light=each(random_cameras.draw_target_light).ravel() * faces_light,
-        grain=each(random_cameras.draw_grain),
-        shoulder=_per_frame(draw_mask(recipe.shoulder_share)) * each(random_cameras.draw_shoulder),
+        target_light=draw_each(random_cameras.draw_target_light).ravel() * faces_light,
+        grain=draw_each(random_cameras.draw_grain),
+        shoulder=_per_frame(draw_mask(recipe.shoulder_share)) * draw_each(random_cameras.draw_shoulder),
         contrast=_per_frame(developed[:, 0]), saturation=_per_frame(developed[:, 1]), lift=_per_frame(developed[:, 2]),
         black=faded[:, 0, :, None, None], white=faded[:, 1, :, None, None],
-        dither=each(random_cameras.draw_dither), jpeg_quality=each(random_cameras.draw_jpeg_quality), channels=channels)
+        dither=draw_each(random_cameras.draw_dither), jpeg_quality=draw_each(random_cameras.draw_jpeg_quality),
+        channels=channels)
 
 
-def draw_flare_placements(random: Random, count: int, canvas: int, width: int, height: int, *,
-                          second: bool = False) -> FlarePlacements:
-    """Draw placement and appearance of `count` flares, one per frame, float32. second: they are the second flares of
+def draw_flare_placements(random: Random, count: int, canvas_size: int, width: int, height: int, *,
+                          is_second: bool = False) -> FlarePlacements:
+    """Draw placement and appearance of `count` flares, one per frame, float32. is_second: they are the second flares of
     their frames, whose strength is random."""
-    shining = [random_cameras.draw_appearance(random, random_cameras.draw_second_strength(random) if second else 1.0)
-               for _ in range(count)]
-    blurs, colours, gains, max_means = (np.array(part) for part in zip(*shining, strict=True))
-    matrices = random_cameras.draw_placement(random, canvas, width, height, (count, random_cameras.PLACEMENTS))
+    appearances = [random_cameras.draw_appearance(
+        random, random_cameras.draw_second_strength(random) if is_second else 1.0) for _ in range(count)]
+    blurs, colours, gains, max_means = (np.array(part) for part in zip(*appearances, strict=True))
+    matrices = random_cameras.draw_placement(random, canvas_size, width, height, (count, random_cameras.PLACEMENTS))
     return FlarePlacements(matrices=matrices, blur=blurs,
                            colour=colours[..., None, None], gain=_per_frame(gains), max_mean=_per_frame(max_means))
 
@@ -142,16 +144,17 @@ def compose(scene: Tensor, gamma: Tensor, frames: FrameParameters,
     scene = torch.where(frames.mirrored > 0, scene.flip(3), scene).float() * frames.exposure
     rest, glow, light = (torch.zeros_like(scene) for _ in range(3))
     for number, (flares, placement) in enumerate(flares_and_placements):
-        rows = slice(0, len(flares.layers))  # the frames that get this flare
-        matrix, light_level = _choose_placement(flares, placement.matrices, scene[rows], frames.faces_light[rows] > 0)
+        flared_frames = slice(0, len(flares.layers))  # the frames that get this flare
+        matrix, light_level = _choose_placement(flares, placement.matrices, scene[flared_frames],
+                                                frames.faces_light[flared_frames] > 0)
         if number == 0:
             exposure = (frames.target_light / light_level.clamp(min=1e-3)).clamp(*random_cameras.EXPOSURE_LIMITS)
             keeps_exposure = (frames.target_light == 0) | ~flares.is_light[:, 0]
             scene = scene * exposure.masked_fill(keeps_exposure, 1)[:, None, None, None]
-        r, g, li = _warp_to_frame(flares, placement, matrix, *scene.shape[2:])
-        rest[rows] += r
-        glow[rows] += g
-        light[rows] = torch.maximum(light[rows], li)
+        warped_rest, warped_glow, warped_light = _warp_to_frame(flares, placement, matrix, *scene.shape[2:])
+        rest[flared_frames] += warped_rest
+        glow[flared_frames] += warped_glow
+        light[flared_frames] = torch.maximum(light[flared_frames], warped_light)
     rest, glow = rest * frames.has_flare, glow * frames.has_flare
     scene = scene + light * frames.has_lights
     grain = (scene.clamp(min=0) * SHOT_NOISE + READ_NOISE).sqrt() * frames.grain * GRAIN
@@ -196,32 +199,34 @@ def _develop(displayed: Tensor, frames: FrameParameters) -> Tensor:
     return frames.black + (frames.white - frames.black) * lifted.clamp(0, 1)
 
 
-def _canvas_to_frame(matrices: Tensor, places: Tensor, size: int) -> Tensor:
-    """Return positions in pixels (n, k, 2), x and y: (n, 2) by k matrices (n, k, 2, 3), or (n, k, 2) by one (n, 1, 2,
-    3)."""
-    positions = (places + 1) * (size / 2)
+def _canvas_to_frame(matrices: Tensor, canvas_positions: Tensor, size: int) -> Tensor:
+    """Return positions in pixels of the frame, x and y (n, k, 2), of positions on the canvas, -1..1.
+
+    matrices, canvas_positions: (n, k, 2, 3) and (n, 2), or (n, 1, 2, 3) and (n, k, 2). size: of the canvas, pixels.
+    """
+    positions = (canvas_positions + 1) * (size / 2)
     positions = positions[:, None] if positions.ndim == 2 else positions
     return (matrices[..., :2] * positions[..., None, :]).sum(-1) + matrices[..., 2]
 
 
 def _choose_placement(flares: FlareBatch, matrices: Tensor, scene: Tensor,
                       faces_light: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (n, 2, 3), each frame's first matrix, or where it `faces_light` (n,) that which puts the first light where
-    the scene is brightest; and the light there (n,).
+    """Return each frame's matrix (n, 2, 3), and the scene's light where it puts the first light (n,).
 
-    matrices: (n, PLACEMENTS, 2, 3). scene: linear light (n, 3, h, w). For a light outside the frame the frame's edge
-    counts.
+    It is the first of the frame's matrices; where the frame `faces_light` (n,), it is the one that puts the light where
+    the scene is brightest. For a light outside the frame the frame's edge counts. matrices: (n, PLACEMENTS, 2, 3).
+    scene: linear light (n, 3, h, w).
     """
     n, _, height, width = scene.shape
-    rows, columns = max(height // 16, 1), max(width // 16, 1)
+    rows, columns = max(height // BRIGHTNESS_CELL, 1), max(width // BRIGHTNESS_CELL, 1)
     brightness = F.adaptive_avg_pool2d(scene.mean(1, keepdim=True), (rows, columns)).flatten(1)
     x, y = _canvas_to_frame(matrices, flares.lights[:, 0], flares.size).unbind(-1)
     row, column = ((coordinates / side * count).long().clamp(0, count - 1)
                    for coordinates, side, count in ((y, height, rows), (x, width, columns)))
-    is_light = brightness.gather(1, row * columns + column)
-    best = torch.where(faces_light & flares.is_light[:, 0], is_light.argmax(1), 0)
-    frames = torch.arange(n, device=scene.device)
-    return matrices[frames, best], is_light[frames, best]
+    light_levels = brightness.gather(1, row * columns + column)
+    best = torch.where(faces_light & flares.is_light[:, 0], light_levels.argmax(1), 0)
+    frame_indices = torch.arange(n, device=scene.device)
+    return matrices[frame_indices, best], light_levels[frame_indices, best]
 
 
 def _warp_to_frame(flares: FlareBatch, placement: FlarePlacements, matrix: Tensor, height: int,
@@ -236,11 +241,12 @@ def _warp_to_frame(flares: FlareBatch, placement: FlarePlacements, matrix: Tenso
     factor = placement.colour * placement.gain * (placement.max_mean / mean.clamp(min=1e-6)).clamp(max=1)
     rest, glow = rest * factor, glow * factor
     light_positions = _canvas_to_frame(matrix[:, None], flares.lights, flares.size)
-    reach = LIGHT_RADIUS * math.hypot(width, height) / 2
+    light_radius = LIGHT_RADIUS * math.hypot(width, height) / 2
     squared_distance = (_pixel_coordinates(height, width, matrix) - light_positions[:, :, None, None]).square().sum(-1)
-    near = (torch.exp(-squared_distance / reach**2) * flares.is_light[:, :, None, None]).amax(1, keepdim=True)
-    clipped = (((rest + glow).amin(1, keepdim=True) * near - CLIP_START) / CLIP_RANGE).clamp(0, 1)
-    clipped = clipped * clipped * (3 - 2 * clipped)
+    light_proximity = (torch.exp(-squared_distance / light_radius**2)
+                       * flares.is_light[:, :, None, None]).amax(1, keepdim=True)
+    clipped = (((rest + glow).amin(1, keepdim=True) * light_proximity - CLIP_START) / CLIP_RANGE).clamp(0, 1)
+    clipped = clipped * clipped * (3 - 2 * clipped)  # smoothstep
     tint = flares.colour[:, :, None, None]
     light = torch.maximum(light, (rest + glow) * clipped)
     return rest * (1 - clipped) * tint, glow * (1 - clipped) * tint, light * tint

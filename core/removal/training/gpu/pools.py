@@ -82,59 +82,61 @@ def frame_shapes(recipe: Recipe, multiple: int) -> list[FrameShape]:
     """Return the frame shapes of the recipe's last stage; sides are multiples of `multiple`."""
     longest = recipe.size_stages[-1][2]
     shapes = []
-    for part, aspect, share in FRAME_SHAPES:
-        width, height = (max(round(longest * part * side / multiple), 2) * multiple
+    for relative_side, aspect, share in FRAME_SHAPES:
+        width, height = (max(round(longest * relative_side * side / multiple), 2) * multiple
                          for side in (min(aspect, 1.0), min(1 / aspect, 1.0)))
         shapes.append(FrameShape(width, height, max(round(recipe.pixels_per_iteration / (width * height)), 1), share))
     return shapes
 
 
-def pool_sizes(free: int, shapes: Sequence[FrameShape], canvas: int) -> tuple[int, int]:
-    """Return how many scenes and flares fit into the pools' share of `free` bytes, at most MAX_SCENES and MAX_FLARES.
-    canvas: side of a flare's canvas, pixels."""
-    scene = 3 * BYTES_PER_HALF * sum(shape.width * shape.height * shape.share for shape in shapes)
-    flare = FLARE_CHANNELS * BYTES_PER_HALF * canvas**2
-    part = min(free * POOL_MEMORY_SHARE / (MAX_SCENES * scene + MAX_FLARES * flare), 1.0)
-    return max(int(MAX_SCENES * part), SCENES_PER_BLOCK), max(int(MAX_FLARES * part), 1)
+def pool_sizes(free_bytes: int, shapes: Sequence[FrameShape], canvas_size: int) -> tuple[int, int]:
+    """Return how many scenes and flares fit into the pools' share of the free memory, at most MAX_SCENES and
+    MAX_FLARES. canvas_size: side of a flare's canvas, pixels."""
+    scene_bytes = 3 * BYTES_PER_HALF * sum(shape.width * shape.height * shape.share for shape in shapes)
+    flare_bytes = FLARE_CHANNELS * BYTES_PER_HALF * canvas_size**2
+    filled_share = min(free_bytes * POOL_MEMORY_SHARE / (MAX_SCENES * scene_bytes + MAX_FLARES * flare_bytes), 1.0)
+    return max(int(MAX_SCENES * filled_share), SCENES_PER_BLOCK), max(int(MAX_FLARES * filled_share), 1)
 
 
 class Pools:
     """Scenes by shape with their gammas, and flares with their metadata, in half precision on `device`."""
 
-    def __init__(self, shapes: Sequence[FrameShape], canvas: int, device: torch.device, scenes: int,
-                 flares: int) -> None:
-        """scenes, flares: how many to hold. Of the scenes each shape has its share, in whole blocks.
+    def __init__(self, shapes: Sequence[FrameShape], canvas_size: int, device: torch.device, scene_count: int,
+                 flare_count: int) -> None:
+        """scene_count, flare_count: how many to hold. Of the scenes each shape has its share, in whole blocks.
 
-        A flare has FLARE_CHANNELS planes of canvas x canvas pixels and METADATA_SIZE numbers.
+        A flare has FLARE_CHANNELS planes of canvas_size x canvas_size pixels and METADATA_SIZE numbers.
         """
         self.shapes, self._device = shapes, device
-        blocks = [max(round(scenes * shape.share / SCENES_PER_BLOCK), 1) for shape in shapes]
+        blocks = [max(round(scene_count * shape.share / SCENES_PER_BLOCK), 1) for shape in shapes]
         self._scenes = [torch.zeros(count * SCENES_PER_BLOCK, 3, shape.height, shape.width, dtype=torch.half,
                                     device=device)
                         for count, shape in zip(blocks, shapes, strict=True)]
         self._gammas = [torch.ones(len(pool), device=device) for pool in self._scenes]
-        self._flares = torch.zeros(flares, FLARE_CHANNELS, canvas, canvas, dtype=torch.half, device=device)
-        self._flare_metadata = torch.zeros(flares, METADATA_SIZE, device=device)
+        self._flares = torch.zeros(flare_count, FLARE_CHANNELS, canvas_size, canvas_size, dtype=torch.half,
+                                   device=device)
+        self._flare_metadata = torch.zeros(flare_count, METADATA_SIZE, device=device)
         self.scenes_stored, self.flares_stored = [0] * len(shapes), 0
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
 
-    def store(self, item: DrawnItem, drawn: NDArray[np.float16]) -> None:
+    def store(self, item: DrawnItem, values: NDArray[np.float16]) -> None:
         """Copy an item to the GPU in place of the oldest, on a stream of its own.
 
-        An iteration that samples the place at that moment sees parts of both.
+        values: the item's slot of its kind's file. An iteration that samples the place at that moment sees parts of
+        both items.
         """
         with torch.cuda.stream(self._stream):  # a no-op for None
-            values = torch.from_numpy(drawn)
+            tensor = torch.from_numpy(values)
             if item.kind == SCENE:
                 pool = self._scenes[item.shape]
-                first = self.scenes_stored[item.shape] % len(pool)
-                slots = slice(first, first + SCENES_PER_BLOCK)
-                # `drawn` has room for the largest shape.
-                pool[slots].copy_(values[:pool[slots].numel()].view(SCENES_PER_BLOCK, *pool.shape[1:]))
+                first_slot = self.scenes_stored[item.shape] % len(pool)
+                slots = slice(first_slot, first_slot + SCENES_PER_BLOCK)
+                # The slot has room for the largest shape.
+                pool[slots].copy_(tensor[:pool[slots].numel()].view(SCENES_PER_BLOCK, *pool.shape[1:]))
                 self._gammas[item.shape][slots].copy_(torch.from_numpy(item.metadata))
             else:
                 index = self.flares_stored % len(self._flares)
-                self._flares[index].copy_(values.view(self._flares.shape[1:]))
+                self._flares[index].copy_(tensor.view(self._flares.shape[1:]))
                 self._flare_metadata[index].copy_(torch.from_numpy(item.metadata))
         if self._stream is not None:
             self._stream.synchronize()  # before the slot is reused
@@ -169,13 +171,13 @@ class Pools:
 
 @contextmanager
 def filled_pools(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
-                 user_flares: UserFlares | None, processes: int) -> Iterator[None]:
-    """Keep `processes` drawing into the pools within this context, half of them scenes and half flares.
+                 user_flares: UserFlares | None, process_count: int) -> Iterator[None]:
+    """Keep `process_count` processes drawing into the pools within this context: half draw scenes, half flares.
 
     The context is entered when the pools hold enough to begin with. Raises RunError where the processes draw nothing.
     """
     spawning = multiprocessing.get_context("spawn")
-    process_counts = (max(processes // 2, 1), max(processes - processes // 2, 1))
+    process_counts = (max(process_count // 2, 1), max(process_count - process_count // 2, 1))
     # numbers in one slot, by kind
     lengths = (SCENES_PER_BLOCK * 3 * max(shape.width * shape.height for shape in pools.shapes),
                FLARE_CHANNELS * recipe.canvas_size**2)
@@ -188,11 +190,11 @@ def filled_pools(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses:
         for slots, memory in zip(free_slots, memories, strict=True):
             for slot in range(len(memory)):
                 slots.put(slot)
-        args = ((backgrounds, pools.shapes), (recipe, lenses, user_flares))
+        kind_args = ((backgrounds, pools.shapes), (recipe, lenses, user_flares))
         processes_drawing = [
             spawning.Process(target=(_draw_scenes, _draw_flares)[kind], daemon=True,
                              args=((recipe.seed, number), files[kind], memories[kind].shape, free_slots[kind], drawn,
-                                   *args[kind]))
+                                   *kind_args[kind]))
             for kind in (SCENE, FLARE) for number in range(process_counts[kind])]
         ended, ready = threading.Event(), threading.Event()
         transfer_thread = threading.Thread(target=_transfer_drawn, daemon=True,
@@ -246,32 +248,33 @@ def _initialise_drawing() -> None:
         os.nice(10)
 
 
-def _draw_scenes(seed: tuple[int, int], path: Path, shape: tuple[int, int], free_slots: Any, drawn: Any,
+def _draw_scenes(seed: tuple[int, int], path: Path, memory_shape: tuple[int, int], free_slots: Any, drawn: Any,
                  backgrounds: Backgrounds, shapes: Sequence[FrameShape]) -> None:
     """Draw blocks of scenes without end, each of one of the shapes; runs in a process of its own.
 
-    path, shape: file and shape of the memory, a row for each slot. free_slots: queue of slots to draw into. drawn:
-    queue of DrawnItems.
+    path, memory_shape: file and shape of the memory, a row for each slot. free_slots: queue of slots to draw into.
+    drawn: queue of DrawnItems.
     """
     _initialise_drawing()
-    memory = np.memmap(path, np.float16, "r+", shape=shape)
+    memory = np.memmap(path, np.float16, "r+", shape=memory_shape)
     random = np.random.default_rng((*seed, SCENE))
     while True:
         slot = free_slots.get()
-        number = int(random.choice(len(shapes), p=[shape.share for shape in shapes]))
-        width, height = shapes[number].width, shapes[number].height
+        shape_index = int(random.choice(len(shapes), p=[shape.share for shape in shapes]))
+        width, height = shapes[shape_index].width, shapes[shape_index].height
         gammas = random.uniform(*GAMMA_RANGE, SCENES_PER_BLOCK).astype(np.float32)
         block = memory[slot, :SCENES_PER_BLOCK * 3 * height * width].reshape(SCENES_PER_BLOCK, 3, height, width)
-        for place, gamma in zip(block, gammas, strict=True):
-            place[:] = _to_half_planes(backgrounds.draw(random, width, height, float(gamma)))
-        drawn.put(DrawnItem(SCENE, slot, number, gammas))
+        for planes, gamma in zip(block, gammas, strict=True):
+            planes[:] = _to_half_planes(backgrounds.draw(random, width, height, float(gamma)))
+        drawn.put(DrawnItem(SCENE, slot, shape_index, gammas))
 
 
-def _draw_flares(seed: tuple[int, int], path: Path, shape: tuple[int, int], free_slots: Any, drawn: Any, recipe: Recipe,
-                 lenses: Sequence[Prescription], user_flares: UserFlares | None) -> None:
-    """Draw flares without end, in a process of its own; path, shape, free_slots and drawn as for `_draw_scenes`."""
+def _draw_flares(seed: tuple[int, int], path: Path, memory_shape: tuple[int, int], free_slots: Any, drawn: Any,
+                 recipe: Recipe, lenses: Sequence[Prescription], user_flares: UserFlares | None) -> None:
+    """Draw flares without end, in a process of its own. path, memory_shape, free_slots, drawn: as for `_draw_scenes`.
+    """
     _initialise_drawing()
-    memory = np.memmap(path, np.float16, "r+", shape=shape)
+    memory = np.memmap(path, np.float16, "r+", shape=memory_shape)
     random = np.random.default_rng((*seed, FLARE))
     synthesis_bank = SynthesisBank(int(random.integers(1 << 40)), 1, recipe.canvas_size, lenses, recipe.coloured_share,
                                    recipe.aspheric_share)
@@ -284,8 +287,8 @@ def _draw_flares(seed: tuple[int, int], path: Path, shape: tuple[int, int], free
         synthesis_bank.renew(serial)
         layers = bank.draw(random)
         canvas = memory[slot].reshape(3, 3, size, size)
-        for place, layer in zip(canvas, (layers.rest, layers.glow, layers.light), strict=True):
-            place[:] = _to_half_planes(layer)
+        for planes, layer in zip(canvas, (layers.rest, layers.glow, layers.light), strict=True):
+            planes[:] = _to_half_planes(layer)
         metadata = np.zeros(METADATA_SIZE, np.float32)
         for light, position in enumerate(layers.lights[:MAX_LIGHTS]):
             metadata[2 * light:2 * light + 2] = position

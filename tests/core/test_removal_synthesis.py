@@ -145,7 +145,7 @@ def test_a_smear_consists_of_beams_from_the_light() -> None:
     x, y = canvas_grid(SIZE)
     turn = np.linspace(-np.pi, np.pi, 400)
     for seed in range(12):
-        beams = shapes.smear(np.random.default_rng(seed), (0.1, -0.2), x, y).mean(-1)
+        beams = shapes.draw_smear(np.random.default_rng(seed), (0.1, -0.2), x, y).mean(-1)
         circles = (np.array([0.1 + r * np.cos(turn), -0.2 + r * np.sin(turn)]) for r in (0.02, 0.25))
         near, quarter = (beams[rows, columns] for columns, rows in (np.int32((at + 1) / 2 * SIZE) for at in circles))
         assert near.max() >= quarter.max() * 0.99, "brightest at the light"

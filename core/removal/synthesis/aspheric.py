@@ -64,13 +64,13 @@ def draw_light_ghosts(random: Random, light: Point, size: int) -> Array:
     texture = _draw_texture(random)
     contrast = log_uniform(random, 0.1, 1.0)  # of the texture, about
     for _ in range(int(random.integers(1, 6))):
-        # Place on the line through the light (1) and the middle (0): most ghosts lie opposite to the light.
-        along = -random.uniform(0.1, 1.4) if random.random() < 0.75 else random.uniform(0.2, 1.2)
-        centre = np.array(light) * along + random.normal(0, 0.02, 2)
+        # On the line through the light (1) and the middle (0): most ghosts lie opposite to the light.
+        line_position = -random.uniform(0.1, 1.4) if random.random() < 0.75 else random.uniform(0.2, 1.2)
+        centre = np.array(light) * line_position + random.normal(0, 0.02, 2)
         radius = log_uniform(random, 0.015, 0.5)
         transmission = 1 + min(contrast * log_uniform(random, 0.3, 3), 1.0) * (texture - 1)
-        level = log_uniform(random, 0.1, 1.0)
-        colour = _draw_coating_colour(random) * level
+        brightness = log_uniform(random, 0.1, 1.0)
+        colour = _draw_coating_colour(random) * brightness
         layer += _draw_ghost(random, centre, radius, np.maximum(transmission, 0), size) * colour
     return layer
 
@@ -103,9 +103,10 @@ def _draw_aberrations(random: Random) -> Aberrations:
     """Draw a ghost's aberrations."""
     strength = random.random() ** 2 * 1.2  # many ghosts are nearly free of aberrations
     spread, spread_of_rim = random.normal(0, 0.04), random.normal(0, 0.1)
-    return Aberrations(1 + spread * CHANNEL_OFFSETS, strength * random.normal(0, 0.5) + spread_of_rim * CHANNEL_OFFSETS,
-                       strength * random.normal(0, 0.4), strength * random.normal(0, 0.25),
-                       strength * random.normal(0, 0.3))
+    return Aberrations(scale=1 + spread * CHANNEL_OFFSETS,
+                       third=strength * random.normal(0, 0.5) + spread_of_rim * CHANNEL_OFFSETS,
+                       fifth=strength * random.normal(0, 0.4), coma=strength * random.normal(0, 0.25),
+                       astigmatism=strength * random.normal(0, 0.3))
 
 
 def _draw_pupil(random: Random, u: Array, v: Array) -> Array:
@@ -135,9 +136,9 @@ def _splat(positions: Array, weights: Array, size: int) -> Array:
     for right in (0, 1):
         for down in (0, 1):
             x, y = low[0] + right, low[1] + down
-            share = weights * np.abs(1 - right - fraction[0]) * np.abs(1 - down - fraction[1])
+            pixel_weight = weights * np.abs(1 - right - fraction[0]) * np.abs(1 - down - fraction[1])
             inside = (x >= 0) & (x < size) & (y >= 0) & (y < size)
-            total += np.bincount((y * size + x)[inside], share[inside], size * size)
+            total += np.bincount((y * size + x)[inside], pixel_weight[inside], size * size)
     return total.reshape(size, size).astype(np.float32)
 
 
@@ -149,16 +150,16 @@ def _draw_texture(random: Random) -> Array:
     r = np.hypot(u, v)
     texture = np.ones_like(r)
     if random.random() < 0.6:  # rings
-        across = cv2.GaussianBlur(random.normal(0, 1, (1, 512)), (0, 0), log_uniform(random, 1, 12))[0]
-        texture += random.uniform(0.05, 0.4) * np.interp(r, np.linspace(0, 1.5, 512), across / across.std())
+        radial_noise = cv2.GaussianBlur(random.normal(0, 1, (1, 512)), (0, 0), log_uniform(random, 1, 12))[0]
+        texture += random.uniform(0.05, 0.4) * np.interp(r, np.linspace(0, 1.5, 512), radial_noise / radial_noise.std())
     if random.random() < 0.6:  # smears
         smear = cv2.GaussianBlur(random.normal(0, 1, r.shape), (0, 0), log_uniform(random, 2, 40))
         texture += random.uniform(0.05, 0.4) * smear / smear.std()
     if random.random() < 0.5:  # dust, out of focus
         specks = np.zeros_like(r)
         for _ in range(int(random.integers(3, 80))):
-            place = tuple(int(part) for part in random.uniform(0, TEXTURE_SIZE, 2))
-            cv2.circle(specks, place, int(log_uniform(random, 1, 14)), (random.uniform(-0.8, 0.4),), -1, cv2.LINE_AA)
+            centre = tuple(int(part) for part in random.uniform(0, TEXTURE_SIZE, 2))
+            cv2.circle(specks, centre, int(log_uniform(random, 1, 14)), (random.uniform(-0.8, 0.4),), -1, cv2.LINE_AA)
         texture += cv2.GaussianBlur(specks, (0, 0), log_uniform(random, 0.5, 4))
     if random.random() < 0.5:  # fringes, which fade from the edge inwards
         inward = np.maximum(0.97 - r, 0)

@@ -57,13 +57,13 @@ def synthesise_flare(seed: int | Sequence[int], size: int, lenses: Sequence[Pres
         positions.append(position)
         strength = 1.0 if number == 0 else log_uniform(random, 0.2, 1)
         colour = random_tint(random, 0.25)
-        part, light_glow = _draw_light_flare(random, lens_seed, kind, position, size, x, y, lenses)
-        rest += part * colour * strength
+        light_rest, light_glow = _draw_light_flare(random, lens_seed, kind, position, size, x, y, lenses)
+        rest += light_rest * colour * strength
         glow += light_glow * colour * strength
         # A light within the canvas or just off it shows; rings have no place relative to a light, so few get one.
         if max(abs(position[0]), abs(position[1])) < 1.05 and (kind != "rings" or random.random() < 0.3) \
                 and random.random() < 0.85:
-            source = shapes.light_shape(random, position, x, y)
+            source = shapes.draw_light(random, position, x, y)
             light = np.maximum(light, source)
             if kind in ("ghosts", "mixed") and random.random() < 0.4:
                 rest += ghosts.draw_mirrored_light(random, source, position) * strength
@@ -105,25 +105,25 @@ def _draw_light_flare(random: Random, lens_seed: int, kind: str, position: Point
     for part in sorted(parts):
         if part == "scatter":
             # Only the core, a few pixels, is 1: at 3e4 the spikes, decades below it, show too.
-            rest += scatter.starburst(lens_random, position, size) * log_uniform(random, 3, 3e4)
+            rest += scatter.draw_starburst(lens_random, position, size) * log_uniform(random, 3, 3e4)
         elif part == "ghosts":
             rest += _normalise_exposure(random, _draw_ghosts(lens_random, position, size, x, y, lenses), 0.02, 1.0)
         elif part == "streak":
             if lens_random.random() < 0.4:
-                rest += shapes.streak(lens_random, position, x, y) * log_uniform(random, 0.05, 3)
+                rest += shapes.draw_streak(lens_random, position, x, y) * log_uniform(random, 0.05, 3)
             else:
-                rest += shapes.smear(lens_random, position, x, y) * log_uniform(random, 0.02, 1.2)
+                rest += shapes.draw_smear(lens_random, position, x, y) * log_uniform(random, 0.02, 1.2)
         elif part == "halo":
-            rest += shapes.halo(lens_random, position, x, y) * log_uniform(random, 0.02, 0.5)
+            rest += shapes.draw_halo(lens_random, position, x, y) * log_uniform(random, 0.02, 0.5)
         elif part == "shimmer":
-            rest += _normalise_exposure(random, scatter.shimmer(lens_random, position, x, y), 0.05, 1.5)
+            rest += _normalise_exposure(random, scatter.draw_shimmer(lens_random, position, x, y), 0.05, 1.5)
         elif part == "rings":
             # The paper draws rings in display values; the power takes them to linear light.
-            rest += shapes.rings(random, x, y) ** np.float32(random.uniform(1, 2.2))
+            rest += shapes.draw_rings(random, x, y) ** np.float32(random.uniform(1, 2.2))
         elif part == "glow":
-            glow += scatter.glow(random, position, x, y) * log_uniform(random, 0.1, 6)
+            glow += scatter.draw_glow(random, position, x, y) * log_uniform(random, 0.1, 6)
         elif part == "veil":
-            glow += scatter.veil(random, position, x, y) * log_uniform(random, 0.005, 0.3)
+            glow += scatter.draw_veil(random, position, x, y) * log_uniform(random, 0.005, 0.3)
     return rest, glow
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
     blades, rotation = int(random.integers(5, 12)), random.uniform(0, 2 * math.pi)
     roundness = random.choice([0.0, 0.0, 0.3, 1.0]) if opening < 0.9 else 1.0
     coating_wavelengths = _draw_coatings(random, lens)
-    soft = log_uniform(random, 0.002, 0.03)
+    softness = log_uniform(random, 0.002, 0.03)
     rim, rim_width = (log_uniform(random, 0.1, 2.0), random.uniform(0.02, 0.12)) if random.random() < 0.6 else (0, 0.1)
     candidates = []  # (greatest channel, light by channel, path)
     for ghost in _ghost_paths(lens):
@@ -62,27 +63,51 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
     saturation = random.uniform(0, 0.8) if random.random() < 0.6 else 0.0  # real coatings have many layers
     unit = HALF_DIAGONAL * crop  # of the canvas, mm
     for strength, weight, ghost in strongest:
-        # A ray of height h and slope u meets the stop at a h + b u, and the sensor at s h + t u. The one through the
-        # stop's centre has h = -b u / a, which gives the ghost's centre; its radius is the stop's times |s / a|.
-        a, b = ghost.stop[:, 0], ghost.stop[:, 1]
-        s, t = ghost.sensor[:, 0], ghost.sensor[:, 1]
-        a = np.where(np.abs(a) < 1e-4, 1e-4, a)
-        scale = s / a
-        centre = np.outer(t - scale * b, slopes) / unit
-        radius = np.maximum(np.abs(scale) * stop / unit, 0.004)
-        last_scale = np.where(np.abs(ghost.last_stop[:, 0]) < 1e-4, 1e-4, ghost.last_stop[:, 0])
-        magnification = s / last_scale  # from the stop at the last passage to the sensor
-        if np.hypot(*centre[1]) - radius[1] > 1.5:  # beyond the canvas
+        images = _project_apertures(ghost, slopes, stop, entrance, unit)
+        if np.hypot(*images.centre[1]) - images.radius[1] > 1.5:  # beyond the canvas
             continue
         gain = (strength / reference) ** power / strength
         level = np.minimum(weight * gain, 4.0) * random_tint(random, saturation)
-        draw_ghost(layer, _to_float32(centre), _to_float32(radius),
-                   _to_float32(np.outer(t, slopes) / unit), _to_float32(np.maximum(np.abs(s) * entrance / unit, 1e-3)),
-                   _to_float32(np.outer(t - magnification * ghost.last_stop[:, 1], slopes) / unit),
-                   _to_float32(np.maximum(np.abs(magnification) * stop / unit, 1e-3)),
-                   _to_float32(level), blades, rotation, float(roundness), soft * (1 + 0.4 * float(radius[1])), rim,
-                   rim_width, random.uniform(0, 0.6) if rim else 0.0, random.uniform(-0.4, 0.4))
+        draw_ghost(layer, _to_float32(images.centre), _to_float32(images.radius), _to_float32(images.clip_centre),
+                   _to_float32(images.clip_radius), _to_float32(images.second_centre),
+                   _to_float32(images.second_radius), _to_float32(level), blades, rotation, float(roundness),
+                   softness * (1 + 0.4 * float(images.radius[1])), rim, rim_width,
+                   random.uniform(0, 0.6) if rim else 0.0, random.uniform(-0.4, 0.4))
     return layer
+
+
+class _ApertureImages(NamedTuple):
+    """The images on the canvas that bound a ghost, by channel: centres (3, 2) and radii (3,), as `draw_ghost` takes
+    them. They are of the stop, of the entrance, and of the stop at the light's last passage."""
+
+    centre: NDArray[np.float64]
+    radius: NDArray[np.float64]
+    clip_centre: NDArray[np.float64]
+    clip_radius: NDArray[np.float64]
+    second_centre: NDArray[np.float64]
+    second_radius: NDArray[np.float64]
+
+
+def _project_apertures(ghost: GhostPath, slopes: NDArray[np.float64], stop: float, entrance: float,
+                       unit: float) -> _ApertureImages:
+    """Return the images of a lens's apertures along a ghost path.
+
+    slopes: of the light's rays, (2,). stop, entrance: radii of the stop and of the front surface, mm. unit: length of 1
+    on the canvas, mm.
+    """
+    # A ray of height h and slope u meets the stop at a h + b u, and the sensor at s h + t u. The one through the
+    # stop's centre has h = -b u / a, which gives the ghost's centre; its radius is the stop's times |s / a|.
+    a, b = ghost.stop[:, 0], ghost.stop[:, 1]
+    s, t = ghost.sensor[:, 0], ghost.sensor[:, 1]
+    a = np.where(np.abs(a) < 1e-4, 1e-4, a)
+    last_a = np.where(np.abs(ghost.last_stop[:, 0]) < 1e-4, 1e-4, ghost.last_stop[:, 0])
+    magnification, last_magnification = s / a, s / last_a  # from the stop to the sensor, and from its last passage
+    return _ApertureImages(
+        centre=np.outer(t - magnification * b, slopes) / unit,
+        radius=np.maximum(np.abs(magnification) * stop / unit, 0.004),
+        clip_centre=np.outer(t, slopes) / unit, clip_radius=np.maximum(np.abs(s) * entrance / unit, 1e-3),
+        second_centre=np.outer(t - last_magnification * ghost.last_stop[:, 1], slopes) / unit,
+        second_radius=np.maximum(np.abs(last_magnification) * stop / unit, 1e-3))
 
 
 def _draw_coatings(random: Random, lens: Prescription) -> NDArray[np.float64]:
@@ -120,7 +145,7 @@ def draw_freehand(random: Random, light: Point, size: int) -> Array:
     middle, of random positions and colours."""
     layer = np.zeros((size, size, 3), np.float32)
     blades, rotation = int(random.integers(5, 10)), random.uniform(0, 2 * math.pi)
-    one_shape = random.random() < 0.6  # all of one shape, or each of another
+    same_shape = random.random() < 0.6  # all of one shape, or each of another
     roundness = random.choice([0.0, 0.5, 1.0])
     base = log_uniform(random, 0.02, 0.25)
     for _ in range(int(random.integers(1, 14))):
@@ -128,17 +153,17 @@ def draw_freehand(random: Random, light: Point, size: int) -> Array:
         line_position = random.normal(0, 0.8) if random.random() < 0.7 else -1 + random.normal(0, 0.1)
         offset = random.normal(0, 0.01, 2) if random.random() < 0.2 else np.zeros(2)
         spread = random.normal(0, 0.02) if random.random() < 0.4 else 0.0
-        places = line_position * (1 + spread * np.array([-1.0, 0.0, 1.0]))
-        centre = np.outer(places, light) + offset
+        channel_positions = line_position * (1 + spread * np.array([-1.0, 0.0, 1.0]))
+        centre = np.outer(channel_positions, light) + offset
         radius = base * log_uniform(random, 0.2, 4) * (1 + random.normal(0, 0.03) * np.array([-1, 0, 1]))
-        if not one_shape:
+        if not same_shape:
             roundness = random.choice([0.0, 0.5, 1.0, 1.0])
         hollow = random.uniform(0, 1) if random.random() < 0.5 else 0.0
         rim = log_uniform(random, 0.1, 3) if random.random() < 0.5 else 0.0
         # A circle beside the ghost cuts some of them, as the rim of another lens does.
-        clip = centre + random.normal(0, 0.3, 2) * radius[1] if random.random() < 0.3 else centre
+        clip_centre = centre + random.normal(0, 0.3, 2) * radius[1] if random.random() < 0.3 else centre
         level = log_uniform(random, 0.03, 1) * random_tint(random, 0.6)
-        draw_ghost(layer, _to_float32(centre), _to_float32(np.abs(radius)), _to_float32(clip),
+        draw_ghost(layer, _to_float32(centre), _to_float32(np.abs(radius)), _to_float32(clip_centre),
                    _to_float32(np.abs(radius) * 1.02), _to_float32(centre),
                    _to_float32(np.abs(radius) * 1.01), level, blades, rotation, float(roundness),
                    float(radius[1]) * log_uniform(random, 0.02, 0.8), rim, log_uniform(random, 0.03, 0.3), hollow,
@@ -156,22 +181,22 @@ def draw_mirrored_light(random: Random, source: Array, light: Point) -> Array:
     import cv2
 
     size = source.shape[0]
-    shape = np.minimum(source, 4.0)  # the image is faint, whatever the light's own level
-    bright = shape.sum(-1)
-    shape = shape * (bright > 0.25 * bright.max())[..., None]
+    source_image = np.minimum(source, 4.0)  # the ghost is faint, whatever the light's own level
+    brightness = source_image.sum(-1)
+    source_image = source_image * (brightness > 0.25 * brightness.max())[..., None]
     layer = np.zeros_like(source)
     for _ in range(int(random.integers(1, 4))):
-        # place: on the line through the light (1) and the middle (0). zoom: below 0 if rotated by 180 degrees.
-        place, zoom = -random.uniform(0.8, 1.2) if random.random() < 0.7 else random.normal(0, 0.9), \
-            log_uniform(random, 0.5, 2.0) * (-1 if random.random() < 0.8 else 1)
+        # On the line through the light (1) and the middle (0).
+        line_position = -random.uniform(0.8, 1.2) if random.random() < 0.7 else random.normal(0, 0.9)
+        zoom = log_uniform(random, 0.5, 2.0) * (-1 if random.random() < 0.8 else 1)  # below 0: rotated by 180 degrees
         half = size / 2
         centre = (np.array(light) + 1) * half
-        target = (np.array(light) * place + 1) * half
+        target = (np.array(light) * line_position + 1) * half
         matrix = np.array([[zoom, 0, target[0] - zoom * centre[0]], [0, zoom, target[1] - zoom * centre[1]]])
-        moved = cv2.warpAffine(shape, matrix, (size, size))
+        mirrored = cv2.warpAffine(source_image, matrix, (size, size))
         blur = log_uniform(random, 0.5, 0.015 * size)
         level = log_uniform(random, 0.02, 0.6) * random_tint(random, 0.8)
-        layer += cv2.GaussianBlur(moved, (0, 0), blur) * level
+        layer += cv2.GaussianBlur(mirrored, (0, 0), blur) * level
     return layer
 
 
@@ -184,14 +209,14 @@ def draw_arc(random: Random, light: Point, size: int, x: Array, y: Array) -> Arr
     angle = np.arctan2(y, x) - direction
     opening_angle = random.uniform(0.1, 0.9) * (1 + light_radius)
     window = np.exp(-(np.arctan2(np.sin(angle), np.cos(angle)) / opening_angle) ** 2 * 2)
-    r = np.hypot(x, y)
-    waves = np.linspace(0.42, 0.68, 9)
-    colours = spectral_colour(waves)
+    radius_of_pixel = np.hypot(x, y)
+    wavelengths = np.linspace(0.42, 0.68, 9)
+    colours = spectral_colour(wavelengths)
     layer = np.zeros((size, size, 3), np.float32)
     spread = random.uniform(-0.6, 0.6)  # of the colours: change of the radius per micrometre from green
-    for wave, colour in zip(waves, colours / colours.sum(0), strict=True):
-        radius_of_wave = radius * (1 + spread * (wave - 0.55))
-        layer += np.exp(-((r - radius_of_wave) / width) ** 2)[..., None] * colour.astype(np.float32)
+    for wavelength, colour in zip(wavelengths, colours / colours.sum(0), strict=True):
+        radius_of_wave = radius * (1 + spread * (wavelength - 0.55))
+        layer += np.exp(-((radius_of_pixel - radius_of_wave) / width) ** 2)[..., None] * colour.astype(np.float32)
     return layer * window[..., None] * log_uniform(random, 0.1, 1.0)
 
 

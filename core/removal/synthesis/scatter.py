@@ -17,7 +17,7 @@ STOP_SAMPLES = 256
 """Samples across the plane of the stop, which fills about half of it."""
 
 
-def starburst(random: Random, light: Point, size: int) -> Array:
+def draw_starburst(random: Random, light: Point, size: int) -> Array:
     """Return (size, size, 3), the light's diffraction image: greatest value 1, in the core, falling over several
     decades."""
     import cv2
@@ -25,23 +25,23 @@ def starburst(random: Random, light: Point, size: int) -> Array:
     stop = _draw_stop(random, dirt=random.random() ** 2)
     phase = _draw_phase(random)
     # Padded to twice the size, which samples the image twice as finely.
-    plane = np.fft.fftshift(np.fft.fft2(stop * np.exp(1j * phase), (2 * STOP_SAMPLES, 2 * STOP_SAMPLES)))
-    raw = (np.abs(plane) ** 2).astype(np.float32)
+    amplitude = np.fft.fftshift(np.fft.fft2(stop * np.exp(1j * phase), (2 * STOP_SAMPLES, 2 * STOP_SAMPLES)))
+    intensity = (np.abs(amplitude) ** 2).astype(np.float32)
     blur = log_uniform(random, 0.5, 2.0)  # lights have an extent, and no camera resolves the fringes
-    power = np.asarray(cv2.GaussianBlur(raw / raw.max(), (0, 0), blur), np.float32)
-    power /= power.max()
-    reach = log_uniform(random, 0.5, 4.0)  # side of the whole image relative to the canvas
+    blurred = np.asarray(cv2.GaussianBlur(intensity / intensity.max(), (0, 0), blur), np.float32)
+    blurred /= blurred.max()
+    relative_size = log_uniform(random, 0.5, 4.0)  # side of the whole image relative to the canvas
     layer = np.zeros((size, size, 3), np.float32)
-    waves = np.linspace(0.41, 0.69, 10)
-    colours = spectral_colour(waves)
+    wavelengths = np.linspace(0.41, 0.69, 10)
+    colours = spectral_colour(wavelengths)
     colours /= colours.sum(0)
     spread = random.uniform(0.3, 1.0)  # of the colours; sensors mix wavelengths
-    for wave, colour in zip(waves, colours.astype(np.float32), strict=True):
+    for wavelength, colour in zip(wavelengths, colours.astype(np.float32), strict=True):
         # An image grows with its wavelength, and its light spreads over zoom^2 as many pixels.
-        zoom = reach * (1 + spread * (wave / 0.55 - 1)) * size / (2 * STOP_SAMPLES)
+        zoom = relative_size * (1 + spread * (wavelength / 0.55 - 1)) * size / (2 * STOP_SAMPLES)
         x, y = (light[0] + 1) * size / 2, (light[1] + 1) * size / 2
         matrix = np.array([[zoom, 0, x - zoom * STOP_SAMPLES], [0, zoom, y - zoom * STOP_SAMPLES]])
-        layer += cv2.warpAffine(power, matrix, (size, size))[..., None] * (colour / zoom**2)
+        layer += cv2.warpAffine(blurred, matrix, (size, size))[..., None] * (colour / zoom**2)
     return layer / max(float(layer.max()), 1e-12)
 
 
@@ -56,26 +56,26 @@ def _draw_stop(random: Random, dirt: float) -> Array:
     if random.random() < 0.2:
         blades = 18  # nearly round
     rotation = random.uniform(0, 2 * math.pi)
-    shape = np.ones((STOP_SAMPLES, STOP_SAMPLES))
-    soft = 90.0  # steepness of the edges
+    opening = np.ones((STOP_SAMPLES, STOP_SAMPLES))
+    edge_steepness = 90.0
     for k in range(blades):
         angle = rotation + 2 * math.pi * (k + random.normal(0, 0.03)) / blades
         edge = 0.5 * (1 + random.normal(0, 0.02))  # distance from the centre; blades are never quite even
         bend = random.uniform(0, 0.25)  # blades are curved, which fans the spikes out
+        along = x * math.cos(angle) + y * math.sin(angle)
         across = x * -math.sin(angle) + y * math.cos(angle)
-        shape *= 1 / (1 + np.exp(np.clip((x * math.cos(angle) + y * math.sin(angle) + bend * across**2 - edge) * soft,
-                                         -60, 60)))
-    mask = shape.astype(np.float32)
+        opening *= 1 / (1 + np.exp(np.clip((along + bend * across**2 - edge) * edge_steepness, -60, 60)))
+    mask = opening.astype(np.float32)
     for _ in range(int(random.poisson(60 * dirt))):  # dust
         middle = (random.uniform(0.25, 0.75, 2) * STOP_SAMPLES).astype(int)
         spot = np.ones_like(mask)
         cv2.circle(spot, tuple(int(v) for v in middle), int(log_uniform(random, 1, 6)), (random.uniform(0, 0.9),), -1,
                    cv2.LINE_AA)
         mask *= spot
-    along = random.uniform(0, math.pi)  # wiping leaves scratches in one direction
+    wiping_angle = random.uniform(0, math.pi)  # wiping leaves scratches in one direction
     spread = random.choice([0.03, 0.2, 2.0])
     for _ in range(int(random.poisson(40 * dirt))):
-        middle, angle = random.uniform(0.2, 0.8, 2) * STOP_SAMPLES, along + random.normal(0, spread)
+        middle, angle = random.uniform(0.2, 0.8, 2) * STOP_SAMPLES, wiping_angle + random.normal(0, spread)
         reach = log_uniform(random, 5, STOP_SAMPLES) / 2
         ends = [(int(middle[0] + sign * reach * math.cos(angle)), int(middle[1] + sign * reach * math.sin(angle)))
                 for sign in (-1, 1)]
@@ -100,34 +100,35 @@ def _draw_phase(random: Random) -> Array:
     return phase.astype(np.float32)
 
 
-def shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
+def draw_shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
     """Return (size, size, 3), many fine rays round the light, of uneven strength and length; `_normalise_exposure` in
     `flare` sets their brightness. x, y: `canvas_grid`."""
     dx, dy = x - light[0], y - light[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
-    count = 2048  # directions, over the whole circle
-    strength = np.zeros(count)
-    kind = random.random()
-    if kind < 0.4:  # a few long ones
-        number, width = int(random.integers(4, 30)), log_uniform(random, 0.002, 0.03)
+    direction_count = 2048  # over the whole circle
+    strength = np.zeros(direction_count)
+    ray_draw = random.random()
+    if ray_draw < 0.4:  # a few long ones
+        ray_count, ray_width = int(random.integers(4, 30)), log_uniform(random, 0.002, 0.03)
     else:  # a curtain of them
-        number, width = int(random.integers(40, 300)), log_uniform(random, 0.001, 0.01)
-    positions = np.arange(count) / count
-    for _ in range(number):
+        ray_count, ray_width = int(random.integers(40, 300)), log_uniform(random, 0.001, 0.01)
+    positions = np.arange(direction_count) / direction_count
+    for _ in range(ray_count):
         centre = random.random()
         gap = np.abs(positions - centre)
-        strength += random.exponential(1) * np.exp(-(np.minimum(gap, 1 - gap) / (width * random.uniform(0.5, 2))) ** 2)
+        strength += random.exponential(1) * np.exp(
+            -(np.minimum(gap, 1 - gap) / (ray_width * random.uniform(0.5, 2))) ** 2)
     strength = strength / strength.max() + random.uniform(0, 0.3)
     # Strong rays are long too; the small random turn loosens that.
     reach = log_uniform(random, 0.08, 0.8) * (0.5 + 0.5 * np.roll(strength, int(random.integers(20))))
-    position = ((angle / (2 * math.pi)) % 1) * count
-    low = position.astype(int) % count  # each pixel lies between directions low and low + 1
-    part = (position - np.floor(position)).astype(np.float32)
-    near = strength[low] * (1 - part) + strength[(low + 1) % count] * part
-    far = reach[low] * (1 - part) + reach[(low + 1) % count] * part
+    position = ((angle / (2 * math.pi)) % 1) * direction_count
+    low = position.astype(int) % direction_count  # each pixel lies between directions low and low + 1
+    fraction = (position - np.floor(position)).astype(np.float32)
+    pixel_strength = strength[low] * (1 - fraction) + strength[(low + 1) % direction_count] * fraction
+    pixel_reach = reach[low] * (1 - fraction) + reach[(low + 1) % direction_count] * fraction
     inner = random.uniform(0, 0.15)  # radius of the middle, even or without rays
-    layer = near * (np.exp(-np.maximum(r - inner, 0) / far) if random.random() < 0.5
-                    else 1 / (1 + (r / far * 2) ** 2.5))
+    layer = pixel_strength * (np.exp(-np.maximum(r - inner, 0) / pixel_reach) if random.random() < 0.5
+                              else 1 / (1 + (r / pixel_reach * 2) ** 2.5))
     if random.random() < 0.5:
         layer = layer * (1 - np.exp(-(r / max(inner, 1e-3)) ** 2))
     hue = _radial_tint(random, r)
@@ -141,7 +142,7 @@ def _radial_tint(random: Random, r: Array) -> Array:
     return np.exp(turns[0] * (1 - share) + turns[1] * share).astype(np.float32)
 
 
-def glow(random: Random, light: Point, x: Array, y: Array) -> Array:
+def draw_glow(random: Random, light: Point, x: Array, y: Array) -> Array:
     """Return (size, size, 3), maximum 1, the glow round a light: one to three lobes that fall off as a power or a
     Gaussian, each of a colour that changes outwards. x, y: `canvas_grid`."""
     dx, dy = x - light[0], y - light[1]
@@ -156,13 +157,13 @@ def glow(random: Random, light: Point, x: Array, y: Array) -> Array:
         # Narrow lobes are brighter.
         layer += (lobe * log_uniform(random, 0.05, 1) * (0.05 / width) ** 0.5)[..., None] * _radial_tint(random, r)
     if random.random() < 0.3:  # uneven round the circle
-        about = np.arctan2(dy, dx)
-        waves = [random.normal(0, 0.3) * np.cos(k * about + random.uniform(0, 7)) for k in range(1, 5)]
+        direction = np.arctan2(dy, dx)
+        waves = [random.normal(0, 0.3) * np.cos(k * direction + random.uniform(0, 7)) for k in range(1, 5)]
         layer *= np.exp(np.sum(waves, axis=0, dtype=np.float32))[..., None]
     return layer / max(float(layer.max()), 1e-9)
 
 
-def veil(random: Random, light: Point, x: Array, y: Array) -> Array:
+def draw_veil(random: Random, light: Point, x: Array, y: Array) -> Array:
     """Return veiling glare, (size, size, 3), at most about 1: light over the whole frame, more on the light's side,
     without any edge. x, y: `canvas_grid`."""
     distance = np.hypot(x - light[0], y - light[1])

@@ -10,7 +10,7 @@ import numpy as np
 from .canvas import Array, Point, Random, log_uniform, random_tint, spectral_colour
 
 
-def streak(random: Random, light: Point, x: Array, y: Array) -> Array:
+def draw_streak(random: Random, light: Point, x: Array, y: Array) -> Array:
     """Return (size, size, 3), maximum 1: the long horizontal line of an anamorphic lens, or a few close to each other.
 
     x, y: `canvas_grid`.
@@ -34,7 +34,7 @@ def streak(random: Random, light: Point, x: Array, y: Array) -> Array:
     return layer / max(float(layer.max()), 1e-9)
 
 
-def smear(random: Random, light: Point, x: Array, y: Array) -> Array:
+def draw_smear(random: Random, light: Point, x: Array, y: Array) -> Array:
     """Return what wiped grease on the front glass shows, as on most telephones at night: beams across the wiping marks,
     which widen outwards, of fine rays or even, on one or both sides of the light.
 
@@ -89,7 +89,7 @@ def _draw_ray_profile(random: Random) -> Callable[[Array], Array]:
     return lambda direction: np.interp(direction, angles, values).astype(np.float32)
 
 
-def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
+def draw_halo(random: Random, light: Point, x: Array, y: Array) -> Array:
     """Return (size, size, 3), maximum 1: one or two rings, white or in the colours of diffraction, whole or partial.
 
     They lie about the light; in three of ten flares about another point on the line through the light and the middle.
@@ -102,13 +102,13 @@ def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
     for _ in range(1 if random.random() < 0.7 else 2):
         radius, width = log_uniform(random, 0.08, 1.4), log_uniform(random, 0.005, 0.2)
         level = log_uniform(random, 0.2, 1)
-        waves = np.linspace(0.42, 0.68, 9)
-        colours = spectral_colour(waves)
+        wavelengths = np.linspace(0.42, 0.68, 9)
+        colours = spectral_colour(wavelengths)
         colours = colours / colours.sum(0)
         spread = random.uniform(-1, 1) if random.random() < 0.7 else 0.0
         ring = np.zeros_like(layer)
-        for wave, colour in zip(waves, colours.astype(np.float32), strict=True):
-            radius_of_wave = radius * (1 + spread * (wave - 0.55))  # about green, micrometres
+        for wavelength, colour in zip(wavelengths, colours.astype(np.float32), strict=True):
+            radius_of_wave = radius * (1 + spread * (wavelength - 0.55))  # about green, micrometres
             side = np.where(r < radius_of_wave, random.uniform(0.7, 1.3), 1.0)
             ring += np.exp(-((r - radius_of_wave) / (width * side)) ** 2)[..., None] * colour
         if random.random() < 0.4:  # partial
@@ -123,7 +123,7 @@ def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
     return layer / max(float(layer.max()), 1e-9)
 
 
-def rings(random: Random, x: Array, y: Array) -> Array:
+def draw_rings(random: Random, x: Array, y: Array) -> Array:
     """Return the paper's procedural rings, display values (size, size, 3): one to three of any centre, radius and
     colour, opacity below 0.7, times a mask that is 0 at the middle of the frame. x, y: `canvas_grid`."""
     layer = np.zeros((*x.shape, 3), np.float32)
@@ -137,22 +137,22 @@ def rings(random: Random, x: Array, y: Array) -> Array:
     return layer * fade[..., None].astype(np.float32)
 
 
-def light_shape(random: Random, light: Point, x: Array, y: Array) -> Array:
+def draw_light(random: Random, light: Point, x: Array, y: Array) -> Array:
     """Return the light itself, which belongs to the scene: a disc, tube, window or cluster, brighter than white.
 
     Linear light (size, size, 3), 0 elsewhere. x, y: `canvas_grid`.
     """
     layer = np.zeros((*x.shape, 3), np.float32)
-    # kind: below 0.65 discs about one centre; then rectangles, from tubes to windows; above 0.85 scattered ones.
-    kind, colour = random.random(), random_tint(random, 0.15)
+    # kind_draw: below 0.65 discs about one centre; then rectangles, from tubes to windows; above 0.85 scattered ones.
+    kind_draw, colour = random.random(), random_tint(random, 0.15)
     level = log_uniform(random, 1.2, 12)
     edge = 2.0 / x.shape[0]  # one pixel
     for _ in range(1 if random.random() < 0.85 else int(random.integers(2, 6))):
         dx, dy = x - light[0], y - light[1]
-        if kind > 0.85:
+        if kind_draw > 0.85:
             dx, dy = dx + random.normal(0, 0.03), dy + random.normal(0, 0.03)
         radius = log_uniform(random, 0.006, 0.07)
-        if kind < 0.65:
+        if kind_draw < 0.65:
             signed_distance = np.hypot(dx, dy) - radius
         else:
             angle, ratio = random.choice([0.0, random.uniform(0, math.pi)]), log_uniform(random, 1, 6)

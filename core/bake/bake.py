@@ -143,7 +143,7 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
     keyed, lights, elements = settings.keyed.with_always(settings.edits), source.lights, source.elements
 
     def edits_of(frame: NumberedFrame) -> LookEdits:
-        keyed_edits, frame_edits = keyed.at(frame.number, lights, elements), renderer_of(frame).edit_texts
+        keyed_edits, frame_edits = keyed.edits_at(frame.number, lights, elements), renderer_of(frame).edit_texts
         return LookEdits.parse([*frame_edits, *keyed_edits.texts()], lights, elements) if frame_edits else keyed_edits
 
     edits = {frame.view: edits_of(frame) for frame in frames}  # invalid edits raise before any file is deleted
@@ -192,7 +192,7 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
 def _layers(renderer: CameraRenderer, camera: Camera, edits: LookEdits, lights: Sequence[str]) -> FrameLayers:
     """Render one frame. The colour of whole lights is applied to the layers afterwards, which is exact for any blend.
     """
-    colours = edits.matrices(lights)
+    colours = edits.colour_matrices(lights)
     if edits.changes_light_colours_only:
         return to_layers(renderer.render(camera), colours)
     return to_layers(renderer.render(camera, edits.without_light_colours()), colours)

@@ -32,7 +32,7 @@ def read_tensors(path: Path | str) -> tuple[Arrays, dict[str, str]]:
         raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.")
     try:
         data = read_bytes(path)
-        return _parse(data)
+        return _parse_tensors(data)
     except OSError as problem:
         raise FlareFileError(f"{path} cannot be read ({problem.strerror or problem}); copy it again, or choose "
                              "another.") from problem
@@ -40,23 +40,23 @@ def read_tensors(path: Path | str) -> tuple[Arrays, dict[str, str]]:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
 
 
-def _parse(data: bytes) -> tuple[Arrays, dict[str, str]]:
+def _parse_tensors(data: bytes) -> tuple[Arrays, dict[str, str]]:
     """Parse a safetensors file to arrays and metadata. Raises ValueError where it is damaged."""
-    length = int.from_bytes(data[:8], "little")
-    if len(data) < 8 or length > min(len(data) - 8, MAX_HEADER_BYTES):
+    header_size = int.from_bytes(data[:8], "little")
+    if len(data) < 8 or header_size > min(len(data) - 8, MAX_HEADER_BYTES):
         raise ValueError("it ends inside its header")
-    header = parse_json(data[8:8 + length])
+    header = parse_json(data[8:8 + header_size])
     metadata = header.pop("__metadata__", {}) or {}
-    body = memoryview(data)[8 + length:]
+    body = memoryview(data)[8 + header_size:]
     arrays: Arrays = {}
     for name, entry in header.items():
         shape = [int(size) for size in entry["shape"]]
         begin, end = (int(offset) for offset in entry["data_offsets"])
-        kind = np.dtype(_DTYPES[entry["dtype"]])
+        dtype = np.dtype(_DTYPES[entry["dtype"]])
         count = math.prod(shape)
-        if min([0, *shape]) < 0 or not 0 <= begin <= end <= len(body) or end - begin != count * kind.itemsize:
+        if min([0, *shape]) < 0 or not 0 <= begin <= end <= len(body) or end - begin != count * dtype.itemsize:
             raise ValueError(f"the tensor {name} does not fit the file")
-        arrays[name] = np.frombuffer(body[begin:end], kind).reshape(shape)
+        arrays[name] = np.frombuffer(body[begin:end], dtype).reshape(shape)
     return arrays, {str(key): str(value) for key, value in metadata.items()}
 
 
@@ -64,9 +64,9 @@ def rewrite_metadata(source: Path | str, target: Path | str, metadata: dict[str,
     """Copy a safetensors file with other metadata and the same tensors, byte for byte. Raises FlareFileError."""
     read_tensors(source)  # raises for an invalid file
     data = read_bytes(source)
-    length = int.from_bytes(data[:8], "little")
-    header = parse_json(data[8:8 + length])
-    text = json.dumps({**header, "__metadata__": metadata}).encode("utf-8")
-    text += b" " * (-len(text) % 8)  # the tensors stay aligned
+    header_size = int.from_bytes(data[:8], "little")
+    header = parse_json(data[8:8 + header_size])
+    new_header = json.dumps({**header, "__metadata__": metadata}).encode("utf-8")
+    new_header += b" " * (-len(new_header) % 8)  # the tensors stay aligned
     with atomic_path(target) as temporary:
-        temporary.write_bytes(len(text).to_bytes(8, "little") + text + data[8 + length:])
+        temporary.write_bytes(len(new_header).to_bytes(8, "little") + new_header + data[8 + header_size:])

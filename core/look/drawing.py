@@ -23,12 +23,12 @@ Box = tuple[int, int, int, int]
 
 
 def extent(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
-    """Return (n,) the Mahalanobis radius beyond which a Gaussian is not drawn."""
+    """Return the Mahalanobis radius (n,) of each Gaussian beyond which it is not drawn."""
     if blend == "add":
         radius = np.full(len(gaussians), math.sqrt(-2 * math.log(PROFILE_MIN)), np.float32)
     else:
-        peaks = np.minimum(gaussians.opacities, OPACITY_MAX)
-        radius = np.sqrt(2 * np.log(np.maximum(peaks / ALPHA_MIN, 1)))
+        peak_opacities = np.minimum(gaussians.opacities, OPACITY_MAX)
+        radius = np.sqrt(2 * np.log(np.maximum(peak_opacities / ALPHA_MIN, 1)))
     if gaussians.rings is not None:
         r0, w = gaussians.rings.T
         # The last term is how far an arc moves the peak outwards.
@@ -55,22 +55,22 @@ def draw_with_transmittance(flares: Iterable[PlaneGaussians], intrinsics: ArrayL
         return picture, transmittance
     centres, covariances = to_pixels(gaussians, intrinsics, pixel_grid)
     arcs = arcs_to_pixels(gaussians, intrinsics)
-    radii = extent(gaussians, blend)
-    for number in range(len(gaussians)):
-        box = bounding_box(centres[number], covariances[number], float(radii[number]), width, height)
+    cutoff_radii = extent(gaussians, blend)
+    for index in range(len(gaussians)):
+        box = bounding_box(centres[index], covariances[index], float(cutoff_radii[index]), width, height)
         if box is None:
             continue
-        ring = None if gaussians.rings is None else gaussians.rings[number]
-        profile = profile_in(box, centres[number], covariances[number], ring, arcs[number])
+        ring = None if gaussians.rings is None else gaussians.rings[index]
+        profile = profile_in_box(box, centres[index], covariances[index], ring, arcs[index])
         rows, columns = slice(box[1], box[3]), slice(box[0], box[2])
         if blend == "add":
-            profile = np.where(profile >= PROFILE_MIN, profile, 0) * gaussians.opacities[number]
+            profile = np.where(profile >= PROFILE_MIN, profile, 0) * gaussians.opacities[index]
         else:
-            profile = profile * min(float(gaussians.opacities[number]), OPACITY_MAX)
+            profile = profile * min(float(gaussians.opacities[index]), OPACITY_MAX)
             profile = np.where(profile >= ALPHA_MIN, profile, 0)
             in_front = transmittance[rows, columns]
             profile, transmittance[rows, columns] = profile * in_front, in_front * (1 - profile)
-        picture[rows, columns] += profile[..., None] * gaussians.colours[number]
+        picture[rows, columns] += profile[..., None] * gaussians.colours[index]
     return picture, transmittance
 
 
@@ -81,22 +81,24 @@ def bounding_box(centre: Floats, covariance: Floats, radius: float, width: int, 
     xx, xy, yy = (float(value) for value in covariance)
     if not xx * yy - xy * xy > 0:
         return None
-    half = radius * math.sqrt(xx), radius * math.sqrt(yy)
+    half_width, half_height = radius * math.sqrt(xx), radius * math.sqrt(yy)
     x, y = float(centre[0]), float(centre[1])
-    if not all(map(math.isfinite, (x, y, *half))):
+    if not all(map(math.isfinite, (x, y, half_width, half_height))):
         return None
-    box = (max(math.floor(x - half[0]), 0), max(math.floor(y - half[1]), 0),
-           min(math.ceil(x + half[0]) + 1, width), min(math.ceil(y + half[1]) + 1, height))
-    return box if box[0] < box[2] and box[1] < box[3] else None
+    left, right = max(math.floor(x - half_width), 0), min(math.ceil(x + half_width) + 1, width)
+    top, bottom = max(math.floor(y - half_height), 0), min(math.ceil(y + half_height) + 1, height)
+    return (left, top, right, bottom) if left < right and top < bottom else None
 
 
-def profile_in(box: Box, centre: Floats, covariance: Floats, ring: NDArray[Any] | None, pixel_arc: Floats) -> Floats:
+def profile_in_box(box: Box, centre: Floats, covariance: Floats, ring: NDArray[Any] | None, pixel_arc: Floats
+                   ) -> Floats:
     """Return the profile (rows, columns) of a Gaussian in a box of pixels, 1 at its peak.
 
     centre (2,), px; covariance (3,), px²; ring (2,): r0 and w, or None; pixel_arc (2,): see `arcs_to_pixels`."""
     xx, xy, yy = covariance
-    dx = np.arange(box[0], box[2], dtype=np.float32) + 0.5 - centre[0]
-    dy = (np.arange(box[1], box[3], dtype=np.float32) + 0.5 - centre[1])[:, None]
+    left, top, right, bottom = box
+    dx = np.arange(left, right, dtype=np.float32) + 0.5 - centre[0]
+    dy = (np.arange(top, bottom, dtype=np.float32) + 0.5 - centre[1])[:, None]
     q = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
     if ring is None:
         return np.asarray(np.exp(-q / 2), np.float32)

@@ -60,7 +60,8 @@ class Edit:
     solo: bool = False
 
     def combine(self, other: Edit) -> Edit:
-        """Return both edits combined; muted if either is. Solo acts within its level and is dropped."""
+        """Return both edits combined: factors multiply, rotations add, muted if either is. Solo acts within its level
+        and is dropped."""
         r, g, b = (x * y for x, y in zip(self.tint, other.tint, strict=True))
         factors = {name: getattr(self, name) * getattr(other, name) for name in _FACTORS}
         return Edit(tint=(r, g, b), rotation=self.rotation + other.rotation, mute=self.mute or other.mute, **factors)
@@ -129,11 +130,11 @@ class LookEdits:
         return all(edit == NEUTRAL for edit in self.elements.values()) and not any(edit.changes_shape for edit in edits)
 
     def without_light_colours(self) -> LookEdits:
-        """Return the edits without the colours of whole lights, which `matrices` applies to finished layers."""
+        """Return the edits without the colours of whole lights, which `colour_matrices` applies to finished layers."""
         lights = {name: edit.without_colour() for name, edit in self.lights.items()}
         return LookEdits(self.master.without_colour(), lights, self.elements)
 
-    def matrices(self, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    def colour_matrices(self, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """Return the linear colour matrix (3, 3) of each changed light; zeros for a light that is off."""
         result = {}
         for name in names:
@@ -144,11 +145,11 @@ class LookEdits:
                 result[name] = edit.matrix
         return result
 
-    def placed(self, sources: Mapping[str, str]) -> LookEdits:
+    def for_placed_lights(self, sources: Mapping[str, str]) -> LookEdits:
         """Return these edits for placed lights. sources: the look's light that each placed light shows, by name."""
-        lights = {name: self.lights[source] for name, source in sources.items() if source in self.lights}
-        elements = {(name, part): edit for name, source in sources.items()
-                    for (light, part), edit in self.elements.items() if light == source}
+        lights = {placed: self.lights[source] for placed, source in sources.items() if source in self.lights}
+        elements = {(placed, element): edit for placed, source in sources.items()
+                    for (light, element), edit in self.elements.items() if light == source}
         return LookEdits(self.master, lights, elements)
 
     # ---- as text -----------------------------------------------------------------------------------
@@ -164,14 +165,14 @@ class LookEdits:
         edits_by_target: dict[tuple[str, str], Edit] = {}
         for text in edits:
             name, equals, value = text.rpartition("=")  # a light's name may hold one itself
-            whom, dot, property_name = name.rpartition(".")
-            if not (equals and dot and whom.strip()):
+            address, dot, property_name = name.rpartition(".")
+            if not (equals and dot and address.strip()):
                 raise SettingsError(f"The edit {text!r} is not of the form light.intensity=2 or light.tint=1,0.5,0.2.")
             change = _parse_change(text, property_name.rstrip(), value.strip())
-            for target in _parse_targets(text, whom, lights, elements):
-                before = edits_by_target.get(target, NEUTRAL)
-                after = before.combine(change)  # without solo
-                edits_by_target[target] = replace(after, solo=before.solo or change.solo)
+            for target in _parse_targets(text, address, lights, elements):
+                previous = edits_by_target.get(target, NEUTRAL)
+                combined = previous.combine(change)  # without solo
+                edits_by_target[target] = replace(combined, solo=previous.solo or change.solo)
         return cls(edits_by_target.pop((ALL, ""), NEUTRAL),
                    {light: edit for (light, part), edit in edits_by_target.items() if not part},
                    {pair: edit for pair, edit in edits_by_target.items() if pair[1]})
@@ -184,7 +185,7 @@ class LookEdits:
 
     def interpolate(self, other: LookEdits, share: float) -> LookEdits:
         """Interpolate linearly between these edits (share 0) and others (1); mute and solo change at share 1."""
-        def between(a: Edit, b: Edit) -> Edit:
+        def interpolate_edit(a: Edit, b: Edit) -> Edit:
             if a == b:
                 return a
             numbers = {name: getattr(a, name) + share * (getattr(b, name) - getattr(a, name))
@@ -193,38 +194,40 @@ class LookEdits:
             flags = {name: getattr(b if share >= 1 else a, name) for name in _FLAGS}
             return Edit(tint=(red, green, blue), **numbers, **flags)
 
-        lights = {name: between(self.lights.get(name, NEUTRAL), other.lights.get(name, NEUTRAL))
+        lights = {name: interpolate_edit(self.lights.get(name, NEUTRAL), other.lights.get(name, NEUTRAL))
                   for name in {**self.lights, **other.lights}}
-        elements = {pair: between(self.elements.get(pair, NEUTRAL), other.elements.get(pair, NEUTRAL))
+        elements = {pair: interpolate_edit(self.elements.get(pair, NEUTRAL), other.elements.get(pair, NEUTRAL))
                     for pair in {**self.elements, **other.elements}}
-        return LookEdits(between(self.master, other.master), lights, elements)
+        return LookEdits(interpolate_edit(self.master, other.master), lights, elements)
 
 
-def _parse_targets(text: str, whom: str, lights: Sequence[str],
+def _parse_targets(text: str, address: str, lights: Sequence[str],
                    elements: Mapping[str, Sequence[str]] | None) -> list[tuple[str, str]]:
     """Return the (light, element or "") pairs that an edit applies to.
 
-    text: the whole edit, for the SettingsError. whom: what it names. lights, elements: see `LookEdits.parse`."""
-    if not any(whom == light or whom.startswith(f"{light}/") for light in lights):
-        whom = whom.lstrip()  # only here, since a light's name may begin with a blank
-    if whom in lights:
-        return [(whom, "")]
-    if whom == ALL:
+    text: the whole edit, for the SettingsError. address: its `light` or `light/element`. lights, elements: see
+    `LookEdits.parse`. Raises SettingsError for an unknown light or element."""
+    if not any(address == light or address.startswith(f"{light}/") for light in lights):
+        address = address.lstrip()  # only here, since a light's name may begin with a blank
+    if address in lights:
+        return [(address, "")]
+    if address == ALL:
         return [(ALL, "")]
     # Names may hold slashes themselves: the longest light that fits.
-    owner = max((light for light in (*lights, ALL) if whom.startswith(f"{light}/")), key=len, default=None)
-    if owner is None:
+    named_light = max((light for light in (*lights, ALL) if address.startswith(f"{light}/")), key=len, default=None)
+    if named_light is None:
         known = ", ".join(lights) or "no lights at all"
-        raise SettingsError(f"The edit {text!r} names the light {whom!r}, but here there is {known}.")
-    part = whom[len(owner) + 1:]
-    owners = list(lights) if owner == ALL else [owner]
+        raise SettingsError(f"The edit {text!r} names the light {address!r}, but here there is {known}.")
+    element = address[len(named_light) + 1:]
+    named_lights = list(lights) if named_light == ALL else [named_light]
     if elements is None:
-        return [(light, part) for light in owners]
-    pairs = [(light, name) for light in owners for name in elements.get(light, ()) if part in (ALL, name)]
-    if not pairs:
-        known = ", ".join(dict.fromkeys(name for light in owners for name in elements.get(light, ()))) or "none at all"
-        raise SettingsError(f"The edit {text!r} names the element {part!r}, but {owner} has {known}.")
-    return pairs
+        return [(light, element) for light in named_lights]
+    targets = [(light, name) for light in named_lights for name in elements.get(light, ()) if element in (ALL, name)]
+    if not targets:
+        names = dict.fromkeys(name for light in named_lights for name in elements.get(light, ()))
+        known = ", ".join(names) or "none at all"
+        raise SettingsError(f"The edit {text!r} names the element {element!r}, but {named_light} has {known}.")
+    return targets
 
 
 def _parse_change(text: str, property_name: str, value: str) -> Edit:
@@ -299,52 +302,53 @@ def apply_edits(gaussians: PlaneGaussians, light: str, light_position: NDArray[A
     return whole_flare.select(np.argsort(np.concatenate(rows), kind="stable"))
 
 
-def apply_colour(part: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:
+def apply_colour(gaussians: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:
     """Return the Gaussians with the colours and opacities of an edit.
 
     With the blend "over" an intensity below 1 lowers the opacities, one above 1 brightens the colours."""
     if not edit.changes_colour:
-        return part
+        return gaussians
     if blend == "add":
         # Not clipped, so that a sum of Gaussians changes as a finished layer would.
-        return replace(part, colours=np.asarray(part.colours @ edit.matrix.T, np.float32))
+        return replace(gaussians, colours=np.asarray(gaussians.colours @ edit.matrix.T, np.float32))
     dimmed, brighter = min(edit.intensity, 1.0), max(edit.intensity, 1.0)
-    linear = linear_from_srgb(part.colours) @ replace(edit, intensity=brighter).matrix.T
-    return replace(part, opacities=np.asarray(part.opacities * dimmed, np.float32),
+    linear = linear_from_srgb(gaussians.colours) @ replace(edit, intensity=brighter).matrix.T
+    return replace(gaussians, opacities=np.asarray(gaussians.opacities * dimmed, np.float32),
                    colours=srgb_from_linear(np.maximum(linear, 0)))
 
 
-def _apply_shape(part: PlaneGaussians, edit: Edit, light_position: NDArray[Any], streak: bool) -> PlaneGaussians:
+def _apply_shape(gaussians: PlaneGaussians, edit: Edit, light_position: NDArray[Any], is_streak: bool
+                 ) -> PlaneGaussians:
     """Transform an element as a whole: x' = c' + A (x - c), covariance' = A covariance A^T, arc' = A arc.
 
     c: the element's centre. c' = l + spread (c - l), l the light. A: streak along the long axis, then scale and
-    rotation. streak: whether the element is a streak."""
-    length = edit.streak if streak else 1.0
-    if (edit.scale, edit.spread, edit.rotation, length) == (1.0, 1.0, 0.0, 1.0):
-        return part
-    weights = part.energy.astype(np.float64) + 1e-12
-    centre = np.average(part.means, axis=0, weights=weights)
+    rotation. is_streak: whether the element is a streak."""
+    stretch = edit.streak if is_streak else 1.0
+    if (edit.scale, edit.spread, edit.rotation, stretch) == (1.0, 1.0, 0.0, 1.0):
+        return gaussians
+    weights = gaussians.energy.astype(np.float64) + 1e-12
+    centre = np.average(gaussians.means, axis=0, weights=weights)
     affine = edit.scale * np.eye(2)
-    if length != 1.0:
-        axis = _long_axis(part, weights, centre)
-        affine = affine @ (np.eye(2) + (length - 1) * np.outer(axis, axis))
+    if stretch != 1.0:
+        axis = _long_axis(gaussians, weights, centre)
+        affine = affine @ (np.eye(2) + (stretch - 1) * np.outer(axis, axis))
     angle = math.radians(edit.rotation)
     affine = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]) @ affine
-    moved = np.asarray(light_position, np.float64) + edit.spread * (centre - light_position)
-    means = moved + (part.means - centre) @ affine.T
+    new_centre = np.asarray(light_position, np.float64) + edit.spread * (centre - light_position)
+    means = new_centre + (gaussians.means - centre) @ affine.T
     (a, b), (c, d) = affine
-    xx, xy, yy = part.covariances.T.astype(np.float64)
+    xx, xy, yy = gaussians.covariances.T.astype(np.float64)
     covariances = np.stack([a * a * xx + 2 * a * b * xy + b * b * yy,
                             a * c * xx + (a * d + b * c) * xy + b * d * yy,
                             c * c * xx + 2 * c * d * xy + d * d * yy], -1)
-    arcs = None if part.arcs is None else np.asarray(part.arcs @ affine.T, np.float32)
-    return replace(part, means=means.astype(np.float32), covariances=covariances.astype(np.float32), arcs=arcs)
+    arcs = None if gaussians.arcs is None else np.asarray(gaussians.arcs @ affine.T, np.float32)
+    return replace(gaussians, means=means.astype(np.float32), covariances=covariances.astype(np.float32), arcs=arcs)
 
 
-def _long_axis(part: PlaneGaussians, weights: Floats | NDArray[Any], centre: NDArray[Any]) -> NDArray[np.float64]:
+def _long_axis(gaussians: PlaneGaussians, weights: Floats | NDArray[Any], centre: NDArray[Any]) -> NDArray[np.float64]:
     """Return the unit vector along the longest extent of the Gaussians as a whole."""
-    xx, xy, yy = np.average(part.covariances, axis=0, weights=weights)
-    offsets = part.means - centre
-    spread = (offsets * np.asarray(weights)[:, None]).T @ offsets / np.sum(weights)
-    _, axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]) + spread)
+    xx, xy, yy = np.average(gaussians.covariances, axis=0, weights=weights)
+    offsets = gaussians.means - centre
+    centre_covariance = (offsets * np.asarray(weights)[:, None]).T @ offsets / np.sum(weights)
+    _, axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]) + centre_covariance)
     return np.asarray(axes[:, 1], np.float64)

@@ -21,6 +21,8 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 
 MAX_ELEMENTS = 12
 """Most elements of a light; the faintest ones join their neighbours."""
+MIN_ELEMENT_ENERGY = 1e-3
+"""Smallest energy of an element, relative to the light's."""
 MIN_RING_RADIUS = 1.0  # r0, Mahalanobis distance, from which a profile is a ring
 MIN_STREAK_RATIO = 4.0  # ratio of axes from which a Gaussian is a streak
 GLARE_WIDTH = 0.15  # |mu - 1| below which compact light is the light's glare
@@ -82,19 +84,19 @@ def group_elements(gaussians: PlaneGaussians, mu: Floats | None) -> list[Element
     """
     energy = gaussians.energy + 1e-12
     kinds = _classify(gaussians)
-    parts: list[tuple[str, NDArray[np.int64]]] = []
+    groups: list[tuple[str, NDArray[np.int64]]] = []
     for kind in ("ring", "streak", "compact"):
         rows = np.flatnonzero(kinds == kind)
         if mu is None or len(rows) < 2:
-            parts += [(kind, rows)] if len(rows) else []
+            groups += [(kind, rows)] if len(rows) else []
         else:
-            parts += [(kind, rows[part]) for part in _split_at_valleys(mu[rows], energy[rows])]
-    parts = _merge_faint(parts, energy, mu)
+            groups += [(kind, rows[part]) for part in _split_at_valleys(mu[rows], energy[rows])]
+    groups = _merge_faint(groups, energy, mu)
     elements: list[Element] = []
-    for kind, rows in sorted(parts, key=lambda part: -float(energy[part[1]].sum())):
+    for kind, rows in sorted(groups, key=lambda part: -float(energy[part[1]].sum())):
         position = float(np.average(mu[rows], weights=energy[rows])) if mu is not None else 0.0
-        compact = "glare" if mu is not None and abs(position - 1) < GLARE_WIDTH else "ghost"
-        name = cast(Kind, compact if kind == "compact" else kind)
+        compact_name = "glare" if mu is not None and abs(position - 1) < GLARE_WIDTH else "ghost"
+        name = cast(Kind, compact_name if kind == "compact" else kind)
         elements.append(Element(_unique_name(name, elements), name, rows, position,
                                 float(energy[rows].sum() / energy.sum()),
                                 *_extent_and_colour(gaussians.select(rows), energy[rows])))
@@ -122,9 +124,9 @@ def _colour(values: Any) -> tuple[float, float, float]:
 def _classify(gaussians: PlaneGaussians) -> NDArray[np.str_]:
     """Return "ring", "streak" or "compact" for each Gaussian (n,)."""
     xx, xy, yy = gaussians.covariances.T
-    half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-    long = np.sqrt((half + root) / np.maximum(half - root, 1e-12)) >= MIN_STREAK_RATIO
-    kinds = np.where(long, "streak", "compact")
+    mean_variance, deviation = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    is_long = np.sqrt((mean_variance + deviation) / np.maximum(mean_variance - deviation, 1e-12)) >= MIN_STREAK_RATIO
+    kinds = np.where(is_long, "streak", "compact")
     if gaussians.rings is not None:
         kinds = np.where(gaussians.rings[:, 0] >= MIN_RING_RADIUS, "ring", kinds)
     return kinds
@@ -145,40 +147,41 @@ def _split_at_valleys(mu: Floats, energy: Floats) -> list[NDArray[np.int64]]:
     density = np.convolve(density, np.exp(-0.5 * (offsets / DENSITY_SIGMA) ** 2))[12:-12]
     cuts: list[float] = []
     peak, valley, valley_index = density[0], density[0], 0
-    for number, value in enumerate(density):
+    for index, value in enumerate(density):
         if value < valley:
-            valley, valley_index = value, number
+            valley, valley_index = value, index
         if valley < VALLEY_RATIO * peak and value > valley / VALLEY_RATIO:  # up again: a new peak began
             cuts.append((edges[valley_index] + edges[valley_index + 1]) / 2)
             peak = valley = value
         elif value > peak:
             peak = valley = value
-    owner = np.searchsorted(np.array(cuts), mu)
-    return [rows for number in range(len(cuts) + 1) if len(rows := np.flatnonzero(owner == number))]
+    part_numbers = np.searchsorted(np.array(cuts), mu)
+    return [rows for index in range(len(cuts) + 1) if len(rows := np.flatnonzero(part_numbers == index))]
 
 
-def _merge_faint(parts: list[tuple[str, NDArray[np.int64]]], energy: Floats,
+def _merge_faint(groups: list[tuple[str, NDArray[np.int64]]], energy: Floats,
                  mu: Floats | None) -> list[tuple[str, NDArray[np.int64]]]:
     """Merge the faintest groups into the nearest of their kind, or of any kind where there is no other of theirs.
 
-    Ends with at most MAX_ELEMENTS groups, each with a thousandth of the light's energy or more."""
-    parts = list(parts)
+    groups: (kind, rows) of each. energy, mu (n,): of the Gaussians. Ends with at most MAX_ELEMENTS groups, each with
+    MIN_ELEMENT_ENERGY of the light's energy or more."""
+    groups = list(groups)
 
     def position(rows: NDArray[np.int64]) -> float:
         return 0.0 if mu is None else float(np.average(mu[rows], weights=energy[rows]))
 
-    def energy_of(part: tuple[str, NDArray[np.int64]]) -> float:
-        return float(energy[part[1]].sum())
+    def group_energy(group: tuple[str, NDArray[np.int64]]) -> float:
+        return float(energy[group[1]].sum())
 
-    floor = 1e-3 * float(energy.sum())
-    while len(parts) > 1 and (len(parts) > MAX_ELEMENTS or energy_of(min(parts, key=energy_of)) < floor):
-        faintest = min(range(len(parts)), key=lambda number: energy_of(parts[number]))
-        kind, rows = parts.pop(faintest)
+    min_energy = MIN_ELEMENT_ENERGY * float(energy.sum())
+    while len(groups) > 1 and (len(groups) > MAX_ELEMENTS or group_energy(min(groups, key=group_energy)) < min_energy):
+        faintest = min(range(len(groups)), key=lambda index: group_energy(groups[index]))
+        kind, rows = groups.pop(faintest)
         position_of_faintest = position(rows)
-        nearest = min(range(len(parts)), key=lambda number: (parts[number][0] != kind,
-                                                             abs(position(parts[number][1]) - position_of_faintest)))
-        parts[nearest] = parts[nearest][0], np.sort(np.concatenate([parts[nearest][1], rows]))
-    return parts
+        nearest = min(range(len(groups)), key=lambda index: (groups[index][0] != kind,
+                                                             abs(position(groups[index][1]) - position_of_faintest)))
+        groups[nearest] = groups[nearest][0], np.sort(np.concatenate([groups[nearest][1], rows]))
+    return groups
 
 
 def _unique_name(name: str, elements: Sequence[Element]) -> str:

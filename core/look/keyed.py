@@ -56,9 +56,11 @@ class KeyedEdits:
         """Return the edits with further texts for every frame."""
         return KeyedEdits((*self.always, *texts), self.frames)
 
-    def at(self, frame: int, lights: Sequence[str], elements: Mapping[str, Sequence[str]] | None = None) -> LookEdits:
-        """Return the edits of a frame; lights, elements, errors: see `LookEdits.parse`."""
-        def parsed(number: int) -> LookEdits:
+    def edits_at(self, frame: int, lights: Sequence[str],
+                 elements: Mapping[str, Sequence[str]] | None = None) -> LookEdits:
+        """Return the edits of a frame, interpolated between keyframes; lights, elements, errors: see
+        `LookEdits.parse`."""
+        def parse_keyframe(number: int) -> LookEdits:
             return LookEdits.parse((*self.always, *self.frames[number]), lights, elements)
 
         if not self.frames:
@@ -67,8 +69,9 @@ class KeyedEdits:
         previous = max((number for number in numbers if number <= frame), default=numbers[0])
         following = min((number for number in numbers if number >= frame), default=numbers[-1])
         if previous >= following:  # on a keyframe, before the first or after the last
-            return parsed(previous if previous in (frame, numbers[-1]) else following)
-        return parsed(previous).interpolate(parsed(following), (frame - previous) / (following - previous))
+            return parse_keyframe(previous if previous in (frame, numbers[-1]) else following)
+        share = (frame - previous) / (following - previous)
+        return parse_keyframe(previous).interpolate(parse_keyframe(following), share)
 
 
 def _read_toml(path: Path) -> Any:

@@ -69,8 +69,8 @@ class TrainedCamera:
         """Return how many pixels of a picture lie along one of this camera's, if both have the same field of view.
 
         Compares widths; for a portrait and a landscape picture the long sides, since the camera is turned then."""
-        turned = (width < height) != (self.width < self.height)
-        return max(width, height) / max(self.width, self.height) if turned else width / self.width
+        is_turned = (width < height) != (self.width < self.height)
+        return max(width, height) / max(self.width, self.height) if is_turned else width / self.width
 
 
 class LightLook:
@@ -78,36 +78,36 @@ class LightLook:
 
     def __init__(self, name: str, xyz: NDArray[np.float64], form: FlareForm, query_range: QueryRange,
                  rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: Blend,
-                 listed: list[Element], clear_visibility: float = 1.0) -> None:
+                 stored_elements: list[Element], clear_visibility: float = 1.0) -> None:
         """rows: parameters of the canonical Gaussians, (n, width) each, by name; tensors: the light's in the file, the
-        network's among them; listed: elements in the file, or [].
+        network's among them; stored_elements: those in the file, or [].
         clear_visibility: visibility of the unoccluded light through the scene of its fit, 0..1
         (`core.flare.model.FlareModel`)."""
         self.name, self.xyz, self.form, self.query_range, self.blend = name, xyz, form, query_range, blend
         self.clear_visibility = clear_visibility
-        self._rows, self._listed = rows, listed
+        self._canonical, self._stored_elements = rows, stored_elements
         encoded = frequency_encoding(rows["positions"])
         if form.latent:
             encoded = np.concatenate([encoded, rows["latent"]], -1)
         self._network = Network(tensors, _head_widths(form, rows), form.levels, form.base, query_range, encoded)
-        self._network.check(has_correction=form.light_correction)
+        self._network.check_shapes(has_correction=form.light_correction)
 
     @property
     def count(self) -> int:
         """Number of Gaussians."""
-        return len(self._rows["positions"])
+        return len(self._canonical["positions"])
 
     @cached_property
     def elements(self) -> list[Element]:
         """The elements in the file, or else those that `group_elements` makes of the canonical Gaussians."""
-        if self._listed:
-            return self._listed
+        if self._stored_elements:
+            return self._stored_elements
         # A light off both axes, at 0.65 of its largest distance in training: elements lie apart along the line.
-        along = self.query_range.light_high[2] * np.array([0.55, 0.35], np.float32)
-        middle = (self.query_range.camera_low + self.query_range.camera_high) / 2
-        view = ViewOfLight(middle, np.eye(3, dtype=np.float32), np.asarray(along, np.float32), 1.0)
-        gaussians, _ = self._gaussians(view, None)
-        return elements.group_elements(gaussians, self._rows["positions"][:, 0] if self.form.line else None)
+        light = self.query_range.light_high[2] * np.array([0.55, 0.35], np.float32)
+        camera = (self.query_range.camera_low + self.query_range.camera_high) / 2
+        view = ViewOfLight(camera, np.eye(3, dtype=np.float32), np.asarray(light, np.float32), 1.0)
+        gaussians, _ = self._evaluate_on_plane(view, None)
+        return elements.group_elements(gaussians, self._canonical["positions"][:, 0] if self.form.line else None)
 
     def evaluate(self, view: ViewOfLight, *, query: ViewOfLight | None = None, edits: LookEdits | None = None,
                  visibility: float = 1.0, name: str | None = None) -> PlaneGaussians | None:
@@ -119,18 +119,18 @@ class LightLook:
         """
         if view.depth <= 0:
             return None
-        gaussians, light = self._gaussians(view, query)
+        gaussians, light = self._evaluate_on_plane(view, query)
         if edits is not None:
             gaussians = apply_edits(gaussians, name or self.name, light, self.elements, edits, self.blend)
         if visibility != 1.0:
             gaussians = replace(gaussians, opacities=np.asarray(gaussians.opacities * visibility, np.float32))
         return gaussians
 
-    def _gaussians(self, view: ViewOfLight, query: ViewOfLight | None) -> tuple[PlaneGaussians, Floats]:
+    def _evaluate_on_plane(self, view: ViewOfLight, query: ViewOfLight | None) -> tuple[PlaneGaussians, Floats]:
         """Return Gaussians on the plane (paper, eq. 1 to 3), and the light's position (2,) with delta_l.
 
         query: see `evaluate`."""
-        form, rows, queried = self.form, self._rows, query or view
+        form, rows, queried = self.form, self._canonical, query or view  # the rows are canonical, before deformation
         features = self._network.view_features(queried.camera, queried.light)
         offsets = self._network.offsets(features)
         light = view.light
@@ -152,12 +152,12 @@ class LightLook:
         sh = (rows["sh"] + offsets["sh"]).reshape(len(means), (self.form.sh_degree + 1) ** 2, 3)
         rings = arcs = None
         if form.rings:
-            raw = rows["rings"] + offsets["rings"]  # r0, and the logarithm of w, clamped as in core.flare
-            rings = np.stack([raw[:, 0], np.exp(np.clip(raw[:, 1], -3, 3))], -1)
+            ring_values = rows["rings"] + offsets["rings"]  # r0, and the logarithm of w, clamped as in core.flare
+            rings = np.stack([ring_values[:, 0], np.exp(np.clip(ring_values[:, 1], -3, 3))], -1)
         if form.arcs and rings is not None:
-            own_rows = rows["arcs"] + offsets["arcs"]
-            opacities = opacities * opacity_gain(own_rows, rings)
-            arcs = arcs_of_ellipse(own_rows, scales, rotations)
+            ellipse_arcs = rows["arcs"] + offsets["arcs"]
+            opacities = opacities * opacity_gain(ellipse_arcs, rings)
+            arcs = arcs_of_ellipse(ellipse_arcs, scales, rotations)
         return PlaneGaussians(means, covariances, opacities, colours(rays, sh, form.sh_degree), rings, arcs), light
 
 
@@ -272,15 +272,15 @@ def read_description(path: Path | str) -> dict[str, Any]:
 
     Raises FlareFileError for a file that is missing, damaged, of a newer version, or not a flare.
     """
-    return _parse_json(Path(path), container.read_tensors(path)[1])
+    return _parse_unchecked(Path(path), container.read_tensors(path)[1])
 
 
 def store_elements(path: Path | str) -> None:
     """Write the elements of each light into a .flare without elements, so that later versions group them alike."""
     look = read_look(path)
     _, metadata = container.read_tensors(path)
-    listed = [element.to_json(light.name) for light in look.lights for element in light.elements]
-    description = {**_parse_json(Path(path), metadata), "elements": listed}
+    entries = [element.to_json(light.name) for light in look.lights for element in light.elements]
+    description = {**_parse_unchecked(Path(path), metadata), "elements": entries}
     container.rewrite_metadata(path, path, {**metadata, METADATA_KEY: json.dumps(description)})
 
 
@@ -290,14 +290,14 @@ def write_annotated(source: Path | str, target: Path | str, *, notes: str, licen
 
     Raises FlareFileError if `source` is not a flare."""
     _, metadata = container.read_tensors(source)
-    description = {**_parse_json(Path(source), metadata), "notes": notes, "licence": licence}
+    description = {**_parse_unchecked(Path(source), metadata), "notes": notes, "licence": licence}
     if edits is not None:
         description["edits"] = edits.texts()
     container.rewrite_metadata(source, target, {**metadata, METADATA_KEY: json.dumps(description)})
 
 
-def _parse_json(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Return the description in a .flare's metadata; checks its version alone. Raises FlareFileError."""
+def _parse_unchecked(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Parse the description in a .flare's metadata; check its version alone. Raises FlareFileError."""
     if METADATA_KEY not in metadata:
         raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.")
     try:
@@ -314,7 +314,7 @@ def parse_description(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]
     """Parse and validate the description in a .flare's metadata, for all readers, so that they accept the same files.
 
     Raises FlareFileError if it is missing, of a newer version, or invalid. Does not compare it with the tensors."""
-    description = _parse_json(path, metadata)
+    description = _parse_unchecked(path, metadata)
     try:
         names = [_check_light(path, entry, description.get("elements", [])) for entry in description["lights"]]
         if len(set(names)) < len(names):
@@ -336,10 +336,11 @@ def parse_description(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]
     return description
 
 
-def _check_light(path: Path, entry: Mapping[str, Any], listed: Any) -> str:
+def _check_light(path: Path, entry: Mapping[str, Any], element_entries: Any) -> str:
     """Validate the description of a light, and return its name.
 
-    entry: of the light. listed: the elements of all lights. Raises FlareFileError, and what the caller converts to it.
+    entry: of the light. element_entries: the elements of all lights. Raises FlareFileError, and what the caller
+    converts to it.
     """
     unknown = set(entry["form"]) - {field.name for field in fields(FlareForm)}
     if unknown:
@@ -353,7 +354,7 @@ def _check_light(path: Path, entry: Mapping[str, Any], listed: Any) -> str:
     if not 0 <= float(entry.get("clear", 1.0)) <= 1:
         raise ValueError("a light's clear share is not valid")
     QueryRange.read(entry["range"])
-    elements.read_elements(listed, name, count)
+    elements.read_elements(element_entries, name, count)
     return name
 
 
@@ -377,18 +378,20 @@ def read_look(path: Path | str) -> Look:
 
 
 def _read_light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: Blend,
-                listed: Any) -> LightLook:
-    """Make the look of light `number` of a file. entry: its description; listed: the elements of all lights."""
+                element_entries: Any) -> LightLook:
+    """Make the look of light `number` of a file from its tensors.
+
+    entry: the light's description. element_entries: the elements of all lights. Raises ValueError and KeyError."""
     form, name, count = FlareForm(**entry["form"]), str(entry["name"]), int(entry["count"])
     xyz = np.array([float(value) for value in entry["xyz"]], np.float64)
-    own_rows = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
-    rows = {key[len("gaussians."):]: np.asarray(value, np.float32) for key, value in own_rows.items()
+    light_tensors = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
+    rows = {key[len("gaussians."):]: np.asarray(value, np.float32) for key, value in light_tensors.items()
             if key.startswith("gaussians.")}
     for key, width in _row_widths(form).items():
         if rows[key].shape != (count, width):
             raise ValueError(f"{key} has the shape {rows[key].shape}")
-    return LightLook(name, xyz, form, QueryRange.read(entry["range"]), rows, own_rows, blend,
-                     elements.read_elements(listed, name, count), float(entry.get("clear", 1.0)))
+    return LightLook(name, xyz, form, QueryRange.read(entry["range"]), rows, light_tensors, blend,
+                     elements.read_elements(element_entries, name, count), float(entry.get("clear", 1.0)))
 
 
 def _row_widths(form: FlareForm) -> dict[str, int]:
@@ -402,8 +405,8 @@ def _row_widths(form: FlareForm) -> dict[str, int]:
 
 def _head_widths(form: FlareForm, rows: Mapping[str, Floats]) -> dict[str, int]:
     """Return the widths of the offsets by name, in the order of the network's head (core.flare.model.LightFlare)."""
-    known = sorted(name for name in _row_widths(form) if name not in ("offsets", "latent"))  # as torch sorts parameters
-    heads = {name: rows[name].shape[1] for name in known}
+    names = sorted(name for name in _row_widths(form) if name not in ("offsets", "latent"))  # as torch sorts parameters
+    heads = {name: rows[name].shape[1] for name in names}
     if form.line and form.plane_offset:
         heads["plane_offset"] = 2  # without the line, positions have two coordinates already
     return heads

@@ -88,14 +88,14 @@ class HashGrid:
         They are, for each level, the values at the corners of the point's cell, interpolated linearly."""
         resolutions = self._resolutions[:, None]
         scaled = (np.clip(point, 0, 1).astype(np.float32)[None] * resolutions.astype(np.float32))
-        low = np.minimum(np.floor(scaled), resolutions.astype(np.float32) - 1)  # 1 lies in the last cell
-        fraction = (scaled - low)[:, None]
-        corner = low.astype(np.int64)[:, None] + CORNERS
+        cell = np.minimum(np.floor(scaled), resolutions.astype(np.float32) - 1)  # 1 lies in the last cell
+        fraction = (scaled - cell)[:, None]
+        corners = cell.astype(np.int64)[:, None] + CORNERS
         weights = np.where(CORNERS.astype(bool), fraction, 1 - fraction).prod(-1)
         side = resolutions + 1
-        dense = corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])
-        mixed = corner * PRIMES
-        hashed = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % self._sizes[:, None]
+        dense = corners[..., 0] + side * (corners[..., 1] + side * corners[..., 2])
+        primed = corners * PRIMES
+        hashed = (primed[..., 0] ^ primed[..., 1] ^ primed[..., 2]) % self._sizes[:, None]
         # A level all of whose corners fit its table needs no hash.
         rows = np.where(side**3 <= self._sizes[:, None], dense, hashed) + self._starts[:, None]
         return np.asarray((self._row_values(rows) * weights[..., None]).sum(1).reshape(-1), np.float32)
@@ -156,20 +156,20 @@ class Network:
                  query_range: QueryRange, encoded: Floats) -> None:
         """tensors: by their names in the file, without the light's number. heads: width of each offset by name.
         levels, base: see `FlareForm`. encoded: (n, d) frequency-encoded canonical positions, then latent codes."""
-        self._t = {name: np.asarray(value, np.float32) for name, value in tensors.items()
+        self._tensors = {name: np.asarray(tensor, np.float32) for name, tensor in tensors.items()
                    if not name.endswith(".rows")}
         self._heads, self._range = dict(heads), query_range
 
-        def grid(name: str, bits: int, growth: float) -> HashGrid:
+        def read_grid(name: str, bits: int, growth: float) -> HashGrid:
             table = f"network.{name}.table.weight"
             return HashGrid(bits, growth, levels, base, tensors[f"{table}.rows"], tensors[f"{table}.values"])
 
-        self._light_grid = grid("light_grid", LIGHT_BITS, LIGHT_GROWTH)
-        self._camera_grid = grid("camera_grid", CAMERA_BITS, CAMERA_GROWTH)
-        self._hidden = sorted(name[:-len(".weight")] for name in self._t
+        self._light_grid = read_grid("light_grid", LIGHT_BITS, LIGHT_GROWTH)
+        self._camera_grid = read_grid("camera_grid", CAMERA_BITS, CAMERA_GROWTH)
+        self._hidden_layers = sorted(name[:-len(".weight")] for name in self._tensors
                               if name.startswith("network.layers.") and name.endswith(".weight"))
         self._encoded, self._number = encoded, next(_numbers)
-        if self._t["network.head.weight"].shape[0] != sum(self._heads.values()):
+        if self._tensors["network.head.weight"].shape[0] != sum(self._heads.values()):
             raise ValueError("the network's heads do not fit the form")
 
     @cached_property
@@ -186,7 +186,7 @@ class Network:
         position = (camera.astype(np.float32) - self._range.camera_low) / extent
         return np.concatenate([self._light_grid(folded / self._range.light_high), self._camera_grid(position)])
 
-    def check(self, *, has_correction: bool) -> None:
+    def check_shapes(self, *, has_correction: bool) -> None:
         """Evaluate one Gaussian, and delta_l if `has_correction`. Raises ValueError or KeyError for tensors that do not
         fit each other."""
         origin = np.zeros(3, np.float32)
@@ -197,20 +197,21 @@ class Network:
 
     def offsets(self, features: Floats) -> dict[str, Floats]:
         """Return the offsets by name, (n, width) each; they are shared and must not be changed."""
-        every = _cache.get((self._number, features.tobytes()), lambda: self._concatenated_offsets(
+        all_offsets = _cache.get((self._number, features.tobytes()), lambda: self._concatenated_offsets(
             self._gaussian_features, features))
         edges = np.cumsum([0, *self._heads.values()])
-        return {name: every[:, a:b] for name, a, b in zip(self._heads, edges[:-1], edges[1:], strict=True)}
+        return {name: all_offsets[:, start:end]
+                for name, start, end in zip(self._heads, edges[:-1], edges[1:], strict=True)}
 
     def _encode_gaussians(self, encoded: Floats) -> Floats:
         """Return the contribution of encoded Gaussians (n, d) to the first layer, (n, width)."""
-        return np.asarray(encoded @ self._t["network.gaussian_layer.weight"].T, np.float32)
+        return np.asarray(encoded @ self._tensors["network.gaussian_layer.weight"].T, np.float32)
 
     def _concatenated_offsets(self, gaussian_features: Floats, features: Floats) -> Floats:
         """Return the offsets of all heads, (n, sum of their widths); see `_encode_gaussians` and `view_features`."""
         x = gaussian_features + self._linear("network.view_layer", features[None])
         np.maximum(x, 0, out=x)
-        for name in self._hidden:
+        for name in self._hidden_layers:
             x = self._linear(name, x)
             np.maximum(x, 0, out=x)
         return self._linear("network.head", x)
@@ -220,8 +221,8 @@ class Network:
         hidden = np.maximum(self._linear("network.correction.0", features[None]), 0)
         return self._linear("network.correction.2", hidden)[0]
 
-    def _linear(self, name: str, x: Floats) -> Floats:
-        """Return x (n, inputs) after the linear layer of this name, (n, outputs)."""
-        result = x @ self._t[f"{name}.weight"].T
-        result += self._t[f"{name}.bias"]
-        return np.asarray(result, np.float32)
+    def _linear(self, name: str, inputs: Floats) -> Floats:
+        """Return the outputs (n, d) of the linear layer of this name for inputs (n, c)."""
+        outputs = inputs @ self._tensors[f"{name}.weight"].T
+        outputs += self._tensors[f"{name}.bias"]
+        return np.asarray(outputs, np.float32)

@@ -102,14 +102,14 @@ def evaluate_placed(light: PlacedLight, world_to_camera: ArrayLike, blend: Blend
     pose = np.asarray(world_to_camera, np.float64)
     eye = -pose[:3, :3].T @ pose[:3, 3]
     if light.extent is None:
-        gaussians = _point(pose, light.xyz, light.visibility, evaluate)
+        gaussians = _evaluate_point(pose, light.xyz, light.visibility, evaluate)
         factor = fall_off(float(np.linalg.norm(light.xyz - eye)), light.reference_distance)
-        return None if gaussians is None else multiply(gaussians, np.multiply(light.factor, factor), blend)
-    return _sum_over_cells(light, light.extent, pose, eye, blend, evaluate, _low_pass(pixel_grid))
+        return None if gaussians is None else multiply_light(gaussians, np.multiply(light.factor, factor), blend)
+    return _sum_over_cells(light, light.extent, pose, eye, blend, evaluate, _low_pass_variance(pixel_grid))
 
 
-def _point(pose: NDArray[np.float64], xyz: NDArray[np.float64], visibility: float, evaluate: Evaluate
-           ) -> PlaneGaussians | None:
+def _evaluate_point(pose: NDArray[np.float64], xyz: NDArray[np.float64], visibility: float, evaluate: Evaluate
+                    ) -> PlaneGaussians | None:
     """Return the flare of a point at xyz (3,); None behind the camera."""
     view = ViewOfLight.of(pose, xyz)
     return evaluate(view, visibility) if view.depth > 0 else None
@@ -119,16 +119,16 @@ def _sum_over_cells(light: PlacedLight, extent: LightExtent, pose: NDArray[np.fl
                     blend: Blend, evaluate: Evaluate, low_pass: float) -> PlaneGaussians | None:
     """Return the flare of a light with an extent: the sum over its cells; None if none is lit and in front.
 
-    pose (4, 4): world to camera. eye (3,): position of the camera. low_pass: see `_low_pass`."""
+    pose (4, 4): world to camera. eye (3,): position of the camera. low_pass: see `_low_pass_variance`."""
     sampled = extent.sampled(light.xyz, pose)
     shares = np.ones(sampled.count) if light.shares is None else np.asarray(light.shares, np.float64)
     strengths = sampled.weights * shares * sampled.emission
     if not strengths.any():
         return None
-    seen = (sampled.points - eye) @ pose[:3, :3].T
+    camera_points = (sampled.points - eye) @ pose[:3, :3].T
     # A cell is in front of the camera if all of its samples are.
-    is_in_front = np.bincount(sampled.cells, seen[:, 2] > 0) == np.bincount(sampled.cells)
-    plane = seen[:, :2] / np.where(seen[:, 2] > 0, seen[:, 2], np.inf)[:, None]
+    is_in_front = np.bincount(sampled.cells, camera_points[:, 2] > 0) == np.bincount(sampled.cells)
+    plane = camera_points[:, :2] / np.where(camera_points[:, 2] > 0, camera_points[:, 2], np.inf)[:, None]
     centres = sampled.centres
     factors = np.array([fall_off(float(distance), light.reference_distance)
                         for distance in np.linalg.norm(centres - eye, axis=1)])[:, None] * light.factor
@@ -136,63 +136,63 @@ def _sum_over_cells(light: PlacedLight, extent: LightExtent, pose: NDArray[np.fl
         factors *= sampled.factors
     elif is_in_front.all() and np.ptp(plane, axis=0).max() < 2 * SMALLEST_EXTENT:
         # Too small to be seen: evaluated once, as a point.
-        gaussians = _point(pose, centres.mean(0), light.visibility * float(strengths.sum()), evaluate)
-        return None if gaussians is None else multiply(gaussians, factors.mean(0), blend)
+        gaussians = _evaluate_point(pose, centres.mean(0), light.visibility * float(strengths.sum()), evaluate)
+        return None if gaussians is None else multiply_light(gaussians, factors.mean(0), blend)
     # Hidden cells are evaluated too, unless they are lights of their own: they show how the Gaussians follow the light.
-    parts, places, cells = [], [], []
+    parts, positions, cells = [], [], []
     for cell in np.flatnonzero(is_in_front & (strengths > 0 if sampled.factors is not None else True)):
-        part = _point(pose, centres[cell], light.visibility, evaluate)
+        part = _evaluate_point(pose, centres[cell], light.visibility, evaluate)
         if part is not None:
             parts.append(part)
-            places.append(plane[sampled.cells == cell].mean(0))
+            positions.append(plane[sampled.cells == cell].mean(0))
             cells.append(int(cell))
     if not parts:
         return None
     are_points = sampled.count == len(sampled.points)  # a cell of one sample has no size to blur by
-    motions = None if are_points else _motions(parts, np.array(places))
+    motions = None if are_points else _fit_motions(parts, np.array(positions))
     visible = []
     for part, cell in zip(parts, cells, strict=True):
         if strengths[cell] > 0:
             if motions is not None:
                 spread = CELL_BLUR * np.cov(plane[sampled.cells == cell].T, bias=True)
-                part = _blurred(part, motions, spread, low_pass)
-            lit = multiply(part, factors[cell], blend)
-            visible.append(replace(lit, opacities=np.asarray(lit.opacities * strengths[cell], np.float32)))
+                part = _blur(part, motions, spread, low_pass)
+            part = multiply_light(part, factors[cell], blend)
+            visible.append(replace(part, opacities=np.asarray(part.opacities * strengths[cell], np.float32)))
     return concatenate(visible)
 
 
-def multiply(gaussians: PlaneGaussians, factor: ArrayLike, blend: Blend) -> PlaneGaussians:
+def multiply_light(gaussians: PlaneGaussians, factor: ArrayLike, blend: Blend) -> PlaneGaussians:
     """Return the Gaussians with their linear light multiplied by factors (3,)."""
-    values = np.asarray(factor, np.float64)
-    if (values == 1).all():
+    factors = np.asarray(factor, np.float64)
+    if (factors == 1).all():
         return gaussians
-    strongest = float(values.max())  # not in the tint, so that with the blend "over" a factor below 1 dims opacities
-    red, green, blue = (values / strongest if strongest > 0 else values).tolist()
-    return apply_colour(gaussians, Edit(intensity=strongest, tint=(red, green, blue)), blend)
+    intensity = float(factors.max())  # not in the tint, so that with the blend "over" a factor below 1 dims opacities
+    red, green, blue = (factors / intensity if intensity > 0 else factors).tolist()
+    return apply_colour(gaussians, Edit(intensity=intensity, tint=(red, green, blue)), blend)
 
 
-def _motions(parts: Sequence[PlaneGaussians], places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fit_motions(parts: Sequence[PlaneGaussians], positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how each Gaussian moves with the light (n, 2, 2), by least squares over the cells.
 
     parts: the flare of each cell. places (k, 2): of the cells on the plane.
     Element [i, a, b] is the motion of coordinate a by coordinate b."""
     means = np.stack([part.means for part in parts]).astype(np.float64)
-    offsets = places - places.mean(0)
+    offsets = positions - positions.mean(0)
     # The cut-off leaves out the direction across a light that is seen as a line: there is no motion to measure.
     slopes = np.linalg.pinv(offsets, rcond=1e-3) @ (means - means.mean(0)).reshape(len(parts), -1)
     return slopes.reshape(2, -1, 2).transpose(1, 2, 0)
 
 
-def _blurred(gaussians: PlaneGaussians, motions: NDArray[np.float64], spread: NDArray[np.float64], low_pass: float
+def _blur(gaussians: PlaneGaussians, motions: NDArray[np.float64], spread: NDArray[np.float64], low_pass: float
              ) -> PlaneGaussians:
     """Return the Gaussians convolved with a light of the covariance `spread` (2, 2), with the same drawn light.
 
-    motions: see `_motions`. low_pass: see `_low_pass`.
+    motions: see `_fit_motions`. low_pass: see `_low_pass_variance`.
     A ring is widened by the mean of the blur in its own coordinates, since its ellipse is not the shape of its line.
     """
     xx, xy, yy = gaussians.covariances.T.astype(np.float64)
-    added = motions @ spread @ motions.transpose(0, 2, 1)
-    ax, ay, axy = added[:, 0, 0], added[:, 1, 1], added[:, 0, 1]
+    blur = motions @ spread @ motions.transpose(0, 2, 1)
+    blur_xx, blur_yy, blur_xy = blur[:, 0, 0], blur[:, 1, 1], blur[:, 0, 1]
     is_plain = np.ones(len(gaussians), bool)
     rings = gaussians.rings
     if rings is not None:
@@ -200,18 +200,18 @@ def _blurred(gaussians: PlaneGaussians, motions: NDArray[np.float64], spread: ND
         is_plain = radius <= width
         determinant = np.maximum(xx * yy - xy * xy, 1e-30)
         # Half the trace of the inverse covariance times the blur's.
-        relative = (yy * ax - 2 * xy * axy + xx * ay) / determinant / 2
+        relative = (yy * blur_xx - 2 * xy * blur_xy + xx * blur_yy) / determinant / 2
         rings = np.stack([radius, np.where(is_plain, width, np.sqrt(width**2 + relative))], -1).astype(np.float32)
     # A plain profile has the standard deviation w times that of its ellipse.
     scale = 1.0 if rings is None else np.maximum(rings[:, 1].astype(np.float64), 1e-6) ** 2
-    grown = np.stack([xx + ax / scale, xy + axy / scale, yy + ay / scale], -1)
+    grown = np.stack([xx + blur_xx / scale, xy + blur_xy / scale, yy + blur_yy / scale], -1)
     covariances = np.where(is_plain[:, None], grown, gaussians.covariances).astype(np.float32)
     blurred = replace(gaussians, covariances=covariances, rings=rings)
-    gain = _areas(gaussians, low_pass) / _areas(blurred, low_pass)
+    gain = _profile_integrals(gaussians, low_pass) / _profile_integrals(blurred, low_pass)
     return replace(blurred, opacities=np.asarray(gaussians.opacities * gain, np.float32))
 
 
-def _areas(gaussians: PlaneGaussians, low_pass: float) -> NDArray[np.float64]:
+def _profile_integrals(gaussians: PlaneGaussians, low_pass: float) -> NDArray[np.float64]:
     """Return the integrals (n,) of the profiles as they are drawn, but for their arcs, which a blur hardly changes.
 
     low_pass: added to the variances. The integral of exp(-(r - r0)^2 / (2 w^2)) over the plane is 2 pi times
@@ -229,11 +229,11 @@ def _areas(gaussians: PlaneGaussians, low_pass: float) -> NDArray[np.float64]:
 def _error_function(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return erf (n,), to 1.5e-7 (Abramowitz and Stegun 1964, 7.1.26)."""
     t = 1 / (1 + 0.3275911 * np.abs(values))
-    series = ((((1.061405429 * t - 1.453152027) * t + 1.421413741) * t - 0.284496736) * t + 0.254829592) * t
-    return np.sign(values) * (1 - series * np.exp(-values**2))
+    polynomial = ((((1.061405429 * t - 1.453152027) * t + 1.421413741) * t - 0.284496736) * t + 0.254829592) * t
+    return np.sign(values) * (1 - polynomial * np.exp(-values**2))
 
 
-def _low_pass(pixel_grid: PixelGrid | None) -> float:
+def _low_pass_variance(pixel_grid: PixelGrid | None) -> float:
     """Return the variance that a rasterizer adds to Gaussians of this grid, normalised coordinates; 0 if unknown."""
     if pixel_grid is None:
         return 0.0

@@ -76,8 +76,8 @@ class PlaneGaussians:
             r0, w = self.rings.T
             area = area * (w * w + np.sqrt(np.pi / 2) * np.maximum(r0, 0) * w)
             # The exponentials of large numbers overflow.
-            clipped = np.clip(np.maximum(r0, 0) * self.arc_strengths.astype(np.float64), 0, 500)
-            area = area * np.i0(clipped) * np.exp(-clipped)  # mean of the arc's factor over the ring
+            exponent = np.clip(np.maximum(r0, 0) * self.arc_strengths.astype(np.float64), 0, 500)
+            area = area * np.i0(exponent) * np.exp(-exponent)  # mean of the arc's factor over the ring
         return np.asarray(self.opacities * area * luminance, np.float32)
 
 
@@ -90,9 +90,9 @@ def covariance_of_solid(means: Floats, log_scales: Floats, quaternions: Floats) 
                          2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
                          2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1).reshape(-1, 3, 3)
     scales = np.exp(log_scales) / PLANE_DEPTH
-    first = (rotation[:, 0] - means[:, :1] * rotation[:, 2]) * scales
-    second = (rotation[:, 1] - means[:, 1:] * rotation[:, 2]) * scales
-    return np.stack([(first * first).sum(-1), (first * second).sum(-1), (second * second).sum(-1)], -1)
+    row_x = (rotation[:, 0] - means[:, :1] * rotation[:, 2]) * scales
+    row_y = (rotation[:, 1] - means[:, 1:] * rotation[:, 2]) * scales
+    return np.stack([(row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)], -1)
 
 
 def covariance_of_ellipse(log_scales: Floats, directions: Floats) -> Floats:
@@ -104,9 +104,9 @@ def covariance_of_ellipse(log_scales: Floats, directions: Floats) -> Floats:
 
 def arcs_of_ellipse(arcs: Floats, log_scales: Floats, directions: Floats) -> Floats:
     """Return (n, 2) arcs on the plane from arcs (n, 2) in standard deviations along the axes."""
-    axis = directions / np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)
+    first_axis = directions / np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)
     along, across = (arcs * np.exp(log_scales)).T
-    return along[:, None] * axis + across[:, None] * np.stack([-axis[:, 1], axis[:, 0]], -1)
+    return along[:, None] * first_axis + across[:, None] * np.stack([-first_axis[:, 1], first_axis[:, 0]], -1)
 
 
 def opacity_gain(arcs: Floats, rings: Floats) -> Floats:
@@ -180,14 +180,15 @@ def concatenate(sets: Sequence[PlaneGaussians]) -> PlaneGaussians | None:
     if not sets:
         return None
 
-    def extra(name: str, plain: Sequence[float]) -> Floats | None:
+    def concatenate_optional(name: str, default: Sequence[float]) -> Floats | None:
         parts = [getattr(gaussians, name) for gaussians in sets]
         if all(part is None for part in parts):
             return None
-        return np.concatenate([np.tile(np.array(plain, np.float32), (len(gaussians), 1)) if part is None else part
+        return np.concatenate([np.tile(np.array(default, np.float32), (len(gaussians), 1)) if part is None else part
                                for gaussians, part in zip(sets, parts, strict=True)])
 
     means, covariances, opacities, sh_colours = (
         np.concatenate([getattr(gaussians, name) for gaussians in sets])
         for name in ("means", "covariances", "opacities", "colours"))
-    return PlaneGaussians(means, covariances, opacities, sh_colours, extra("rings", (0, 1)), extra("arcs", (0, 0)))
+    return PlaneGaussians(means, covariances, opacities, sh_colours, concatenate_optional("rings", (0, 1)),
+                          concatenate_optional("arcs", (0, 0)))

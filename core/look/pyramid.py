@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..colour.srgb import linear_from_srgb
 from ..conventions.splatting import PROFILE_MIN
-from .drawing import Box, bounding_box, draw_with_transmittance, extent, profile_in
+from .drawing import Box, bounding_box, draw_with_transmittance, extent, profile_in_box
 from .look import Look
 from .plane import Floats, PlaneGaussians, arcs_to_pixels, to_pixels
 
@@ -42,8 +42,8 @@ def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, 
     It is the coarsest grid on which the Gaussian's narrow side deviates by `min_texels` or more, else the finest.
     """
     xx, xy, yy = covariances.T
-    half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-    narrow = np.sqrt(np.maximum(half - root, 0))
+    mean_variance, deviation = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    narrow = np.sqrt(np.maximum(mean_variance - deviation, 0))
     if rings is not None:  # the line of a ring is w times as wide as its ellipse
         narrow = narrow * np.minimum(rings[:, 1], 1)
     return np.clip(np.searchsorted(np.array(levels), narrow / min_texels, side="right") - 1, 0, len(levels) - 1)
@@ -57,29 +57,29 @@ def draw_added(gaussians: PlaneGaussians, look: Look, intrinsics: ArrayLike, wid
     picture: Floats | None = None
     for index in reversed(range(len(LEVELS))):
         divisor = LEVELS[index]
-        rows = np.flatnonzero(indices == index)
-        if picture is None and not len(rows) and index:
+        level_rows = np.flatnonzero(indices == index)
+        if picture is None and not len(level_rows) and index:
             continue  # coarser grids than the first with a Gaussian stay empty; there is a finest grid always
         size = -(-height // divisor) + 2 * _MARGIN, -(-width // divisor) + 2 * _MARGIN
         grid = np.zeros((*size, 3), np.float32) if picture is None else _enlarge(picture, size)
-        for row in rows.tolist():
+        for row in level_rows.tolist():
             ring = None if gaussians.rings is None else gaussians.rings[row]
             light = gaussians.colours[row] * gaussians.opacities[row]
-            _add(grid, centres[row] / divisor + _MARGIN, covariances[row] / divisor**2, float(radii[row]), ring,
-                 arcs[row] / divisor, light)
+            _add_gaussian(grid, centres[row] / divisor + _MARGIN, covariances[row] / divisor**2, float(radii[row]),
+                          ring, arcs[row] / divisor, light)
         picture = grid
     assert picture is not None
     return np.maximum(picture[_MARGIN:_MARGIN + height, _MARGIN:_MARGIN + width], 0)
 
 
-def _add(grid: Floats, centre: Floats, covariance: Floats, radius: float, ring: Floats | None, arc: Floats,
-         light: Floats) -> None:
+def _add_gaussian(grid: Floats, centre: Floats, covariance: Floats, radius: float, ring: Floats | None, arc: Floats,
+                  light: Floats) -> None:
     """Add one Gaussian to a grid (rows, columns, 3). Lengths are in texels of the grid.
 
     radius: see `drawing.extent`. arc: see `arcs_to_pixels`. light: RGB at the peak."""
     box = bounding_box(centre, covariance, radius, grid.shape[1], grid.shape[0])
     for part in () if box is None else _bands(box, centre, covariance, radius):
-        profile = profile_in(part, centre, covariance, ring, arc)
+        profile = profile_in_box(part, centre, covariance, ring, arc)
         profile[profile < PROFILE_MIN] = 0
         target = grid[part[1]:part[3], part[0]:part[2]]
         for channel in range(3):
@@ -93,53 +93,53 @@ def _bands(box: Box, centre: Floats, covariance: Floats, radius: float) -> Itera
     left, top, right, bottom = box
     xx, xy, yy = (float(value) for value in covariance)
     # The ellipse's area relative to that of its bounding box.
-    share = math.pi / 4 * math.sqrt(max(xx * yy - xy * xy, 0) / (xx * yy))
-    if (right - left) * (bottom - top) < _LARGE_BOX or share > _FULL_SHARE:
+    area_share = math.pi / 4 * math.sqrt(max(xx * yy - xy * xy, 0) / (xx * yy))
+    if (right - left) * (bottom - top) < _LARGE_BOX or area_share > _FULL_SHARE:
         yield box
         return
     step = max((bottom - top) // _BANDS, 4)
-    reach = radius * math.sqrt(xx)
-    extreme = radius * xy / math.sqrt(xx)  # how far below the centre the ellipse reaches farthest to the right
+    half_width = radius * math.sqrt(xx)
+    rightmost_dy = radius * xy / math.sqrt(xx)  # of the ellipse's rightmost point, below its centre
     for start in range(top, bottom, step):
         end = min(start + step, bottom)
-        low, high = start + 0.5 - float(centre[1]), end - 0.5 - float(centre[1])
-        reaches = [_row_reach(dy, xx, xy, yy, radius) for dy in (low, high)]
-        lowest, highest = (min(pair[0] for pair in reaches), max(pair[1] for pair in reaches))
-        if low <= extreme <= high:
-            highest = max(highest, reach)
-        if low <= -extreme <= high:
-            lowest = min(lowest, -reach)
-        first = max(math.floor(float(centre[0]) + lowest) - 1, left)
-        last = min(math.ceil(float(centre[0]) + highest) + 1, right)
-        if first < last:
-            yield first, start, last, end
+        top_dy, bottom_dy = start + 0.5 - float(centre[1]), end - 0.5 - float(centre[1])
+        row_ends = [_row_ends(dy, xx, xy, yy, radius) for dy in (top_dy, bottom_dy)]
+        leftmost, rightmost = (min(ends[0] for ends in row_ends), max(ends[1] for ends in row_ends))
+        if top_dy <= rightmost_dy <= bottom_dy:
+            rightmost = max(rightmost, half_width)
+        if top_dy <= -rightmost_dy <= bottom_dy:
+            leftmost = min(leftmost, -half_width)
+        band_left = max(math.floor(float(centre[0]) + leftmost) - 1, left)
+        band_right = min(math.ceil(float(centre[0]) + rightmost) + 1, right)
+        if band_left < band_right:
+            yield band_left, start, band_right, end
 
 
-def _row_reach(dy: float, xx: float, xy: float, yy: float, radius: float) -> tuple[float, float]:
+def _row_ends(dy: float, xx: float, xy: float, yy: float, radius: float) -> tuple[float, float]:
     """Return the left and right end of the ellipse, relative to its centre, in the row `dy` below the centre.
 
     In a row above or below the ellipse, both are those of its highest or lowest point."""
-    inside = min(max(dy, -radius * math.sqrt(yy)), radius * math.sqrt(yy))
-    half = math.sqrt(max((radius * radius - inside * inside / yy) * (xx - xy * xy / yy), 0))
-    return xy / yy * inside - half, xy / yy * inside + half
+    clamped_dy = min(max(dy, -radius * math.sqrt(yy)), radius * math.sqrt(yy))
+    half = math.sqrt(max((radius * radius - clamped_dy * clamped_dy / yy) * (xx - xy * xy / yy), 0))
+    return xy / yy * clamped_dy - half, xy / yy * clamped_dy + half
 
 
 def _enlarge(grid: Floats, size: tuple[int, int]) -> Floats:
     """Return a grid at twice the resolution. size: rows and columns of the result; both have a margin of `_MARGIN`."""
-    return _double(_double(grid, size[0]).swapaxes(0, 1), size[1]).swapaxes(0, 1)
+    return _double_rows(_double_rows(grid, size[0]).swapaxes(0, 1), size[1]).swapaxes(0, 1)
 
 
-def _double(grid: Floats, count: int) -> Floats:
+def _double_rows(grid: Floats, count: int) -> Floats:
     """Interpolate to twice the resolution along the first axis: `count` rows, the first of which lies `_MARGIN` rows
     before the picture."""
-    first = (np.arange(count) - _MARGIN) // 2 + _MARGIN  # the coarse row that holds each fine one
-    odd = (np.arange(count) - _MARGIN) % 2 == 1
+    coarse_rows = (np.arange(count) - _MARGIN) // 2 + _MARGIN  # the coarse row that holds each fine one
+    is_odd_row = (np.arange(count) - _MARGIN) % 2 == 1
     result = np.zeros((count, *grid.shape[1:]), np.float32)
     # An even fine row lies a quarter of a row before the middle of its coarse row, an odd one a quarter after it.
     for is_odd, weights, offset in ((False, _WEIGHTS[::-1], -2), (True, _WEIGHTS, -1)):
-        rows = first[odd == is_odd]
-        result[odd == is_odd] = sum(np.float32(weights[tap]) * grid[np.clip(rows + offset + tap, 0, len(grid) - 1)]
-                                    for tap in range(4))
+        rows = coarse_rows[is_odd_row == is_odd]
+        result[is_odd_row == is_odd] = sum(
+            np.float32(weights[tap]) * grid[np.clip(rows + offset + tap, 0, len(grid) - 1)] for tap in range(4))
     return result
 
 
@@ -153,11 +153,11 @@ def draw_layers(look: Look, flares: Mapping[str, PlaneGaussians], intrinsics: Ar
     if look.blend == "add":
         return {name: draw_added(gaussians, look, intrinsics, width, height) for name, gaussians in flares.items()}
     layers: dict[str, Floats] = {}
-    below = display = np.zeros((height, width, 3), np.float32)
+    light_below = display = np.zeros((height, width, 3), np.float32)
     for name, gaussians in reversed(list(flares.items())):  # the first light lies in front
         colour, transmittance = draw_with_transmittance([gaussians], intrinsics, width, height, look.blend,
                                                         look.pixel_grid)
         display = colour + transmittance[..., None] * display
-        above = np.asarray(linear_from_srgb(np.maximum(display, 0)), np.float32)
-        layers[name], below = above - below, above
+        light_above = np.asarray(linear_from_srgb(np.maximum(display, 0)), np.float32)
+        layers[name], light_below = light_above - light_below, light_above
     return {name: layers[name] for name in flares}

@@ -84,12 +84,12 @@ class Shot:
         """Folder of each camera's layers, "" for a single camera without `own_folder`; distinct on any file system."""
         folder_by_name: dict[str, str] = {}
         for name in dict.fromkeys(frame.name for frame in self.frames):
-            plain = re.sub(r"[^\w-]+", "_", name).strip("_") or "camera"
-            plain = avoid_device_name(plain)
-            used, folder, number = {other.casefold() for other in folder_by_name.values()}, plain, 1
-            while folder.casefold() in used:
-                number += 1
-                folder = f"{plain}_{number}"
+            base = re.sub(r"[^\w-]+", "_", name).strip("_") or "camera"
+            base = avoid_device_name(base)
+            used_folders, folder, suffix = {used.casefold() for used in folder_by_name.values()}, base, 1
+            while folder.casefold() in used_folders:
+                suffix += 1
+                folder = f"{base}_{suffix}"
             folder_by_name[name] = folder
         return folder_by_name if len(folder_by_name) > 1 or self.own_folder else dict.fromkeys(folder_by_name, "")
 
@@ -159,10 +159,10 @@ def _read_frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
         raise ValueError(f"frame {entry['frame']} has two lights of one name")
     if not all(isinstance(text, str) for text in entry.get("edits", [])):
         raise ValueError("edits are a list of texts")
-    number = _to_int(entry["frame"])
-    if not 0 <= number < MAX_FRAME:
-        raise ValueError(f"the frame {number} is no number of a file")
-    return ShotFrame(number, str(entry.get("name", "Camera")),
+    frame_number = _to_int(entry["frame"])
+    if not 0 <= frame_number < MAX_FRAME:
+        raise ValueError(f"the frame {frame_number} is no number of a file")
+    return ShotFrame(frame_number, str(entry.get("name", "Camera")),
                      Camera(width, height, fx, fy, cx, cy, pose, exposure), lights, tuple(entry.get("edits", [])))
 
 
@@ -183,15 +183,15 @@ def _light_entry(light: PlacedLight) -> dict[str, Any]:
 
 def _read_light(entry: Mapping[str, Any]) -> PlacedLight:
     """Parse one light. Raises ValueError, KeyError or TypeError where it is invalid."""
-    def numbers(name: str) -> tuple[float, ...]:
+    def read_numbers(name: str) -> tuple[float, ...]:
         return tuple(_to_float(value) for value in entry[name])
 
-    xyz, factor = np.array(numbers("xyz")), numbers("factor") if "factor" in entry else (1.0, 1.0, 1.0)
+    xyz, factor = np.array(read_numbers("xyz")), read_numbers("factor") if "factor" in entry else (1.0, 1.0, 1.0)
     if len(factor) != 3 or not all(0 <= value <= MAX_FACTOR for value in factor):
         raise ValueError(f"the factor of a light has three numbers from 0 to {MAX_FACTOR:g}")
     red, green, blue = factor
     extent = LightExtent.read(entry["extent"]) if entry.get("extent") is not None else None
-    shares = numbers("shares") if extent is not None and entry.get("shares") is not None else None
+    shares = read_numbers("shares") if extent is not None and entry.get("shares") is not None else None
     light = PlacedLight(str(entry["name"]), str(entry["source"]), xyz, _to_float(entry.get("share", 1.0)), extent,
                         shares, (red, green, blue), _to_float(entry.get("reference_distance", 0.0)))
     if xyz.shape != (3,):

@@ -18,11 +18,11 @@ def draw_thumbnail(look: Look, width: int, height: int) -> NDArray[np.float32]:
 
     The camera is the look's own, cropped about the centre to this aspect ratio. The look must add light."""
     focal = look.camera.fx / look.camera.width * max(width, height * look.camera.width / look.camera.height)
-    k = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    place = np.array([PLACE[0] * width / 2 / focal, PLACE[1] * height / 2 / focal], np.float32)
+    intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    light_position = np.array([PLACE[0] * width / 2 / focal, PLACE[1] * height / 2 / focal], np.float32)
     light = look.lights[0]
-    middle = (light.query_range.camera_low + light.query_range.camera_high) / 2
-    gaussians = light.evaluate(ViewOfLight(middle, np.eye(3, dtype=np.float32), place, 1.0))
+    camera = (light.query_range.camera_low + light.query_range.camera_high) / 2
+    gaussians = light.evaluate(ViewOfLight(camera, np.eye(3, dtype=np.float32), light_position, 1.0))
     picture = (np.zeros((height, width, 3), np.float32) if gaussians is None
-               else draw([gaussians], k, width, height, look.blend, look.pixel_grid))
+               else draw([gaussians], intrinsics, width, height, look.blend, look.pixel_grid))
     return np.clip(srgb_from_linear(np.maximum(picture, 0)), 0, 1)

@@ -184,7 +184,7 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     # After jobs, this keeps their finished frames and returns the record of all.
     bake_settings = layers.bake_settings(args)
     sources = {light.name: light.source for frame in target.frames for light in frame.shot.lights}
-    stored = () if targets.is_shot_file(options) else transfer.look.edits.placed(sources).texts()
+    stored = () if targets.is_shot_file(options) else transfer.look.edits.for_placed_lights(sources).texts()
     if stored:
         progress.say(f"The edits that {flare} stores are applied: {', '.join(stored)}.")
         bake_settings = replace(bake_settings, edits=(*stored, *bake_settings.edits))

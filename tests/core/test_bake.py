@@ -145,7 +145,7 @@ def test_a_flare_without_lights_is_black() -> None:
 def gains(edits: list[str], lights: list[str]) -> dict[str, list[float]]:
     """The factors that edits put on lights; matrices without saturation are plain factors."""
     return {name: matrix.diagonal().tolist()
-            for name, matrix in LookEdits.parse(edits, lights).matrices(lights).items()}
+            for name, matrix in LookEdits.parse(edits, lights).colour_matrices(lights).items()}
 
 
 def test_edits_multiply() -> None:
@@ -434,7 +434,7 @@ def test_layer_colours_keep_light_nonnegative_and_diagonal_factors_exact() -> No
     """A covering flare may take light away: a factor leaves that, so that scene + flare stays the composite."""
     layer = np.full((2, 2, 3), (1.0, 0.0, -0.25), np.float32)
     rendering = ViewLayers(np.zeros_like(layer), {"lamp": layer}, layer[..., 0])
-    vivid, hardly, double = (LookEdits.parse([f"lamp.{edit}"], ["lamp"]).matrices(["lamp"])
+    vivid, hardly, double = (LookEdits.parse([f"lamp.{edit}"], ["lamp"]).colour_matrices(["lamp"])
                              for edit in ("saturation=2", "saturation=0.999", "intensity=2"))
     light = ViewLayers(np.zeros_like(layer), {"lamp": np.abs(layer)}, layer[..., 0])
     assert (to_layers(light, vivid).flares["lamp"] >= 0).all()

@@ -417,7 +417,7 @@ def test_colour_edits_of_gaussians_equal_those_of_the_layer() -> None:
     gaussians = replace(gaussians, colours=np.array([[1, 0.2, 0], [0.1, 0.9, 0.3], [0, 0, 1]], np.float32))
     edits = LookEdits.parse(["lamp.intensity=2", "lamp.tint=1,0.5,0.25", "*.saturation=1.6"], ["lamp"])
     gaussians_first = draw([apply_edits(gaussians, "lamp", LIGHT, elements, edits, "add")], intrinsics, 40, 20)
-    layer_first = draw([gaussians], intrinsics, 40, 20) @ edits.matrices(["lamp"])["lamp"].T
+    layer_first = draw([gaussians], intrinsics, 40, 20) @ edits.colour_matrices(["lamp"])["lamp"].T
     np.testing.assert_allclose(gaussians_first, layer_first, atol=1e-5)
 
 
@@ -458,10 +458,10 @@ def test_keyed_edits_are_interpolated_between_keyframes(tmp_path: Path) -> None:
     keyed.write(tmp_path / "edits.json")
     again = KeyedEdits.read(tmp_path / "edits.json")
     assert again == keyed
-    strength = [again.at(frame, ["lamp"]).light_edit("lamp").intensity for frame in (1, 10, 15, 20, 99)]
+    strength = [again.edits_at(frame, ["lamp"]).light_edit("lamp").intensity for frame in (1, 10, 15, 20, 99)]
     np.testing.assert_allclose(strength, [0, 0, 0.5, 1, 1])
-    assert [again.at(frame, ["lamp"]).light_edit("lamp").mute for frame in (10, 19, 20)] == [False, False, True]
-    assert again.at(15, ["lamp"]).light_edit("lamp").scale == 2
+    assert [again.edits_at(frame, ["lamp"]).light_edit("lamp").mute for frame in (10, 19, 20)] == [False, False, True]
+    assert again.edits_at(15, ["lamp"]).light_edit("lamp").scale == 2
     for text in ("[]", '{"set": "a"}', '{"frames": {"x": []}}', "{", '{"frames": {"6": [], "06": []}}',
                  '{"frames": {"6": [], "6": []}}', '{"frames": {"1_0": []}}', '{"frames": {"9999999999": []}}'):
         (tmp_path / "edits.json").write_text(text)
@@ -629,7 +629,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of Rec. 709
 
 def test_saturation_is_applied_before_the_tint() -> None:
     texts = ["lamp.tint=1,0.5,0.25", "lamp.saturation=0", "lamp.intensity=2"]
-    matrix = LookEdits.parse(texts, ["lamp"]).matrices(["lamp"])["lamp"]
+    matrix = LookEdits.parse(texts, ["lamp"]).colour_matrices(["lamp"])["lamp"]
     np.testing.assert_allclose(matrix @ (0.2, 0.6, 1.0), 2 * (LUMINANCE @ (0.2, 0.6, 1.0)) * np.array([1, 0.5, 0.25]),
                                rtol=1e-6)
 
@@ -675,7 +675,7 @@ def test_a_flare_stores_edits_of_its_lights(tmp_path: Path) -> None:
     look = read_look(tmp_path / "b.flare")
     assert plain.edits.is_neutral
     assert sorted(look.edits.texts()) == sorted(edits.texts())
-    placed = look.edits.placed({"key": first, "rim": first, "moon": second})
+    placed = look.edits.for_placed_lights({"key": first, "rim": first, "moon": second})
     assert placed.lights["key"] == placed.lights["rim"] == edits.lights[first]
     assert placed.lights["moon"].mute and placed.elements["rim", part].scale == 1.5 and placed.master == edits.master
     tensors, metadata = read_tensors(tmp_path / "b.flare")

@@ -632,8 +632,8 @@ def test_edits_by_frame_may_be_toml(tmp_path: Path) -> None:
     (tmp_path / "edits.toml").write_text('set = ["lamp.tint=1,0.5,1"]\n[frames]\n1 = ["lamp.intensity=0"]\n'
                                          '3 = ["lamp.intensity=1"]\n')
     keyed = KeyedEdits.read(tmp_path / "edits.toml")
-    assert keyed.at(2, ["lamp"]).light_edit("lamp").intensity == pytest.approx(0.5)
-    assert keyed.at(2, ["lamp"]).light_edit("lamp").tint == (1, 0.5, 1)
+    assert keyed.edits_at(2, ["lamp"]).light_edit("lamp").intensity == pytest.approx(0.5)
+    assert keyed.edits_at(2, ["lamp"]).light_edit("lamp").tint == (1, 0.5, 1)
     (tmp_path / "bad.toml").write_text("set = [")
     with pytest.raises(SettingsError, match=r"bad\.toml is not valid TOML"):
         KeyedEdits.read(tmp_path / "bad.toml")

@@ -151,9 +151,9 @@ def formats(base: Path) -> list[Format]:
     add("training.jsonl", "training.jsonl", lambda folder: _read_log(folder / "training.jsonl", 3),
         file("training.jsonl", lines))
     keyed = {"set": ["lamp.intensity=2"], "frames": {"1": ["lamp.tint=1,0.5,0.2"], "9": ["lamp.scale=2"]}}
-    add("edits.json", "edits.json", lambda folder: KeyedEdits.read(folder / "edits.json").at(4, ["lamp"]),
+    add("edits.json", "edits.json", lambda folder: KeyedEdits.read(folder / "edits.json").edits_at(4, ["lamp"]),
         file("edits.json", json.dumps(keyed)))
-    add("edits.toml", "edits.toml", lambda folder: KeyedEdits.read(folder / "edits.toml").at(4, ["lamp"]),
+    add("edits.toml", "edits.toml", lambda folder: KeyedEdits.read(folder / "edits.toml").edits_at(4, ["lamp"]),
         file("edits.toml", 'set = ["lamp.intensity=2"]\n[frames]\n1 = ["lamp.tint=1,0.5,0.2"]\n9 = ["lamp.scale=2"]\n'))
     tables = {"plates": {"a.png": "1"}, "flares": {"a.png": "f/a.exr"}, "flares_made": {"a.png": "1"},
               "sources": {"a.png": "2"}, "written": {"a.png": "3"}}

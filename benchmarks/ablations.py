@@ -43,7 +43,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import report
 from benchmarks.bilateral import BilateralTrainer
 from benchmarks.hidden_lights import hidden_flare
-from benchmarks.known_scene import KnownScene, score
+from benchmarks.known_scene import KnownScene, score_flare
 from core.capture import Camera, Capture, Light
 from core.choices import ITERATIONS, OUR_PRESETS, Preset
 from core.fit import fit
@@ -62,8 +62,8 @@ DOCUMENT = report.RESULTS / "ablations.md"
 SAMPLE = report.ROOT / "sample_scenes" / "desk"
 SIGMAS = (0.0, 0.1, 0.5, 1.0)
 SCORES = "scores.json"
-Length = Callable[..., FitSettings]
-"""A preset of a given number of iterations, for which form and mode are chosen."""
+PresetFactory = Callable[..., FitSettings]
+"""Makes a preset of a given number of iterations from form and mode."""
 Results = dict[str, dict[str, dict[str, dict[str, Any]]]]
 """Scores by study, by row, by capture."""
 STUDIES = ("form", "comparison", "robustness", "robustness-ours", "supervision", "known", "extrapolation",
@@ -94,84 +94,100 @@ class Experiment:
         return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _seeded(seed: int, name: Preset, **form: Any) -> FitSettings:
+def _seeded_preset(seed: int, name: Preset, **form: Any) -> FitSettings:
     return replace(preset(name, **form), seed=seed)
 
 
-def ours(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
-    """Return our form at this length, with settings changed by dotted name (`__` for the dot)."""
-    return override_settings(length(mode=mode), {name.replace("__", "."): value for name, value in changes.items()})
+def our_settings(make_preset: PresetFactory, mode: str = "default", **changes: Any) -> FitSettings:
+    """Return our form's settings, changed by dotted name (`__` for the dot). make_preset: sets the length."""
+    return override_settings(make_preset(mode=mode), _dotted(changes))
 
 
-def papers(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
-    """Return the paper's form and loss at this length, with our rates. changes: as for `ours`."""
-    settings = length(model="paper", mode=mode)
-    return override_settings(settings, {name.replace("__", "."): value for name, value in changes.items()})
+def paper_settings(make_preset: PresetFactory, mode: str = "default", **changes: Any) -> FitSettings:
+    """Return the settings of the paper's form and loss, with our rates. Parameters: as for `our_settings`."""
+    return override_settings(make_preset(model="paper", mode=mode), _dotted(changes))
 
 
-def experiments(length: Length) -> list[Experiment]:
+def _dotted(changes: dict[str, Any]) -> dict[str, Any]:
+    return {name.replace("__", "."): value for name, value in changes.items()}
+
+
+def _variants(study: str, settings_by_name: dict[str, FitSettings]) -> list[Experiment]:
+    return [Experiment(study, name, settings) for name, settings in settings_by_name.items()]
+
+
+def experiments(make_preset: PresetFactory) -> list[Experiment]:
     """Return the experiments of all studies."""
-    def variants_of(study: str, variants: dict[str, FitSettings]) -> list[Experiment]:
-        return [Experiment(study, name, settings) for name, settings in variants.items()]
-
-    result = variants_of("form", {
-        "ours": ours(length),
-        "without rings": ours(length, flare__form__rings=False),
-        "with arcs": ours(length, flare__form__arcs=True),
-        "without static offsets": ours(length, flare__form__static_offset=False),
-        "without latent": ours(length, flare__form__latent=0),
-        "without plane offsets": ours(length, flare__form__plane_offset=False),
-        "without light correction": ours(length, flare__form__light_correction=False),
-        "without the line (2d)": ours(length, "2d"),
-        "without occlusion": ours(length, flare__occlusion=False),
-        "fine grids": ours(length, flare__form__levels=16, flare__form__base=16),
-        "fitted jointly throughout": ours(length, separate_until=0.0),
-        "fitted apart throughout": ours(length, separate_until=1.0),
-        "the paper's": papers(length),
+    ours, papers = partial(our_settings, make_preset), partial(paper_settings, make_preset)
+    result = _variants("form", {
+        "ours": ours(),
+        "without rings": ours(flare__form__rings=False),
+        "with arcs": ours(flare__form__arcs=True),
+        "without static offsets": ours(flare__form__static_offset=False),
+        "without latent": ours(flare__form__latent=0),
+        "without plane offsets": ours(flare__form__plane_offset=False),
+        "without light correction": ours(flare__form__light_correction=False),
+        "without the line (2d)": ours("2d"),
+        "without occlusion": ours(flare__occlusion=False),
+        "fine grids": ours(flare__form__levels=16, flare__form__base=16),
+        "fitted jointly throughout": ours(separate_until=0.0),
+        "fitted apart throughout": ours(separate_until=1.0),
+        "the paper's": papers(),
     })
-    result += variants_of("comparison", {
-        "default": papers(length),
-        "2d": papers(length, "2d"),
-        "in-flare": papers(length, "in-flare"),
-        "unsup": papers(length, "unsup"),
-        "without delta_l": papers(length, flare__form__light_correction=False),
-        "without delta_f": papers(length, flare__form__plane_offset=False),
-        "without detection": papers(length, flare__detection=False),
-        "3dgs": papers(length, "3dgs"),
+    result += _variants("comparison", {
+        "default": papers(),
+        "2d": papers("2d"),
+        "in-flare": papers("in-flare"),
+        "unsup": papers("unsup"),
+        "without delta_l": papers(flare__form__light_correction=False),
+        "without delta_f": papers(flare__form__plane_offset=False),
+        "without detection": papers(flare__detection=False),
+        "3dgs": papers("3dgs"),
     })
-    for corrections, light, plane in (("both", True, True), ("delta_l", True, False), ("delta_f", False, True),
-                                      ("neither", False, False)):
-        for study, form in (("robustness", papers), ("robustness-ours", ours)):
-            settings = form(length, flare__form__light_correction=light, flare__form__plane_offset=plane)
-            if not light:  # as they are given, then
-                settings = override_settings(settings, {"flare.snap_lights": False})
-            result += [Experiment(study, f"{corrections}, sigma {sigma:g}", settings, sigma) for sigma in SIGMAS]
-    result += variants_of("supervision", {"exact flare-free frames": ours(length), "none: split": ours(length, "split"),
-                               "none: unsup": ours(length, "unsup")})
-    result += [Experiment("supervision", "what remove makes, for exact", ours(length), frames="cleaned"),
-             Experiment("supervision", "what remove makes: estimated", ours(length, "estimated"), frames="cleaned")]
+    result += _robustness_experiments(make_preset)
+    result += _variants("supervision", {"exact flare-free frames": ours(), "none: split": ours("split"),
+                                        "none: unsup": ours("unsup")})
+    result += [Experiment("supervision", "what remove makes, for exact", ours(), frames="cleaned"),
+               Experiment("supervision", "what remove makes: estimated", ours("estimated"), frames="cleaned")]
     for mode, title in (("default", "exact flare-free frames"), ("split", "none: split")):
-        result += variants_of("far layer", {
-            title: ours(length, mode), f"{title}, without a far layer": ours(length, mode, scene__far_layer=False)})
-    many = {"flare.count": 900, "flare.density.max_gaussians": 900}  # of each light, from the beginning to the end
-    alone = override_settings(ours(length), {**many, "flare.occlusion": False})
-    result += [Experiment("known", "ours", alone, known_scene=True),
-             Experiment("known", "with arcs", override_settings(alone, {"flare.form.arcs": True}), known_scene=True),
-             Experiment("known", "without rings", override_settings(alone, {"flare.form.rings": False}),
-                        known_scene=True),
-             Experiment("known", "the paper's", override_settings(papers(length), many), known_scene=True)]
-    result += [Experiment("extrapolation", "every n-th view", ours(length)),
-             Experiment("extrapolation", "a stretch", ours(length), stretch=True),
-             Experiment("extrapolation", "a stretch, the paper's", papers(length), stretch=True)]
-    plain = papers(length, "3dgs")
-    result += [Experiment("reconstruction", "3dgs on the frames", plain),
-             Experiment("reconstruction", "3dgs on the frames, bilateral grids", plain, frames="graded"),
-             Experiment("reconstruction", "3dgs on flare-free frames", plain, frames="removed"),
-             Experiment("reconstruction", "our joint fit", ours(length))]
+        result += _variants("far layer", {
+            title: ours(mode), f"{title}, without a far layer": ours(mode, scene__far_layer=False)})
+    result += _known_scene_experiments(make_preset)
+    result += [Experiment("extrapolation", "every n-th view", ours()),
+               Experiment("extrapolation", "a stretch", ours(), stretch=True),
+               Experiment("extrapolation", "a stretch, the paper's", papers(), stretch=True)]
+    scene_only = papers("3dgs")
+    result += [Experiment("reconstruction", "3dgs on the frames", scene_only),
+               Experiment("reconstruction", "3dgs on the frames, bilateral grids", scene_only, frames="graded"),
+               Experiment("reconstruction", "3dgs on flare-free frames", scene_only, frames="removed"),
+               Experiment("reconstruction", "our joint fit", ours())]
     return result
 
 
-def displaced(capture: Capture, sigma: float, seed: int = 0) -> Capture:
+def _robustness_experiments(make_preset: PresetFactory) -> list[Experiment]:
+    """Return fits of both forms with displaced lights, for each choice of corrections and each sigma."""
+    result = []
+    for corrections, light, plane in (("both", True, True), ("delta_l", True, False), ("delta_f", False, True),
+                                      ("neither", False, False)):
+        for study, form_settings in (("robustness", paper_settings), ("robustness-ours", our_settings)):
+            settings = form_settings(make_preset, flare__form__light_correction=light, flare__form__plane_offset=plane)
+            if not light:  # the lights then stay where they were moved to
+                settings = override_settings(settings, {"flare.snap_lights": False})
+            result += [Experiment(study, f"{corrections}, sigma {sigma:g}", settings, sigma) for sigma in SIGMAS]
+    return result
+
+
+def _known_scene_experiments(make_preset: PresetFactory) -> list[Experiment]:
+    """Return fits of the flare alone over the exact scene, with 900 Gaussians for each light in all iterations."""
+    counts = {"flare.count": 900, "flare.density.max_gaussians": 900}
+    ours = override_settings(our_settings(make_preset), {**counts, "flare.occlusion": False})
+    return [Experiment("known", name, settings, known_scene=True) for name, settings in (
+        ("ours", ours), ("with arcs", override_settings(ours, {"flare.form.arcs": True})),
+        ("without rings", override_settings(ours, {"flare.form.rings": False})),
+        ("the paper's", override_settings(paper_settings(make_preset), counts)))]
+
+
+def displace_lights(capture: Capture, sigma: float, seed: int = 0) -> Capture:
     """Move each light of the capture once, by noise of this sigma (scene units) along each axis; return the capture."""
     if sigma:
         noise = np.random.default_rng(seed).normal(0, sigma, (len(capture.lights), 3))
@@ -180,61 +196,62 @@ def displaced(capture: Capture, sigma: float, seed: int = 0) -> Capture:
     return capture
 
 
-def stretch(capture: Capture, share: float = 0.15) -> list[str]:
+def middle_stretch(capture: Capture, share: float = 0.15) -> list[str]:
     """Return the names of the views in one stretch in the middle of the path. share: of all views."""
     count = max(round(share * len(capture.views)), 1)
     first = (len(capture.views) - count) // 2
     return [view.name for view in capture.views[first : first + count]]
 
 
-def run(experiment: Experiment, folder: Path, capture: Path, width: int, progress: Progress) -> dict[str, Any]:
-    """Return the scores of one experiment, read from `folder` if it was done before, else written there.
+def run_experiment(experiment: Experiment, folder: Path, capture: Path, width: int,
+                   progress: Progress) -> dict[str, Any]:
+    """Return the scores of one experiment: read from `folder` if it is finished, else fitted and written there.
 
     folder: of this experiment and capture. width: of the frames that are fitted, pixels.
     """
-    file = folder / SCORES
-    if file.exists():
-        stored: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    score_file = folder / SCORES
+    if score_file.exists():
+        stored: dict[str, Any] = json.loads(score_file.read_text(encoding="utf-8"))
         return stored
-    opened = displaced(Capture.open(capture), experiment.displacement)
+    fit_capture = displace_lights(Capture.open(capture), experiment.displacement)
     settings = replace(experiment.settings, width=width)
     if experiment.stretch:
         split = folder / "stretch.json"
-        write_json(split, {"test": stretch(opened)})
+        write_json(split, {"test": middle_stretch(fit_capture)})
         settings = replace(settings, holdout=str(split))
-    began = time.monotonic()
+    start = time.monotonic()
     if experiment.known_scene:
-        scores = _known(opened, settings, progress)
+        scores = _fit_known_scene(fit_capture, settings, progress)
     elif experiment.frames == "graded":
-        scores = _graded(opened, settings, progress)
+        scores = _fit_with_grids(fit_capture, settings, progress)
     else:
         if experiment.frames == "removed":
-            opened = _capture_of(folder / "capture", capture, images="removed")
+            fit_capture = _link_capture(folder / "capture", capture, images="removed")
         elif experiment.frames == "cleaned":
-            opened = _cleaned(folder / "capture", capture, progress)
-        fitted = fit(opened, settings, folder / "run", progress, resume=True)
-        scores = _scores(fitted, capture, settings, progress)
-    scores["seconds"], scores["commit"] = round(time.monotonic() - began), _commit()
-    write_json(file, scores)
+            fit_capture = _clean_copy(folder / "capture", capture, progress)
+        fitted = fit(fit_capture, settings, folder / "run", progress, resume=True)
+        scores = _score_held_out(fitted, capture, settings, progress)
+    scores["seconds"], scores["commit"] = round(time.monotonic() - start), _current_commit()
+    write_json(score_file, scores)
     return scores
 
 
-def _train(trainer: KnownScene | BilateralTrainer, stage: str, iterations: int, progress: Progress) -> None:
+def _run_iterations(trainer: KnownScene | BilateralTrainer, stage: str, iterations: int, progress: Progress) -> None:
     progress.stage(stage, iterations)
     for _ in range(iterations):
         trainer.step()
         progress.advance()
 
 
-def _known(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
+def _fit_known_scene(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
     """Fit the flare alone over the exact scene; return its scores."""
     trainer = KnownScene(capture, settings)
-    _train(trainer, "flare alone", settings.iterations, progress)
-    return score(trainer, capture.split(settings.holdout)[1])
+    _run_iterations(trainer, "flare alone", settings.iterations, progress)
+    return score_flare(trainer, capture.split(settings.holdout)[1])
 
 
 @dataclass(frozen=True)
-class _SceneAlone:
+class _SceneRenderer:
     """A scene without flare, as `evaluate` renders it."""
 
     scene: SceneGaussians
@@ -244,14 +261,14 @@ class _SceneAlone:
         return ViewLayers(view.layers.scene.numpy(), {}, view.scene.depth.numpy())
 
 
-def _graded(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
+def _fit_with_grids(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
     """Fit the scene with a bilateral grid for each frame; return its scores."""
     trainer = BilateralTrainer(capture, settings)
-    _train(trainer, "scene with grids", settings.iterations, progress)
-    return _scores(_SceneAlone(trainer.scene), capture.folder, settings, progress)
+    _run_iterations(trainer, "scene with grids", settings.iterations, progress)
+    return _score_held_out(_SceneRenderer(trainer.scene), capture.folder, settings, progress)
 
 
-def _capture_of(folder: Path, capture: Path, **origins: str) -> Capture:
+def _link_capture(folder: Path, capture: Path, **origins: str) -> Capture:
     """Make a capture of links to another's frames, cameras and lights, without its clean frames.
 
     origins: the file or folder of `capture` that a name links to instead.
@@ -264,27 +281,28 @@ def _capture_of(folder: Path, capture: Path, **origins: str) -> Capture:
     return Capture.open(folder)
 
 
-def _cleaned(folder: Path, capture: Path, progress: Progress) -> Capture:
+def _clean_copy(folder: Path, capture: Path, progress: Progress) -> Capture:
     """Return a copy of the capture, in `folder`, whose clean frames `remove` made."""
-    copy = _capture_of(folder, capture)
-    if not copy.has_removed:
-        clean_capture(copy, Remover(glow="remove"), progress)
+    linked = _link_capture(folder, capture)
+    if not linked.has_removed:
+        clean_capture(linked, Remover(glow="remove"), progress)
     return Capture.open(folder)
 
 
-def _scores(renderer: Run | _SceneAlone, folder: Path, settings: FitSettings, progress: Progress) -> dict[str, Any]:
-    """Return means over the held-out views of the unchanged capture: lights are displaced for the fit alone.
+def _score_held_out(renderer: Run | _SceneRenderer, folder: Path, settings: FitSettings,
+                    progress: Progress) -> dict[str, Any]:
+    """Return mean scores over the held-out views of the unchanged capture: lights are displaced for the fit alone.
 
     folder: of the capture. `hidden`: see `hidden_lights`, over all views, since few of those held out hide a light.
     """
     capture = Capture.open(folder)
     held_out = capture.split(settings.holdout)[1]
     frames = Frames(capture, settings.width)
-    evaluated = evaluate(renderer, capture, {view: frames.camera(view) for view in held_out}, progress,
+    evaluation = evaluate(renderer, capture, {view: frames.camera(view) for view in held_out}, progress,
                          frames.picture_area)
-    scores: dict[str, Any] = {layer: part for layer, part in evaluated.items() if isinstance(part, dict)}
+    scores: dict[str, Any] = {layer: values for layer, values in evaluation.items() if isinstance(values, dict)}
     if settings.mode == "3dgs":  # it has no flare to score
-        scores = {layer: part for layer, part in scores.items() if not layer.startswith("flare")}
+        scores = {layer: layer_scores for layer, layer_scores in scores.items() if not layer.startswith("flare")}
     else:
         hidden = hidden_flare(renderer, folder, {view: frames.camera(view) for view in capture.views})
         if hidden is not None:
@@ -302,48 +320,48 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
 )  # fmt: skip
 
 
-def _cell(values: Iterable[float | None], digits: int) -> str:
-    known = [value for value in values if value is not None]
-    return f"{np.mean(known):.{digits}f}" if known else "–"
+def _mean_cell(values: Iterable[float | None], digits: int) -> str:
+    present = [value for value in values if value is not None]
+    return f"{np.mean(present):.{digits}f}" if present else "–"
 
 
-def tables(results: Results) -> str:
+def study_tables(results: Results) -> str:
     """Return a Markdown table for each study; figures are means over the captures that all of its rows have."""
     parts = []
     for study, rows in results.items():
-        names = shared(rows)
+        names = shared_captures(rows)
         scores = {name: [row[capture] for capture in names] for name, row in rows.items()}
-        all_scores = [scored for row in scores.values() for scored in row]
+        all_scores = [result for row in scores.values() for result in row]
         columns = [(layer, key, title) for layer, key, title in COLUMNS
-                   if any(scored.get(layer, {}).get(key) is not None for scored in all_scores)]
+                   if any(result.get(layer, {}).get(key) is not None for result in all_scores)]
         lines = []
         for name, row in scores.items():
-            cells = [_cell((scored.get(layer, {}).get(key) for scored in row), 2 if key == "psnr" else 3)
+            cells = [_mean_cell((result.get(layer, {}).get(key) for result in row), 2 if key == "psnr" else 3)
                      for layer, key, _ in columns]
-            lines.append([name, *cells, _cell((scored.get("seconds") for scored in row), 0)])
+            lines.append([name, *cells, _mean_cell((result.get("seconds") for result in row), 0)])
         table = report.table([study, *[title for *_, title in columns], "s"], lines)
         parts.append(f"### {study}\n\nMeans over {', '.join(names)}.\n\n{table}")
     return "\n\n".join(parts)
 
 
-def shared(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def shared_captures(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return the names of the captures that every row of a study has, in the first row's order."""
     first, *others = rows.values()
     return [name for name in first if all(name in other for other in others)]
 
 
-def by_capture(rows: Mapping[str, Mapping[str, dict[str, Any]]]) -> str:
-    """Return a table of one study by capture: the flare in dB, and the linear flare's relative error."""
-    names = shared(rows)
+def table_by_capture(rows: Mapping[str, Mapping[str, dict[str, Any]]]) -> str:
+    """Return a table of a study, a column for each capture: the flare's PSNR and the linear flare's relative error."""
+    names = shared_captures(rows)
     lines = []
     for title, row in rows.items():
         cells = [(row[name].get("flare", {}).get("psnr"), row[name].get("flare_linear", {}).get("relative_l2"))
                  for name in names]
-        lines.append([title, *[f"{_cell([decibels], 2)}; {_cell([error], 3)}" for decibels, error in cells]])
+        lines.append([title, *[f"{_mean_cell([decibels], 2)}; {_mean_cell([error], 3)}" for decibels, error in cells]])
     return report.table(["flare, dB; rel. L2", *names], lines)
 
 
-def plot(rows: Mapping[str, Mapping[str, dict[str, Any]]], picture: Path) -> None:
+def plot_displacements(rows: Mapping[str, Mapping[str, dict[str, Any]]], picture: Path) -> None:
     """Plot the flare's PSNR against the displacement of its light, a line for each choice of corrections.
 
     rows: of a study of robustness, named "CORRECTIONS, sigma S".
@@ -353,7 +371,7 @@ def plot(rows: Mapping[str, Mapping[str, dict[str, Any]]], picture: Path) -> Non
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    names = shared(rows)
+    names = shared_captures(rows)
     figure, axes = pyplot.subplots(figsize=(6, 3.6), layout="constrained")
     for corrections in dict.fromkeys(name.split(",")[0] for name in rows):
         points = [(float(name.rsplit(" ", 1)[1]), np.mean([scores[capture]["flare"]["psnr"] for capture in names]))
@@ -366,27 +384,27 @@ def plot(rows: Mapping[str, Mapping[str, dict[str, Any]]], picture: Path) -> Non
     pyplot.close(figure)
 
 
-def _commit() -> str:
+def _current_commit() -> str:
     done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=report.ROOT, capture_output=True, text=True,
                           check=False)  # fmt: skip
     return done.stdout.strip() or "unknown"
 
 
-def write(results: Results, section: str, length: str, document: Path) -> str:
+def write_results(results: Results, section: str, conditions: str, document: Path) -> str:
     """Write the tables, with commit and settings, into a section of the document; return the text.
 
-    length: a phrase on preset, iterations and size, for the heading.
+    conditions: a phrase on preset, iterations and size, for the heading.
     """
     commits = {result["commit"]: None for rows in results.values() for row in rows.values() for result in row.values()}
     head = f"Fitted at commit {', '.join(commits)}; times include other load on the machine. {report.conditions()}"
-    text = f"## Figures: {length[0].lower()}{length[1:]}\n\n{head}\n\n{tables(results)}"
+    text = f"## Figures: {conditions[0].lower()}{conditions[1:]}\n\n{head}\n\n{study_tables(results)}"
     for study in ("form", "known", "extrapolation"):
-        if study in results and len(shared(results[study])) > 1:
-            text += f"\n\n### {study}, by capture\n\n" + by_capture(results[study])
+        if study in results and len(shared_captures(results[study])) > 1:
+            text += f"\n\n### {study}, by capture\n\n" + table_by_capture(results[study])
     for study in ("robustness", "robustness-ours"):
         if study in results:
             picture = document.parent / f"{section}-{study}.png"
-            plot(results[study], picture)
+            plot_displacements(results[study], picture)
             text += f"\n\n![The flare against the displacement of its light]({picture.name})"
     report.write_section(document, section, text)
     return text
@@ -413,23 +431,24 @@ def main() -> None:
                 and (not args.variants or experiment.name in args.variants))
 
     # All fits of a study have one length, also those by parallax, which presets make longer.
-    length = partial(_seeded, args.seed, args.preset, iterations=args.iterations or ITERATIONS[args.preset])
-    result = length()
+    make_preset = partial(_seeded_preset, args.seed, args.preset, iterations=args.iterations or ITERATIONS[args.preset])
+    settings = make_preset()
     seed = f"-seed-{args.seed}" if args.seed else ""
-    section = f"ablations-{args.preset}-{result.iterations}-{args.width}{seed}"
+    section = f"ablations-{args.preset}-{settings.iterations}-{args.width}{seed}"
     progress = TerminalProgress()
-    for experiment in filter(is_selected, experiments(length)):
+    for experiment in filter(is_selected, experiments(make_preset)):
         for capture in args.captures:
             folder = args.out / section / experiment.key() / capture.name
             if args.finished and not (folder / SCORES).is_file():
                 continue
             progress.say(f"{experiment.study}: {experiment.name}, {capture.name}")
-            scores = run(experiment, folder, capture.resolve(), args.width, progress)
+            scores = run_experiment(experiment, folder, capture.resolve(), args.width, progress)
             results.setdefault(experiment.study, {}).setdefault(experiment.name, {})[capture.name] = scores
     progress.close()
     size = f"{args.width} pixels wide" if args.width else "at the size of the frames"
     size += f", seed {args.seed}" if args.seed else ""
-    text = write(results, section, f"Preset {args.preset} of {result.iterations} iterations, {size}", args.document)
+    conditions = f"Preset {args.preset} of {settings.iterations} iterations, {size}"
+    text = write_results(results, section, conditions, args.document)
     sys.stdout.write(text + "\n")
 
 

@@ -45,18 +45,19 @@ class FloatFrames(Capture):
         return self.truth_scene(view, size)
 
 
-def scores(run: Run, capture: Capture) -> list[float]:
+def mean_scores(run: Run, capture: Capture) -> list[float]:
     """Return the scores of `COLUMNS`, averaged over the held-out views that have them."""
     rows = []
     for view in capture.split(run.settings.holdout)[1]:
         layers = run.render(view.camera)
-        rendered = np.sum([*layers.flare_by_light.values()], axis=0)
+        rendered_flare = np.sum([*layers.flare_by_light.values()], axis=0)
         scene, flare = capture.truth_scene(view), capture.truth_flare(view)
         assert scene is not None and flare is not None
         flare_bright, scene_bright = (_is_above_white(layer.linear()) for layer in (flare, scene))
-        exact = flare.linear()
-        rows.append([relative_l2(rendered, exact, ~flare_bright), relative_l2(rendered, exact, flare_bright),
-                     rendered.max(), exact.max(), rendered.sum() / exact.sum(),
+        exact_flare = flare.linear()
+        rows.append([relative_l2(rendered_flare, exact_flare, ~flare_bright),
+                     relative_l2(rendered_flare, exact_flare, flare_bright),
+                     rendered_flare.max(), exact_flare.max(), rendered_flare.sum() / exact_flare.sum(),
                      relative_l2(layers.scene, scene.linear(), scene_bright)])
     return np.nanmean(np.array(rows, np.float64), 0).tolist()
 
@@ -79,8 +80,8 @@ def main() -> None:
             for name, white in (("clipped", 1.0), ("as they are", MAX_WHITE)):
                 with tempfile.TemporaryDirectory() as folder_name:
                     settings = replace(preset(args.preset, mode=mode), white=white)
-                    rendered = scores(fit(capture, settings, Path(folder_name) / "run"), capture)
-                rows.append([folder.name, mode, name, *(f"{value:.2f}" for value in rendered)])
+                    scores = mean_scores(fit(capture, settings, Path(folder_name) / "run"), capture)
+                rows.append([folder.name, mode, name, *(f"{value:.2f}" for value in scores)])
                 print(*rows[-1], sep="\t", file=sys.stderr, flush=True)
     print(report.table(["capture", "mode", "frames", *COLUMNS], rows))
 

@@ -23,7 +23,7 @@ SIZE = 96
 INTRINSICS = torch.tensor([[96.0, 0, 48], [0, 96.0, 48], [0, 0, 1]])
 
 
-def targets() -> dict[str, Tensor]:
+def target_pictures() -> dict[str, Tensor]:
     """Return (SIZE, SIZE) pictures of linear light: a ring clipped by a soft edge, a rimmed disc by a hard one."""
     coordinates = torch.arange(SIZE) + 0.5
     x, y = torch.meshgrid(coordinates, coordinates, indexing="xy")
@@ -31,8 +31,8 @@ def targets() -> dict[str, Tensor]:
     def ring(radius: float, width: float) -> Tensor:
         return torch.exp(-((torch.hypot(x - 48, y - 48) - radius) ** 2) / (2 * width**2))
 
-    def disc(cx: float, cy: float, radius: float, soft: float) -> Tensor:
-        return torch.sigmoid((radius - torch.hypot(x - cx, y - cy)) / soft)
+    def disc(centre_x: float, centre_y: float, radius: float, softness: float) -> Tensor:
+        return torch.sigmoid((radius - torch.hypot(x - centre_x, y - centre_y)) / softness)
 
     return {"clipped ring": ring(26, 2.5) * disc(70, 48, 34, 4),
             "lune": (0.25 * disc(48, 48, 26, 1) + ring(25, 1.5)) * disc(74, 40, 30, 1.5)}
@@ -45,8 +45,8 @@ def fit_psnr(target: Tensor, count: int, arcs: bool, seed: int, iterations: int 
     """
     generator = torch.Generator().manual_seed(seed)
 
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(shape, generator=generator)
+    def uniform(low: float, high: float, *ring_shapes: int) -> Tensor:
+        return low + (high - low) * torch.rand(ring_shapes, generator=generator)
 
     rings = torch.zeros(count, 2)
     # Every fourth begins as a ring: radius 3, and width 0.5 as a logarithm.
@@ -58,19 +58,20 @@ def fit_psnr(target: Tensor, count: int, arcs: bool, seed: int, iterations: int 
         "opacity_logits": (torch.full((count,), -2.0), 5e-2), "colours": (torch.ones(count, 1), 1e-2),
         "rings": (rings, 2e-2), "arcs": (torch.zeros(count, 2), 2e-2),
     }  # fmt: skip
-    rows = {name: torch.nn.Parameter(values) for name, (values, _) in initial.items()}
-    adam = torch.optim.Adam([{"params": [rows[name]], "lr": rate} for name, (_, rate) in initial.items()])
+    parameters = {name: torch.nn.Parameter(values) for name, (values, _) in initial.items()}
+    adam = torch.optim.Adam([{"params": [parameters[name]], "lr": rate} for name, (_, rate) in initial.items()])
     # Rates are constant in the first half, then fall to a twentieth.
     schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda i: 0.05 ** max(2 * i / iterations - 1, 0))
     loss = target.new_zeros(())
     for _ in range(iterations):
-        shape = torch.stack([rows["rings"][:, 0], rows["rings"][:, 1].clamp(-3, 3).exp()], -1)
-        opacities, arc_vectors = rows["opacity_logits"].sigmoid(), None
+        ring_shapes = torch.stack([parameters["rings"][:, 0], parameters["rings"][:, 1].clamp(-3, 3).exp()], -1)
+        opacities, arc_vectors = parameters["opacity_logits"].sigmoid(), None
         if arcs:
-            opacities = opacities * opacity_gain(rows["arcs"], shape)
-            arc_vectors = arcs_of_ellipse(rows["arcs"], rows["log_scales"], rows["rotations"])
-        flare = PlaneGaussians(rows["means"], covariance_of_ellipse(rows["log_scales"], rows["rotations"]), opacities,
-                               rows["colours"].repeat(1, 3), shape, arc_vectors)
+            opacities = opacities * opacity_gain(parameters["arcs"], ring_shapes)
+            arc_vectors = arcs_of_ellipse(parameters["arcs"], parameters["log_scales"], parameters["rotations"])
+        covariances = covariance_of_ellipse(parameters["log_scales"], parameters["rotations"])
+        flare = PlaneGaussians(parameters["means"], covariances, opacities, parameters["colours"].repeat(1, 3),
+                               ring_shapes, arc_vectors)
         loss = (splat_flare(flare, INTRINSICS, SIZE, SIZE, "add").colour[..., 0] - target).square().mean()
         adam.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -86,7 +87,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=4)
     args = parser.parse_args()
     rows = []
-    for name, target in targets().items():
+    for name, target in target_pictures().items():
         for count in args.counts:
             psnrs = [sum(fit_psnr(target, count, arcs, seed) for seed in range(args.seeds)) / args.seeds
                      for arcs in (False, True)]

@@ -19,7 +19,8 @@ from core.fit.settings import FitSettings
 from core.fit.trainer import Trainer
 
 ACROSS, DOWN, LUMAS = 16, 16, 8
-RATE, TOTAL_VARIATION_WEIGHT = 2e-3, 10.0
+"""Cells of a grid along x, y and luma."""
+LEARNING_RATE, TOTAL_VARIATION_WEIGHT = 2e-3, 10.0
 """The authors' choices of Adam's learning rate, which falls to a hundredth, and the weight of the total variation."""
 LUMA = (0.299, 0.587, 0.114)
 
@@ -32,21 +33,21 @@ class BilateralGrids(torch.nn.Module):
         identity = torch.eye(3, 4).reshape(12, 1, 1, 1).expand(12, LUMAS, DOWN, ACROSS)
         self.cells = torch.nn.ParameterList(Parameter(identity.clone()) for _ in range(views))
 
-    def forward(self, number: int, picture: Tensor) -> Tensor:
-        """Return the picture (h, w, 3), display values, with the transforms of frame `number` applied."""
+    def forward(self, index: int, picture: Tensor) -> Tensor:
+        """Return the picture (h, w, 3), display values, with the transforms of frame `index` applied."""
         height, width, _ = picture.shape
         y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
         luma = (picture.detach() @ picture.new_tensor(LUMA)).clamp(0, 1) * 2 - 1
         coordinates = torch.stack([x, y, luma], -1)[None, None]
         affine = functional.grid_sample(
-            self.cells[number][None], coordinates, align_corners=True, padding_mode="border"
+            self.cells[index][None], coordinates, align_corners=True, padding_mode="border"
         )
         affine = affine[0, :, 0].permute(1, 2, 0).reshape(height, width, 3, 4)
         return (affine[..., :3] @ picture[..., None])[..., 0] + affine[..., 3]
 
-    def total_variation(self, number: int) -> Tensor:
+    def total_variation(self, index: int) -> Tensor:
         """Return the total variation of one frame's grid: mean squared differences along luma, y and x."""
-        cells = self.cells[number]
+        cells = self.cells[index]
         return torch.stack([cells.diff(dim=axis).square().mean() for axis in (1, 2, 3)]).sum()
 
 
@@ -56,24 +57,24 @@ class BilateralTrainer(Trainer):
     def __init__(self, capture: Capture, settings: FitSettings) -> None:
         super().__init__(capture, settings)
         self.grids = BilateralGrids(len(self.views))
-        self.grid_optimiser = torch.optim.Adam(self.grids.parameters(), lr=RATE, eps=1e-15)
+        self.grid_optimiser = torch.optim.Adam(self.grids.parameters(), lr=LEARNING_RATE, eps=1e-15)
         self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.grid_optimiser, 0.01 ** (1 / settings.iterations))
 
     def step(self) -> dict[str, float]:
         """Make one iteration on the next view, with a step of its grid and the penalty of its total variation."""
         figures = super().step()
-        number = self._number(self._view())
-        (TOTAL_VARIATION_WEIGHT * self.grids.total_variation(number)).backward()
+        index = self._view_index(self._view())
+        (TOTAL_VARIATION_WEIGHT * self.grids.total_variation(index)).backward()
         self.grid_optimiser.step()
         self.grid_optimiser.zero_grad()
         self.schedule.step()
         return figures
 
-    def _flare_background(self, targets: Targets, scene: Tensor,  # noqa: ARG002 - the trainer's own door
+    def _flare_background(self, targets: Targets, scene: Tensor,  # noqa: ARG002 - the base class calls it with these
                           light_discs: Tensor | None) -> Tensor:  # noqa: ARG002
         """Return the scene through the grid of its view, which the trainer compares with the frame."""
-        return self.grids(self._number(self._view()), scene)
+        return self.grids(self._view_index(self._view()), scene)
 
-    def _number(self, view: View) -> int:
+    def _view_index(self, view: View) -> int:
         views: Sequence[View] = self.views
         return views.index(view)

@@ -43,23 +43,23 @@ def make_capture(folder: Path, cameras: int = CAMERAS) -> Path:
     model.mkdir(parents=True)
     images.mkdir()
     # One grey PNG, written by hand: 54 rows, each a filter byte and 96 pixels.
-    raw = zlib.compress(b"".join(b"\0" + b"\x80" * 3 * 96 for _ in range(54)))
+    pixels = zlib.compress(b"".join(b"\0" + b"\x80" * 3 * 96 for _ in range(54)))
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    png = (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 96, 54, 8, 2, 0, 0, 0)) + chunk(b"IDAT", raw)
-           + chunk(b"IEND", b""))
+    header = struct.pack(">IIBBBBB", 96, 54, 8, 2, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
     lens = struct.pack("<Q", 1) + struct.pack("<iiQQ4d", 1, 1, 96, 54, 90.0, 90.0, 47.0, 28.0)
     (model / "cameras.bin").write_bytes(lens)
-    lines = [struct.pack("<Q", cameras)]
+    records = [struct.pack("<Q", cameras)]
     for number in range(cameras):
         angle = 0.01 * number
         name = f"{number + 1:04d}.png"
         (images / name).write_bytes(png)
-        lines.append(struct.pack("<i7di", number + 1, np.cos(angle), 0, np.sin(angle), 0, 0, 0, 4, 1) + name.encode()
+        records.append(struct.pack("<i7di", number + 1, np.cos(angle), 0, np.sin(angle), 0, 0, 0, 4, 1) + name.encode()
                      + b"\0" + struct.pack("<Q", 0))
-    (model / "images.bin").write_bytes(b"".join(lines))
+    (model / "images.bin").write_bytes(b"".join(records))
     xyz = np.random.default_rng(0).normal(size=(POINTS, 3))
     points = [struct.pack("<Q", POINTS)]
     points += [struct.pack("<Q3d3BdQ", number, *place, 200, 100, 50, 0.5, 0) for number, place in enumerate(xyz)]
@@ -72,16 +72,16 @@ def make_flare(path: Path) -> Path:
     """Write a .flare of one light with numpy alone: random weights, empty hash tables."""
     random = np.random.default_rng(1)
     widths = {"positions": 1, "log_scales": 2, "rotations": 2, "opacity_logits": 1, "sh": 3, "rings": 2}
-    n = GAUSSIANS
-    arrays = {f"0.gaussians.{name}": random.normal(size=(n, width)) for name, width in widths.items()}
-    arrays["0.gaussians.log_scales"] = np.log(random.uniform(0.01, 0.06, (n, 2)))
+    count = GAUSSIANS
+    arrays = {f"0.gaussians.{name}": random.normal(size=(count, width)) for name, width in widths.items()}
+    arrays["0.gaussians.log_scales"] = np.log(random.uniform(0.01, 0.06, (count, 2)))
     arrays["0.gaussians.opacity_logits"] -= 3
-    arrays["0.gaussians.rings"] = np.zeros((n, 2))
-    arrays["0.gaussians.offsets"], arrays["0.gaussians.latent"] = np.zeros((n, 2)), random.normal(size=(n, 4))
+    arrays["0.gaussians.rings"] = np.zeros((count, 2))
+    arrays["0.gaussians.offsets"], arrays["0.gaussians.latent"] = np.zeros((count, 2)), random.normal(size=(count, 4))
     # Two features for each level of two hash grids; the offsets of every parameter and of the place on the plane.
-    view, heads = 4 * LEVELS, sum(widths.values()) + 2
-    shapes = {"view_layer": (128, view), "layers.0": (128, 128), "layers.1": (128, 128), "head": (heads, 128),
-              "correction.0": (128, view), "correction.2": (2, 128)}
+    features, outputs = 4 * LEVELS, sum(widths.values()) + 2
+    shapes = {"view_layer": (128, features), "layers.0": (128, 128), "layers.1": (128, 128), "head": (outputs, 128),
+              "correction.0": (128, features), "correction.2": (2, 128)}
     for name, shape in shapes.items():
         arrays[f"0.network.{name}.weight"] = random.normal(size=shape) * 0.02
         arrays[f"0.network.{name}.bias"] = np.zeros(shape[0])
@@ -98,27 +98,27 @@ def make_flare(path: Path) -> Path:
                                                                "data_offsets": [len(body), len(body)]}
     form = {"line": True, "light_correction": True, "plane_offset": True, "solid": False, "sh_degree": 0,
             "static_offset": True, "rings": True, "latent": 4, "levels": LEVELS}
-    reach = {"camera_low": [-5, -5, -5], "camera_high": [5, 5, 5], "light_high": [0.6, 0.4, 0.7]}
+    query_range = {"camera_low": [-5, -5, -5], "camera_high": [5, 5, 5], "light_high": [0.6, 0.4, 0.7]}
     camera = {"width": 96, "height": 54, "fx": 90.0, "fy": 90.0, "cx": 47.0, "cy": 28.0}
-    description = {"version": 1, "blend": "add", "camera": camera,
-                   "lights": [{"name": "lamp", "xyz": [0.3, -0.2, 1.0], "form": form, "range": reach, "count": n}]}
+    light = {"name": "lamp", "xyz": [0.3, -0.2, 1.0], "form": form, "range": query_range, "count": count}
+    description = {"version": 1, "blend": "add", "camera": camera, "lights": [light]}
     header["__metadata__"] = {"fit_flare": json.dumps(description)}
     text = json.dumps(header).encode()
     path.write_bytes(len(text).to_bytes(8, "little") + text + body)
     return path
 
 
-def time_range(call: Any, times: int = 10) -> tuple[float, float]:
-    """Return the fastest and the slowest of `times` calls, ms."""
+def time_range(call: Any, repeats: int = 10) -> tuple[float, float]:
+    """Return the fastest and the slowest of `repeats` calls, ms."""
     times_ms = []
-    for _ in range(times):
+    for _ in range(repeats):
         start = time.perf_counter()
         call()
         times_ms.append(1e3 * (time.perf_counter() - start))
     return min(times_ms), max(times_ms)
 
 
-def time_lamps(looks: Any, overlay: Any, look: Path, window: Any) -> list[str]:
+def time_lamp_overlay(looks: Any, overlay: Any, look: Path, window: Any) -> list[str]:
     """Return lines on the overlay of a hundred lamps with one look, with a camera that moves and one that stands.
 
     looks, overlay: modules of the add-on. look: a .flare. window: the region that is drawn.
@@ -136,17 +136,17 @@ def time_lamps(looks: Any, overlay: Any, look: Path, window: Any) -> list[str]:
         lamp.location = random.uniform(-4, 4), 10, random.uniform(-2, 2)
     looks.show_look(scene, look, lamps, add=True)
     lines = []
-    for moves in (True, False):
-        def frame(moves: bool = moves) -> None:
-            camera.location.x += 0.01 * moves
+    for camera_moves in (True, False):
+        def draw_frame(camera_moves: bool = camera_moves) -> None:
+            camera.location.x += 0.01 * camera_moves
             bpy.context.view_layer.update()
             flares = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), camera)
             overlay.quads_by_level(overlay.concatenate(list(flares.values())), window, looks.look_of(scene))
 
-        frame()
-        fast, slow = time_range(frame, 5)
+        draw_frame()
+        fast, slow = time_range(draw_frame, 5)
         lines.append(f"overlay of {LAMPS} lamps with one look, all but the GPU, camera "
-                     f"{'moves' if moves else 'stands'}: {fast:.0f} to {slow:.0f} ms")
+                     f"{'moves' if camera_moves else 'stands'}: {fast:.0f} to {slow:.0f} ms")
     return lines
 
 
@@ -186,18 +186,19 @@ def main() -> None:
 
         look = looks.look_of(scene)
 
-        def frame(*, moves: bool = True) -> None:
+        def draw_frame(*, moves: bool = True) -> None:
             if moves:  # the network is needed again
                 scene.camera.delta_location.x += 1e-4
                 bpy.context.view_layer.update()
             gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
             overlay.quads_by_level(gaussians, window, look)
 
-        frame()
-        fast, slow = time_range(frame, 20)
+        draw_frame()
+        fast, slow = time_range(draw_frame, 20)
         count = sum(map(len, looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
         lines.append(f"overlay of {count} Gaussians, all but the GPU: {fast:.1f} to {slow:.1f} ms")
-        lines += time_lamps(looks, overlay, load_module("flare_addon.library").BOX / "Anamorphic Blue.flare", window)
+        library_look = load_module("flare_addon.library").BOX / "Anamorphic Blue.flare"
+        lines += time_lamp_overlay(looks, overlay, library_look, window)
     print("\n".join(lines))
     sys.stdout.flush()
     os._exit(0)

@@ -50,45 +50,45 @@ class Tally:
 
     def add(self, picture: LitPicture, detections: Sequence[Detection]) -> None:
         """Count one picture; a detection hits every light whose mask has its centroid."""
-        claimed = union_mask(detections, picture.picture.size)
+        detected = union_mask(detections, picture.picture.size)
         for name, truth in (("shape", picture.masks.any(axis=0)), ("glare", picture.clipped)):
-            self.pixels[name] += [(claimed & truth).sum(), (claimed & ~truth).sum(), (truth & ~claimed).sum()]
-        hit = set()
+            self.pixels[name] += [(detected & truth).sum(), (detected & ~truth).sum(), (truth & ~detected).sum()]
+        hit_lights = set()
         for detection in detections:
             x, y = detection.xy.astype(int)
-            on = np.flatnonzero(picture.masks[:, y, x])
-            hit.update(on.tolist())
-            self.false += not len(on)
-        self.detected += len(hit)
+            lights_below = np.flatnonzero(picture.masks[:, y, x])
+            hit_lights.update(lights_below.tolist())
+            self.false += not len(lights_below)
+        self.detected += len(hit_lights)
         self.lights += len(picture.masks)
 
-    def row(self, truth: str) -> tuple[float, float, float, float]:
+    def scores(self, truth: str) -> tuple[float, float, float, float]:
         """Return precision, recall, F1 and IoU by pixel. truth: "shape" or "glare"."""
         hit, false, missed = self.pixels[truth]
         precision, recall = hit / max(hit + false, 1), hit / max(hit + missed, 1)
-        harmonic = 2 * precision * recall / max(precision + recall, 1e-9)
-        return precision, recall, harmonic, hit / max(hit + false + missed, 1)
+        f1 = 2 * precision * recall / max(precision + recall, 1e-9)
+        return precision, recall, f1, hit / max(hit + false + missed, 1)
 
 
-def pictures(photos: Sequence[Path], number: int, seed: int) -> Iterator[LitPicture]:
+def compose_pictures(photos: Sequence[Path], number: int, seed: int) -> Iterator[LitPicture]:
     """Yield `number` compositions of 1 to 5 lights over the photographs in turn."""
     for i in range(number):
         rng = np.random.default_rng((seed, i))
         yield compose_lights(read_picture(photos[i % len(photos)]), rng, int(rng.integers(1, 6)))
 
 
-def in_pictures(detector: Detector, photos: Sequence[Path], number: int, seed: int) -> dict[float, Tally]:
+def detect_in_pictures(detector: Detector, photos: Sequence[Path], number: int, seed: int) -> dict[float, Tally]:
     """Return tallies by threshold; the detector, made for the lowest, runs once for each picture."""
     tallies = {threshold: Tally() for threshold in THRESHOLDS}
-    for picture in pictures(photos, number, seed):
+    for picture in compose_pictures(photos, number, seed):
         detections = detector.detect(picture.picture)
         for threshold, tally in tallies.items():
             tally.add(picture, [detection for detection in detections if detection.score >= threshold])
     return tallies
 
 
-def in_captures(folders: Sequence[Path], detector: Detector) -> None:
-    """Print the 3D error of every light of every capture, of the nearest found light that is not taken yet."""
+def print_capture_errors(folders: Sequence[Path], detector: Detector) -> None:
+    """Print, for every light of every capture, the error of the nearest detected light that no other light has."""
     print(f"{'capture':24s} {'light':12s} {'error':>9s} {'of extent':>9s} {'median px':>9s} {'support':>8s}")
     for folder in folders:
         try:
@@ -104,14 +104,14 @@ def in_captures(folders: Sequence[Path], detector: Detector) -> None:
                 continue
             nearest = min(unmatched, key=lambda other: float(np.linalg.norm(other.xyz - light.xyz)))
             unmatched.remove(nearest)
-            off = []
+            pixel_errors = []
             for view in capture.views:
                 pixel, depth = view.camera.project([light.xyz])
                 if view.camera.contains(pixel, depth)[0]:
-                    off.append(np.linalg.norm(view.camera.project([nearest.xyz])[0][0] - pixel[0]))
+                    pixel_errors.append(np.linalg.norm(view.camera.project([nearest.xyz])[0][0] - pixel[0]))
             error = float(np.linalg.norm(nearest.xyz - light.xyz))
             print(f"{folder.name:24s} {light.name:12s} {error:9.4f} {error / capture.extent:9.4f} "
-                  f"{np.median(off):9.3f} {len(nearest.support):4d}/{nearest.visible}")
+                  f"{np.median(pixel_errors):9.3f} {len(nearest.support):4d}/{nearest.visible}")
         print(f"{folder.name:24s} {len(capture.lights)} lights, {len(lights)} found, {len(unmatched)} false")
 
 
@@ -137,26 +137,28 @@ def main() -> None:
             if not photos:
                 print(f"{method}: skipped, {args.photos} holds no photographs.")
             else:
-                _print(method, in_pictures(detector, photos, args.pictures, args.seed), args.pictures)
+                tallies = detect_in_pictures(detector, photos, args.pictures, args.seed)
+                _print_picture_scores(method, tallies, args.pictures)
         if args.capture:
-            in_captures(args.capture, detector_for(method, None, args.boxes, args.masks))
+            print_capture_errors(args.capture, detector_for(method, None, args.boxes, args.masks))
     if args.photos is None and not args.capture:
         print("Nothing to measure: give --photos FOLDER, --capture FOLDER or both.")
 
 
-def _print(method: str, tallies: dict[float, Tally], number: int) -> None:
+def _print_picture_scores(method: str, tallies: dict[float, Tally], number: int) -> None:
     """Print precision, recall, F1 and IoU of each threshold. number: of pictures."""
     print(f"{method}, {number} pictures, {next(iter(tallies.values())).lights} lights")
     print("          |        shape             |        glare             | by light")
     print("threshold |  P     R     F1    IoU   |  P     R     F1    IoU   | recall  precision  false per picture")
     for threshold, tally in tallies.items():
-        cells = " | ".join(" ".join(f"{x:.3f}" for x in tally.row(truth)) + " " for truth in ("shape", "glare"))
+        cells = " | ".join(" ".join(f"{score:.3f}" for score in tally.scores(truth)) + " "
+                           for truth in ("shape", "glare"))
         precision = tally.detected / max(tally.detected + tally.false, 1)
         print(f"   {threshold:.2f}   | {cells} |  {tally.detected / max(tally.lights, 1):.3f}    {precision:.3f}      "
               f"{tally.false / number:.2f}")
     for truth in ("shape", "glare"):
-        threshold = max(tallies, key=lambda t: tallies[t].row(truth)[2])
-        print(f"best F1 by {truth}: {tallies[threshold].row(truth)[2]:.3f} at threshold {threshold:.2f}")
+        threshold = max(tallies, key=lambda candidate: tallies[candidate].scores(truth)[2])
+        print(f"best F1 by {truth}: {tallies[threshold].scores(truth)[2]:.3f} at threshold {threshold:.2f}")
 
 
 if __name__ == "__main__":

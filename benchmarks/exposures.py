@@ -31,71 +31,73 @@ from core.images.picture import Picture
 from core.metrics.evaluation import LAYERS, evaluate
 
 COLUMNS = ("mode", "frames", "fitted as", *LAYERS, "error, stops")
-ROUNDS = 1.5
+PERIODS = 1.5
 """Periods of the exposure's variation along the shot."""
 
 
-class Drifting(Capture):
-    """A capture whose light is multiplied by a factor for each view, `times` by name.
+class DriftingCapture(Capture):
+    """A capture whose light is multiplied by a factor for each view, `factors` by its name.
 
     Frames and clean frames are clipped at white and rounded to 8 bits; exact layers are not.
     """
 
-    def __init__(self, capture: Capture, times: Mapping[str, float]) -> None:
+    def __init__(self, capture: Capture, factors: Mapping[str, float]) -> None:
         self.__dict__.update(capture.__dict__)
-        self.times = times
+        self.factors = factors
 
     def frame(self, view: View, size: tuple[int, int] | None = None) -> Picture:
         """Return the frame as a camera of that exposure films it."""
-        return self._filmed(super().frame(view, size), view)
+        return self._filmed_frame(super().frame(view, size), view)
 
     def removed(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
         """Return its clean frame."""
         picture = super().removed(view, size)
-        return None if picture is None else self._filmed(picture, view)
+        return None if picture is None else self._filmed_frame(picture, view)
 
     def truth_scene(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
         """Return its exact scene layer."""
-        return self._lit(super().truth_scene(view, size), view)
+        return self._scaled_layer(super().truth_scene(view, size), view)
 
     def truth_flare(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
         """Return its exact flare layer."""
-        return self._lit(super().truth_flare(view, size), view)
+        return self._scaled_layer(super().truth_flare(view, size), view)
 
-    def _filmed(self, picture: Picture, view: View) -> Picture:
-        light = picture.linear() * np.float32(self.times[view.name])
+    def _filmed_frame(self, picture: Picture, view: View) -> Picture:
+        light = picture.linear() * np.float32(self.factors[view.name])
         return Picture(np.round(srgb_from_linear(light).clip(0, 1) * 255) / np.float32(255), "srgb")
 
-    def _lit(self, picture: Picture | None, view: View) -> Picture | None:
-        return None if picture is None else replace(picture, pixels=picture.pixels * np.float32(self.times[view.name]))
+    def _scaled_layer(self, picture: Picture | None, view: View) -> Picture | None:
+        if picture is None:
+            return None
+        return replace(picture, pixels=picture.pixels * np.float32(self.factors[view.name]))
 
 
-def scores(run: Run, capture: Capture) -> list[str]:
-    """Return the PSNR of each of LAYERS, dB, as text: means over the held-out views, "-" for a layer without."""
+def layer_scores(run: Run, capture: Capture) -> list[str]:
+    """Return the PSNR of each of LAYERS, dB, as text: means over the held-out views, "-" for a layer without scores."""
     _, views = capture.with_exposures(run.exposures).split(run.settings.holdout)
     cameras = {view: view.camera.scaled(run.settings.width) for view in views}
     results: dict[str, Any] = evaluate(run, capture, cameras)
     return [f"{results[layer]['psnr']:.2f}" if layer in results else "-" for layer in LAYERS]
 
 
-def compare(capture: Capture, mode: str, args: argparse.Namespace) -> list[list[str]]:
+def compare_exposures(capture: Capture, mode: str, args: argparse.Namespace) -> list[list[str]]:
     """Return a row for the unchanged capture, and one for each way to fit the drifting one."""
     count = len(capture.views)
-    stops = {view.name: args.stops * math.sin(2 * math.pi * ROUNDS * number / count)
+    stops = {view.name: args.stops * math.sin(2 * math.pi * PERIODS * number / count)
              for number, view in enumerate(capture.views)}
-    drifting = Drifting(capture, {name: 2**stop for name, stop in stops.items()})
+    drifting = DriftingCapture(capture, {name: 2**stop for name, stop in stops.items()})
     rows = []
     for name, frames, exposure in (("as they are", capture, "measured"), ("drifting", drifting, "fixed"),
-                           ("drifting", drifting, "measured")):
+                                   ("drifting", drifting, "measured")):
         settings = replace(preset(args.preset, mode=mode), width=args.size, exposure=exposure)  # type: ignore[arg-type]
-        with tempfile.TemporaryDirectory() as place:
-            run = fit(frames, settings, Path(place) / "run")
-            error = _error(run.exposures, stops if frames is drifting else {})
-            rows.append([mode, name, exposure, *scores(run, frames), error])
+        with tempfile.TemporaryDirectory() as folder:
+            run = fit(frames, settings, Path(folder) / "run")
+            error = _exposure_error(run.exposures, stops if frames is drifting else {})
+            rows.append([mode, name, exposure, *layer_scores(run, frames), error])
     return rows
 
 
-def _error(estimated: Mapping[str, float], stops: Mapping[str, float]) -> str:
+def _exposure_error(estimated: Mapping[str, float], stops: Mapping[str, float]) -> str:
     """Return the standard deviation of estimated exposures from the true ones, stops, as text.
 
     estimated: factors by view. stops: true exposures by view; {} for a constant one.
@@ -116,7 +118,7 @@ def main() -> None:
     for folder in args.captures:
         capture = Capture.open(folder)
         modes = ["split", *(["default"] if capture.has_removed or capture.has_truth else [])]
-        rows = [row for mode in modes for row in compare(capture, mode, args)]
+        rows = [row for mode in modes for row in compare_exposures(capture, mode, args)]
         print(f"{folder.name}, {args.stops:g} stops to either side, preset {args.preset}, {args.size} pixels\n")
         print(report.table(COLUMNS, rows))
 

@@ -32,7 +32,7 @@ def side_by_side(capture: Capture, name: str, runs: list[Run]) -> Pixels:
 
     Raises CaptureError if the view or its layers are missing.
     """
-    view = next((each for each in capture.views if Path(each.name).stem == Path(name).stem), None)
+    view = next((candidate for candidate in capture.views if Path(candidate.name).stem == Path(name).stem), None)
     if view is None:
         raise CaptureError(f"{capture.folder} has no view {name}; give a frame's name.")
     camera = Frames(capture, runs[0].settings.width).camera(view)

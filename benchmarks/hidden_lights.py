@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from core.capture import Camera, View
+from core.capture.renderer import ViewRenderer
 from core.errors import CaptureError
-from core.metrics.evaluation import Renderer
 from core.system.files import read_json
 
 SHARES = "truth/visible_share.json"
 """File of a sample capture: visibility by frame and light, the share of its disc that no geometry hides, 0..1."""
 
 
-def hidden_flare(renderer: Renderer, folder: Path, cameras: Mapping[View, Camera]) -> dict[str, Any] | None:
+def hidden_flare(renderer: ViewRenderer, folder: Path, cameras: Mapping[View, Camera]) -> dict[str, Any] | None:
     """Return energies of the lights' flares (means of the linear layer over pixels and channels), averaged over views
     and lights.
 

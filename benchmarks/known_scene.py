@@ -41,11 +41,11 @@ class KnownScene(Trainer):
 
 
 @torch.no_grad()
-def score(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
+def score_flare(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
     """Return mean scores over views: of the flare as |composite - scene| in display space, compared with exact layers
     or, without these, with frames and clean frames, whose noise is no error of a fit; and of the linear layer outside
     clipped pixels, compared with the exact one."""
-    display, linear, relative = [], [], []
+    display_psnr, linear_psnr, relative_errors = [], [], []
     for view in views:
         targets = trainer.frames.targets(view)
         assert targets.clean is not None
@@ -54,18 +54,19 @@ def score(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
             continue
         picture = composite(targets.clean, flare, trainer.settings.blend)
         rendered_display = (picture - targets.clean).abs().numpy()
-        scene, truth = (exact(view, targets.camera.size) for exact in (trainer.capture.truth_scene,
+        scene, truth = (read_layer(view, targets.camera.size) for read_layer in (trainer.capture.truth_scene,
                                                                        trainer.capture.truth_flare))
         if scene is None or truth is None:
-            display.append(psnr(rendered_display, (targets.frame - targets.clean).abs().numpy()))
+            display_psnr.append(psnr(rendered_display, (targets.frame - targets.clean).abs().numpy()))
             continue
         with_flare = srgb_from_linear(scene.linear() + truth.linear()).clip(0, 1)
-        display.append(psnr(rendered_display, np.abs(with_flare - srgb_from_linear(scene.linear()).clip(0, 1))))
-        keep = ~unscored_mask(trainer.capture, view, targets.camera.size)
+        display_psnr.append(psnr(rendered_display, np.abs(with_flare - srgb_from_linear(scene.linear()).clip(0, 1))))
+        is_scored = ~unscored_mask(trainer.capture, view, targets.camera.size)
         rendered = flare.colour if trainer.settings.blend == "add" else decode(picture) - decode(targets.clean)
-        linear.append(psnr(rendered.numpy(), truth.linear(), keep))
-        relative.append(relative_l2(rendered.numpy(), truth.linear(), keep))
-    return {"flare": {"psnr": _mean(display)}, "flare_linear": {"psnr": _mean(linear), "relative_l2": _mean(relative)}}
+        linear_psnr.append(psnr(rendered.numpy(), truth.linear(), is_scored))
+        relative_errors.append(relative_l2(rendered.numpy(), truth.linear(), is_scored))
+    return {"flare": {"psnr": _mean(display_psnr)},
+            "flare_linear": {"psnr": _mean(linear_psnr), "relative_l2": _mean(relative_errors)}}
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -52,11 +52,11 @@ def write_sheet(file: Path, settings: TracedFlareSettings, model: FlareModel, pa
 
     path: the tracing along the path; its places are spread evenly, without the ends.
     """
-    chosen = np.linspace(1, len(path.places) - 2, SHEET_ROWS).round().astype(int)
-    fitted = draw_fitted(model, traced_camera(settings), path.places[chosen])
-    rows = [side_by_side([srgb_from_linear(np.clip(truth, 0, 1)), srgb_from_linear(np.clip(drawn, 0, 1)),
-                          np.clip(0.5 + drawn - truth, 0, 1)])
-            for truth, drawn in zip(path.pictures[chosen], fitted, strict=True)]
+    indices = np.linspace(1, len(path.places) - 2, SHEET_ROWS).round().astype(int)
+    fitted = draw_fitted(model, traced_camera(settings), path.places[indices])
+    rows = [side_by_side([srgb_from_linear(np.clip(traced_flare, 0, 1)), srgb_from_linear(np.clip(fitted_flare, 0, 1)),
+                          np.clip(0.5 + fitted_flare - traced_flare, 0, 1)])
+            for traced_flare, fitted_flare in zip(path.pictures[indices], fitted, strict=True)]
     write_png(file, np.concatenate(rows))
 
 
@@ -71,7 +71,7 @@ def main() -> int:
     print("| lens | focal length, mm | surfaces | mean error | largest error | time, s |\n| --- " + "| ---: " * 5 + "|")
     errors: list[float] = []
     for name in args.lenses:
-        began = time.monotonic()
+        start = time.monotonic()
         try:
             settings = TracedFlareSettings().override({**dict(map(parse_setting, args.changes)), "lens": name})
             setup, progress = exposed_setup(settings), TerminalProgress()
@@ -81,14 +81,14 @@ def main() -> int:
             continue
         traced = trace(settings, setup, spread_places(settings), progress, "trace")
         model = fit_traced(settings, setup, traced, progress)
-        seconds = time.monotonic() - began
+        seconds = time.monotonic() - start
         path = trace(settings, setup, path_places(settings), progress, "measure")
         progress.close()
-        here = relative_errors(model, traced_camera(settings), path)
-        errors.append(float(np.mean(here)))
+        path_errors = relative_errors(model, traced_camera(settings), path)
+        errors.append(float(np.mean(path_errors)))
         lens = find_lens(name)
         print(f"| {Path(name).stem} | {settings.used_focal_length:.1f} | {len(lens.index) - 1} | {errors[-1]:.3f} | "
-              f"{max(here):.3f} | {seconds:.0f} |", flush=True)
+              f"{max(path_errors):.3f} | {seconds:.0f} |", flush=True)
         if args.sheets:
             args.sheets.mkdir(parents=True, exist_ok=True)
             write_sheet(args.sheets / f"{Path(name).stem}.png", settings, model, path)

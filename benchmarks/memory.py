@@ -32,19 +32,19 @@ RUN = ROOT / "headless" / "run.py"
 
 def measure_process(args: list[object]) -> tuple[float, float]:
     """Run a process; return its peak resident memory, MiB, and its seconds. Raises RuntimeError if it fails."""
-    began = time.monotonic()
-    with tempfile.TemporaryFile() as noise:
-        child = subprocess.Popen(list(map(str, args)), stdout=subprocess.DEVNULL, stderr=noise)
+    start = time.monotonic()
+    with tempfile.TemporaryFile() as error_output:
+        child = subprocess.Popen(list(map(str, args)), stdout=subprocess.DEVNULL, stderr=error_output)
         _, status, usage = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)
         if child.returncode:
-            noise.seek(0)
-            raise RuntimeError(noise.read().decode()[-2000:])
+            error_output.seek(0)
+            raise RuntimeError(error_output.read().decode()[-2000:])
     # In KiB, on macOS in bytes.
-    return usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1 << 20), time.monotonic() - began
+    return usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1 << 20), time.monotonic() - start
 
 
-def camera_at(angle: float, width: int, height: int) -> Camera:
+def camera_on_arc(angle: float, width: int, height: int) -> Camera:
     """Return a camera on an arc about the origin, 4 units away, that looks at it. angle: radians; y points down."""
     position = np.array([4 * np.sin(angle), -0.3, -4 * np.cos(angle)])
     forward = -position / np.linalg.norm(position)
@@ -61,26 +61,26 @@ def make_capture(folder: Path, count: int, width: int, height: int) -> Path:
     random = np.random.default_rng(0)
     xyz, rgb = random.uniform(-1.2, 1.2, (2000, 3)), random.integers(20, 235, (2000, 3))
     model = folder / "sparse" / "0"
-    lines = []
+    image_lines = []
     noise = random.integers(0, 24, (height, width, 3), np.uint8)
-    for kind in ("images", "removed"):
-        (folder / kind).mkdir(parents=True)
+    for folder_name in ("images", "removed"):
+        (folder / folder_name).mkdir(parents=True)
     for number in range(count):
-        camera = camera_at(1.2 * (number / max(count - 1, 1) - 0.5), width, height)
+        camera = camera_on_arc(1.2 * (number / max(count - 1, 1) - 0.5), width, height)
         picture = np.roll(noise, 31 * number, 1) + np.uint8(40)
         for (x, y), colour in zip(camera.project(xyz)[0], rgb, strict=True):
             cv2.circle(picture, (int(x), int(y)), width // 120, colour.tolist(), -1)
-        for kind in ("images", "removed"):
-            cv2.imwrite(str(folder / kind / f"{number:04d}.jpg"), picture)
+        for folder_name in ("images", "removed"):
+            cv2.imwrite(str(folder / folder_name / f"{number:04d}.jpg"), picture)
         pose = camera.world_to_camera
         pose_text = " ".join(map(str, (*quaternion_from_rotation(pose[:3, :3]), *pose[:3, 3])))
-        lines.append(f"{number + 1} {pose_text} 1 {number:04d}.jpg\n\n")
+        image_lines.append(f"{number + 1} {pose_text} 1 {number:04d}.jpg\n\n")
     lens = f"{0.9 * width} {0.9 * width} {width / 2} {height / 2}"
     write_text(model / "cameras.txt", f"1 PINHOLE {width} {height} {lens}\n")
-    write_text(model / "images.txt", "".join(lines))
+    write_text(model / "images.txt", "".join(image_lines))
     write_text(model / "points3D.txt", "".join(
-        f"{i + 1} {p[0]} {p[1]} {p[2]} {c[0]} {c[1]} {c[2]} 0.5\n"
-        for i, (p, c) in enumerate(zip(xyz, rgb, strict=True))))
+        f"{index + 1} {point[0]} {point[1]} {point[2]} {colour[0]} {colour[1]} {colour[2]} 0.5\n"
+        for index, (point, colour) in enumerate(zip(xyz, rgb, strict=True))))
     write_json(folder / "lights.json", {"lights": [{"name": "lamp", "xyz": [0.3, -0.6, 1.5]}]})
     return folder
 

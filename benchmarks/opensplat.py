@@ -45,7 +45,7 @@ PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
 """
 
 
-def build(checkout: Path) -> Any:
+def build_module(checkout: Path) -> Any:
     """Build the rasterizer as a module with `forward` and `backward`. Raises SystemExit for another `checkout`."""
     from torch.utils.cpp_extension import load
 
@@ -64,7 +64,7 @@ def build(checkout: Path) -> Any:
 class Rasterizer:
     """A scene that is projected once; only its rasterization is repeated.
 
-    module: of `build`. camera: world to camera (4, 4) and intrinsics (3, 3). upstream: gradient of the
+    module: of `build_module`. camera: world to camera (4, 4) and intrinsics (3, 3). upstream: gradient of the
     picture (h, w, 3).
     """
 

@@ -23,6 +23,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -75,7 +76,7 @@ ITERATION_CASES = (
 )  # fmt: skip
 PEER_CASES = RASTER_CASES[:5]
 CURVE = (10_000, 20_000, 50_000, 100_000, 200_000, 350_000, 500_000)
-SLOW_FROM = 150_000
+TILES_LIMIT = 150_000
 """Number of Gaussians or pixels from which the kernel set `tiles` is omitted, since it takes too long."""
 
 
@@ -107,11 +108,11 @@ class Raster:
 
     def __init__(self, case: Case, rasterizer: Rasterizer, kernel_set: str | None, device: str) -> None:
         self.case, self.rasterizer, self.kernel_set = case, rasterizer, kernel_set
-        raw = workload.scene(case.gaussians)
+        raw = workload.make_scene(case.gaussians)
         values = (raw.means, raw.quaternions, raw.log_scales.exp(), raw.opacity_logits.sigmoid(), raw.sh)
         self.inputs = [value.to(device).requires_grad_() for value in values]
         self.camera = [torch.eye(4, device=device), workload.intrinsics(case.width, case.height).to(device)]
-        flares = workload.flares(case.flares, case.width, case.height)
+        flares = workload.make_flares(case.flares, case.width, case.height)
         self.flares = [value.to(device).requires_grad_() for value in flares]
         self.upstream = torch.randn(case.height, case.width, 3, generator=torch.Generator().manual_seed(0)).to(device)
 
@@ -140,8 +141,8 @@ class Iteration:
 
     def __init__(self, case: Case, kernel_set: str) -> None:
         self.case, self.kernel_set = case, kernel_set
-        self.scene = SceneGaussians(*workload.scene(case.gaussians))
-        self.flares = [torch.nn.Parameter(v) for v in workload.flares(case.flares, case.width, case.height)]
+        self.scene = SceneGaussians(*workload.make_scene(case.gaussians))
+        self.flares = [torch.nn.Parameter(v) for v in workload.make_flares(case.flares, case.width, case.height)]
         self.camera = (torch.eye(4), workload.intrinsics(case.width, case.height))
         self.target = torch.rand(case.height, case.width, 3, generator=torch.Generator().manual_seed(0))
         parameters = dict(self.scene.named_parameters())
@@ -155,9 +156,9 @@ class Iteration:
 
     def step(self) -> None:
         """Make one iteration: render, L1 + SSIM, backward and Adam."""
-        s, size = self.scene, (self.case.width, self.case.height)
+        scene, size = self.scene, (self.case.width, self.case.height)
         picture = rasterization(
-            s.means, s.quaternions, s.log_scales, s.opacity_logits, s.sh, *self.camera, *size,
+            scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits, scene.sh, *self.camera, *size,
             kernels=self.kernel_set, depth=False, raw=True,  # type: ignore[arg-type]
         ).colour  # fmt: skip
         if self.case.flares:
@@ -172,10 +173,10 @@ class Iteration:
         self.optimiser.step()
 
 
-def too_slow(name: str, case: Case) -> bool:
+def is_too_slow(name: str, case: Case) -> bool:
     """Return whether a case takes too long for the kernel set `torch` or `tiles`."""
     size = max(case.gaussians, case.width * case.height)
-    return (name == "torch" and size > 20_000) or (name == "tiles" and size >= SLOW_FROM)
+    return (name == "torch" and size > 20_000) or (name == "tiles" and size >= TILES_LIMIT)
 
 
 def raster_section(rasterizers: dict[str, Rasterizer], thread_counts: list[int], rounds: int, device: str) -> str:
@@ -183,7 +184,7 @@ def raster_section(rasterizers: dict[str, Rasterizer], thread_counts: list[int],
     work: dict[str, Callable[[], object]] = {}
     for case in RASTER_CASES:
         for name, rasterizer in rasterizers.items():
-            if too_slow(name, case) or (case.flares and name not in kernels.MODULES):
+            if is_too_slow(name, case) or (case.flares and name not in kernels.MODULES):
                 continue
             raster = Raster(case, rasterizer, name if name in kernels.MODULES else None, device)
             for count in thread_counts:
@@ -193,15 +194,15 @@ def raster_section(rasterizers: dict[str, Rasterizer], thread_counts: list[int],
     names = [name for name in rasterizers if any(f"|{name}|" in key for key in times)]
     parts = []
     for kind, title in (("forward", "Forward, ms"), ("both", "Forward + backward, ms")):
-        head = [title, *[f"{name}, {_thread_label(c)}" for name in names for c in thread_counts]]
-        few, many = thread_counts[0], thread_counts[-1]
-        head += [f"cpu, {few} to {many} threads", f"tiles / cpu, {_thread_label(many)}"]
+        head = [title, *[f"{name}, {_thread_label(count)}" for name in names for count in thread_counts]]
+        min_threads, max_threads = thread_counts[0], thread_counts[-1]
+        head += [f"cpu, {min_threads} to {max_threads} threads", f"tiles / cpu, {_thread_label(max_threads)}"]
         rows = []
         for case in RASTER_CASES:
-            cells = {(n, c): times.get(f"{case}|{n}|{c}|{kind}") for n in names for c in thread_counts}
-            speedup = _ratio(cells.get(("cpu", few)), cells.get(("cpu", many)))
-            relative_to_tiles = _ratio(cells.get(("tiles", many)), cells.get(("cpu", many)))
-            rows.append([str(case), *[milliseconds(v) for v in cells.values()], speedup, relative_to_tiles])
+            cells = {(n, count): times.get(f"{case}|{n}|{count}|{kind}") for n in names for count in thread_counts}
+            speedup = _ratio_text(cells.get(("cpu", min_threads)), cells.get(("cpu", max_threads)))
+            relative_to_tiles = _ratio_text(cells.get(("tiles", max_threads)), cells.get(("cpu", max_threads)))
+            rows.append([str(case), *[milliseconds(value) for value in cells.values()], speedup, relative_to_tiles])
         parts.append(table(head, rows))
     return "\n\n".join(parts)
 
@@ -215,7 +216,7 @@ def gpu_section(rounds: int) -> str:
     work: dict[str, Callable[[], object]] = {}
     for case in GPU_CASES:
         for name, device in rasterizers.items():
-            if not too_slow(name, case):
+            if not is_too_slow(name, case):
                 raster = Raster(case, our_rasterizer(name), name, device)
                 work |= {f"{case}|{name}|forward": raster.forward, f"{case}|{name}|both": raster.forward_backward}
     times = median_times(work, rounds)
@@ -227,26 +228,26 @@ def gpu_section(rounds: int) -> str:
     rows = []
     for case in GPU_CASES:
         cells = {(kind, n): times.get(f"{case}|{n}|{kind}") for kind in ("forward", "both") for n in rasterizers}
-        ratios = [_ratio(cells["both", name], cells["both", "cuda"]) for name in ("tiles", "cpu")]
+        ratios = [_ratio_text(cells["both", name], cells["both", "cuda"]) for name in ("tiles", "cpu")]
         rows.append([str(case), *[milliseconds(v) for v in cells.values()], *ratios])
     return table(head, rows)
 
 
-def iteration_section(sets: list[str], thread_counts: list[int], rounds: int) -> str:
-    """Return the table of training iterations. sets: names of kernel sets."""
+def iteration_section(kernel_sets: list[str], thread_counts: list[int], rounds: int) -> str:
+    """Return the table of training iterations. kernel_sets: their names."""
     work: dict[str, Callable[[], object]] = {}
     for case in ITERATION_CASES:
-        for name in sets:
-            if not too_slow(name, case):
+        for name in kernel_sets:
+            if not is_too_slow(name, case):
                 step = Iteration(case, name).step
                 work |= {f"{case}|{name}|{count}": on_threads(count, step) for count in thread_counts}
     times = median_times(work, rounds)
-    names = [name for name in sets if any(f"|{name}|" in key for key in times)]
+    names = [name for name in kernel_sets if any(f"|{name}|" in key for key in times)]
     rows = [
-        [str(case), *[milliseconds(times.get(f"{case}|{name}|{c}")) for name in names for c in thread_counts]]
+        [str(case), *[milliseconds(times.get(f"{case}|{name}|{count}")) for name in names for count in thread_counts]]
         for case in ITERATION_CASES
     ]
-    head = [f"{name}, {_thread_label(c)}" for name in names for c in thread_counts]
+    head = [f"{name}, {_thread_label(count)}" for name in names for count in thread_counts]
     return table(["A training iteration, ms", *head], rows)
 
 
@@ -279,105 +280,105 @@ def stage_section(thread_counts: list[int], rounds: int) -> str:
 def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
     """Return the median seconds of each stage over repetitions of a step; the stages are timed inside `parallel`."""
     step()  # loads the kernels
-    spent: dict[str, float] = {}
+    seconds: dict[str, float] = {}
     parallel = importlib.import_module("core.gaussians.cpu.threads").parallel
 
     def timed(function: Callable[..., object], *args: object, **options: object) -> None:
         start = time.perf_counter()
         parallel(function, *args, **options)
-        spent[function.__name__] = spent.get(function.__name__, 0.0) + time.perf_counter() - start
+        seconds[function.__name__] = seconds.get(function.__name__, 0.0) + time.perf_counter() - start
 
-    users = [module for name, module in sys.modules.items()
+    kernel_modules = [module for name, module in sys.modules.items()
              if name.startswith("core.gaussians.cpu.") and getattr(module, "parallel", None) is parallel]
     samples: dict[str, list[float]] = {name: [] for name in (*STAGES, "between the kernels", "iteration")}
-    for module in users:
+    for module in kernel_modules:
         module.parallel = timed  # type: ignore[attr-defined]
     try:
         for _ in range(3 + repeats):  # the first three are left out
-            spent.clear()
+            seconds.clear()
             iteration_time = time_once(step)
             for name, functions in STAGES.items():
-                samples[name].append(sum(spent.get(function, 0.0) for function in functions))
-            samples["between the kernels"].append(iteration_time - sum(spent.values()))
+                samples[name].append(sum(seconds.get(function, 0.0) for function in functions))
+            samples["between the kernels"].append(iteration_time - sum(seconds.values()))
             samples["iteration"].append(iteration_time)
     finally:
-        for module in users:
+        for module in kernel_modules:
             module.parallel = parallel  # type: ignore[attr-defined]
     return {name: statistics.median(values[3:]) for name, values in samples.items()}
 
 
-def flare_section(sets: list[str], rounds: int) -> str:
+def flare_section(kernel_sets: list[str], rounds: int) -> str:
     """Return a table of 2,000 flare Gaussians alone: both blends, plain and rings, at full and mixed resolution."""
     rows, work = [], {}
-    variants = [(b, r, m) for b in ("over", "add") for r in (False, True) for m in ("full", "mixed")]
+    variants = list(product(("over", "add"), (False, True), ("full", "mixed")))
     for width, height in ((480, 270), (960, 540)):
-        for name in sets:
-            for blend, ring, resolution in variants:
+        for name in kernel_sets:
+            for blend, has_ring, resolution in variants:
                 if name == "tiles" and width > 480:
                     continue
-                inputs = [v.requires_grad_() for v in workload.flares(2000, width, height)]
-                rings = torch.tensor([[1.0, 0.3]]).repeat(2000, 1) if ring else None
-                work[f"{width}|{name}|{blend}|{ring}|{resolution}"] = _splat_work(
+                inputs = [values.requires_grad_() for values in workload.make_flares(2000, width, height)]
+                rings = torch.tensor([[1.0, 0.3]]).repeat(2000, 1) if has_ring else None
+                work[f"{width}|{name}|{blend}|{has_ring}|{resolution}"] = _splat_function(
                     inputs, width, height, rings, blend, resolution, name
                 )
     times = median_times(work, rounds)
-    for blend, ring, resolution in variants:
-        row = [f"{blend}, {'ring r0 = 1, w = 0.3' if ring else 'plain'}, {resolution}"]
+    for blend, has_ring, resolution in variants:
+        row = [f"{blend}, {'ring r0 = 1, w = 0.3' if has_ring else 'plain'}, {resolution}"]
         for width in (480, 960):
             row += [
-                milliseconds(times.get(f"{width}|{name}|{blend}|{ring}|{resolution}"))
-                for name in sets
+                milliseconds(times.get(f"{width}|{name}|{blend}|{has_ring}|{resolution}"))
+                for name in kernel_sets
                 if not (name == "tiles" and width > 480)
             ]
         rows.append(row)
     head = ["2,000 flares, forward + backward, ms"]
     for size in ("480x270", "960x540"):
-        head += [f"{name}, {size}" for name in sets if not (name == "tiles" and size != "480x270")]
+        head += [f"{name}, {size}" for name in kernel_sets if not (name == "tiles" and size != "480x270")]
     return table(head, rows)
 
 
-def _splat_work(
-    inputs: list[Tensor], width: int, height: int, rings: Tensor | None, blend: str, resolution: str, name: str
+def _splat_function(
+    inputs: list[Tensor], width: int, height: int, rings: Tensor | None, blend: str, resolution: str, kernel_set: str
 ) -> Callable[[], object]:
-    """Return a function that splats the flare Gaussians `inputs`, forward and backward. name: of the kernel set."""
-    upstream = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0))
+    """Return a function that splats the flare Gaussians `inputs`, forward and backward."""
+    picture_gradient = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0))
 
     def run() -> None:
         for value in inputs:
             value.grad = None
         splats = splat(
-            *inputs, width, height, rings=rings, blend=blend, resolution=resolution, kernels=name  # type: ignore[arg-type]
+            *inputs, width, height, rings=rings, blend=blend, resolution=resolution, kernels=kernel_set  # type: ignore[arg-type]
         )
-        splats.colour.backward(upstream)
+        splats.colour.backward(picture_gradient)
 
     return run
 
 
 def curve_section(rasterizers: dict[str, Rasterizer], rounds: int, device: str, picture: Path) -> str:
     """Return a table of forward + backward by the number of Gaussians, and draw it as a picture."""
-    rows, lines = [], {}
-    fast = [name for name in rasterizers if name not in ("torch", "tiles")]
-    for name in fast:
+    rows, times_by_set = [], {}
+    fast_sets = [name for name in rasterizers if name not in ("torch", "tiles")]
+    for name in fast_sets:
         work: dict[str, Callable[[], object]] = {
-            str(n): Raster(Case(n, 480, 270), rasterizers[name], None, device).forward_backward for n in CURVE
+            str(size): Raster(Case(size, 480, 270), rasterizers[name], None, device).forward_backward for size in CURVE
         }
-        lines[name] = median_times(work, rounds)
-    for n in CURVE:
-        row = [f"{n // 1000}k"]
-        for name in fast:
-            seconds = lines[name][str(n)]
-            row += [milliseconds(seconds), f"{seconds / n * 1e9:.0f}"]
+        times_by_set[name] = median_times(work, rounds)
+    for size in CURVE:
+        row = [f"{size // 1000}k"]
+        for name in fast_sets:
+            seconds = times_by_set[name][str(size)]
+            row += [milliseconds(seconds), f"{seconds / size * 1e9:.0f}"]
         rows.append(row)
-    plot_times(lines, picture)
+    plot_times(times_by_set, picture)
     head = ["Gaussians, 480x270"]
-    for name in fast:
+    for name in fast_sets:
         head += [f"{name}, ms", f"{name}, ns a Gaussian"]
     return table(head, rows) + f"\n\n![Forward + backward against the number of Gaussians]({picture.name})"
 
 
 def peer_section(checkout: Path, rounds: int) -> str:
     """Return the table of OpenSplat's rasterizer, built from `checkout`, beside ours; it has colours in place of SH."""
-    module, rows = opensplat.build(checkout), []
+    module, rows = opensplat.build_module(checkout), []
     threads = torch.get_num_threads()
     for case in PEER_CASES:
         our_raster = Raster(case, our_rasterizer("cpu"), "cpu", "cpu")
@@ -392,33 +393,33 @@ def peer_section(checkout: Path, rounds: int) -> str:
         work = {"peer": opensplat_scene.forward_backward, "1": on_threads(1, our_raster.forward_backward),
                 "all": on_threads(threads, our_raster.forward_backward)}
         times = median_times(work, rounds)
-        ratios = [_ratio(times["peer"], times[key]) for key in ("1", "all")]
+        ratios = [_ratio_text(times["peer"], times[key]) for key in ("1", "all")]
         rows.append([str(case), *[milliseconds(times[key]) for key in work], *ratios, f"{difference:.1e}"])
     head = ["Forward + backward, ms", "OpenSplat, 1 thread", "cpu, 1 thread", f"cpu, {_thread_label(threads)}"]
     head += [f"OpenSplat / cpu, {_thread_label(count)}" for count in (1, threads)] + ["mean difference of the pictures"]
     return table(head, rows)
 
 
-def probe(what: str, name: str) -> dict[str, float]:
+def probe(measurement: str, kernel_set: str) -> dict[str, float]:
     """Return the figures of one measurement, which runs in a process of its own.
 
-    what: "start", seconds of the imports and of two iterations; "both", seconds of forward + backward; "memory", the
-    resident memory before training and its peak, MB. name: of the kernel set.
+    measurement: "start", seconds of the imports and of two iterations; "both", seconds of forward + backward; "memory",
+    the resident memory before training and its peak, MB.
     """
     case = Case(50_000, 480, 270)
-    if what == "start":
+    if measurement == "start":
         imported = time.perf_counter() - START
-        iteration = Iteration(Case(1000, 480, 270), name)
+        iteration = Iteration(Case(1000, 480, 270), kernel_set)
         times = []
         for _ in range(2):
             start = time.perf_counter()
             iteration.step()
             times.append(time.perf_counter() - start)
         return {"import": imported, "first": times[0], "second": times[1]}
-    if what == "both":
-        return median_times({"both": Raster(case, our_rasterizer(name), name, "cpu").forward_backward}, 5)
+    if measurement == "both":
+        return median_times({"both": Raster(case, our_rasterizer(kernel_set), kernel_set, "cpu").forward_backward}, 5)
     before = resident_memory()
-    iteration = Iteration(case, name)
+    iteration = Iteration(case, kernel_set)
     for _ in range(5):
         iteration.step()
     return {"before": before, "peak": peak_memory()}
@@ -428,8 +429,11 @@ def _thread_label(threads: int) -> str:
     return "1 thread" if threads == 1 else f"{threads} threads"
 
 
-def _ratio(a: float | None, b: float | None) -> str:
-    return "–" if a is None or b is None else f"{a / b:.2f}x" if a / b < 10 else f"{a / b:.0f}x"
+def _ratio_text(numerator: float | None, denominator: float | None) -> str:
+    if numerator is None or denominator is None:
+        return "–"
+    ratio = numerator / denominator
+    return f"{ratio:.2f}x" if ratio < 10 else f"{ratio:.0f}x"
 
 
 def main() -> None:
@@ -451,9 +455,9 @@ def main() -> None:
     rasterizers = {name: our_rasterizer(name) for name in args.kernels}
     if args.device == "cuda" and importlib.util.find_spec("gsplat"):
         rasterizers["gsplat"] = gsplat_rasterizer
-    for entry in args.rasterizer:
-        name, place = entry.split("=")
-        module, function = place.split(":")
+    for option in args.rasterizer:
+        name, function_path = option.split("=")
+        module, function = function_path.split(":")
         rasterizers[name] = getattr(importlib.import_module(module), function)
     rounds = 2 if args.quick else 5
     thread_counts = sorted(set(args.threads))

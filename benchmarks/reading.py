@@ -27,7 +27,7 @@ from core.images.read import read_picture
 from core.images.video import Video
 
 SIZE = 1920, 1080
-TO_709 = np.array([[1.04, -0.03, -0.01], [-0.02, 1.04, -0.02], [-0.01, -0.03, 1.04]], np.float32)
+BT709_MATRIX = np.array([[1.04, -0.03, -0.01], [-0.02, 1.04, -0.02], [-0.01, -0.03, 1.04]], np.float32)
 """In place of the matrix from BT.601 to BT.709: other numbers, the same cost."""
 
 
@@ -37,14 +37,15 @@ def write_inputs(folder: Path, frames: int) -> dict[str, Path]:
     scene = cv2.resize(random.integers(20, 220, (40, 60, 3), np.uint8), (SIZE[0] + frames, SIZE[1] + frames),
                        interpolation=cv2.INTER_CUBIC)
     grain = random.integers(0, 24, (SIZE[1], SIZE[0], 3), np.uint8)
-    pictures = [np.ascontiguousarray(scene[n:n + SIZE[1], n:n + SIZE[0]] + grain) for n in range(frames)]
+    pictures = [np.ascontiguousarray(scene[shift:shift + SIZE[1], shift:shift + SIZE[0]] + grain)
+                for shift in range(frames)]
     paths = {}
-    for bits, pixels in ((8, "yuv420p"), (10, "yuv420p10le")):
-        paths[f"HEVC, {bits} bits"] = folder / f"{bits}.mp4"
-        with av.open(str(folder / f"{bits}.mp4"), "w") as container:
+    for depth, pixel_format in ((8, "yuv420p"), (10, "yuv420p10le")):
+        paths[f"HEVC, {depth} bits"] = folder / f"{depth}.mp4"
+        with av.open(str(folder / f"{depth}.mp4"), "w") as container:
             stream = container.add_stream("libx265", rate=25, options={"preset": "ultrafast", "crf": "22",
                                                                        "x265-params": "log-level=none"})
-            stream.width, stream.height, stream.pix_fmt = *SIZE, pixels
+            stream.width, stream.height, stream.pix_fmt = *SIZE, pixel_format
             for picture in pictures:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
             container.mux(stream.encode())
@@ -56,18 +57,18 @@ def write_inputs(folder: Path, frames: int) -> dict[str, Path]:
     return paths
 
 
-def read_by_capture(path: Path) -> int:
+def read_video_by_opencv(path: Path) -> int:
     """Decode a video by OpenCV to float R G B, with the work that right colours cost; return the number of frames."""
     capture, count = cv2.VideoCapture(str(path)), 0
     while True:
-        good, frame = capture.read()
-        if not good:
+        has_frame, frame = capture.read()
+        if not has_frame:
             return count
-        cv2.transform(frame, TO_709)[..., ::-1].astype(np.float32) / np.float32(255)
+        cv2.transform(frame, BT709_MATRIX)[..., ::-1].astype(np.float32) / np.float32(255)
         count += 1
 
 
-def read_by_video(path: Path) -> int:
+def read_video(path: Path) -> int:
     """Read a video by this program; return the number of frames."""
     count = 0
     with Video(path) as video:
@@ -77,8 +78,8 @@ def read_by_video(path: Path) -> int:
     return count
 
 
-def read_by_imread(folder: Path) -> int:
-    """Read pictures by OpenCV, as float R G B at 0..1."""
+def read_pictures_by_opencv(folder: Path) -> int:
+    """Read pictures by OpenCV, as float R G B at 0..1; return their number."""
     files = sorted(folder.iterdir())
     for file in files:
         stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
@@ -86,25 +87,26 @@ def read_by_imread(folder: Path) -> int:
     return len(files)
 
 
-def read_by_picture(folder: Path) -> int:
-    """Read pictures by this program."""
+def read_pictures(folder: Path) -> int:
+    """Read pictures by this program; return their number."""
     files = sorted(folder.iterdir())
     for file in files:
         np.ascontiguousarray(read_picture(file).pixels)
     return len(files)
 
 
-def measure(readers: dict[str, Callable[[Path], int]], path: Path, frames: int,
+def fastest_times(readers: dict[str, Callable[[Path], int]], path: Path, frames: int,
             rounds: int) -> dict[str, tuple[float, float]]:
-    """Return for each reader the milliseconds per frame, of the clock and of the processor: the least of all rounds."""
-    best = dict.fromkeys(readers, (np.inf, np.inf))
+    """Return for each reader the milliseconds per frame by the clock and by processor time, of its fastest round."""
+    fastest = dict.fromkeys(readers, (np.inf, np.inf))
     for _ in range(rounds):
         for name, read in readers.items():
-            clock, processor = time.perf_counter(), time.process_time()
+            start, cpu_start = time.perf_counter(), time.process_time()
             assert read(path) == frames
-            took = time.perf_counter() - clock, time.process_time() - processor
-            best[name] = (min(best[name][0], took[0] / frames * 1e3), min(best[name][1], took[1] / frames * 1e3))
-    return best
+            elapsed, cpu_elapsed = time.perf_counter() - start, time.process_time() - cpu_start
+            fastest[name] = (min(fastest[name][0], elapsed / frames * 1e3),
+                             min(fastest[name][1], cpu_elapsed / frames * 1e3))
+    return fastest
 
 
 def main() -> None:
@@ -117,12 +119,12 @@ def main() -> None:
     print("| --- | --- | --- | --- | --- |")
     with tempfile.TemporaryDirectory() as name:
         for kind, path in write_inputs(Path(name), args.frames).items():
-            readers = ({"old": read_by_imread, "new": read_by_picture} if path.is_dir() else
-                       {"old": read_by_capture, "new": read_by_video})
-            times = measure(readers, path, args.frames, args.rounds)
-            (old, old_cpu), (new, new_cpu) = times["old"], times["new"]
-            print(f"| {kind} | {old:.1f} ({old_cpu:.1f}) | {new:.1f} ({new_cpu:.1f}) | {new / old:.2f} | "
-                  f"{new_cpu / old_cpu:.2f} |", flush=True)
+            readers = ({"OpenCV": read_pictures_by_opencv, "ours": read_pictures} if path.is_dir() else
+                       {"OpenCV": read_video_by_opencv, "ours": read_video})
+            times = fastest_times(readers, path, args.frames, args.rounds)
+            (opencv, opencv_cpu), (ours, ours_cpu) = times["OpenCV"], times["ours"]
+            print(f"| {kind} | {opencv:.1f} ({opencv_cpu:.1f}) | {ours:.1f} ({ours_cpu:.1f}) | {ours / opencv:.2f} | "
+                  f"{ours_cpu / opencv_cpu:.2f} |", flush=True)
 
 
 if __name__ == "__main__":

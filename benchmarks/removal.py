@@ -45,7 +45,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -89,17 +89,17 @@ def draw_plate(path: Path, width: int, height: int) -> None:
 
 def measure_plate(plate: Path, size: int = WORKING_SIZE, weights: Path | None = None) -> None:
     """Print seconds and peak megabytes of one plate; `speed` runs it in a process of its own."""
-    began = time.perf_counter()
+    start = time.perf_counter()
     remover = Remover(weights, working_size=size)
     loaded = time.perf_counter()
     remove_all([plate], plate.parent / "out", remover, Progress(), overwrite=True)
     first = time.perf_counter()
     remove_all([plate], plate.parent / "out", remover, Progress(), overwrite=True)
-    print(json.dumps({"load_s": loaded - began, "first_s": first - loaded, "again_s": time.perf_counter() - first,
+    print(json.dumps({"load_s": loaded - start, "first_s": first - loaded, "again_s": time.perf_counter() - first,
                       "peak_mb": peak_memory()}))
 
 
-def speed(weights: Path | None = None) -> None:
+def measure_speed(weights: Path | None = None) -> None:
     """Measure time and memory of each case, at the working size and at full size."""
     for name, (width, height) in CASES.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -107,21 +107,21 @@ def speed(weights: Path | None = None) -> None:
             draw_plate(path, width, height)
             figures: dict[str, dict[str, float]] = {}
             for kind, size in (("working", WORKING_SIZE), ("full", width)):
-                subparser = [sys.executable, __file__, "measure_plate", str(path), "--size", str(size)]
-                done = subprocess.run(subparser + (["--weights", str(weights)] if weights else []), capture_output=True,
-                                      text=True, check=False)
-                if done.returncode:
-                    print(f"{name}, {kind}: failed, {done.stderr.strip().splitlines()[-1:]}")
+                command = [sys.executable, __file__, "measure_plate", str(path), "--size", str(size)]
+                command += ["--weights", str(weights)] if weights else []
+                process = subprocess.run(command, capture_output=True, text=True, check=False)
+                if process.returncode:
+                    print(f"{name}, {kind}: failed, {process.stderr.strip().splitlines()[-1:]}")
                     continue
-                figures[kind] = json.loads(done.stdout)
-                case = figures[kind]
-                print(f"{name:16} {kind:8} load {case['load_s']:5.2f} s, plate {case['first_s']:6.2f} s, "
-                      f"the next {case['again_s']:6.2f} s, peak {case['peak_mb']:6.0f} MB")
+                figures[kind] = json.loads(process.stdout)
+                measured = figures[kind]
+                print(f"{name:16} {kind:8} load {measured['load_s']:5.2f} s, plate {measured['first_s']:6.2f} s, "
+                      f"the next {measured['again_s']:6.2f} s, peak {measured['peak_mb']:6.0f} MB")
             if len(figures) == 2:
                 print(f"{name:16} ratio    {figures['full']['again_s'] / figures['working']['again_s']:.1f}")
 
 
-def sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | None = None,
+def score_sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | None = None,
            sheet: Path | None = None) -> None:
     """Measure the PSNR of every frame against the exact scene, and flicker."""
     previous_errors: Any = None
@@ -131,7 +131,7 @@ def sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | No
     shown = sheet_frames(len(paths))
     for number, (path, codes) in enumerate(zip(paths, results, strict=True)):
         truth = read_picture(capture / "truth" / "scene" / f"{path.stem}.exr").display()
-        frame, result = (part.astype(np.float32) / 255 for part in (read_plate(path).codes, codes))
+        frame, result = (values.astype(np.float32) / 255 for values in (read_plate(path).codes, codes))
         scores.append((psnr(frame, truth), psnr(result, truth)))
         if number in shown:
             rows.append(np.concatenate([frame, result, np.clip(truth, 0, 1)], 1))
@@ -140,9 +140,9 @@ def sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | No
             flicker.append([float(np.abs(current - previous).mean())
                             for current, previous in zip(errors, previous_errors, strict=True)])
         previous_errors = errors
-    untouched, after = np.mean(scores, 0)
+    psnr_before, psnr_after = np.mean(scores, 0)
     gains = np.diff(scores, axis=1)[:, 0]
-    print(f"scene PSNR {after:.2f} dB, untouched {untouched:.2f}, gain {gains.mean():+.2f} "
+    print(f"scene PSNR {psnr_after:.2f} dB, untouched {psnr_before:.2f}, gain {gains.mean():+.2f} "
           f"(lowest {gains.min():+.2f}, highest {gains.max():+.2f}) over {len(scores)} frames")
     print(f"flicker {np.mean(flicker, 0)[1]:.5f}, untouched {np.mean(flicker, 0)[0]:.5f}")
     if sheet:
@@ -176,7 +176,7 @@ def _read_cleaned(paths: list[Path], folder: Path) -> Iterator[Any]:
     return (read_plate(pictures[path.stem]).codes for path in paths)
 
 
-def clean(folders: list[Path], weights: Path | None = None) -> None:
+def measure_clean_pictures(folders: list[Path], weights: Path | None = None) -> None:
     """Measure the change of pictures without flare."""
     from core.removal.training.backgrounds import PHOTO_SUFFIXES, list_pictures
 
@@ -196,7 +196,7 @@ def clean(folders: list[Path], weights: Path | None = None) -> None:
           "dB or more")
 
 
-def scenes(folders: list[Path], weights: Path | None = None, count: int = 300) -> None:
+def measure_clean_scenes(folders: list[Path], weights: Path | None = None, count: int = 300) -> None:
     """Measure the change of held-out scenes without flare."""
     from core.optics.prescription import built_in_lenses
     from core.removal.training.backgrounds import read_backgrounds
@@ -207,12 +207,13 @@ def scenes(folders: list[Path], weights: Path | None = None, count: int = 300) -
     values = []
     for number in range(count):
         random = np.random.default_rng((1002, number))
-        source = SingleFlareBank((1002, number), 160, built_in_lenses(), "glow")
-        frame = make_pair(random, source, backgrounds, 480, 320, clean_share=1.0).frame
+        bank = SingleFlareBank((1002, number), 160, built_in_lenses(), "glow")
+        frame = make_pair(random, bank, backgrounds, 480, 320, clean_share=1.0).frame
         values.append(min(psnr(remover.clean_display(frame), frame), 100.0))
-    low = sorted(value for value in values if value < 60)
-    print(f"{len(values) - len(low)} of {len(values)} scenes at 60 dB or more, {np.mean(np.array(values) >= 45):.0%} "
-          f"at 45; the others {', '.join(f'{value:.1f}' for value in low) or 'none'} dB")
+    changed = sorted(value for value in values if value < 60)
+    print(f"{len(values) - len(changed)} of {len(values)} scenes at 60 dB or more, "
+          f"{np.mean(np.array(values) >= 45):.0%} at 45; the others "
+          f"{', '.join(f'{value:.1f}' for value in changed) or 'none'} dB")
 
 
 def _held_out_lenses(lenses: Path | None) -> Any:
@@ -235,7 +236,8 @@ CLASSES_WITH_LIGHTS = ("scatter", "ghosts", "streak", "glow", "mixed")
 """Flare classes that have a light in the frame."""
 
 
-def against(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 20) -> None:
+def measure_against_light(folders: list[Path], lenses: Path | None = None, weights: Path | None = None,
+                          count: int = 20) -> None:
     """Measure the gain where lights are in a bright part of the scene, and where they are anywhere."""
     from core.removal.evaluation import CANVAS_SIZE
     from core.removal.training.flare_bank import SingleFlareBank
@@ -243,12 +245,13 @@ def against(folders: list[Path], lenses: Path | None = None, weights: Path | Non
     remover, backgrounds, lenses_held_out = Remover(weights), _held_out_backgrounds(folders), _held_out_lenses(lenses)
     seeds = [((1003, index, number), kind) for index, kind in enumerate(CLASSES_WITH_LIGHTS) for number in range(count)]
     for name, share in (("against the light", 1.0), ("anywhere", 0.0)):
-        _print_gains(f"{name:17}", [_gain(remover, seed, SingleFlareBank(seed, CANVAS_SIZE, lenses_held_out, kind),
-                                          backgrounds, share)
-                                    for seed, kind in seeds])
+        gains = [_removal_gain(remover, seed, SingleFlareBank(seed, CANVAS_SIZE, lenses_held_out, kind), backgrounds,
+                               share) for seed, kind in seeds]
+        _print_gains(f"{name:17}", gains)
 
 
-def coloured(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 20) -> None:
+def measure_coloured_lights(folders: list[Path], lenses: Path | None = None, weights: Path | None = None,
+                            count: int = 20) -> None:
     """Measure the gain for flares of lights of a saturated colour, and for the same of white lights."""
     from core.removal.evaluation import CANVAS_SIZE
     from core.removal.synthesis.flare import FLARE_CLASSES
@@ -261,24 +264,25 @@ def coloured(folders: list[Path], lenses: Path | None = None, weights: Path | No
         colours = [WHITE if white else draw_saturated_colour(np.random.default_rng(seed)) for seed, _ in seeds]
         banks = [SingleFlareBank(seed, CANVAS_SIZE, lenses_held_out, kind, colour)
                  for (seed, kind), colour in zip(seeds, colours, strict=True)]
-        _print_gains(f"{name:13}", [_gain(remover, seed, bank, backgrounds)
+        _print_gains(f"{name:13}", [_removal_gain(remover, seed, bank, backgrounds)
                                     for (seed, _), bank in zip(seeds, banks, strict=True)])
 
 
-def confidence(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 600) -> None:
+def fit_confidence(folders: list[Path], lenses: Path | None = None, weights: Path | None = None,
+                   count: int = 600) -> None:
     """Fit and score the weights of the confidence that a predicted flare is real."""
     from core.removal.inference.confidence import BIAS, FEATURE_WEIGHTS, confidence_from_log_odds
     from core.removal.training.backgrounds import read_backgrounds
 
     remover = Remover(weights)
-    fitted = _logistic(*_draw_features(remover, 1006, count, read_backgrounds(folders, "train", max(SIZE)),
-                                       _training_lenses(lenses)))
+    backgrounds = read_backgrounds(folders, "train", max(SIZE))
+    fitted = _fit_logistic_regression(*_draw_features(remover, 1006, count, backgrounds, _training_lenses(lenses)))
     print("FEATURE_WEIGHTS, BIAS =", ", ".join(f"{value:.3g}" for value in fitted))
     features, gains = _draw_features(remover, 1007, count // 2, _held_out_backgrounds(folders),
                                      _held_out_lenses(lenses))
     flares = gains > 0
-    for name, by in (("in use", np.array([*FEATURE_WEIGHTS, BIAS])), ("fitted", fitted)):
-        log_odds = features @ by[:-1] + by[-1]
+    for name, weights_and_bias in (("in use", np.array([*FEATURE_WEIGHTS, BIAS])), ("fitted", fitted)):
+        log_odds = features @ weights_and_bias[:-1] + weights_and_bias[-1]
         area = np.mean(log_odds[flares][:, None] > log_odds[~flares])
         applied = np.array([confidence_from_log_odds(value) for value in log_odds])
         print(f"{name}: area under the curve {area:.3f}; applied of {flares.sum()} useful predictions "
@@ -299,21 +303,22 @@ def _draw_features(remover: Remover, seed: int, count: int, backgrounds: Any, le
     features, gains = [], []
     for number in range(count):
         # Two thirds are without flare; the others have each class in turn.
-        bare, kind = number % 3 > 0, FLARE_CLASSES[number // 3 % len(FLARE_CLASSES)]
-        pair = make_pair(np.random.default_rng((seed, number)), SingleFlareBank((seed, number), 160, lenses, kind),
-                         backgrounds, *SIZE, clean_share=float(bare), lifted_black_share=0.25, shoulder_share=0.3,
+        without_flare, kind = number % 3 > 0, FLARE_CLASSES[number // 3 % len(FLARE_CLASSES)]
+        bank = SingleFlareBank((seed, number), 160, lenses, kind)
+        pair = make_pair(np.random.default_rng((seed, number)), bank, backgrounds, *SIZE,
+                         clean_share=float(without_flare), lifted_black_share=0.25, shoulder_share=0.3,
                          against_light_share=0.35)
         prediction = remover.predict_with_tta(pair.frame)
         if prediction.features is None:
             continue
-        left = psnr(np.maximum(pair.frame - prediction.mean, 0), pair.scene)
-        if not bare or left < 45:
+        psnr_after = psnr(np.maximum(pair.frame - prediction.mean, 0), pair.scene)
+        if not without_flare or psnr_after < 45:
             features.append(prediction.features)
-            gains.append(-5.0 if bare else left - psnr(pair.frame, pair.scene))
+            gains.append(-5.0 if without_flare else psnr_after - psnr(pair.frame, pair.scene))
     return np.array(features), np.array(gains)
 
 
-def _logistic(features: Any, gains: Any) -> Any:
+def _fit_logistic_regression(features: Any, gains: Any) -> Any:
     """Fit weights (6,) of features (n, 5) and a constant to the log odds that a prediction is useful.
 
     The constant is last. Predictions are weighted by the size of their gain, up to 15 dB. Newton's method; the weights
@@ -321,15 +326,15 @@ def _logistic(features: Any, gains: Any) -> Any:
     """
     mean, deviation = features.mean(0), features.std(0)
     design = np.column_stack([(features - mean) / deviation, np.ones(len(features))])
-    counts, flares = np.minimum(np.abs(gains), 15) / 5, gains > 0
-    ridge, solution = np.diag([1.0] * features.shape[1] + [0.0]), np.zeros(design.shape[1])
+    sample_weights, is_useful = np.minimum(np.abs(gains), 15) / 5, gains > 0
+    ridge, parameters = np.diag([1.0] * features.shape[1] + [0.0]), np.zeros(design.shape[1])
     for _ in range(30):
-        probabilities = 1 / (1 + np.exp(-design @ solution))
-        step = design.T @ (counts * (probabilities - flares)) + ridge @ solution
-        curvature = counts * probabilities * (1 - probabilities)
-        solution -= np.linalg.solve(design.T @ (design * curvature[:, None]) + ridge, step)
-    weights = solution[:-1] / deviation  # of the features as they are
-    return np.append(weights, solution[-1] - weights @ mean)
+        probabilities = 1 / (1 + np.exp(-design @ parameters))
+        gradient = design.T @ (sample_weights * (probabilities - is_useful)) + ridge @ parameters
+        curvature = sample_weights * probabilities * (1 - probabilities)
+        parameters -= np.linalg.solve(design.T @ (design * curvature[:, None]) + ridge, gradient)
+    weights = parameters[:-1] / deviation  # of the features as they are
+    return np.append(weights, parameters[-1] - weights @ mean)
 
 
 class _AsphericBank:
@@ -352,11 +357,11 @@ class _AsphericBank:
         return FlareLayers(ghosts, np.zeros_like(ghosts), flare.light, flare.lights)
 
 
-def aspheric(folders: list[Path], weights: Path | None = None, count: int = 64) -> None:
+def measure_aspheric_ghosts(folders: list[Path], weights: Path | None = None, count: int = 64) -> None:
     """Measure the gain for ghosts of moulded lenses, of lights that have no other flare."""
     remover, backgrounds = Remover(weights), _held_out_backgrounds(folders)
     seeds = [(1005, number) for number in range(count)]
-    _print_gains("moulded lenses", [_gain(remover, seed, _AsphericBank(seed), backgrounds) for seed in seeds])
+    _print_gains("moulded lenses", [_removal_gain(remover, seed, _AsphericBank(seed), backgrounds) for seed in seeds])
 
 
 SIZE = (480, 320)
@@ -370,7 +375,7 @@ def _held_out_backgrounds(folders: list[Path]) -> Any:
     return read_backgrounds(folders, "test", max(SIZE))
 
 
-def _gain(remover: Remover, seed: tuple[int, ...], bank: Any, backgrounds: Any,
+def _removal_gain(remover: Remover, seed: tuple[int, ...], bank: Any, backgrounds: Any,
           against_light_share: float = 0.0) -> float:
     """Return the gain of the removal in PSNR, dB, for the picture of a seed with a flare of the bank.
 
@@ -389,7 +394,8 @@ def _print_gains(name: str, gains: Any) -> None:
           f"{len(gains)}")
 
 
-def matte(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 20) -> None:
+def measure_matte_gain(folders: list[Path], lenses: Path | None = None, weights: Path | None = None,
+                       count: int = 20) -> None:
     """Measure the gain with a rough matte of the flare, and without."""
     from core.images.plates import Plate
     from core.removal.evaluation import synthetic_cases
@@ -409,23 +415,23 @@ def _rough_matte(frame: Any, truth: Any) -> Any:
     import cv2
 
     changed = (np.abs(frame - truth).max(-1) > 0.05).astype(np.uint8)
-    reach = max(frame.shape[:2]) // 20
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    wide = cv2.dilate(cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), kernel)
-    return cv2.blur(wide.astype(np.float32), (reach // 2, reach // 2))
+    brush = max(frame.shape[:2]) // 20
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (brush, brush))
+    widened = cv2.dilate(cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), kernel)
+    return cv2.blur(widened.astype(np.float32), (brush // 2, brush // 2))
 
 
-def coverage(sheet: Path | None = None, count: int = 400) -> None:
+def print_coverage(sheet: Path | None = None, count: int = 400) -> None:
     """Print a histogram of the coverage of synthesised flares, and draw a sheet of them."""
     from core.optics.prescription import built_in_lenses
-    from core.removal.model.image_formation import coverage as covered
+    from core.removal.model.image_formation import coverage
     from core.removal.synthesis.flare import FLARE_CLASSES, add_aspheric_ghosts, synthesise_flare
 
     lenses = built_in_lenses()
-    shares = [covered(synthesise_flare((1, number), 160, lenses).whole) for number in range(count)]
+    shares = [coverage(synthesise_flare((1, number), 160, lenses).whole) for number in range(count)]
     counts, edges = np.histogram(shares, [0, 0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1])
-    for k, value in enumerate(counts):
-        print(f"{edges[k]:5.1%} to {edges[k + 1]:6.1%}  {value / count:6.1%}  {'#' * round(100 * value / count)}")
+    for low, high, value in zip(edges[:-1], edges[1:], counts, strict=True):
+        print(f"{low:5.1%} to {high:6.1%}  {value / count:6.1%}  {'#' * round(100 * value / count)}")
     print(f"median {np.median(shares):.1%}, below 2 %: {np.mean(np.array(shares) < 0.02):.0%}, above 70 %: "
           f"{np.mean(np.array(shares) > 0.7):.0%} of {count}")
     if sheet:
@@ -440,6 +446,13 @@ def coverage(sheet: Path | None = None, count: int = 400) -> None:
         cv2.imwrite(str(sheet), picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
+BENCHMARKS: dict[str, Callable[..., None]] = {
+    "speed": measure_speed, "measure_plate": measure_plate, "sample": score_sample, "clean": measure_clean_pictures,
+    "scenes": measure_clean_scenes, "matte": measure_matte_gain, "against": measure_against_light,
+    "coloured": measure_coloured_lights, "confidence": fit_confidence, "aspheric": measure_aspheric_ghosts,
+    "coverage": print_coverage,
+}
+"""The benchmarks by the name of their command."""
 PARAMETERS: dict[str, dict[str, Any]] = {
     "folders": {"type": Path, "nargs": "+", "metavar": "PHOTOS"},
     "plate": {"type": Path},
@@ -458,16 +471,15 @@ def main() -> None:
     """Run the benchmark that the arguments name; its parameters are its options."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = parser.add_subparsers(required=True, metavar="BENCHMARK")
-    for benchmark in (speed, measure_plate, sample, clean, scenes, matte, against, coloured, confidence, aspheric,
-                      coverage):
-        aliases = ["odds"] if benchmark is confidence else []  # its former name
-        subparser = names.add_parser(benchmark.__name__, aliases=aliases, help=inspect.getdoc(benchmark))
+    for name, benchmark in BENCHMARKS.items():
+        aliases = ["odds"] if name == "confidence" else []  # its former name
+        subparser = names.add_parser(name, aliases=aliases, help=inspect.getdoc(benchmark))
         subparser.set_defaults(benchmark=benchmark)
-        for name, parameter in inspect.signature(benchmark).parameters.items():
+        for option, parameter in inspect.signature(benchmark).parameters.items():
             if parameter.default is parameter.empty:
-                subparser.add_argument(name, **PARAMETERS[name])
+                subparser.add_argument(option, **PARAMETERS[option])
             else:
-                subparser.add_argument(f"--{name}", default=parameter.default, **PARAMETERS[f"--{name}"])
+                subparser.add_argument(f"--{option}", default=parameter.default, **PARAMETERS[f"--{option}"])
     options = vars(parser.parse_args())
     options.pop("benchmark")(**options)
 

@@ -39,9 +39,11 @@ from core.gaussians import SceneGaussians, kernels, splat
 from core.look.form import FlareForm
 
 SIZES = ((1920, 1080), (3840, 2160))
-SCENE, FLARE = 162_283, 10_965
-DEFORMATION = {1: 3.9, 2: 6.8, 3: 11.1}
-"""The paper's measurements, ms, by the number of lights."""
+PAPER_SCENE_COUNT, PAPER_FLARE_COUNT = 162_283, 10_965
+"""The paper's numbers of scene Gaussians, and of flare Gaussians for each light."""
+PAPER_DEFORMATION_MS = {1: 3.9, 2: 6.8, 3: 11.1}
+PAPER_FRAME_MS = "10.79"
+"""The paper's measurements at 1920x1080: of the deformation by the number of lights, and of a frame with one light."""
 STAGES = ("deformation", "projection", "flare raster", "flare raster, mixed", "scene", "composite")
 
 
@@ -57,16 +59,19 @@ class RenderedScene(NamedTuple):
     """Focal length of a picture one pixel wide."""
 
 
-def synthetic(form: FlareForm, blend: Blend, size: int = SCENE, flare: int = FLARE) -> RenderedScene:
+def synthetic_scene(
+    form: FlareForm, blend: Blend, scene_count: int = PAPER_SCENE_COUNT, flare_count: int = PAPER_FLARE_COUNT
+) -> RenderedScene:
     """Return a scene and three lights in front of the workload's camera, with untrained flares.
 
-    size: number of scene Gaussians. flare: number of flare Gaussians for each light.
+    scene_count, flare_count: numbers of scene Gaussians, and of flare Gaussians for each light.
     """
     generator = torch.Generator().manual_seed(0)
     positions = torch.tensor([[0.6, -0.4, 3.0], [-1.0, 0.3, 4.0], [0.2, 0.8, 5.0]], dtype=torch.float64)
     query = QueryRange((-1, -1, -1), (1, 1, 1), (1, 1, 1))
-    flares = [LightFlare(form, query, flare, generator) for _ in positions]
-    return RenderedScene(SceneGaussians(*workload.scene(size)), flares, positions, blend, np.eye(4), 0.5 / workload.TAN)
+    flares = [LightFlare(form, query, flare_count, generator) for _ in positions]
+    scene = SceneGaussians(*workload.make_scene(scene_count))
+    return RenderedScene(scene, flares, positions, blend, np.eye(4), 0.5 / workload.TAN_HALF_ANGLE)
 
 
 def load_run(folder: Path) -> RenderedScene:
@@ -92,7 +97,7 @@ def load_run(folder: Path) -> RenderedScene:
     raise SystemExit(f"No camera of {run.capture_folder} has all lights in front of it.")
 
 
-def stages(
+def stage_functions(
     rendered: RenderedScene, lights: int, width: int, height: int, kernel_set: str, device: str
 ) -> dict[str, Callable[[], object]]:
     """Return each of STAGES of a frame as a function to time; the first `lights` lights have flares."""
@@ -106,9 +111,9 @@ def stages(
     def evaluate_flares() -> PlaneGaussians:
         gaussians = concatenate(model(pose))
         assert gaussians is not None
-        return PlaneGaussians(*(None if part is None else part.to(device) for part in gaussians))
+        return PlaneGaussians(*(None if values is None else values.to(device) for values in gaussians))
 
-    def raster(resolution: str) -> Callable[[], object]:
+    def flare_raster(resolution: str) -> Callable[[], object]:
         return lambda: splat(
             *pixel_gaussians, flare.opacities, flare.colours, width, height, rings=flare.rings, arcs=arcs,
             blend=rendered.blend, resolution=resolution, kernels=kernel_set,  # type: ignore[arg-type]
@@ -121,25 +126,27 @@ def stages(
     pixel_gaussians = to_pixels(flare, intrinsics)
     arcs = None if flare.arcs is None else arcs_to_pixels(flare.arcs, pixel_gaussians[1], intrinsics)
     # What `composite` is timed on; rings and arcs do not change its time.
-    behind, front = render_scene(), splat(
+    scene_colour, flare_splats = render_scene(), splat(
         *pixel_gaussians, flare.opacities, flare.colours, width, height, blend=rendered.blend, kernels=kernel_set  # type: ignore[arg-type]
     )
-    work: tuple[Callable[[], object], ...] = (
-        evaluate_flares, lambda: to_pixels(flare, intrinsics), raster("full"), raster("mixed"), render_scene,
-        lambda: composite(behind, front, rendered.blend),
+    functions: tuple[Callable[[], object], ...] = (
+        evaluate_flares, lambda: to_pixels(flare, intrinsics), flare_raster("full"), flare_raster("mixed"),
+        render_scene, lambda: composite(scene_colour, flare_splats, rendered.blend),
     )  # fmt: skip
-    return dict(zip(STAGES, work, strict=True))
+    return dict(zip(STAGES, functions, strict=True))
 
 
-def measure(rendered: RenderedScene, kernel_set: str, device: str, rounds: int) -> str:
+def stage_table(rendered: RenderedScene, kernel_set: str, device: str, rounds: int) -> str:
     """Return the table of the stages of a frame; a frame's time is their sum, with one of the two flare rasters."""
     rows = []
     for width, height in SIZES:
         for lights in (1, 2, 3):
-            times = median_times(stages(rendered, lights, width, height, kernel_set, device), rounds)
+            times = median_times(stage_functions(rendered, lights, width, height, kernel_set, device), rounds)
             shared = sum(times[stage] for stage in ("deformation", "projection", "scene", "composite"))
             full, mixed = shared + times["flare raster"], shared + times["flare raster, mixed"]
-            paper = (str(DEFORMATION[lights]), "10.79" if lights == 1 else "–") if width == 1920 else ("–", "–")
+            paper = ("–", "–")
+            if width == 1920:
+                paper = (str(PAPER_DEFORMATION_MS[lights]), PAPER_FRAME_MS if lights == 1 else "–")
             cells = [milliseconds(seconds) for seconds in (*times.values(), full, mixed)]
             rows.append([f"{width}x{height}, {lights}", *cells, f"{1 / mixed:.1f}", *paper])
     head = ["ms; picture, lights", *STAGES, "frame", "frame, mixed", "frames/s, mixed"]
@@ -158,18 +165,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=report.RESULTS / "rasterizer.md")
     args = parser.parse_args()
     form = PAPER if args.form == "paper" else OURS
-    rendered = load_run(args.run) if args.run else synthetic(form, args.blend)
+    rendered = load_run(args.run) if args.run else synthetic_scene(form, args.blend)
     conditions = report.conditions()
     with torch.no_grad():
-        text = measure(rendered, args.kernels, args.device, args.rounds)
-    what = (
+        text = stage_table(rendered, args.kernels, args.device, args.rounds)
+    description = (
         f"{len(rendered.scene):,} scene Gaussians, {rendered.flares[0].count:,} for each light, "
         f"blend {rendered.blend}, "
         f"{'a run' if args.run else f'synthetic, untrained flares of the form {args.form!r}'}, "
         f"on {args.device.upper()}, {torch.get_num_threads()} threads. Scene: projection, sorting and raster."
     )
     name = "a run" if args.run else f"{args.form}, {args.blend}"
-    text = f"## Rendering: {name}\n\n{what}\n\n{text}\n\n{conditions}"
+    text = f"## Rendering: {name}\n\n{description}\n\n{text}\n\n{conditions}"
     report.write_section(args.out, f"render {name}", text)
     sys.stdout.write(text + "\n")
 

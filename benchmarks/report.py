@@ -37,11 +37,11 @@ def processor() -> str:
     except OSError:
         return f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
     models = re.findall(r"^model name\s*: (.*)$", text, re.M) or [platform.machine()]
-    words = set(text.split())
-    wide = next((name for flag, name in (("avx512f", "AVX-512"), ("avx2", "AVX2")) if flag in words), "SSE or NEON")
-    codes = [re.findall(rf"^{key}\s*: (\d+)$", text, re.M) for key in ("cpu family", "model")]
-    code = f" (family {codes[0][0]}, model {codes[1][0]})" if all(codes) else ""
-    return f"{models[0]}{code}, {wide}, {len(os.sched_getaffinity(0))} cores"
+    flags = set(text.split())
+    vectors = next((name for flag, name in (("avx512f", "AVX-512"), ("avx2", "AVX2")) if flag in flags), "SSE or NEON")
+    code_matches = [re.findall(rf"^{key}\s*: (\d+)$", text, re.M) for key in ("cpu family", "model")]
+    code = f" (family {code_matches[0][0]}, model {code_matches[1][0]})" if all(code_matches) else ""
+    return f"{models[0]}{code}, {vectors}, {len(os.sched_getaffinity(0))} cores"
 
 
 def conditions() -> str:
@@ -49,31 +49,31 @@ def conditions() -> str:
     import numba
 
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    state = "idle" if load < 0.5 else f"under other load ({load:.1f})"
+    activity = "idle" if load < 0.5 else f"under other load ({load:.1f})"
     return (
         f"{processor()}; {platform.system()} {platform.machine()}, Python {platform.python_version()}, "
-        f"torch {torch.__version__.split('+')[0]}, numba {numba.__version__}; machine {state} at the start."
+        f"torch {torch.__version__.split('+')[0]}, numba {numba.__version__}; machine {activity} at the start."
     )
 
 
 def write_section(path: Path, name: str, text: str) -> None:
     """Replace the text between the markers of this name, or append both to the document."""
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-    old = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
+    old_text = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
     section = f"{begin}\n{text.strip()}\n{end}"
-    if begin in old and end in old:
-        before, rest = old.split(begin, 1)
-        new = before + section + rest.split(end, 1)[1]
+    if begin in old_text and end in old_text:
+        before, after = old_text.split(begin, 1)
+        new_text = before + section + after.split(end, 1)[1]
     else:
-        new = old.rstrip() + "\n\n" + section + "\n"
+        new_text = old_text.rstrip() + "\n\n" + section + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(new, encoding="utf-8")
+    path.write_text(new_text, encoding="utf-8")
 
 
-def plot_times(lines: dict[str, dict[str, float]], picture: Path) -> None:
+def plot_times(times_by_set: dict[str, dict[str, float]], picture: Path) -> None:
     """Draw times, ms, against the number of Gaussians, a line for each kernel set.
 
-    lines: seconds by number of Gaussians (as text), by kernel set.
+    times_by_set: seconds by number of Gaussians (as text), by kernel set.
     """
     import matplotlib
 
@@ -81,13 +81,13 @@ def plot_times(lines: dict[str, dict[str, float]], picture: Path) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(6, 3.6), layout="constrained")
-    for name, times in lines.items():
-        thread_counts = [int(n) / 1000 for n in times]
-        axes.plot(thread_counts, [t * 1e3 for t in times.values()], "o-", label=name)
+    for name, times in times_by_set.items():
+        thousands = [int(count) / 1000 for count in times]
+        axes.plot(thousands, [seconds * 1e3 for seconds in times.values()], "o-", label=name)
     axes.set(xlabel="Gaussians, thousands", ylabel="forward + backward, ms", xlim=(0, None), ylim=(0, None))
     axes.set_title(f"480x270, {torch.get_num_threads()} threads", fontsize=10)
     axes.grid(alpha=0.3)
-    if len(lines) > 1:
+    if len(times_by_set) > 1:
         axes.legend()
     figure.savefig(picture, dpi=150)
     pyplot.close(figure)

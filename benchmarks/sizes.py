@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,8 +32,17 @@ SCALES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 COLUMNS = ("size", "", "scene, dB", "composite", "linear flare", "its light")
 
 
-def scores(run: Run, capture: Capture, views: Sequence[View], width: int) -> tuple[float, float, float, float]:
-    """Return PSNR of scene, composite and linear flare, dB, and the flare's mean light, averaged over the views.
+class SizeScores(NamedTuple):
+    """PSNR of scene, composite and linear flare, dB, and the flare's mean linear light."""
+
+    scene: float
+    composite: float
+    linear_flare: float
+    flare_light: float
+
+
+def mean_scores(run: Run, capture: Capture, views: Sequence[View], width: int) -> SizeScores:
+    """Return scores averaged over the views.
 
     width: at which they are rendered, pixels. Raises CaptureError without exact layers.
     """
@@ -50,23 +60,22 @@ def scores(run: Run, capture: Capture, views: Sequence[View], width: int) -> tup
                    for picture in (layers.scene, scene, layers.scene + flare_sum, scene + flare)]
         rows.append((psnr(display[0], display[1]), psnr(display[2], display[3]),
                      psnr(np.clip(flare_sum, 0, 1), np.clip(flare, 0, 1)), float(flare_sum.mean())))
-    first, second, third, fourth = np.mean(np.array(rows, np.float64), 0).tolist()
-    return first, second, third, fourth
+    return SizeScores(*np.mean(np.array(rows, np.float64), 0).tolist())
 
 
 def compare_sizes(run: Run, capture: Capture, fitted_width: int, max_width: int) -> list[list[str]]:
-    """Return two rows for each size up to `max_width`, with the pixel grid of the fit and without."""
+    """Return two rows for each size up to `max_width`: with the pixel grid of the fit, and without."""
     _, views = capture.split(run.settings.holdout)
     scene, flare = run.scene, run.flare
     assert flare is not None
     grids = {"by its grid": (scene.pixel_grid, flare.pixel_grid), "without": (None, None)}
-    light = scores(run, capture, views, fitted_width)[3]
+    fitted_light = mean_scores(run, capture, views, fitted_width).flare_light
     rows = []
     for width in sorted({min(round(scale * fitted_width), max_width) for scale in SCALES}):
-        for name, (of_scene, of_flare) in grids.items():
-            scene.pixel_grid, flare.pixel_grid = of_scene, of_flare
-            *flare_sum, total = scores(run, capture, views, width)
-            rows.append([f"{width}", name, *(f"{value:.2f}" for value in flare_sum), f"{total / light:.2f}"])
+        for name, (scene_grid, flare_grid) in grids.items():
+            scene.pixel_grid, flare.pixel_grid = scene_grid, flare_grid
+            *psnrs, light = mean_scores(run, capture, views, width)
+            rows.append([f"{width}", name, *(f"{value:.2f}" for value in psnrs), f"{light / fitted_light:.2f}"])
     return rows
 
 

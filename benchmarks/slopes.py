@@ -48,7 +48,7 @@ WARM_UP = 0.2
 """Part of the samples that is left out."""
 
 
-class Sampling(Progress):
+class MemorySampler(Progress):
     """Samples (units, MB, open files, threads) at every step."""
 
     def __init__(self) -> None:
@@ -65,7 +65,7 @@ class Sampling(Progress):
         self.samples.append((self._units, resident_memory(), self._process.num_fds(), self._process.num_threads()))
 
 
-def plates(folder: Path, count: int, progress: Progress) -> None:
+def clean_plates(folder: Path, count: int, progress: Progress) -> None:
     """Clean `count` plates."""
     random = np.random.default_rng(0)
     for number in range(count):
@@ -74,7 +74,7 @@ def plates(folder: Path, count: int, progress: Progress) -> None:
     remove_all([folder / "plates"], folder / "clean", remover, progress, independent=True)
 
 
-def frames(folder: Path, count: int, progress: Progress) -> None:
+def bake_frames(folder: Path, count: int, progress: Progress) -> None:
     """Bake `count` frames of a shot."""
     save_flare(folder / "look.flare", FlareFile(some_flare(count=6), "over", TrainedCamera(64, 40, 70.0, 70.0, 33.0,
                                                                                            19.5)))
@@ -83,41 +83,41 @@ def frames(folder: Path, count: int, progress: Progress) -> None:
     bake_shot(shot, folder / "layers", progress=progress)
 
 
-def iterations(folder: Path, count: int, progress: Progress) -> None:
-    """Fit for `count` iterations without clones, since the memory of clones is no leak."""
+def fit_fixed_count(folder: Path, count: int, progress: Progress) -> None:
+    """Fit for `count` iterations with a fixed number of Gaussians: the memory of clones is no leak."""
     # Cloning would begin and end after the last iteration.
     never = {f"{part}.{end}": 10 * count for part in ("scene.classic", "scene.mcmc", "flare.density")
              for end in ("start", "stop")}
-    growing(folder, count, progress, **never)
+    fit_growing_count(folder, count, progress, **never)
 
 
-def growing(folder: Path, count: int, progress: Progress, **changes: int) -> None:
+def fit_growing_count(folder: Path, count: int, progress: Progress, **changes: int) -> None:
     """Fit for `count` iterations, in which Gaussians may be cloned. changes: settings by name."""
     capture = Capture.open(flared_capture(folder / "capture", count=7, dots=60))
     settings = override_settings(preset("draft", iterations=count), {"flare.count": 24, **changes})
     fit(capture, settings, folder / "run", progress)
 
 
-WORK: dict[str, Callable[[Path, int, Progress], None]] = {"plates": plates, "frames": frames, "iterations": iterations,
-                                                         "growing": growing}
+WORK: dict[str, Callable[[Path, int, Progress], None]] = {
+    "plates": clean_plates, "frames": bake_frames, "iterations": fit_fixed_count, "growing": fit_growing_count}
 UNLIMITED = ("growing",)
 """Work whose memory may grow."""
 
 
-def slope(x: list[float], y: list[float]) -> float:
-    """Return the slope of the least-squares line, per hundred of `x`."""
+def slope_per_hundred(x: list[float], y: list[float]) -> float:
+    """Return the slope of the least-squares line of `y`, per hundred of `x`; 0 where all `x` are equal."""
     return float(np.polyfit(x, y, 1)[0]) * 100 if len(set(x)) > 1 else 0.0
 
 
-def measure(kind: str, count: int) -> int:
+def measure_growth(kind: str, count: int) -> int:
     """Do the work of one kind and print its line; return the exit status, 1 where something grows too much."""
     torch.set_num_threads(1)
-    progress = Sampling()
+    progress = MemorySampler()
     with tempfile.TemporaryDirectory(prefix="slopes-") as folder:
         WORK[kind](Path(folder), count, progress)
     samples = progress.samples[int(len(progress.samples) * WARM_UP):]
     units, *columns = (list(map(float, column)) for column in zip(*samples, strict=True))
-    memory, files, threads = (slope(units, column) for column in columns)
+    memory, files, threads = (slope_per_hundred(units, column) for column in columns)
     print(f"| {kind} | {int(units[-1])} | {columns[0][0]:.0f} | {columns[0][-1]:.0f} | {memory:+.3f} | {files:+.3f} | "
           f"{threads:+.3f} |", flush=True)
     too_much = memory >= MAX_MB_PER_HUNDRED and kind not in UNLIMITED
@@ -133,7 +133,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     if args.here:
-        return measure(args.kinds[0], args.count)
+        return measure_growth(args.kinds[0], args.count)
     print("| work | units | MB after warm-up | MB at the end | MB per 100 | open files per 100 | threads per 100 |\n"
           "| --- | --- | --- | --- | --- | --- | --- |", flush=True)
     return max(subprocess.run([sys.executable, __file__, kind, "--count", str(args.count), "--here"],

@@ -17,17 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import report
-from benchmarks.ablations import displaced
+from benchmarks.ablations import displace_lights
 from core.capture import Capture
 from core.fit.settings import preset
 from core.fit.trainer import Trainer
 
 SIGMAS = (0.0, 0.1, 0.25, 0.5, 1.0)
-NEAR = 0.012
+MAX_NEAR_ERROR = 0.012
 """Distance of a snapped light from the exact one that counts as near, relative to the frame's width."""
 
 
-def errors(capture: Capture, places: ArrayLike) -> NDArray[np.float64]:
+def light_errors(capture: Capture, places: ArrayLike) -> NDArray[np.float64]:
     """Return (lights,): the mean distance of each light from its place in `places` (lights, 3), in widths of the frame.
 
     Views in which one of the two is behind the camera are left out.
@@ -35,9 +35,9 @@ def errors(capture: Capture, places: ArrayLike) -> NDArray[np.float64]:
     distances = []
     for view in capture.views:
         pixels, depth = view.camera.project([light.xyz for light in capture.lights])
-        others, behind = view.camera.project(places)
-        distance = np.linalg.norm(pixels - others, axis=1) / view.camera.width
-        distances.append(np.where((depth > 0) & (behind > 0), distance, np.nan))
+        other_pixels, other_depth = view.camera.project(places)
+        distance = np.linalg.norm(pixels - other_pixels, axis=1) / view.camera.width
+        distances.append(np.where((depth > 0) & (other_depth > 0), distance, np.nan))
     return np.asarray(np.nanmean(distances, 0))
 
 
@@ -53,17 +53,18 @@ def main() -> None:
         for sigma in SIGMAS:
             errors_before, errors_after = [], []
             for seed in range(args.seeds if sigma else 1):
-                moved = displaced(Capture.open(folder), sigma, seed)
-                flare = Trainer(moved, preset("standard")).flare
+                displaced = displace_lights(Capture.open(folder), sigma, seed)
+                flare = Trainer(displaced, preset("standard")).flare
                 assert flare is not None
-                errors_before.append(errors(truth, [light.xyz for light in moved.lights]))
-                errors_after.append(errors(truth, flare.positions.numpy()))
+                errors_before.append(light_errors(truth, [light.xyz for light in displaced.lights]))
+                errors_after.append(light_errors(truth, flare.positions.numpy()))
             initial, snapped = np.concatenate(errors_before), np.concatenate(errors_after)
             rows.append([folder.name, f"{sigma:g}", f"{initial.max():.1%}", f"{np.median(snapped):.2%}",
-                         f"{(snapped < NEAR).sum()} of {len(snapped)}", str((snapped > initial + 1e-3).sum())])
+                         f"{(snapped < MAX_NEAR_ERROR).sum()} of {len(snapped)}",
+                         str((snapped > initial + 1e-3).sum())])
             print(*rows[-1], sep="\t", file=sys.stderr, flush=True)
     print(report.table(["capture", "sigma", "initial, worst", "snapped, median",
-                        f"within {NEAR:.1%}", "worse than initial"],
+                        f"within {MAX_NEAR_ERROR:.1%}", "worse than initial"],
                        rows))
 
 

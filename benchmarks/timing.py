@@ -38,12 +38,12 @@ def median_times(cases: Mapping[str, Callable[[], object]], rounds: int) -> dict
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
     """Run the body with this number of threads of torch, which the kernels use too."""
-    before = torch.get_num_threads()
+    previous = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(previous)
 
 
 def on_threads(count: int, work: Callable[[], object]) -> Callable[[], object]:

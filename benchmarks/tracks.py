@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,44 +32,65 @@ from sample_scenes.shot_scenes import SHOTS
 
 MIN_VISIBLE = 0.3
 """Visible share of a light's disc from which a frame is said to show it."""
+MAX_MATCH_DISTANCE = 10.0
+"""Distance in pixels, below which a followed light counts as near an exact one."""
 
 
-def measure(capture: Capture, truth: Light, visible: dict[str, float], light: TrackedLight) -> dict[str, Any]:
-    """Return the figures of one light. truth: the exact one. visible: share of its disc that is visible, by frame.
+class TrackScores(NamedTuple):
+    """The figures of one light: numbers of frames, and lists of errors by frame."""
 
-    Numbers of frames: visible, followed, keys, doubtful, doubtful_visible. Lists of errors: seen (pixels, in frames
-    that show the light), sure (pixels, where the place is not doubtful), brightness.
-    """
+    visible: int
+    """Frames that show the light."""
+    followed: int
+    """Those of them in which it was followed."""
+    keys: int
+    """Frames with a key."""
+    doubtful: int
+    """Frames whose key is doubtful."""
+    doubtful_visible: int
+    """Those of them that show the light."""
+    visible_errors: list[float]
+    """Pixels, in frames that show the light."""
+    confident_errors: list[float]
+    """Pixels, in frames whose key is not doubtful."""
+    brightness_errors: list[float]
+
+
+def score_track(capture: Capture, truth: Light, visible: dict[str, float], light: TrackedLight) -> TrackScores:
+    """Return the scores of one light. truth: the exact one. visible: share of its disc that is visible, by frame."""
     size = np.array(capture.views[0].camera.size)
-    errors, shown, brightness = {}, [], []
+    errors, visible_frames, brightness_errors = {}, [], []
     for name, key in truth.keys.items():
-        found = light.keys.get(name)
+        tracked = light.keys.get(name)
         assert key.xy is not None and key.on is not None
         inside = bool(((key.xy > 0) & (key.xy < size)).all())
         if inside and visible[name] >= MIN_VISIBLE and key.on > 0:
-            shown.append(name)
-        if found is None or found.xy is None:
+            visible_frames.append(name)
+        if tracked is None or tracked.xy is None:
             continue
-        errors[name] = float(np.linalg.norm(found.xy - key.xy))
-        if found.on is not None and inside:
-            brightness.append(abs(found.on - key.on))
-    sure = [error for name, error in errors.items() if light.keys[name].confidence >= DOUBTFUL]
-    seen = [errors[name] for name in shown if name in errors]
-    return {"visible": len(shown), "followed": sum(name in light.support for name in shown), "seen": seen, "sure": sure,
-            "doubtful": len(light.doubtful), "keys": len(light.keys), "brightness": brightness,
-            "doubtful_visible": sum(light.keys[name].confidence < DOUBTFUL for name in shown if name in light.keys)}
+        errors[name] = float(np.linalg.norm(tracked.xy - key.xy))
+        if tracked.on is not None and inside:
+            brightness_errors.append(abs(tracked.on - key.on))
+    return TrackScores(
+        visible=len(visible_frames), followed=sum(name in light.support for name in visible_frames),
+        keys=len(light.keys), doubtful=len(light.doubtful),
+        doubtful_visible=sum(light.keys[name].confidence < DOUBTFUL for name in visible_frames if name in light.keys),
+        visible_errors=[errors[name] for name in visible_frames if name in errors],
+        confident_errors=[error for name, error in errors.items() if light.keys[name].confidence >= DOUBTFUL],
+        brightness_errors=brightness_errors)
 
 
-def match(truth: Light, lights: list[TrackedLight]) -> TrackedLight | None:
-    """Return the light that is within 10 pixels of a true one in the most frames; None where none ever is."""
-    def near(light: TrackedLight) -> int:
-        return sum(float(np.linalg.norm(light.keys[name].place - truth.keys[name].xy)) < 10 for name in light.support)
+def match_light(truth: Light, lights: list[TrackedLight]) -> TrackedLight | None:
+    """Return the light that is near (MAX_MATCH_DISTANCE) a true one in the most frames; None where none ever is."""
+    def count_near(light: TrackedLight) -> int:
+        return sum(float(np.linalg.norm(light.keys[name].place - truth.keys[name].xy)) < MAX_MATCH_DISTANCE
+                   for name in light.support)
 
-    best = max(lights, key=near, default=None)
-    return best if best is not None and near(best) else None
+    best = max(lights, key=count_near, default=None)
+    return best if best is not None and count_near(best) else None
 
 
-def row(values: list[float]) -> str:
+def error_columns(values: list[float]) -> str:
     """Return median, 95th percentile and largest value as text."""
     if not values:
         return "    -      -      -"
@@ -94,17 +115,19 @@ def main() -> None:
             entries = read_json(folder / "truth" / "lights.json", CaptureError)["lights"]
             matched = []
             for truth, entry in zip(read_lights(folder / "truth" / "lights.json"), entries, strict=True):
-                light = match(truth, lights)
+                light = match_light(truth, lights)
                 if light is None:
                     print(f"{shot + '_' + str(seed):8s} {truth.name:6s} not found")
                     continue
                 matched.append(light)
                 visible = {name: key["visible"] for name, key in entry["frames"].items()}
-                figures = measure(capture, truth, visible, light)
-                print(f"{shot + '_' + str(seed):8s} {truth.name:6s} {figures['visible']:7d} {figures['followed']:8d} |"
-                      f"       {row(figures['seen'])}    |       {row(figures['sure'])}          | "
-                      f"{figures['doubtful']:3d} of {figures['keys']:3d} ({figures['doubtful_visible']:d})     |"
-                      f"     {np.median(figures['brightness']):5.2f} {np.percentile(figures['brightness'], 95):5.2f}",
+                scores = score_track(capture, truth, visible, light)
+                print(f"{shot + '_' + str(seed):8s} {truth.name:6s} {scores.visible:7d} {scores.followed:8d} |"
+                      f"       {error_columns(scores.visible_errors)}    |"
+                      f"       {error_columns(scores.confident_errors)}          | "
+                      f"{scores.doubtful:3d} of {scores.keys:3d} ({scores.doubtful_visible:d})     |"
+                      f"     {np.median(scores.brightness_errors):5.2f}"
+                      f" {np.percentile(scores.brightness_errors, 95):5.2f}",
                       flush=True)
             false = sum(light not in matched for light in lights)
             print(f"{shot + '_' + str(seed):8s} {len(lights)} lights, {false} of them false")

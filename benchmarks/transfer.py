@@ -20,7 +20,7 @@ import argparse
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,15 +44,29 @@ from sample_scenes.flares import LENS_SETUPS, render_flare
 from sample_scenes.scenes.desk import DESK
 
 Pixels = NDArray[np.float32]
+SHEET_ROWS = 6
+"""Frames on the picture of a transfer, about."""
 
 
 @dataclass(frozen=True)
-class Truth:
+class ExactFrame:
     """A target's frame: what it is, with the exact share of each light; the exact flare and scene, scene-linear."""
 
     shot: ShotFrame
     flare: Pixels
     scene: Pixels
+
+
+class FrameScores(NamedTuple):
+    """Scores by frame, and what no frame's scores have."""
+
+    rows: list[dict[str, Any]]
+    """By frame: "flare" and "flare_linear" are PSNR of the transferred flare, "empty" that of none, dB. "inside": the
+    frame's lights are in the trained range."""
+    max_hidden_light: float
+    """Largest value in the flare of a light that is hidden."""
+    sheet: Pixels
+    """Some frames, display values: the exact one beside the transferred one."""
 
 
 def camera_path(number: int, count: int) -> NDArray[np.float64]:
@@ -77,15 +91,15 @@ def move_world(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     return motion, pose @ np.linalg.inv(motion)
 
 
-def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Truth]:
+def synthetic_target(count: int, world: str, size: tuple[int, int], look: Look) -> list[ExactFrame]:
     """Synthesise `count` frames with exact flares on a new camera path. size: width and height, pixels.
 
     world: "same" keeps the capture's coordinates, "moved" turns and shifts the target. Each light is hidden in some
     frames, and partly hidden in those next to them.
     """
-    sources = sources_of(look)
+    sources = nearest_sources(look)
     width, height = size
-    truths = []
+    frames = []
     for number in range(count):
         pose, motion = camera_path(number, count), np.eye(4)
         camera = Camera(width, height, 0.93 * width, 0.93 * width, 0.487 * width, 0.52 * height, pose)
@@ -97,35 +111,35 @@ def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Tr
             centre = count * (0.35 + 0.3 * index)
             share = float(np.clip((abs(number - centre) - 2.5) / 3, 0, 1))
             xyz = np.array(light.xyz)
-            local = pose[:3, :3] @ xyz + pose[:3, 3]
-            flare += render_flare(LENS_SETUPS[DESK.lens], camera, local, colour=light.colour, visible_share=share,
-                                  intensity=light.flare_strength(float(np.linalg.norm(local))))
+            camera_xyz = pose[:3, :3] @ xyz + pose[:3, 3]
+            flare += render_flare(LENS_SETUPS[DESK.lens], camera, camera_xyz, colour=light.colour, visible_share=share,
+                                  intensity=light.flare_strength(float(np.linalg.norm(camera_xyz))))
             lights.append(PlacedLight(light.name, sources[light.name], motion[:3, :3] @ xyz + motion[:3, 3], share))
-        truths.append(Truth(ShotFrame(number + 1, "Camera", camera, tuple(lights)), flare, background(camera)))
-    return truths
+        frames.append(ExactFrame(ShotFrame(number + 1, "Camera", camera, tuple(lights)), flare, background(camera)))
+    return frames
 
 
-def rendered_target(folder: Path, scene: Path, look: Look) -> tuple[list[Truth], Target]:
+def rendered_target(folder: Path, scene: Path, look: Look) -> tuple[list[ExactFrame], Target]:
     """Return the frames of a capture with exact layers, and the capture as a target.
 
     The target has its cameras, the places of its lights and the splats `scene`, but nothing that only the truth knows.
     """
     capture = Capture.open(folder)
     shares = read_json(folder / "truth" / "visible_share.json", CaptureError)
-    target_ = capture_target(capture, look, sources_of(look), scene=scene)
+    transfer_target = capture_target(capture, look, nearest_sources(look), scene=scene)
     views = {view.name: view for view in capture.views}
-    truths = []
-    for frame in target_.frames:
+    frames = []
+    for frame in transfer_target.frames:
         view = views[frame.frame.view]
-        flare, below = capture.truth_flare(view), capture.truth_scene(view)
-        if flare is None or below is None:
+        flare, scene_layer = capture.truth_flare(view), capture.truth_scene(view)
+        if flare is None or scene_layer is None:
             raise CaptureError(f"{folder} has no exact layers; make it with sample_scenes/render.py.")
         lights = tuple(replace(light, visibility=shares[view.name][light.name]) for light in frame.shot.lights)
-        truths.append(Truth(replace(frame.shot, lights=lights), flare.pixels, below.pixels))
-    return truths, target_
+        frames.append(ExactFrame(replace(frame.shot, lights=lights), flare.pixels, scene_layer.pixels))
+    return frames, transfer_target
 
 
-def sources_of(look: Look) -> dict[str, str]:
+def nearest_sources(look: Look) -> dict[str, str]:
     """Return the nearest light of the look for each of the desk's lights, by name."""
     return {light.name: min(look.lights, key=lambda source: float(np.linalg.norm(source.xyz - light.xyz))).name
             for light in DESK.lights}
@@ -141,6 +155,36 @@ def background(camera: Camera) -> Pixels:
 def psnr(first: Pixels, second: Pixels) -> float:
     """Return the PSNR of two pictures whose white is 1, dB, at most 120."""
     return float(-10 * np.log10(max(float(((first - second) ** 2).mean()), 1e-12)))
+
+
+def score_frames(transfer: Transfer, frames: list[ExactFrame], look: Look) -> FrameScores:
+    """Compare the transferred flares with the exact ones, and print a line for each frame."""
+    ranges = {light.name: transfer.training_views[light.name] for light in look.lights}
+    rows: list[dict[str, Any]] = []
+    max_hidden_light, pictures = 0.0, []
+    for index, exact in enumerate(frames):
+        camera, scene = exact.shot.camera, exact.scene
+        layers = transfer.frame_renderer(transfer.target.frames[index].frame).render(camera)
+        flare = sum(layers.flare_by_light.values())
+        for light in exact.shot.lights:
+            if light.visibility == 0:
+                max_hidden_light = max(max_hidden_light, float(np.abs(layers.flare_by_light[light.name]).max()))
+        inside = all(is_in_trained_range(ranges[light.source], ViewOfLight.of(camera.world_to_camera, light.xyz),
+                                         float(np.linalg.norm(camera.position - light.xyz)))
+                     for light in exact.shot.lights)
+        clipped = np.clip(scene + exact.flare, 0, 1), np.clip(scene + flare, 0, 1)
+        displayed = displayed_flare(scene + exact.flare, scene)
+        rows.append({"frame": exact.shot.frame, "inside": inside,
+                     "shares": [light.visibility for light in exact.shot.lights],
+                     "flare": psnr(displayed, displayed_flare(scene + flare, scene)), "flare_linear": psnr(*clipped),
+                     "empty": psnr(displayed, 0 * displayed)})
+        if index % max(len(frames) // SHEET_ROWS, 1) == 0:
+            pictures.append(np.concatenate([srgb_from_linear(part) for part in clipped], 1))
+        print(f"frame {rows[-1]['frame']:3}  inside {inside!s:5}  shares "
+              + " ".join(f"{share:.2f}" for share in rows[-1]["shares"])
+              + "".join(f"  {name} {rows[-1][name]:.2f}" for name in ("flare", "flare_linear", "empty")),
+              flush=True)
+    return FrameScores(rows, max_hidden_light, np.concatenate(pictures))
 
 
 def main() -> None:
@@ -163,38 +207,13 @@ def main() -> None:
                            need_frames=False)
     training = [view.camera.world_to_camera for view in capture.split(run.settings.holdout)[0]]
     if args.to:
-        truths, transfer_target = rendered_target(args.to, args.scene, look)
+        exact_frames, transfer_target = rendered_target(args.to, args.scene, look)
     else:
-        truths = target(args.frames, args.world, (args.width, args.width * 5 // 8), look)
-        transfer_target = shot_target(Shot(args.run / FLARE, tuple(truth.shot for truth in truths)), look, {})
+        exact_frames = synthetic_target(args.frames, args.world, (args.width, args.width * 5 // 8), look)
+        transfer_target = shot_target(Shot(args.run / FLARE, tuple(exact.shot for exact in exact_frames)), look, {})
     settings = TransferSettings(query=args.query, smooth=args.smooth)
     transfer = Transfer(args.run / FLARE, transfer_target, settings, training)
-    ranges = {light.name: transfer.training_views[light.name] for light in look.lights}
-
-    rows: list[dict[str, Any]] = []
-    max_hidden_light, pictures = 0.0, []
-    for index, truth in enumerate(truths):
-        camera = truth.shot.camera
-        exact, scene = truth.flare, truth.scene
-        layers = transfer.frame_renderer(transfer.target.frames[index].frame).render(camera)
-        ours = sum(layers.flare_by_light.values())
-        for light in truth.shot.lights:
-            if light.visibility == 0:
-                max_hidden_light = max(max_hidden_light, float(np.abs(layers.flare_by_light[light.name]).max()))
-        inside = all(is_inside(ranges[light.source], ViewOfLight.of(camera.world_to_camera, light.xyz),
-                               float(np.linalg.norm(camera.position - light.xyz))) for light in truth.shot.lights)
-        clipped = np.clip(scene + exact, 0, 1), np.clip(scene + ours, 0, 1)
-        displayed = displayed_flare(scene + exact, scene)
-        rows.append({"frame": truth.shot.frame, "inside": inside,
-                     "shares": [light.visibility for light in truth.shot.lights],
-                     "flare": psnr(displayed, displayed_flare(scene + ours, scene)), "flare_linear": psnr(*clipped),
-                     "empty": psnr(displayed, 0 * displayed)})
-        if index % max(len(truths) // 6, 1) == 0:
-            pictures.append(np.concatenate([srgb_from_linear(part) for part in clipped], 1))
-        print(f"frame {rows[-1]['frame']:3}  inside {inside!s:5}  shares "
-              + " ".join(f"{share:.2f}" for share in rows[-1]["shares"])
-              + "".join(f"  {name} {rows[-1][name]:.2f}" for name in ("flare", "flare_linear", "empty")),
-              flush=True)
+    rows, max_hidden_light, sheet = score_frames(transfer, exact_frames, look)
     scored = [row for row in rows if row["inside"]]
     means = {name: float(np.mean([row[name] for row in scored])) for name in ("flare", "flare_linear", "empty")}
     worst = min(scored, key=lambda row: row["flare"])
@@ -203,19 +222,19 @@ def main() -> None:
           f"{means['empty']:.2f}; most light of a hidden light: {max_hidden_light:g}")
     if args.out:
         name = f"transfer_{args.to.name if args.to else args.world}_{args.query}"
-        write_png(args.out / f"{name}.png", np.concatenate(pictures))
+        write_png(args.out / f"{name}.png", sheet)
         write_json(args.out / f"{name}.json", {"means": means, "views": rows})
 
 
-def is_inside(training: object, view: ViewOfLight, distance: float) -> bool:
+def is_in_trained_range(training: object, view: ViewOfLight, distance: float) -> bool:
     """Return whether a light is in the range of the training views.
 
     training: of `Transfer.training_views`. The range is of the light's place in the frame, up to mirroring, and of its
     distance from the camera.
     """
     lights, distances = np.abs(training.lights), training.distances  # type: ignore[attr-defined]
-    place = np.abs(view.light)
-    return bool((place <= lights.max(0)).all() and distances.min() <= distance <= distances.max())
+    position = np.abs(view.light)
+    return bool((position <= lights.max(0)).all() and distances.min() <= distance <= distances.max())
 
 
 if __name__ == "__main__":

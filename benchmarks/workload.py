@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-TAN = math.tan(math.radians(30))
+TAN_HALF_ANGLE = math.tan(math.radians(30))
+"""Of the frustum's angle across."""
 
 
 class Scene(NamedTuple):
@@ -38,40 +39,42 @@ class Flares(NamedTuple):
     colours: Tensor
 
 
-def scene(n: int, seed: int = 0) -> Scene:
-    """Return a scene of n Gaussians."""
+def make_scene(count: int, seed: int = 0) -> Scene:
+    """Make a scene of `count` Gaussians."""
     rng = np.random.default_rng(seed)
-    z = rng.uniform(2, 10, n)
-    x = z * TAN * rng.uniform(-1.1, 1.1, n)
-    y = z * TAN * 270 / 480 * rng.uniform(-1.15, 1.15, n)
-    typical = np.log(0.042 * math.sqrt(10_000 / n) * z / 5)
-    log_scales = typical[:, None] + rng.normal(0, 0.55, (n, 1)) + rng.normal(0, 0.45, (n, 3))
-    quaternions = rng.normal(size=(n, 4))
-    opacity_logits = rng.normal(-0.4, 1.8, n)
-    sh = rng.normal(0, 0.1, (n, 16, 3))
-    sh[:, 0] = rng.normal(0, 1, (n, 3))
+    z = rng.uniform(2, 10, count)
+    x = z * TAN_HALF_ANGLE * rng.uniform(-1.1, 1.1, count)
+    y = z * TAN_HALF_ANGLE * 270 / 480 * rng.uniform(-1.15, 1.15, count)
+    mean_log_scale = np.log(0.042 * math.sqrt(10_000 / count) * z / 5)
+    log_scales = mean_log_scale[:, None] + rng.normal(0, 0.55, (count, 1)) + rng.normal(0, 0.45, (count, 3))
+    quaternions = rng.normal(size=(count, 4))
+    opacity_logits = rng.normal(-0.4, 1.8, count)
+    sh = rng.normal(0, 0.1, (count, 16, 3))
+    sh[:, 0] = rng.normal(0, 1, (count, 3))
     values = (np.stack([x, y, z], 1), log_scales, quaternions, opacity_logits, sh)
     return Scene(*(torch.tensor(value, dtype=torch.float32) for value in values))
 
 
 def intrinsics(width: int, height: int) -> Tensor:
     """Return the matrix (3, 3) of the camera."""
-    focal = width / (2 * TAN)
+    focal = width / (2 * TAN_HALF_ANGLE)
     return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
 
-def flares(n: int, width: int, height: int, seed: int = 1) -> Flares:
-    """Return n flare Gaussians for a picture of this size, pixels."""
+def make_flares(count: int, width: int, height: int, seed: int = 1) -> Flares:
+    """Make `count` flare Gaussians for a picture of this size, pixels."""
     rng = np.random.default_rng(seed)
-    covered = np.exp(rng.uniform(math.log(0.05), math.log(0.4), n)) * width * height
-    opacities = np.exp(rng.uniform(math.log(0.006), math.log(0.03), n))
-    variance = covered / (math.pi * 2 * np.log(255 * opacities))  # alpha falls to 1/255 at the rim
-    stretch = np.exp(rng.normal(0, 0.5, n))
-    theta = rng.uniform(0, math.pi, n)
-    c, s = np.cos(theta), np.sin(theta)
-    a, b = variance * stretch, variance / stretch
+    covered_area = np.exp(rng.uniform(math.log(0.05), math.log(0.4), count)) * width * height
+    opacities = np.exp(rng.uniform(math.log(0.006), math.log(0.03), count))
+    variance = covered_area / (math.pi * 2 * np.log(255 * opacities))  # alpha falls to 1/255 at the rim
+    stretch = np.exp(rng.normal(0, 0.5, count))
+    angle = rng.uniform(0, math.pi, count)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    major, minor = variance * stretch, variance / stretch
     # 0.3 px² is the low-pass filter of 3DGS.
-    covariances = np.stack([c * c * a + s * s * b + 0.3, c * s * (a - b), s * s * a + c * c * b + 0.3], 1)
-    centres = np.stack([rng.uniform(0.1, 0.9, n) * width, rng.uniform(0.1, 0.9, n) * height], 1)
-    values = (centres, covariances, opacities, rng.uniform(0, 1, (n, 3)))
+    xx = cosine * cosine * major + sine * sine * minor + 0.3
+    yy = sine * sine * major + cosine * cosine * minor + 0.3
+    covariances = np.stack([xx, cosine * sine * (major - minor), yy], 1)
+    centres = np.stack([rng.uniform(0.1, 0.9, count) * width, rng.uniform(0.1, 0.9, count) * height], 1)
+    values = (centres, covariances, opacities, rng.uniform(0, 1, (count, 3)))
     return Flares(*(torch.tensor(value, dtype=torch.float32) for value in values))

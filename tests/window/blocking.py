@@ -19,7 +19,7 @@ import bpy
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 sys.path.insert(0, str(Path(__file__).parent))
-import blender as made
+import blender as benchmark_inputs
 import driver as ui
 from measure import NAME, Gaps, Ours, Times, milliseconds, module, noted
 
@@ -39,7 +39,7 @@ def steps():
         bpy.data.objects.remove(item)
     yield 1
     yield from ui.open_tab("Fit Flare")
-    capture = made.make_capture(out / f"capture_{CAMERAS}", CAMERAS)
+    capture = benchmark_inputs.make_capture(out / f"capture_{CAMERAS}", CAMERAS)
     scene = bpy.context.scene
     figures: dict[str, object] = {"blender": bpy.app.version_string, "cameras": CAMERAS}
     steps: Times = []
@@ -82,7 +82,7 @@ def steps():
     while job.running:
         yield 0.5
     assert job.state == "stopped", (job.state, job.error)
-    flare = made.make_flare(out / "made.flare")
+    flare = benchmark_inputs.make_flare(out / "made.flare")
     gaps = Gaps()
     yield 1
     module("looks").show_look(scene, flare)  # what the end of a fit does

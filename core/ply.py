@@ -33,10 +33,10 @@ class Element(NamedTuple):
 
         Raises ValueError with the words of a property that is no plain number, such as a list.
         """
-        for words in self.properties:
-            if len(words) != 2 or words[0] not in NUMPY_TYPES:
-                raise ValueError(repr(" ".join(words)))
-        return [(name, NUMPY_TYPES[kind]) for kind, name in self.properties]
+        for tokens in self.properties:
+            if len(tokens) != 2 or tokens[0] not in NUMPY_TYPES:
+                raise ValueError(repr(" ".join(tokens)))
+        return [(name, NUMPY_TYPES[type_name]) for type_name, name in self.properties]
 
     def row(self, order: str) -> np.dtype[Any]:
         """Return the type of a row of a binary file. Raises ValueError likewise, and for a duplicate name."""
@@ -58,19 +58,19 @@ def read_header(data: bytes) -> Header | None:
     start = data.find(b"\n", end + 1) + 1
     if not data.startswith(b"ply") or end < 0 or not start:
         return None
-    format_, comments = "", []
+    format_name, comments = "", []
     elements: list[Element] = []
     for line in data[:end].decode("ascii", "replace").splitlines():
         match line.split():
-            case ["format", format_, *_]:
+            case ["format", format_name, *_]:
                 pass
-            case ["comment", *words]:
-                comments.append(words)
-            case ["element", name, number]:
-                elements.append(Element(name, _parse_count(number), []))
-            case ["property", *words] if elements:
-                elements[-1].properties.append(words)
-    return Header(format_, comments, elements, start)
+            case ["comment", *tokens]:
+                comments.append(tokens)
+            case ["element", name, row_count]:
+                elements.append(Element(name, _parse_count(row_count), []))
+            case ["property", *tokens] if elements:
+                elements[-1].properties.append(tokens)
+    return Header(format_name, comments, elements, start)
 
 
 def read_table(data: bytes, row: np.dtype[Any], count: int, start: int) -> NDArray[Any]:

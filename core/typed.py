@@ -35,8 +35,8 @@ class Bounds:
 
     def contains(self, value: float) -> bool:
         """True if the number lies in the range; NaN never does."""
-        low = self.minimum < value if self.exclusive_minimum else self.minimum <= value
-        return low and (value < self.maximum if self.exclusive_maximum else value <= self.maximum)
+        above_minimum = self.minimum < value if self.exclusive_minimum else self.minimum <= value
+        return above_minimum and (value < self.maximum if self.exclusive_maximum else value <= self.maximum)
 
 
 def is_utf8(text: str) -> bool:
@@ -78,19 +78,19 @@ def parse_value(kind: Any, value: Any) -> Any:
         raise ValueError(f"{value!r} is not UTF-8")
     if dataclasses.is_dataclass(kind):
         return parse_table(kind, value)
-    parts = typing.get_args(kind)
+    type_args = typing.get_args(kind)
     if typing.get_origin(kind) is Literal:
-        if value not in parts:
-            raise ValueError(f"{value!r} is not one of {', '.join(parts)}")
+        if value not in type_args:
+            raise ValueError(f"{value!r} is not one of {', '.join(type_args)}")
         return value
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list | tuple):
             raise ValueError(f"{value!r} is not {_type_name(kind)}")
-        kinds = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
-        if len(kinds) != len(value):
-            raise ValueError(f"{value!r} should have {len(kinds)} parts")
-        return tuple(parse_value(part_kind, part) for part_kind, part in zip(kinds, value, strict=True))
-    for option in parts if isinstance(kind, types.UnionType) else (kind,):
+        part_types = type_args[:1] * len(value) if type_args[-1] is Ellipsis else type_args
+        if len(part_types) != len(value):
+            raise ValueError(f"{value!r} should have {len(part_types)} parts")
+        return tuple(parse_value(part_kind, part) for part_kind, part in zip(part_types, value, strict=True))
+    for option in type_args if isinstance(kind, types.UnionType) else (kind,):
         if option is float and isinstance(value, int | float) and not isinstance(value, bool):
             if not math.isfinite(value):
                 raise ValueError("it must be a finite number")

@@ -43,23 +43,24 @@ def space_of_profile(profile: bytes) -> ColourSpace:
         if space is not None:
             return space
     name = _description(tags)
-    if profile[16:20] == b"GRAY" and b"kTRC" in tags:
-        return _space(name, np.eye(3), [_parse_curve(tags[b"kTRC"])] * 3)
-    if profile[16:20] != b"RGB ":
-        raise UnreadableProfile(f"is for {profile[16:20].decode('latin-1').strip()}, not for R G B")
-    needed = (b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC")
-    if not all(tag in tags for tag in needed):
+    data_space = profile[16:20]  # of the header
+    if data_space == b"GRAY" and b"kTRC" in tags:
+        return _make_space(name, np.eye(3), [_parse_curve(tags[b"kTRC"])] * 3)
+    if data_space != b"RGB ":
+        raise UnreadableProfile(f"is for {data_space.decode('latin-1').strip()}, not for R G B")
+    required = (b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC")
+    if not all(tag in tags for tag in required):
         if "srgb" in name.lower():  # some sRGB profiles consist of tables
             return colour_space("srgb")
         raise UnreadableProfile("consists of tables")
-    columns = [_parse_xyz(tags[tag]) for tag in needed[:3]]  # X, Y, Z of each primary, under white D50
+    columns = [_parse_xyz(tags[tag]) for tag in required[:3]]  # X, Y, Z of each primary, under white D50
     matrix = np.linalg.inv(_to_d50(matrix_to_xyz(REC_709))) @ np.array(columns).T
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-6:
         raise UnreadableProfile("has primaries that span no space")
-    return _space(name, matrix, [_parse_curve(tags[tag]) for tag in needed[3:]])
+    return _make_space(name, matrix, [_parse_curve(tags[tag]) for tag in required[3:]])
 
 
-def _space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> ColourSpace:
+def _make_space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> ColourSpace:
     """Make the space of a profile's curves, one per channel, and its matrix (3, 3) to linear Rec. 709."""
     ramp = np.linspace(0, 1, _SAMPLES, dtype=np.float32)
     decoded = np.stack([curve(ramp) for curve in curves])
@@ -90,11 +91,11 @@ def _invert(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) -> Pixel
     """
     value = np.interp(light, decoded, ramp)
     step = np.float32(0.5 / _SAMPLES)
-    above, below = (curve(np.clip(value + way * step, 0, 1).astype(np.float32)) for way in (1, -1))
+    above, below = (curve(np.clip(value + sign * step, 0, 1).astype(np.float32)) for sign in (1, -1))
     slope = above - below
     error = light - curve(value.astype(np.float32))
-    moved = value + np.clip(np.where(slope > 0, error / np.maximum(slope, 1e-9) * 2 * step, 0), -2 * step, 2 * step)
-    return np.clip(np.where((light > 0) & (light < 1), moved, value), 0, 1).astype(np.float32)
+    refined = value + np.clip(np.where(slope > 0, error / np.maximum(slope, 1e-9) * 2 * step, 0), -2 * step, 2 * step)
+    return np.clip(np.where((light > 0) & (light < 1), refined, value), 0, 1).astype(np.float32)
 
 
 def _read_tags(profile: bytes) -> dict[bytes, bytes]:
@@ -107,10 +108,10 @@ def _read_tags(profile: bytes) -> dict[bytes, bytes]:
         entry = profile[132 + 12 * index:144 + 12 * index]
         if len(entry) < 12:
             raise UnreadableProfile("is damaged")
-        name, at, length = struct.unpack(">4sII", entry)
-        if at + length > len(profile):
+        name, offset, length = struct.unpack(">4sII", entry)
+        if offset + length > len(profile):
             raise UnreadableProfile("is damaged")
-        tags[name] = profile[at:at + length]
+        tags[name] = profile[offset:offset + length]
     return tags
 
 
@@ -118,8 +119,8 @@ def _description(tags: dict[bytes, bytes]) -> str:
     """Return the profile's name: of version 4 ("mluc") in its first language, of version 2 ("desc") in ASCII."""
     text = tags.get(b"desc", b"")
     if text[:4] == b"mluc" and len(text) >= 28:
-        length, at = struct.unpack(">II", text[20:28])
-        return text[at:at + length].decode("utf-16-be", "replace").strip("\0 ") or "without a name"
+        length, offset = struct.unpack(">II", text[20:28])
+        return text[offset:offset + length].decode("utf-16-be", "replace").strip("\0 ") or "without a name"
     if text[:4] == b"desc" and len(text) >= 12:
         return text[12:12 + int.from_bytes(text[8:12], "big")].decode("latin-1").strip("\0 ") or "without a name"
     return "without a name"
@@ -144,14 +145,15 @@ def _parse_curve(data: bytes) -> Table:
             return lambda x: np.asarray(x, np.float32)  # linear
         if count == 1:
             return _power(float(values[0]) / 256)  # the exponent, with 8 bits behind the point
-        table, places = values.astype(np.float64) / 65535, np.linspace(0, 1, count)
-        return lambda x: np.interp(x, places, table).astype(np.float32)
+        table, positions = values.astype(np.float64) / 65535, np.linspace(0, 1, count)
+        return lambda x: np.interp(x, positions, table).astype(np.float32)
     if data[:4] == b"para" and len(data) >= 12:
-        kind = int.from_bytes(data[8:10], "big")
-        if kind <= 4:
-            length = (1, 3, 4, 5, 7)[kind]  # number of parameters, fixed-point of 16.16 bits
-            if len(data) >= 12 + 4 * length:
-                return _parametric(kind, [n / 65536 for n in struct.unpack(f">{length}i", data[12:12 + 4 * length])])
+        function_type = int.from_bytes(data[8:10], "big")
+        if function_type <= 4:
+            parameter_count = (1, 3, 4, 5, 7)[function_type]  # fixed-point numbers of 16.16 bits
+            if len(data) >= 12 + 4 * parameter_count:
+                numbers = struct.unpack(f">{parameter_count}i", data[12:12 + 4 * parameter_count])
+                return _parametric(function_type, [number / 65536 for number in numbers])
     raise UnreadableProfile("is damaged")
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import EngineError, SettingsError
 from ..system.reading import check_regular
-from .spaces import REC_709, ColourSpace, colour_space, linear_space
+from .spaces import REC_709, Chromaticities, ColourSpace, colour_space, linear_space
 from .spaces import built_in_names as built_in_names
 
 CONFIGURED_NAMES = {
@@ -47,33 +47,34 @@ def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
     A space that OpenColorIO calls linear comes as a matrix. Raises SettingsError for a configuration that cannot be
     read or lacks the space, EngineError where the library is not installed.
     """
-    library = _library()
-    where = str(config or os.environ.get("OCIO") or _BUILT_IN)
-    check_regular(where)
+    library = _import_library()
+    config_path = str(config or os.environ.get("OCIO") or _BUILT_IN)
+    check_regular(config_path)
     try:
-        opened = library.Config.CreateFromFile(where)
+        configuration = library.Config.CreateFromFile(config_path)
     except Exception as problem:  # its own class, which exists only where it is installed
-        raise SettingsError(f"The OpenColorIO configuration {where} cannot be read ({_one_line(problem)}); choose "
-                            "another file.") from problem
-    configured = opened.getColorSpace(name)
-    if configured is None:
+        raise SettingsError(f"The OpenColorIO configuration {config_path} cannot be read ({_one_line(problem)}); "
+                            "choose another file.") from problem
+    space = configuration.getColorSpace(name)
+    if space is None:
         if name.lower() in built_in_names():
             return colour_space(name)
-        raise SettingsError(f"The OpenColorIO configuration {where} has no colour space {name!r}; it has "
-                            f"{', '.join(list(opened.getColorSpaceNames())[:12])}, …")
-    if opened.isColorSpaceLinear(name, library.REFERENCE_SPACE_SCENE):
-        processor = _processor(library, opened, name, forward=True)
+        raise SettingsError(f"The OpenColorIO configuration {config_path} has no colour space {name!r}; it has "
+                            f"{', '.join(list(configuration.getColorSpaceNames())[:12])}, …")
+    if configuration.isColorSpaceLinear(name, library.REFERENCE_SPACE_SCENE):
+        processor = _get_processor(library, configuration, name, forward=True)
         matrix = _apply_processor(processor, np.eye(3, dtype=np.float32)).T.astype(np.float64)  # columns: primaries
-        known = _built_in_space(configured)
-        return linear_space(name, matrix, known.chromaticities if known else _chromaticities(matrix))
-    forward, inverse = (_processor(library, opened, name, forward=is_forward) for is_forward in (True, False))
+        built_in = _built_in_space(space)
+        return linear_space(name, matrix, built_in.chromaticities if built_in else _derive_chromaticities(matrix))
+    forward, inverse = (_get_processor(library, configuration, name, forward=is_forward)
+                        for is_forward in (True, False))
     return ColourSpace(name, lambda pixels: _apply_processor(forward, pixels),
                        lambda pixels: _apply_processor(inverse, pixels))
 
 
 def camera_space(name: str) -> ColourSpace:
     """Return the space of a camera's logarithm, by OpenColorIO's own transforms. Raises EngineError without it."""
-    library = _library()
+    library = _import_library()
     transform = library.BuiltinTransform(style=f"{_CAMERA_TRANSFORMS[name]}_to_ACES2065-1")
     config = library.Config.CreateRaw()
     forward, inverse = (config.getProcessor(transform, direction).getDefaultCPUProcessor()
@@ -83,7 +84,7 @@ def camera_space(name: str) -> ColourSpace:
                        lambda light: _apply_processor(inverse, aces.from_linear(light)), has_headroom=True)
 
 
-def _library() -> ModuleType:
+def _import_library() -> ModuleType:
     """Import PyOpenColorIO: the installed package, else Blender's own, which lies where Python does not search."""
     if importlib.util.find_spec("PyOpenColorIO"):
         return importlib.import_module("PyOpenColorIO")
@@ -100,7 +101,7 @@ def _library() -> ModuleType:
                       "environment.")
 
 
-def _processor(library: ModuleType, config: Any, name: str, *, forward: bool) -> Any:
+def _get_processor(library: ModuleType, config: Any, name: str, *, forward: bool) -> Any:
     """Return the processor from the space to linear Rec. 709 (`forward`), or back.
 
     A configuration without a name for linear Rec. 709 is converted through OpenColorIO's own one.
@@ -134,7 +135,7 @@ def _built_in_space(space: Any) -> ColourSpace | None:
     return None
 
 
-def _chromaticities(matrix: NDArray[np.float64]) -> tuple[float, float, float, float, float, float, float, float]:
+def _derive_chromaticities(matrix: NDArray[np.float64]) -> Chromaticities:
     """Derive primaries from a space's matrix (3, 3) to linear Rec. 709, with the white of Rec. 709: the matrix has its
     own white adapted to that."""
     from .spaces import matrix_to_xyz

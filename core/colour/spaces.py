@@ -151,14 +151,14 @@ def colour_space(name: str, config: Path | str | None = None) -> ColourSpace:
         from .ocio import ocio_space
 
         return ocio_space(name, config)
-    plain = _plain(name)
-    if plain in _ALIASES:
-        known = _ALIASES[plain]
+    normalised = _normalise_name(name)
+    if normalised in _ALIASES:
+        known = _ALIASES[normalised]
         return (_BUILT_IN.get(known) or _CURVED[known])()
     from .ocio import camera_space, has_configuration, ocio_space
 
-    if plain in _CAMERAS:
-        return camera_space(_CAMERAS[plain])
+    if normalised in _CAMERAS:
+        return camera_space(_CAMERAS[normalised])
 
     if not has_configuration():
         names = ", ".join(plate_names())
@@ -180,10 +180,10 @@ def plate_names() -> list[str]:
 
 def is_plate_name(name: str) -> bool:
     """True if `colour_space` knows a name without a configuration, however people write it."""
-    return _plain(name) in _ALIASES or _plain(name) in _CAMERAS
+    return _normalise_name(name) in _ALIASES or _normalise_name(name) in _CAMERAS
 
 
-def _plain(name: str) -> str:
+def _normalise_name(name: str) -> str:
     """Return a name as the tables below have it: lower case, letters and digits alone, since people write the others
     differently."""
     return "".join(character for character in name.lower() if character.isalnum())
@@ -210,7 +210,7 @@ _LINEAR: dict[str, Chromaticities] = {"linear": REC_709, "acescg": AP1, "aces206
                                       "p3-d65": P3_D65}
 
 
-def _linear(name: str) -> Callable[[], ColourSpace]:
+def _linear_maker(name: str) -> Callable[[], ColourSpace]:
     """Return a function that makes the built-in linear space of this name."""
     return lambda: linear_space(name, matrix_between(_LINEAR[name], REC_709), _LINEAR[name])
 
@@ -219,7 +219,7 @@ _ADOBE_RGB: Chromaticities = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290
 _BUILT_IN: dict[str, Callable[[], ColourSpace]] = {
     "srgb": lambda: ColourSpace("srgb", linear_from_srgb, srgb_from_linear),
     "rec709": lambda: ColourSpace("rec709", _linear_from_rec709, _rec709_from_linear),
-    **{name: _linear(name) for name in _LINEAR},
+    **{name: _linear_maker(name) for name in _LINEAR},
 }
 _CURVED: dict[str, Callable[[], ColourSpace]] = {
     "display-p3": lambda: curved_space("display-p3", linear_from_srgb, srgb_from_linear, P3_D65),
@@ -230,10 +230,10 @@ _CURVED: dict[str, Callable[[], ColourSpace]] = {
     "hlg": lambda: curved_space("hlg", light_from_hlg, hlg_from_light, REC_2020, has_headroom=True),
     "cineon": lambda: curved_space("cineon", light_from_cineon, cineon_from_light, REC_709, has_headroom=True),
 }
-_ALIASES = {**{_plain(name): name for name in [*_BUILT_IN, *_CURVED]}, "bt709": "rec709", "linearrec709": "linear",
-            "linrec709": "linear", "ap1": "acescg", "ap0": "aces2065-1", "linearrec2020": "rec2020",
-            "linrec2020": "rec2020", "p3": "display-p3", "adobergb1998": "adobergb", "rec2100pq": "pq",
-            "rec2100hlg": "hlg", "st2084": "pq"}
+_ALIASES = {**{_normalise_name(name): name for name in [*_BUILT_IN, *_CURVED]}, "bt709": "rec709",
+            "linearrec709": "linear", "linrec709": "linear", "ap1": "acescg", "ap0": "aces2065-1",
+            "linearrec2020": "rec2020", "linrec2020": "rec2020", "p3": "display-p3", "adobergb1998": "adobergb",
+            "rec2100pq": "pq", "rec2100hlg": "hlg", "st2084": "pq"}
 _CAMERAS = {
     **dict.fromkeys(("logc3", "arrilogc3", "logc3awg3", "logcei800", "alexalogc"), "logc3"),
     **dict.fromkeys(("logc4", "arrilogc4", "logc4awg4"), "logc4"),
@@ -246,4 +246,4 @@ _CAMERAS = {
     **dict.fromkeys(("clog3", "canonlog3", "clog3cgamut"), "clog3"),
     "applelog": "applelog",
 }
-"""Names of the cameras' spaces by what people write, as `_plain` returns it."""
+"""Names of the cameras' spaces by what people write, as `_normalise_name` returns it."""

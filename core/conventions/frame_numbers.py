@@ -51,8 +51,8 @@ def number_views(views: Iterable[str]) -> list[NumberedFrame]:
         numbers = {name: number for name, number in parsed.items() if number is not None}
         if not numbers or len(set(numbers.values())) < len(numbers):
             numbers = _differing_numbers(list(parsed))
-        after = max(numbers.values(), default=0) + 1
-        numbers.update(zip((name for name in parsed if name not in numbers), itertools.count(after)))
+        next_number = max(numbers.values(), default=0) + 1
+        numbers.update(zip((name for name in parsed if name not in numbers), itertools.count(next_number)))
         pairs = sorted((number, name) for name, number in numbers.items())
         frames += [NumberedFrame(name, number, layers_file(folder, number)) for number, name in pairs]
     return frames
@@ -70,12 +70,12 @@ def _parse_number(name: PurePath) -> int | None:
 def _differing_numbers(names: Sequence[str]) -> dict[str, int]:
     """Return the number of each name where all are equal but for one number; empty where they are not."""
     pieces = {name: re.split(r"(\d+)", PurePosixPath(name).stem) for name in names}
-    if len(pieces) < 2 or len({len(each) for each in pieces.values()}) > 1:
+    if len(pieces) < 2 or len({len(name_pieces) for name_pieces in pieces.values()}) > 1:
         return {}
     differing = [column for column, values in enumerate(zip(*pieces.values(), strict=True)) if len(set(values)) > 1]
     if len(differing) != 1 or differing[0] % 2 == 0:  # texts stand at the even places, numbers at the odd ones
         return {}
-    numbers = {name: each[differing[0]] for name, each in pieces.items()}
+    numbers = {name: name_pieces[differing[0]] for name, name_pieces in pieces.items()}
     if any(len(number) > _MAX_DIGITS for number in numbers.values()):
         return {}
     number_by_name = {name: int(number) for name, number in numbers.items()}
@@ -92,13 +92,13 @@ def number_sequences(paths: Iterable[Path]) -> dict[Path, int]:
     for path in dict.fromkeys(paths):
         folders.setdefault(path.parent, []).append(path)
     numbers: dict[Path, int] = {}
-    for inside in folders.values():  # one group, unless two plates share a number
-        ends = [number for path in inside if (number := _parse_number(path)) is not None]
+    for folder_paths in folders.values():  # one group, unless two plates share a number
+        end_numbers = [number for path in folder_paths if (number := _parse_number(path)) is not None]
         groups: dict[tuple[str, str], list[Path]] = {}
-        for path in inside:
+        for path in folder_paths:
             match = _LAST_NUMBER.search(path.stem)
             key = ((path.stem[:match.start()], path.suffix.lower()) if match else ("", ""))
-            groups.setdefault(key if len(set(ends)) < len(ends) else ("", ""), []).append(path)
+            groups.setdefault(key if len(set(end_numbers)) < len(end_numbers) else ("", ""), []).append(path)
         for group in groups.values():
             by_name = {path.name: path for path in group}
             numbers |= {by_name[frame.view]: frame.number for frame in number_views(by_name)}
@@ -152,9 +152,9 @@ def select_task_frames(frames: Sequence[NumberedFrame], text: str | None,
         return list(frames)
     ranges, job_ranges = _parse_ranges(text), _parse_ranges(job_text) if job_text is not None else []
     numbers = sorted(frame.number for frame in frames)
-    if any(number in each for number in numbers for each in ranges):
+    if any(number in job_range for number in numbers for job_range in ranges):
         return select_frames(frames, text)
-    has_others = any(number in each for number in numbers for each in job_ranges)
+    has_others = any(number in job_range for number in numbers for job_range in job_ranges)
     if not has_others and (job_text is not None or not _is_between(numbers, ranges)):
         raise _no_frames(frames, job_text or text)
     return []
@@ -162,7 +162,8 @@ def select_task_frames(frames: Sequence[NumberedFrame], text: str | None,
 
 def _is_between(numbers: Sequence[int], ranges: Sequence[range]) -> bool:
     """Return whether any of the ranges begins after the first and ends before the last of sorted numbers."""
-    return bool(numbers) and any(numbers[0] < each[0] and each[-1] < numbers[-1] for each in ranges)
+    return bool(numbers) and any(numbers[0] < number_range[0] and number_range[-1] < numbers[-1]
+                                 for number_range in ranges)
 
 
 def _no_frames(frames: Sequence[NumberedFrame], text: str) -> SettingsError:
@@ -174,10 +175,10 @@ def _no_frames(frames: Sequence[NumberedFrame], text: str) -> SettingsError:
 
 def missing_numbers(frames: Sequence[NumberedFrame], text: str | None) -> str:
     """Return the numbers in the list `text` that no frame has, as such a list; "" where there are none, or no text."""
-    known, gaps = {frame.number for frame in frames}, []
+    existing, gaps = {frame.number for frame in frames}, []
     for numbers in _parse_ranges(text) if text is not None else []:
-        # Places in the range that a frame has; a gap lies between neighbours that are more than 1 apart.
-        present = [-1, *sorted(numbers.index(number) for number in known if number in numbers), len(numbers)]
+        # Indices in the range that a frame has; a gap lies between neighbours that are more than 1 apart.
+        present = [-1, *sorted(numbers.index(number) for number in existing if number in numbers), len(numbers)]
         gaps += [numbers[before + 1:after] for before, after in itertools.pairwise(present) if after > before + 1]
     return ",".join(str(gap[0]) if len(gap) == 1 else f"{gap[0]}-{gap[-1]}" + f":{gap.step}" * (gap.step > 1)
                     for gap in gaps)

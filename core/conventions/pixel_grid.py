@@ -43,8 +43,8 @@ class PixelGrid:
     @classmethod
     def from_focal_lengths(cls, focal_lengths: Iterable[float]) -> PixelGrid:
         """The grid of frames with these focal lengths, px."""
-        known = list(focal_lengths)
-        return cls(min(known), max(known))
+        lengths = list(focal_lengths)
+        return cls(min(lengths), max(lengths))
 
     @classmethod
     def read(cls, entry: Mapping[str, Any] | None) -> PixelGrid | None:

@@ -52,20 +52,21 @@ def evaluate(renderer: ViewRenderer, capture: Capture, cameras: Mapping[View, Ca
     for view, camera in cameras.items():
         rendering = renderer.render(camera)
         composite = sum(rendering.flare_by_light.values(), rendering.scene)
-        part = (slice(None), slice(None)) if area is None else area.slices
-        clean = {"truth": capture.truth_scene, "removed": capture.removed}.get(reference, _no_picture)
-        flare = capture.truth_flare if reference == "truth" else _no_picture
-        # The reference scene, and the exact flare, where the capture has them.
-        known, exact = (None if picture is None else replace(picture, pixels=picture.pixels[part])
-                        for picture in (clean(view, camera.size), flare(view, camera.size)))
+        area_slices = (slice(None), slice(None)) if area is None else area.slices
+        read_scene = {"truth": capture.truth_scene, "removed": capture.removed}.get(reference, _no_picture)
+        read_flare = capture.truth_flare if reference == "truth" else _no_picture
+        scene_reference, flare_truth = (  # None where the capture has none
+            None if picture is None else replace(picture, pixels=picture.pixels[area_slices])
+            for picture in (read_scene(view, camera.size), read_flare(view, camera.size)))
         filmed = capture.frame(view, camera.size)
         mask = capture.mask(view, camera.size)
-        counted = None if mask is None else mask[part]
+        scored_mask = None if mask is None else mask[area_slices]
         scored.append((view.name, score_view(
-            composite[part], rendering.scene[part], replace(filmed, pixels=filmed.pixels[part]), known, exact,
-            unscored_mask(capture, view, camera.size)[part], lpips, counted)))
-        if counted is not None and not counted.all():
-            masked[view.name] = round(1 - float(counted.mean()), 4)
+            composite[area_slices], rendering.scene[area_slices],
+            replace(filmed, pixels=filmed.pixels[area_slices]), scene_reference, flare_truth,
+            unscored_mask(capture, view, camera.size)[area_slices], lpips, scored_mask)))
+        if scored_mask is not None and not scored_mask.all():
+            masked[view.name] = round(1 - float(scored_mask.mean()), 4)
         progress.advance()
     size = next(iter(cameras.values())).size if cameras else (0, 0)
     return {**summarise(reference, scored, size), **({"masked": masked} if masked else {})}
@@ -77,26 +78,26 @@ def _no_picture(_view: View, _size: tuple[int, int]) -> None:
 
 def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: Picture | None,
                flare_truth: Picture | None = None, unscored: NDArray[np.bool_] | None = None,
-               lpips: Perceptual | None = None, counted: NDArray[np.bool_] | None = None) -> dict[str, Scores]:
+               lpips: Perceptual | None = None, scored_mask: NDArray[np.bool_] | None = None) -> dict[str, Scores]:
     """Return the scores of one view by layer: psnr, ssim, lpips (null without weights), flip.
 
     composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size. unscored: (height,
-    width), pixels in which the linear flare is not scored; by default the clipped ones. A flare also has `empty_psnr`,
-    the score of an empty flare. counted: (height, width), the pixels to score, None for all; the others are replaced by
-    those of the reference, since some scores look at whole windows.
+    width), pixels in which the linear flare is not scored; by default the clipped ones. scored_mask: (height, width),
+    the pixels to score, None for all; the others are replaced by those of the reference, since some scores look at
+    whole windows. A flare also has `empty_psnr`, the score of an empty flare.
     """
     displayed, clean, filmed = _to_display(composite), _to_display(scene), frame.display()
-    scores = {"composite": _score_picture(displayed, filmed, lpips, counted)}
+    scores = {"composite": _score_picture(displayed, filmed, lpips, scored_mask)}
     if scene_reference is not None:
         reference = scene_reference.display()
         flare, flare_reference = displayed_flare(composite, scene), np.abs(filmed - reference)
-        scores["scene"] = _score_picture(clean, reference, lpips, counted)
-        scores["flare"] = {**_score_picture(flare, flare_reference, lpips, counted),
-                           "empty_psnr": psnr(np.zeros_like(flare), flare_reference, counted)}
+        scores["scene"] = _score_picture(clean, reference, lpips, scored_mask)
+        scores["flare"] = {**_score_picture(flare, flare_reference, lpips, scored_mask),
+                           "empty_psnr": psnr(np.zeros_like(flare), flare_reference, scored_mask)}
     if flare_truth is not None:
         truth, layer = flare_truth.linear(), composite - scene
         mask = ~(clipped_mask(frame) if unscored is None else unscored)
-        mask = mask if counted is None else mask & counted
+        mask = mask if scored_mask is None else mask & scored_mask
         scores["flare_linear"] = {
             "psnr": psnr(layer, truth, mask), "relative_l2": relative_l2(layer, truth, mask),
             "empty_psnr": psnr(np.zeros_like(layer), truth, mask)}
@@ -110,12 +111,12 @@ def unscored_mask(capture: Capture, view: View, size: tuple[int, int] | None = N
     any channel. size: (width, height) of the result, the camera's by default.
     """
     frame, scene, flare = capture.frame(view), capture.truth_scene(view), capture.truth_flare(view)
-    white = clipped_mask(frame)
+    clipped = clipped_mask(frame)
     if scene is not None and flare is not None and frame.encoding != "linear":
-        reached = (scene.linear() + flare.linear() >= 1).any(-1)
+        reaches_white = (scene.linear() + flare.linear() >= 1).any(-1)
         # Layers of another size than the frame do not tell.
-        white = white | reached if reached.shape == white.shape else white
-    return _downscale_mask(white, frame.size, size)
+        clipped = clipped | reaches_white if reaches_white.shape == clipped.shape else clipped
+    return _downscale_mask(clipped, frame.size, size)
 
 
 def clipped_mask(frame: Picture, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
@@ -125,10 +126,10 @@ def clipped_mask(frame: Picture, size: tuple[int, int] | None = None) -> NDArray
     size: (width, height) of the result, where the frame is larger: pixels with a clipped one among theirs.
     """
     if frame.encoding == "linear":
-        white = np.zeros(frame.pixels.shape[:2], np.bool_)
+        clipped = np.zeros(frame.pixels.shape[:2], np.bool_)
     else:
-        white = (frame.pixels >= _CLIP_LEVEL).any(-1)
-    return _downscale_mask(white, frame.size, size)
+        clipped = (frame.pixels >= _CLIP_LEVEL).any(-1)
+    return _downscale_mask(clipped, frame.size, size)
 
 
 def _downscale_mask(mask: NDArray[np.bool_], full: tuple[int, int], size: tuple[int, int] | None) -> NDArray[np.bool_]:
@@ -150,12 +151,13 @@ def _to_display(linear: Array) -> Array:
     return np.clip(srgb_from_linear(linear), 0, 1)
 
 
-def _score_picture(image: Array, target: Array, lpips: Perceptual | None, counted: NDArray[np.bool_] | None) -> Scores:
+def _score_picture(image: Array, target: Array, lpips: Perceptual | None,
+                   scored_mask: NDArray[np.bool_] | None) -> Scores:
     """Return the scores of one layer of display values; arguments as of `score_view`."""
-    if counted is not None:
-        image = np.where(counted[..., None], image, target)
-    return {"psnr": psnr(image, target, counted), "ssim": ssim(image, target, mask=counted),
-            "lpips": lpips(image, target) if lpips else None, "flip": flip(image, target, counted)}
+    if scored_mask is not None:
+        image = np.where(scored_mask[..., None], image, target)
+    return {"psnr": psnr(image, target, scored_mask), "ssim": ssim(image, target, mask=scored_mask),
+            "lpips": lpips(image, target) if lpips else None, "flip": flip(image, target, scored_mask)}
 
 
 def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]]],
@@ -165,13 +167,13 @@ def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]
     The PSNR of the flare, the PSNR of an empty flare and the relative error are means over the views whose reference
     holds a flare, because an empty flare has an infinite PSNR where the reference is black.
     """
-    mean = {layer: _mean([scores[layer] for _, scores in views if layer in scores]) for layer in LAYERS}
+    means = {layer: _mean([scores[layer] for _, scores in views if layer in scores]) for layer in LAYERS}
     return {
         "reference": reference,
         "size": list(size),
         "ssim_borders": "valid",
-        **{layer: _null_if_infinite(scores) for layer, scores in mean.items() if scores},
-        "views": [{"name": name, **{layer: _null_if_infinite(part) for layer, part in scores.items()}}
+        **{layer: _null_if_infinite(scores) for layer, scores in means.items() if scores},
+        "views": [{"name": name, **{layer: _null_if_infinite(layer_scores) for layer, layer_scores in scores.items()}}
                   for name, scores in views],
     }
 
@@ -200,31 +202,31 @@ def _null_if_infinite(scores: Scores) -> Scores:
 def format_table(scores: dict[str, Any]) -> str:
     """Return the means of eval.json as text, with the view that scored lowest in each layer."""
     count = len(scores["views"])
-    against = {"truth": "scene and flare against the exact layers",
+    reference_text = {"truth": "scene and flare against the exact layers",
                "removed": "scene and flare against the frames of removed/",
                "none": "without anything to score scene and flare against"}[scores["reference"]]
     width, height = scores["size"]
-    lines = [f"{count} views at {width} x {height}, {against}",
+    lines = [f"{count} views at {width} x {height}, {reference_text}",
              f"{'':13}{'PSNR':>8}{'empty':>8}{'SSIM':>8}{'LPIPS':>8}{'FLIP':>8}{'rel. L2':>9}  lowest PSNR"]
     for layer in LAYERS:
         if layer not in scores:
             continue
-        part = scores[layer]
-        cells = [format_cell(part.get(key), decimals) for key, decimals in
+        means = scores[layer]
+        cells = [format_cell(means.get(key), decimals) for key, decimals in
                  (("psnr", 2), ("empty_psnr", 2), ("ssim", 4), ("lpips", 4), ("flip", 4))]
-        scored = [view for view in scores["views"] if view.get(layer, {}).get("psnr") is not None]
-        worst = min(scored, key=lambda view: view[layer]["psnr"], default=None)
-        where = f"{worst[layer]['psnr']:.2f} in {worst['name']}" if worst else "-"
+        scored_views = [view for view in scores["views"] if view.get(layer, {}).get("psnr") is not None]
+        worst = min(scored_views, key=lambda view: view[layer]["psnr"], default=None)
+        worst_text = f"{worst[layer]['psnr']:.2f} in {worst['name']}" if worst else "-"
         lines.append(f"{layer:13}{''.join(f'{text:>8}' for text in cells)}"
-                     f"{format_cell(part.get('relative_l2'), 3):>9}  {where}")
+                     f"{format_cell(means.get('relative_l2'), 3):>9}  {worst_text}")
     if masked := scores.get("masked"):
         share = sum(masked.values()) / len(masked)
         lines.append(f"Masks leave {share:.0%} of the pixels of {len(masked)} views out; these are not scored.")
     for layer in LAYERS:
-        without = sum(_has_no_flare(view[layer]) for view in scores["views"] if layer in view)
-        if without:
-            lines.append(f"{without} of {count} views show no flare to be scored against: PSNR, empty and rel. L2 of "
-                         f"{layer} are of the others.")
+        without_flare = sum(_has_no_flare(view[layer]) for view in scores["views"] if layer in view)
+        if without_flare:
+            lines.append(f"{without_flare} of {count} views show no flare to be scored against: PSNR, empty and rel. "
+                         f"L2 of {layer} are of the others.")
     return "\n".join(lines)
 
 

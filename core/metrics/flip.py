@@ -43,24 +43,24 @@ def flip_map(image: Planes, target: Planes) -> Plane:
     Values beyond 0..1 are clipped.
     """
     opponents = [_to_opponent(picture) for picture in (image, target)]
-    colour = _redistribute(_distance(*(_to_perceived_lab(planes) for planes in opponents)))
+    colour = _redistribute(_hyab_distance(*(_to_perceived_lab(planes) for planes in opponents)))
     exponent = 1 - _feature_difference(*(planes[..., 0] / 116 for planes in opponents))
     return np.asarray(np.power(colour, exponent), np.float32)
 
 
 def _to_opponent(picture: Planes) -> Planes:
     """Convert sRGB to Y C_x C_z."""
-    return _matrix(linear_from_srgb(np.clip(picture, 0, 1).astype(np.float32)), _OPPONENT_FROM_RGB)
+    return _apply_matrix(linear_from_srgb(np.clip(picture, 0, 1).astype(np.float32)), _OPPONENT_FROM_RGB)
 
 
-def _matrix(planes: Planes, matrix: NDArray[np.float32]) -> Planes:
+def _apply_matrix(planes: Planes, matrix: NDArray[np.float32]) -> Planes:
     """Apply a matrix (3, 3) to each pixel."""
     return np.asarray(planes.reshape(-1, 3) @ matrix.T, np.float32).reshape(planes.shape)
 
 
 def _to_perceived_lab(planes: Planes) -> Planes:
     """Filter Y C_x C_z by the contrast sensitivity, and convert to Hunt-adjusted L*a*b*, sections 4.1.1 and 4.1.2."""
-    lab = _lab(np.clip(_matrix(_filter_contrast(planes), _RGB_FROM_OPPONENT), 0, 1))
+    lab = _to_lab(np.clip(_apply_matrix(_filter_contrast(planes), _RGB_FROM_OPPONENT), 0, 1))
     lab[..., 1:] *= 0.01 * lab[..., :1]  # Hunt: colours look paler where it is dark
     return lab
 
@@ -69,10 +69,10 @@ def _filter_contrast(planes: Planes) -> Planes:
     """Filter each channel of Y C_x C_z by its contrast sensitivity, section 4.1.1."""
     radius = math.ceil(3 * math.sqrt(max(b for part in _CONTRAST for _, b in part) / (2 * math.pi ** 2))
                        * PIXELS_PER_DEGREE)
-    place = np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE  # degrees
+    degrees = np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE
     filtered = np.empty_like(planes)
     for channel, gaussians in enumerate(_CONTRAST):
-        rows = [np.exp(-math.pi ** 2 * place ** 2 / b) for _, b in gaussians]
+        rows = [np.exp(-math.pi ** 2 * degrees ** 2 / b) for _, b in gaussians]
         gains = [a * math.sqrt(math.pi / b) for a, b in gaussians]  # as the authors weight them
         total = sum(gain * row.sum() ** 2 for gain, row in zip(gains, rows, strict=True))
         plane = np.ascontiguousarray(planes[..., channel])
@@ -88,16 +88,16 @@ def _convolve(plane: Plane, row: NDArray[np.float64], column: NDArray[np.float64
     return np.asarray(cv2.sepFilter2D(plane, cv2.CV_32F, row, column, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
-def _lab(rgb: Planes) -> Planes:
+def _to_lab(rgb: Planes) -> Planes:
     """Convert linear Rec. 709 to L*a*b* (white: that of the primaries)."""
-    relative = _matrix(rgb, _RELATIVE_XYZ_FROM_RGB)
+    relative = _apply_matrix(rgb, _RELATIVE_XYZ_FROM_RGB)
     edge = 6 / 29
     root = np.where(relative > edge ** 3, np.cbrt(relative), relative / (3 * edge ** 2) + 4 / 29)
     x, y, z = root[..., 0], root[..., 1], root[..., 2]
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1).astype(np.float32)
 
 
-def _distance(first: Planes, second: Planes) -> Plane:
+def _hyab_distance(first: Planes, second: Planes) -> Plane:
     """Return the HyAB distance."""
     difference = first - second
     return np.asarray(np.abs(difference[..., 0]) + np.hypot(difference[..., 1], difference[..., 2]), np.float32)
@@ -105,9 +105,9 @@ def _distance(first: Planes, second: Planes) -> Plane:
 
 def _largest_distance() -> float:
     """Return the distance of green and blue to the power q_c, the largest of the display."""
-    corners = _lab(np.array([[[0, 1, 0], [0, 0, 1]]], np.float32))
+    corners = _to_lab(np.array([[[0, 1, 0], [0, 0, 1]]], np.float32))
     corners[..., 1:] *= 0.01 * corners[..., :1]
-    return float(_distance(corners[:, :1], corners[:, 1:])[0, 0]) ** _COLOUR_EXPONENT
+    return float(_hyab_distance(corners[:, :1], corners[:, 1:])[0, 0]) ** _COLOUR_EXPONENT
 
 
 def _redistribute(distance: Plane) -> Plane:
@@ -121,15 +121,16 @@ def _redistribute(distance: Plane) -> Plane:
 def _feature_difference(first: Plane, second: Plane) -> Plane:
     """Return the difference of edges and points of two luminances 0..1, section 4.2."""
     sigma = 0.5 * _EDGE_WIDTH * PIXELS_PER_DEGREE
-    place = np.arange(-math.ceil(3 * sigma), math.ceil(3 * sigma) + 1)
-    bell = np.exp(-place ** 2 / (2 * sigma ** 2))
-    edges = -place * bell
-    points = (place ** 2 / sigma ** 2 - 1) * bell
+    offsets = np.arange(-math.ceil(3 * sigma), math.ceil(3 * sigma) + 1)
+    gaussian = np.exp(-offsets ** 2 / (2 * sigma ** 2))
+    edges = -offsets * gaussian
+    points = (offsets ** 2 / sigma ** 2 - 1) * gaussian
     largest = np.zeros(first.shape, np.float32)
     for row in (edges, points):
         # The weights of either sign sum to 1.
         row = np.where(row > 0, row / row[row > 0].sum(), row / -row[row < 0].sum())
-        strengths = [np.hypot(_convolve(plane, row, bell / bell.sum()), _convolve(plane, bell / bell.sum(), row))
+        smoothing = gaussian / gaussian.sum()
+        strengths = [np.hypot(_convolve(plane, row, smoothing), _convolve(plane, smoothing, row))
                      for plane in map(np.ascontiguousarray, (first, second))]
         np.maximum(largest, np.abs(strengths[0] - strengths[1]), out=largest)
     return np.asarray(np.power(largest / np.float32(math.sqrt(2)), np.float32(_FEATURE_EXPONENT)), np.float32)

@@ -50,9 +50,10 @@ class Lpips:
     def distance(self, image: Tensor, target: Tensor) -> Tensor:
         """Return the mean distance of pictures (n, 3, h, w), with gradients."""
         total = torch.zeros((), device=image.device)
-        for level, (a, b) in enumerate(zip(self._features(image), self._features(target), strict=True)):
-            weight = self._weights[f"lin{level}.model.1.weight"].reshape(1, -1, 1, 1).to(a)
-            total = total + (((a - b) ** 2) * weight).sum(1).mean()
+        features = zip(self._features(image), self._features(target), strict=True)
+        for level, (image_features, target_features) in enumerate(features):
+            weight = self._weights[f"lin{level}.model.1.weight"].reshape(1, -1, 1, 1).to(image_features)
+            total = total + (((image_features - target_features) ** 2) * weight).sum(1).mean()
         return total
 
     def _features(self, x: Tensor) -> list[Tensor]:
@@ -60,8 +61,8 @@ class Lpips:
         shift, scale = (torch.tensor(values, device=x.device).reshape(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
         x = (x * 2 - 1 - shift) / scale
         features = []
-        for index, stride, padding, pooled in _LAYERS:
-            if pooled:
+        for index, stride, padding, is_pooled in _LAYERS:
+            if is_pooled:
                 x = F.max_pool2d(x, 3, 2)
             kernel, bias = (self._weights[f"features.{index}.{kind}"].to(x) for kind in ("weight", "bias"))
             x = F.relu(F.conv2d(x, kernel, bias, stride, padding))

@@ -110,5 +110,5 @@ def flip(image: Array, target: Array, mask: Array | None = None) -> float:
 
     _check_same_size(image, target)
     errors = flip_map(image, target)
-    counted = errors if mask is None else errors[mask]
-    return float(counted.mean(dtype=np.float64)) if counted.size else math.nan
+    scored_errors = errors if mask is None else errors[mask]
+    return float(scored_errors.mean(dtype=np.float64)) if scored_errors.size else math.nan

@@ -44,46 +44,46 @@ def run_in_child(function: Callable[..., Any], *args: Any, progress: Progress) -
     function: of a module, so that the child finds it by name. Raises what it raises, what `progress` raises, and
     ChildDied where the child ends by itself, for instance by a library that aborts it.
     """
-    path = [*([] if _PACKAGE else [str(_ROOT)]), *filter(None, sys.path)]  # "" would be the working folder
-    code = _START.format(path=path, package=_PACKAGE, root=str(_ROOT), module=__name__)
+    search_path = [*([] if _PACKAGE else [str(_ROOT)]), *filter(None, sys.path)]  # "" would be the working folder
+    code = _START.format(path=search_path, package=_PACKAGE, root=str(_ROOT), module=__name__)
     with subprocess.Popen([sys.executable, "-I", "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                           stderr=subprocess.DEVNULL, env=child_environment(), **new_process_group()) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            return _converse(process.stdin, process.stdout, (function, args), progress)
+            return _exchange_messages(process.stdin, process.stdout, (function, args), progress)
         except (EOFError, BrokenPipeError, pickle.UnpicklingError) as problem:
             process.kill()
             status = process.wait()
-            how = signal.Signals(-status).name if status < 0 else f"status {status}"
-            raise ChildDied(f"{progress.stage_name or 'start-up'}, {how}") from problem
+            ending = signal.Signals(-status).name if status < 0 else f"status {status}"
+            raise ChildDied(f"{progress.stage_name or 'start-up'}, {ending}") from problem
         finally:
             process.kill()
 
 
-def _converse(to_child: IO[bytes], from_child: IO[bytes], call: tuple[Callable[..., Any], tuple[Any, ...]],
+def _exchange_messages(to_child: IO[bytes], from_child: IO[bytes], call: tuple[Callable[..., Any], tuple[Any, ...]],
               progress: Progress) -> Any:
-    """Send a call, pass the calls of its progress on to `progress`, and return or raise what the call does.
+    """Send a call to the child, call `progress` as the child asks, and return or raise what the call does.
 
     The reply to each message is whether to continue; what `progress` raises is raised when the child has ended its
     work."""
     _send(to_child, call)
-    raised: BaseException | None = None
+    progress_error: BaseException | None = None
     while True:
         kind, *message = pickle.load(from_child)
         if kind == "returned":
-            if raised is not None:
-                raise raised
+            if progress_error is not None:
+                raise progress_error
             return message[0]
         if kind == "raised":
-            raise raised or message[0]
+            raise progress_error or message[0]
         try:
-            if raised is None:
+            if progress_error is None:
                 name, args, figures = message
                 getattr(progress, name)(*args, **figures)
         except BaseException as problem:  # the child has to end its work first
-            raised = problem
-        _send(to_child, raised is None)
+            progress_error = problem
+        _send(to_child, progress_error is None)
 
 
 def _send(stream: IO[bytes], message: Any) -> None:
@@ -128,9 +128,9 @@ def serve() -> None:
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     # The messages keep their own descriptors; what libraries read and print at 0 and 1 goes nowhere.
     from_parent, to_parent = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    nowhere = os.open(os.devnull, os.O_RDWR)
-    for number in (0, 1):
-        os.dup2(nowhere, number)
+    null_device = os.open(os.devnull, os.O_RDWR)
+    for descriptor in (0, 1):
+        os.dup2(null_device, descriptor)
     function, args = pickle.load(from_parent)
     replies: queue.Queue[Any] = queue.Queue()
     threading.Thread(target=_receive, args=(from_parent, replies), daemon=True).start()

@@ -42,18 +42,18 @@ def canonical_name(name: PurePath | str) -> str:
 
 
 def name_below(folder: Path, name: str) -> str:
-    """Return the end of an absolute path of another machine that lies in a folder; other names as they are.
+    """Return the part of an absolute path of another machine that lies below `folder`; other names as they are.
 
     "D:/shots/one/images/1.png" is images/1.png if the folder has images/.
     """
     parts = PurePosixPath(name.replace("\\", "/")).parts
     if not parts or ".." in parts or not (parts[0] == "/" or _DRIVE.fullmatch(parts[0])):
         return name
-    for start in range(1, len(parts)):
+    for first in range(1, len(parts)):
         # The file itself may be missing, but not the folder that it lies in.
-        inside = find_entry(folder, "/".join(parts[start:-1] or parts[start:]))
-        if inside is not None:
-            return "/".join(parts[start:])
+        entry = find_entry(folder, "/".join(parts[first:-1] or parts[first:]))
+        if entry is not None:
+            return "/".join(parts[first:])
     return name
 
 

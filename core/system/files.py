@@ -123,15 +123,15 @@ def remove_folder(folder: Path) -> None:
     It disappears as a whole. Where a file of it is in use on Windows, it stays unchanged and OSError is raised.
     Contents that cannot be deleted after the folder was moved aside are deleted by the next call.
     """
-    for old in folder.parent.glob(f"{glob.escape(folder.name)}{_TRASH}*"):
-        shutil.rmtree(old, ignore_errors=True)
+    for trash in folder.parent.glob(f"{glob.escape(folder.name)}{_TRASH}*"):
+        shutil.rmtree(trash, ignore_errors=True)
     if not folder.exists():
         return
-    old = Path(tempfile.mkdtemp(prefix=f"{folder.name}{_TRASH}", dir=folder.parent))
+    trash = Path(tempfile.mkdtemp(prefix=f"{folder.name}{_TRASH}", dir=folder.parent))
     try:
-        retry_while_locked(folder.rename, old / folder.name)
+        retry_while_locked(folder.rename, trash / folder.name)
     finally:
-        shutil.rmtree(old, ignore_errors=True)
+        shutil.rmtree(trash, ignore_errors=True)
 
 
 def _apply_umask(temporary: Path, mode: int) -> None:
@@ -215,12 +215,12 @@ def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
         except (FileExistsError, PermissionError) as problem:
             time.sleep(0.01)
             try:
-                state = lock.stat()
-                if state.st_mtime_ns != last_mtime:
-                    last_mtime, since = state.st_mtime_ns, time.monotonic()
-                if max(time.time() - state.st_mtime, time.monotonic() - since) > stale_s:
+                status = lock.stat()
+                if status.st_mtime_ns != last_mtime:
+                    last_mtime, since = status.st_mtime_ns, time.monotonic()
+                if max(time.time() - status.st_mtime, time.monotonic() - since) > stale_s:
                     with file_lock(lock.with_name(lock.name + ".taken_over"), stale_s):  # others may want to as well
-                        _remove_lock(lock, state.st_mtime_ns)
+                        _remove_lock(lock, status.st_mtime_ns)
             except FileNotFoundError:
                 # Windows refuses while another process removes it; a folder that is not writable refuses for ever.
                 refusals += isinstance(problem, PermissionError)
@@ -319,13 +319,13 @@ def safe_join(folder: Path | str, name: str, error: type[FitFlareError]) -> Path
     a name in a file from elsewhere must not reach the rest of the disk.
     """
     folder = Path(folder)
-    parts = Path(name.replace("\\", "/"))
-    if (not parts.parts or "\0" in name or parts.is_absolute() or _DRIVE.match(parts.parts[0])
-            or ".." in parts.parts or not all(map(_is_file_name, parts.parts))):
+    relative = Path(name.replace("\\", "/"))
+    if (not relative.parts or "\0" in name or relative.is_absolute() or _DRIVE.match(relative.parts[0])
+            or ".." in relative.parts or not all(map(_is_file_name, relative.parts))):
         raise error(f"{folder} names the file {name!r:.150}, which is not inside the folder; remove that entry.")
-    if WINDOWS and any(map(_DEVICE_NAME.match, parts.parts)):
+    if WINDOWS and any(map(_DEVICE_NAME.match, relative.parts)):
         raise error(f"{folder} names the file {name!r:.150}, which Windows takes for a device; give it another name.")
-    path = folder / parts
+    path = folder / relative
     if not path.resolve().is_relative_to(folder.resolve()):
         raise error(f"{path} is a link that leads out of {folder}; put the file itself there.")
     return path
@@ -358,14 +358,14 @@ def _file_identity(path: Path) -> object:
     """
     resolved = real_path(path)
     try:
-        folder, file = resolved.parent.stat(), resolved.stat()
+        parent, file = resolved.parent.stat(), resolved.stat()
     except OSError:
         return resolved
-    return (folder.st_dev, folder.st_ino, file.st_ino) if folder.st_ino and file.st_ino else resolved
+    return (parent.st_dev, parent.st_ino, file.st_ino) if parent.st_ino and file.st_ino else resolved
 
 
 def hash_files(paths: Iterable[Path]) -> str:
-    """Hash the joint content of these files; missing ones are left out."""
+    """Return a hash of the joint content of these files, 16 hexadecimal digits; missing ones are left out."""
     digest = hashlib.sha256()
     for path in paths:
         if path.is_file():
@@ -374,7 +374,7 @@ def hash_files(paths: Iterable[Path]) -> str:
 
 
 def content_hash(path: Path) -> str:
-    """Hash the content of a file; cached while its size and time stay the same."""
+    """Return a hash of a file's content, 16 hexadecimal digits; cached while its size and time stay the same."""
     state = path.stat()
     return _cached_hash(path, state.st_size, state.st_mtime_ns)
 

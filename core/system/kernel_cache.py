@@ -27,11 +27,11 @@ def compile_cached(function: Callable[..., Any], **options: Any) -> Any:
     """Return a dispatcher that compiles `function` without the interpreter's lock, by numba's `options`."""
     folder = cache_folder(function.__module__.rpartition(".")[0], Path(function.__code__.co_filename).parent)
     config: Any = numba.config  # numba reads the folder here, when a function is declared
-    before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+    default_folder, config.CACHE_DIR = config.CACHE_DIR, str(folder)
     try:
         dispatcher = numba.njit(nogil=True, cache=True, **options)(function)
     finally:
-        config.CACHE_DIR = before
+        config.CACHE_DIR = default_folder
     if hasattr(dispatcher, "_cache"):  # missing where NUMBA_DISABLE_JIT is set
         dispatcher._cache.save_overload = _ignore_os_errors(dispatcher._cache.save_overload)
     return dispatcher

@@ -29,15 +29,15 @@ CENTURY_S = 36525 * DAY_S
 """Upper bound for the age of a process."""
 
 
-def find_python(place: Path) -> Path | None:
-    """Return the interpreter at `place`: the file itself, or that of the virtual environment or (Windows) conda
-    environment.
+def find_python(path: Path) -> Path | None:
+    """Return the Python interpreter at a path: the file itself, or that of the virtual environment or (Windows) conda
+    environment in that folder.
 
     None as well where the Python that the environment was made from is gone.
     """
-    for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python", place / "python.exe"):
-        if os.path.isfile(path) and not (WINDOWS and _is_base_missing(path)):  # noqa: PTH113 - pathlib's may raise
-            return path.absolute()  # not resolved: a virtual environment's python is a link
+    for python in (path, path / "Scripts" / "python.exe", path / "bin" / "python", path / "python.exe"):
+        if os.path.isfile(python) and not (WINDOWS and _is_base_missing(python)):  # noqa: PTH113 - pathlib's may raise
+            return python.absolute()  # not resolved: a virtual environment's python is a link
     return None
 
 
@@ -75,11 +75,11 @@ def machine_id() -> str:
     """
     if sys.platform == "darwin":
         with contextlib.suppress(OSError, RuntimeError, ValueError):  # of a user without a home, too
-            return _stored_id(Path.home() / "Library" / "Application Support" / "fit_flare" / "machine")
+            return _read_or_create_id(Path.home() / "Library" / "Application Support" / "fit_flare" / "machine")
     return platform.node()
 
 
-def _stored_id(file: Path) -> str:
+def _read_or_create_id(file: Path) -> str:
     """Return the name that the file holds; write a random one where there is none."""
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -104,8 +104,8 @@ def is_same_process(pid: int, started: float) -> bool:
     A process with another start time has the id by coincidence: it began later, or the record is of another machine or
     of the time before this one was restarted.
     """
-    began = _start_time(pid)
-    return began is not None and abs(began - started) <= CLOCK_TOLERANCE_S
+    actual_start = _start_time(pid)
+    return actual_start is not None and abs(actual_start - started) <= CLOCK_TOLERANCE_S
 
 
 def is_running(pid: int) -> bool:
@@ -140,11 +140,11 @@ def _start_time_windows(pid: int) -> float | None:
     handle = ctypes.c_void_p(kernel.OpenProcess(0x1000, False, pid))  # PROCESS_QUERY_LIMITED_INFORMATION
     if not handle:
         return None
-    code, times = ctypes.c_ulong(), [ctypes.c_ulonglong() for _ in range(4)]
-    kernel.GetExitCodeProcess(handle, ctypes.byref(code))
+    exit_code, times = ctypes.c_ulong(), [ctypes.c_ulonglong() for _ in range(4)]
+    kernel.GetExitCodeProcess(handle, ctypes.byref(exit_code))
     kernel.GetProcessTimes(handle, *map(ctypes.byref, times))
     kernel.CloseHandle(handle)
-    if code.value != 259:  # STILL_ACTIVE
+    if exit_code.value != 259:  # STILL_ACTIVE
         return None
     return times[0].value / 1e7 - 11_644_473_600  # tenths of microseconds since 1601
 

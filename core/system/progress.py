@@ -35,6 +35,8 @@ STOP_FILE_INTERVAL_S = 0.3
 """Seconds between two looks for that file."""
 MIN_PACE_WINDOW_S, MAX_PACE_WINDOW_S = 1.0, 60.0
 """Shortest and longest time over which the pace of work is measured: a fit slows down as its Gaussians become more."""
+LINE_INTERVAL_S, JSON_INTERVAL_S, OPEN_JD_INTERVAL_S = 10.0, 0.1, 1.0
+"""Shortest time between two reports of progress: by lines, as JSON, and to Open Job Description."""
 _STREAM_GONE = (*DISK_FULL, errno.EIO)
 """Error numbers of a stream that takes no more: the disk is full, or (EIO) the terminal is closed."""
 
@@ -101,14 +103,15 @@ class Progress:
             return 0.0
         if not self._samples:
             return None
-        since, before = self._samples[0]
-        passed = time.monotonic() - since
-        if passed < MIN_PACE_WINDOW_S or self._done == before:
+        sample_time, sample_done = self._samples[0]
+        elapsed_s = time.monotonic() - sample_time
+        if elapsed_s < MIN_PACE_WINDOW_S or self._done == sample_done:
             return None
-        return passed / (self._done - before) * (self._total - self._done)
+        return elapsed_s / (self._done - sample_done) * (self._total - self._done)
 
     def _sample_pace(self) -> None:
-        """Note the steps done now, and forget samples older than the window, but for the one at its start."""
+        """Add the steps done by now to the samples, and drop those older than the window, but for the one at its start.
+        """
         now, samples = time.monotonic(), self._samples
         if not samples or now - samples[-1][0] >= MIN_PACE_WINDOW_S:
             samples.append((now, self._done))
@@ -144,14 +147,14 @@ def flush_or_drop(stream: TextIO) -> None:
         if problem.errno not in _STREAM_GONE:
             raise
         # Flush what is left into nowhere, and give the stream its file back.
-        number, null = stream.fileno(), os.open(os.devnull, os.O_WRONLY)
-        before = os.dup(number)
-        os.dup2(null, number)
+        descriptor, null = stream.fileno(), os.open(os.devnull, os.O_WRONLY)
+        saved_descriptor = os.dup(descriptor)
+        os.dup2(null, descriptor)
         try:
             stream.flush()
         finally:
-            os.dup2(before, number)
-            os.close(before)
+            os.dup2(saved_descriptor, descriptor)
+            os.close(saved_descriptor)
             os.close(null)
 
 
@@ -169,7 +172,7 @@ class _LineProgress:
     def update(self, steps: int) -> None:
         """Count steps, and print a line if one is due."""
         self._done += steps
-        if self._done >= self._total or time.monotonic() - self._reported > 10:
+        if self._done >= self._total or time.monotonic() - self._reported > LINE_INTERVAL_S:
             self._reported = time.monotonic()
             _write_line(self._stream, f"{self._name}: {self._done}/{self._total}{self._figures}")
 
@@ -244,7 +247,7 @@ class JsonProgress(Progress):
 
     def _show_progress(self, figures: dict[str, float]) -> None:
         now = time.monotonic()
-        if self._done < self._total and now - self._last < 0.1:
+        if self._done < self._total and now - self._last < JSON_INTERVAL_S:
             return
         self._last = now
         eta = self.eta_s
@@ -282,12 +285,12 @@ class OpenJdProgress(Progress):
         self._show_progress({})
 
     def _show_progress(self, figures: dict[str, float]) -> None:  # noqa: ARG002 - the base's signature
-        share = int(100 * min(max(self._done / self._total, 0), 1)) if self._total > 0 else 100
+        percent = int(100 * min(max(self._done / self._total, 0), 1)) if self._total > 0 else 100
         now = time.monotonic()
-        if share == self._reported or (share < 100 and now - self._last < 1):
+        if percent == self._reported or (percent < 100 and now - self._last < OPEN_JD_INTERVAL_S):
             return
-        self._reported, self._last = share, now
-        self._line("progress", f"{share}")
+        self._reported, self._last = percent, now
+        self._line("progress", f"{percent}")
 
     def say(self, text: str) -> None:
         self._line("status", text)
@@ -345,22 +348,23 @@ def is_hangup(number: int) -> bool:
 
 @contextlib.contextmanager
 def _stop_on_signals(progress: Progress) -> Iterator[Progress]:
-    """Set the handlers for the length of the block. Only the main thread may; elsewhere this changes nothing."""
+    """Request a stop on one of `stop_signals`, for the length of the block. Only the main thread may set handlers;
+    elsewhere this changes nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield progress
         return
-    before = {number: signal.getsignal(number) for number in stop_signals()}
+    previous_handlers = {number: signal.getsignal(number) for number in stop_signals()}
 
     def request_stop(number: int, _frame: Any) -> None:
         progress.request_stop()
         # A second signal takes effect at once. A closed terminal signals twice: by the system and by the shell.
         signal.signal(number, signal.SIG_IGN if is_hangup(number) else signal.SIG_DFL)
 
-    for number in before:
+    for number in previous_handlers:
         signal.signal(number, request_stop)
     try:
         yield progress
     finally:
-        for number, handler in before.items():
+        for number, handler in previous_handlers.items():
             # None is a handler that Python did not set (Blender's own) and cannot set again.
             signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -62,9 +62,9 @@ class Tally:
             return f"{start}, none left out."
         reasons = sorted(self.skipped.items(), key=lambda item: -len(item[1]))
         parts = [f"{list_first(names)} ({reason})" for reason, names in reasons[:MAX_REASONS]]
-        more = len({name for _, names in reasons[MAX_REASONS:] for name in names})
-        rest = f", and {more} for other reasons" if more else ""
-        return f"{start}; {self.left_out} left out: {', '.join(parts)}{rest}."
+        more_names = len({name for _, names in reasons[MAX_REASONS:] for name in names})
+        more_text = f", and {more_names} for other reasons" if more_names else ""
+        return f"{start}; {self.left_out} left out: {', '.join(parts)}{more_text}."
 
     def as_result(self) -> dict[str, Any]:
         """Return the counts and the names with their reasons, JSON-able, for the result of a command."""

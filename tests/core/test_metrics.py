@@ -213,7 +213,7 @@ def test_what_a_mask_leaves_out_of_the_fit_is_not_scored(pair: tuple[np.ndarray,
     passer_by = target.copy()
     passer_by[~counted] = 1 - passer_by[~counted]
     light = linear_from_srgb(image)
-    scores = [score_view(light, light, Picture(frame, "srgb"), Picture(frame, "srgb"), counted=mask)
+    scores = [score_view(light, light, Picture(frame, "srgb"), Picture(frame, "srgb"), scored_mask=mask)
               for frame, mask in ((target, counted), (passer_by, counted), (passer_by, None))]
     for layer in ("composite", "scene"):
         alone, passed, unmasked = ({name: scores[index][layer][name] or 0.0 for name in ("psnr", "ssim")}
@@ -223,7 +223,7 @@ def test_what_a_mask_leaves_out_of_the_fit_is_not_scored(pair: tuple[np.ndarray,
         assert unmasked["psnr"] < passed["psnr"] - 3
         assert unmasked["ssim"] < passed["ssim"] - 0.05
     none = np.zeros_like(counted)
-    assert math.isnan(score_view(light, light, Picture(target, "srgb"), None, counted=none)["composite"]["psnr"])
+    assert math.isnan(score_view(light, light, Picture(target, "srgb"), None, scored_mask=none)["composite"]["psnr"])
 
 
 def test_the_table_says_how_much_masks_leave_out() -> None:

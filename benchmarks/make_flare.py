@@ -23,10 +23,10 @@ from core.errors import FitFlareError
 from core.fit.traced_flare import (
     TracedPictures,
     draw_fitted,
-    exposed_setup,
     fit_traced,
     path_places,
     relative_errors,
+    setup_with_ghost_gain,
     spread_places,
     trace,
     traced_camera,
@@ -74,7 +74,7 @@ def main() -> int:
         start = time.monotonic()
         try:
             settings = TracedFlareSettings().override({**dict(map(parse_setting, args.changes)), "lens": name})
-            setup, progress = exposed_setup(settings), TerminalProgress()
+            setup, progress = setup_with_ghost_gain(settings), TerminalProgress()
         except FitFlareError as problem:
             print(f"| {Path(name).stem} | refused | | | | |", flush=True)
             print(problem, file=sys.stderr)

@@ -19,7 +19,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from core.fit.traced_flare import describe, make_flare
+from core.fit.traced_flare import default_notes, make_flare
 from core.fit.traced_settings import TracedFlareSettings
 from core.images.contact_sheet import add_label, side_by_side
 from core.images.write import write_png
@@ -150,7 +150,7 @@ def make_library(folder: Path, names: list[str], progress: Progress) -> None:
         is_current = read_index(folder).get(look.name, {}).get("settings") == digest and file.is_file()
         if is_current or (names and look.name not in names):
             continue
-        result = make_flare(settings, file, progress, notes=f"{look.text} {describe(settings)}", licence=LICENCE)
+        result = make_flare(settings, file, progress, notes=f"{look.text} {default_notes(settings)}", licence=LICENCE)
         write_png(file.with_suffix(".png"), draw_thumbnail(read_look(file), THUMBNAIL_SIZE, THUMBNAIL_SIZE))
         entries = read_index(folder)  # another process may have added its looks meanwhile
         entries[look.name] = {"name": look.name, "text": look.text, "lens": settings.lens, "licence": LICENCE,

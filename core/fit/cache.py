@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 
 MEMORY = 1 << 29
 """Bytes kept in memory: 86 frames of 960x540 with their clean frames."""
-DISK_LEFT = 1 << 31
+MIN_FREE_DISK = 1 << 31
 """Bytes left free on the disk."""
 
 Codes = NDArray[np.uint16]
 
 
 class _Place(NamedTuple):
+    """Where an array lies in the file: offset in bytes, and shape."""
+
     offset: int
     shape: tuple[int, ...]
 
@@ -33,7 +35,7 @@ class PictureCache:
     """Caches 16 bit arrays by name. `get` returns None for an array that fitted neither in memory nor on disk."""
 
     def __init__(self, memory: int = MEMORY) -> None:
-        self._left = memory
+        self._free_bytes = memory  # of the memory
         self._in_memory: dict[str, Codes] = {}
         self._on_disk: dict[str, _Place] = {}
         self._file: BinaryIO | None = None
@@ -70,16 +72,16 @@ class PictureCache:
 
     def put(self, name: str, codes: Codes) -> None:
         """Store an array under a name, in memory or on disk; without room in both it is not stored."""
-        if codes.nbytes <= self._left:
-            self._left -= codes.nbytes
+        if codes.nbytes <= self._free_bytes:
+            self._free_bytes -= codes.nbytes
             self._in_memory[name] = codes
         elif self._file is not None and self._folder is not None:
             try:
-                if shutil.disk_usage(self._folder).free - codes.nbytes < DISK_LEFT:
+                if shutil.disk_usage(self._folder).free - codes.nbytes < MIN_FREE_DISK:
                     return
                 offset = self._file.seek(0, 2)  # the end
                 if self._file.write(codes.tobytes()) < codes.nbytes:
-                    return  # the disk, or what one may have of it, is full
+                    return  # the disk or the user's quota is full
             except OSError:
                 self._close()
                 return

@@ -134,14 +134,15 @@ class FitInputs:
         current = self.state()
         tolerance = LIGHT_TOLERANCE * self._capture.extent
         if "lights" in current and stored.get("lights") is not None and (
-                changed := _describe_change(stored["lights"], current["lights"], tolerance)):
-            raise RunError(f"{self._capture.folder / LIGHTS} has changed since the fit began ({changed}); put "
+                light_change := _describe_light_change(stored["lights"], current["lights"], tolerance)):
+            raise RunError(f"{self._capture.folder / LIGHTS} has changed since the fit began ({light_change}); put "
                            "the old one back, or begin the fit anew in another folder.")
         before, after = dict(stored.get("views") or []), dict(current["views"])
-        if before and (others := [name for name in {**before, **after} if before.get(name) != after.get(name)]):
-            raise RunError(f"{self._capture.folder} has changed since the fit began ({len(others)} of {len(after)} "
-                           f"views have another frame, clean frame or camera, {others[0]} first); put the old "
-                           "ones back, or begin the fit anew in another folder.")
+        changed_views = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+        if before and changed_views:
+            raise RunError(f"{self._capture.folder} has changed since the fit began ({len(changed_views)} of "
+                           f"{len(after)} views have another frame, clean frame or camera, {changed_views[0]} first); "
+                           "put the old ones back, or begin the fit anew in another folder.")
 
     def _digest(self, view: View) -> str:
         """Hash the camera and the files of a view: frame, mask and, with `removed`, clean frame."""
@@ -156,10 +157,10 @@ class FitInputs:
         return hashlib.blake2b(" ".join(inputs).encode(), digest_size=8).hexdigest()
 
 
-def _describe_change(old: list[Any], new: list[Any], tolerance: float) -> str:
-    """Return what differs between two lists of `Light.numbers`, [name, [x, y, z], ...]; "" if nothing does.
+def _describe_light_change(old: list[Any], new: list[Any], tolerance: float) -> str:
+    """Return a clause on what differs between two lists of `Light.numbers`, [name, [x, y, z], ...]; "" if nothing does.
 
-    That is the names, else the first light whose position (None if it moves) or other values differ.
+    It is about the names, else about the first light whose position (None if it moves) or other values differ.
     Positions may differ by `tolerance`, and by what Blender's single precision rounds to.
     """
     before, after = ([name for name, *_ in lights] for lights in (old, new))

@@ -24,7 +24,8 @@ def write_config(path: Path, settings: FitSettings) -> None:
 
 
 def _write_table(lines: list[str], keys: list[str], table: Any) -> None:
-    """Append a dataclass as a TOML table, its plain values before its nested tables."""
+    """Append a dataclass to `lines` as a TOML table, its plain values before its nested tables. keys: dotted name of
+    the table, in parts; empty for the outermost one."""
     plain = [entry for entry in fields(table) if not is_dataclass(getattr(table, entry.name))]
     if keys:
         lines += ["", f"[{'.'.join(keys)}]"]

@@ -36,7 +36,7 @@ BARE_PARALLAX_PX, PARALLAXES_PX = 2.0, (4.0, 7.0, 12.0, 20.0)
 patch must agree better on the infinite sphere than on that of bare parallax; the others are the near ones."""
 MAX_DIFFERENCE = 0.05
 """Difference, display values, up to which two views agree."""
-MIN_VIEWS, MIN_SEEN_SHARE = 3, 0.5
+MIN_VIEWS, MIN_VISIBLE_SHARE = 3, 0.5
 """Number of views that must see a direction, and share of a patch's directions that so many must see."""
 MIN_CONTRAST = 0.1
 """Share of the views that differ on near spheres, below which a patch is plain and undecided."""
@@ -59,6 +59,9 @@ POINT_PITCH_PX = 4.0
 MAX_POINTS = 16_000
 COLOUR_QUANTILE = 0.25
 """Quantile of the views' colours that a far point takes where the frames have a flare: flares only add light."""
+
+DIRECTIONS_AT_ONCE = 4096
+"""Directions that are compared with others at a time; bounds the memory."""
 
 Floats = NDArray[np.float64]
 Values = NDArray[np.float32]
@@ -88,17 +91,17 @@ def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) ->
     told: without points, or with all cameras in one place."""
     sampled = subsample(views, SWEEP_VIEWS)
     cameras = [view.camera.scaled(min(SWEEP_WIDTH, view.camera.width)) for view in sampled]
-    extent = _spread(cameras)
-    if not len(capture.points) or not extent or capture.is_rotation_only:
+    spread = _camera_spread(cameras)
+    if not len(capture.points) or not spread or capture.is_rotation_only:
         return None
-    patches = decide_patches([_sweep_view(view, frames) for view in sampled])
+    patches = classify_patches([_make_sweep_view(view, frames) for view in sampled])
     if patches is None:
         return None
-    distances = np.linalg.norm(capture.points.xyz - _centre(cameras), axis=1)
+    distances = np.linalg.norm(capture.points.xyz - _camera_centre(cameras), axis=1)
     focal = max(frames.camera(view).focal_length for view in sampled)  # the longest lens shows the most parallax
-    radius = max(RADIUS_FACTOR * float(np.quantile(distances, FARTHEST_QUANTILE)), extent * focal / MAX_PARALLAX_PX)
-    sphere = FarSphere(tuple(map(float, _centre(cameras))), radius)
-    return FarLayer(sphere, _far_points(sphere, patches, sampled, frames))
+    radius = max(RADIUS_FACTOR * float(np.quantile(distances, FARTHEST_QUANTILE)), spread * focal / MAX_PARALLAX_PX)
+    sphere = FarSphere(tuple(map(float, _camera_centre(cameras))), radius)
+    return FarLayer(sphere, _make_far_points(sphere, patches, sampled, frames))
 
 
 def far_layer_sentences(scene: SceneGaussians) -> tuple[str, ...]:
@@ -116,20 +119,20 @@ class Patches:
     directions: Floats
     is_far: Booleans
 
-    def contain(self, directions: Floats) -> Booleans:
+    def are_far(self, directions: Floats) -> Booleans:
         """Return (m,) whether the patches of directions (m, 3) are far."""
-        return self.is_far[_nearest(directions, self.directions)]
+        return self.is_far[_nearest_indices(directions, self.directions)]
 
 
-def decide_patches(views: list[SweepView]) -> Patches | None:
-    """Decide which patches of directions are far; None where too few are for a far layer."""
-    directions, costs, bare, misaligned = sweep_patches(views)
-    # The patches that are certainly far decide whether there is a far layer; `_fill` then decides every patch anew.
-    has_contrast = misaligned >= MIN_CONTRAST
-    is_far = has_contrast & (costs < DECISIVE_RATIO * misaligned) & (costs <= bare)
+def classify_patches(views: list[SweepView]) -> Patches | None:
+    """Return which patches of directions are far; None where too few are for a far layer."""
+    directions, infinite_costs, bare_costs, near_costs = sweep_patches(views)
+    # The patches that are certainly far decide whether there is a far layer; then every patch is decided anew.
+    has_contrast = near_costs >= MIN_CONTRAST
+    is_far = has_contrast & (infinite_costs < DECISIVE_RATIO * near_costs) & (infinite_costs <= bare_costs)
     if is_far.sum() < max(MIN_FAR_PATCHES, MIN_FAR_SHARE * has_contrast.sum()):
         return None
-    return Patches(directions, _fill(directions, costs, misaligned))
+    return Patches(directions, _classify_by_neighbours(directions, infinite_costs, near_costs))
 
 
 def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats, Floats]:
@@ -141,40 +144,41 @@ def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats, Float
     cameras = [view.camera for view in views]
     focal = float(np.median([camera.focal_length for camera in cameras]))
     pitch = PITCH_PX / focal
-    directions = _seen_directions(cameras, pitch)
-    patch_directions = _seen_directions(cameras, PATCH_PITCHES * pitch)
-    patch_of = _nearest(directions, patch_directions)
-    members = np.bincount(patch_of, minlength=len(patch_directions))
+    directions = _visible_directions(cameras, pitch)
+    patch_directions = _visible_directions(cameras, PATCH_PITCHES * pitch)
+    patch_of = _nearest_indices(directions, patch_directions)
+    sizes = np.bincount(patch_of, minlength=len(patch_directions))  # directions in each patch
     spheres = (0.0, BARE_PARALLAX_PX, *PARALLAXES_PX)
     costs = np.full((len(spheres), len(patch_directions)), np.nan)
     for row, parallax in zip(costs, spheres, strict=True):
         # A point at distance r has a parallax of focal * spread / r pixels.
-        cost, seen = _disagreement(views, directions, parallax / focal / _spread(cameras))
-        sums = np.bincount(patch_of, np.where(seen, cost, 0), len(patch_directions))
-        numbers = np.bincount(patch_of, seen, len(patch_directions))
-        row[:] = np.where((numbers > 0) & (numbers >= MIN_SEEN_SHARE * members), sums / np.maximum(numbers, 1), np.nan)
+        cost, visible = _disagreement(views, directions, parallax / focal / _camera_spread(cameras))
+        sums = np.bincount(patch_of, np.where(visible, cost, 0), len(patch_directions))
+        visible_counts = np.bincount(patch_of, visible, len(patch_directions))
+        is_seen = (visible_counts > 0) & (visible_counts >= MIN_VISIBLE_SHARE * sizes)
+        row[:] = np.where(is_seen, sums / np.maximum(visible_counts, 1), np.nan)
     # Known on the infinite sphere, on that of bare parallax, and on some near one.
     usable = np.isfinite(costs[:2]).all(0) & np.isfinite(costs[2:]).any(0)
     return patch_directions[usable], *costs[:2, usable], np.nanmedian(costs[2:, usable], axis=0)
 
 
-def _fill(directions: Floats, costs: Floats, misaligned: Floats) -> Booleans:
+def _classify_by_neighbours(directions: Floats, infinite_costs: Floats, near_costs: Floats) -> Booleans:
     """Return which patches (n,) are far, each by the nearest patches that are not plain, weighted by their contrast.
 
-    A patch that is not plain is far, too, if its own cost is below MAX_COST. costs, misaligned: shares (n,) of the
-    views that differ on the infinite sphere, and on near ones.
+    A patch that is not plain is far, too, if its own cost on the infinite sphere is below MAX_COST. infinite_costs,
+    near_costs: shares (n,) of the views that differ on the infinite sphere, and on near ones.
     """
-    known = misaligned >= MIN_CONTRAST
-    count = min(NEIGHBOURS, int(known.sum()))
-    filled = np.zeros(len(directions), bool)
+    has_contrast = near_costs >= MIN_CONTRAST
+    count = min(NEIGHBOURS, int(has_contrast.sum()))
+    is_far = np.zeros(len(directions), bool)
     for index, direction in enumerate(directions):
-        nearest = np.argpartition(-(directions[known] @ direction), count - 1)[:count]
-        gain = misaligned[known][nearest] - costs[known][nearest]
-        filled[index] = gain.sum() > MIN_GAIN * misaligned[known][nearest].sum()
-    return filled | known & (costs < MAX_COST)
+        nearest = np.argpartition(-(directions[has_contrast] @ direction), count - 1)[:count]
+        gain = near_costs[has_contrast][nearest] - infinite_costs[has_contrast][nearest]
+        is_far[index] = gain.sum() > MIN_GAIN * near_costs[has_contrast][nearest].sum()
+    return is_far | has_contrast & (infinite_costs < MAX_COST)
 
 
-def _sweep_view(view: View, frames: Frames) -> SweepView:
+def _make_sweep_view(view: View, frames: Frames) -> SweepView:
     """Return a view for the sweep, at the usual exposure: its clean frame if the fit has one, else its frame."""
     camera, frame, clean = frames.targets(view)
     small = camera.scaled(min(SWEEP_WIDTH, camera.width))
@@ -195,25 +199,25 @@ def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: fl
     Groups are robust: a direction may be hidden by something near in most views. inverse_radius: of the sphere, 0 for
     an infinite one. The share is 0 where too few views see a point.
     """
-    centre = _centre([view.camera for view in views])
+    centre = _camera_centre([view.camera for view in views])
     values = np.full((len(views), len(directions), 3), np.nan, np.float32)
     for row, view in zip(values, views, strict=True):
-        inside, place = _project(view.camera, centre, directions, inverse_radius)
-        x, y = np.minimum(place.astype(int), np.array(view.camera.size) - 1).T
-        row[inside] = _bilinear(view.picture, place)
+        inside, places = _project_sphere(view.camera, centre, directions, inverse_radius)
+        x, y = np.minimum(places.astype(int), np.array(view.camera.size) - 1).T
+        row[inside] = _bilinear(view.picture, places)
         if view.counts is not None:
             row[np.flatnonzero(inside)[~view.counts[y, x]]] = np.nan
-    numbers = np.isfinite(values[..., 0]).sum(0)
-    seen = numbers >= MIN_VIEWS
+    view_counts = np.isfinite(values[..., 0]).sum(0)
+    visible = view_counts >= MIN_VIEWS
     cost = np.zeros(len(directions))
-    red, green, blue = torch.from_numpy(np.ascontiguousarray(values[:, seen].transpose(2, 0, 1)))
-    best = torch.zeros(red.shape[1], dtype=torch.int32)
+    red, green, blue = torch.from_numpy(np.ascontiguousarray(values[:, visible].transpose(2, 0, 1)))
+    largest_group = torch.zeros(red.shape[1], dtype=torch.int32)
     for r, g, b in zip(red, green, blue, strict=True):
         difference = (red - r).abs_().maximum((green - g).abs_()).maximum((blue - b).abs_())
         agree = (difference <= MAX_DIFFERENCE).sum(0, dtype=torch.int32)  # comparisons with NaN are false
-        best = torch.maximum(best, agree)
-    cost[seen] = 1 - (best.numpy() - 1) / (numbers[seen] - 1)  # every view agrees with itself
-    return cost, seen
+        largest_group = torch.maximum(largest_group, agree)
+    cost[visible] = 1 - (largest_group.numpy() - 1) / (view_counts[visible] - 1)  # every view agrees with itself
+    return cost, visible
 
 
 def _bilinear(picture: Values, places: Floats) -> Values:
@@ -228,7 +232,8 @@ def _bilinear(picture: Values, places: Floats) -> Values:
     return np.asarray(upper * (1 - v) + lower * v)
 
 
-def _project(camera: Camera, centre: Floats, directions: Floats, inverse_radius: float) -> tuple[Booleans, Floats]:
+def _project_sphere(camera: Camera, centre: Floats, directions: Floats, inverse_radius: float
+                    ) -> tuple[Booleans, Floats]:
     """Return which points (n,) of a sphere about `centre`, in these directions, lie on the camera's frame, and their
     places (m, 2), pixels. inverse_radius: of the sphere, 0 for an infinite one."""
     rotation = camera.world_to_camera[:3, :3]
@@ -241,7 +246,7 @@ def _project(camera: Camera, centre: Floats, directions: Floats, inverse_radius:
     return inside, places[inside]
 
 
-def _far_points(sphere: FarSphere, patches: Patches, views: Sequence[View], frames: Frames) -> PointCloud:
+def _make_far_points(sphere: FarSphere, patches: Patches, views: Sequence[View], frames: Frames) -> PointCloud:
     """Return at most about MAX_POINTS points on the far sphere in the far patches, in the colours of the frames.
 
     Colours are those at the usual exposure: medians of clean frames, else a low quantile of the frames.
@@ -251,11 +256,11 @@ def _far_points(sphere: FarSphere, patches: Patches, views: Sequence[View], fram
     focal = float(np.median([target.camera.focal_length for target in targets]))
     pitch = POINT_PITCH_PX / focal
     cameras = [target.camera for target in targets]
-    directions = _seen_directions(cameras, pitch)
-    directions = directions[patches.contain(directions)]
+    directions = _visible_directions(cameras, pitch)
+    directions = directions[patches.are_far(directions)]
     if len(directions) > MAX_POINTS:
-        directions = _seen_directions(cameras, pitch * (len(directions) / MAX_POINTS) ** 0.5)
-        directions = directions[patches.contain(directions)]
+        directions = _visible_directions(cameras, pitch * (len(directions) / MAX_POINTS) ** 0.5)
+        directions = directions[patches.are_far(directions)]
     colours = np.full((len(views), len(directions), 3), np.nan, np.float32)
     is_exact = all(target.clean is not None for target in targets)
     for row, view, (camera, frame, clean) in zip(colours, views, targets, strict=True):
@@ -263,29 +268,29 @@ def _far_points(sphere: FarSphere, patches: Patches, views: Sequence[View], fram
         small = camera.scaled(max(round(camera.width * PITCH_PX / POINT_PITCH_PX), 8))
         picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
         values = Picture(picture, "srgb").resized(*small.size).display()
-        inside, place = _project(small, centre, directions, 0.0)
-        row[inside] = _bilinear(values, place)
+        inside, places = _project_sphere(small, centre, directions, 0.0)
+        row[inside] = _bilinear(values, places)
         if (mask := frames.mask(view)) is not None:
-            x, y = np.minimum((place / small.width * camera.width).astype(int), np.array(camera.size) - 1).T
+            x, y = np.minimum((places / small.width * camera.width).astype(int), np.array(camera.size) - 1).T
             row[np.flatnonzero(inside)[~mask.numpy()[y, x]]] = np.nan
-    seen = np.isfinite(colours[..., 0]).any(0)
-    chosen = np.nanquantile(colours[:, seen], 0.5 if is_exact else COLOUR_QUANTILE, axis=0)
-    xyz = centre + sphere.radius * directions[seen]
-    return PointCloud(xyz.astype(np.float32), (chosen.clip(0, 1) * 255 + 0.5).astype(np.uint8),
+    visible = np.isfinite(colours[..., 0]).any(0)
+    chosen_colours = np.nanquantile(colours[:, visible], 0.5 if is_exact else COLOUR_QUANTILE, axis=0)
+    xyz = centre + sphere.radius * directions[visible]
+    return PointCloud(xyz.astype(np.float32), (chosen_colours.clip(0, 1) * 255 + 0.5).astype(np.uint8),
                       np.zeros(len(xyz), np.float32))
 
 
-def _centre(cameras: list[Camera]) -> Floats:
+def _camera_centre(cameras: list[Camera]) -> Floats:
     """Return (3,), the mean position of cameras."""
     return np.asarray(np.mean([camera.position for camera in cameras], axis=0))
 
 
-def _spread(cameras: list[Camera]) -> float:
+def _camera_spread(cameras: list[Camera]) -> float:
     """Return the largest distance of a camera from the mean position, world units."""
-    return max(float(np.linalg.norm(camera.position - _centre(cameras))) for camera in cameras)
+    return max(float(np.linalg.norm(camera.position - _camera_centre(cameras))) for camera in cameras)
 
 
-def _seen_directions(cameras: list[Camera], pitch: float) -> Floats:
+def _visible_directions(cameras: list[Camera], pitch: float) -> Floats:
     """Return unit vectors (n, 3) that some camera sees, about `pitch` radians from each other.
 
     They are part of a Fibonacci lattice (Swinbank and Purser 2006) about the mean viewing direction.
@@ -302,17 +307,18 @@ def _seen_directions(cameras: list[Camera], pitch: float) -> Floats:
     right = np.cross(helper, axis)
     right /= np.linalg.norm(right)
     directions = fibonacci_directions(count, lowest) @ np.stack([right, np.cross(axis, right), axis])
-    seen = np.zeros(count, bool)
+    visible = np.zeros(count, bool)
     for camera in cameras:
-        seen |= _project(camera, camera.position, directions, 0.0)[0]
-    return directions[seen]
+        visible |= _project_sphere(camera, camera.position, directions, 0.0)[0]
+    return directions[visible]
 
 
-def _nearest(directions: Floats, others: Floats) -> NDArray[np.int64]:
+def _nearest_indices(directions: Floats, others: Floats) -> NDArray[np.int64]:
     """Return (n,) the index of the nearest of other unit vectors (m, 3) for each of (n, 3)."""
-    result = np.zeros(len(directions), np.int64)
-    right = torch.from_numpy(others.T.astype(np.float32))
-    for start in range(0, len(directions), 4096):
-        block = torch.from_numpy(directions[start:start + 4096].astype(np.float32))
-        result[start:start + 4096] = (block @ right).argmax(1).numpy()
-    return result
+    indices = np.zeros(len(directions), np.int64)
+    columns = torch.from_numpy(others.T.astype(np.float32))
+    for start in range(0, len(directions), DIRECTIONS_AT_ONCE):
+        block = slice(start, start + DIRECTIONS_AT_ONCE)
+        cosines = torch.from_numpy(directions[block].astype(np.float32)) @ columns
+        indices[block] = cosines.argmax(1).numpy()
+    return indices

@@ -27,8 +27,8 @@ from .light_brightness import normalise_brightness, solve_brightness
 from .light_results import (
     flare_shares,
     select_flaring,
+    select_lights,
     share_sentences,
-    without_other_lights,
     write_frame_lights,
 )
 from .optimisers import Optimisers
@@ -100,7 +100,7 @@ class FlareTrainer(abc.ABC):
         normalise_brightness(self.flare, self.views)
         shares = flare_shares(self.flare, self.views, self.frames, self.render_view)
         flaring = select_flaring(shares)
-        self.flare = without_other_lights(self.flare, flaring)
+        self.flare = select_lights(self.flare, flaring)
         write_frame_lights(folder / FRAME_LIGHTS, self.capture, self.flare)
         return share_sentences(shares, flaring)
 
@@ -116,8 +116,8 @@ class FlareTrainer(abc.ABC):
         Purposes: 0 the scene's density, 1 the order of the views, 2 + n the density of the n-th flare.
         """
         # A large prime keeps the seeds of different purposes and numbers apart.
-        mixed = (self.settings.seed * 1_000_003 + purpose) * 1_000_003 + number
-        return torch.Generator().manual_seed(mixed % (1 << 62))
+        seed = (self.settings.seed * 1_000_003 + purpose) * 1_000_003 + number
+        return torch.Generator().manual_seed(seed % (1 << 62))
 
     def _change_flare_density(self) -> None:
         """Clone and prune the flare's Gaussians, at the iterations that the settings name."""

@@ -79,7 +79,7 @@ class Frames:
         self.display_white = display_white
         self._width = width
         # Codes per display value: 16 bit keep the smoothness of linear footage at half the size of float.
-        self._codes = 65535 / display_white
+        self._codes_per_value = 65535 / display_white
         self.cache = PictureCache(memory)
         self.reference = ("" if frames_only else "removed" if capture.has_removed else
                           "truth" if truth and capture.has_truth else "")
@@ -108,16 +108,16 @@ class Frames:
         sizes = {self.camera(view).size for view in self.capture.views}
         if len(sizes) != 1:
             return None
-        size, common = sizes.pop(), None
+        size, shared_borders = sizes.pop(), None
         for view in subsample(self.capture.views, SAMPLED_FRAMES):
-            stored = self._stored(view, "frame", self.capture.frame)
-            if stored is None or stored.max() <= MAX_BORDER_LEVEL * self._codes:  # faded out
+            codes = self._load_codes(view, "frame", self.capture.frame)
+            if codes is None or codes.max() <= MAX_BORDER_LEVEL * self._codes_per_value:  # faded out
                 continue
-            borders = Borders.of(stored, lambda line: line / self._codes)
-            common = borders if common is None else common.intersection(borders)
-            if max(common) < MIN_BORDER_LINES:
+            borders = Borders.of(codes, lambda line: line / self._codes_per_value)
+            shared_borders = borders if shared_borders is None else shared_borders.intersection(borders)
+            if max(shared_borders) < MIN_BORDER_LINES:
                 return None
-        inside = None if common is None else common.area(*size, BORDER_MARGIN)
+        inside = None if shared_borders is None else shared_borders.area(*size, BORDER_MARGIN)
         return None if inside is None or inside.size == size else inside
 
     def targets(self, view: View) -> Targets:
@@ -133,7 +133,7 @@ class Frames:
 
     def frame(self, view: View) -> Tensor:
         """Return the frame as filmed, without borders. Raises CaptureError."""
-        pixels = self._display(view, "frame", self.capture.frame)
+        pixels = self._load_display(view, "frame", self.capture.frame)
         if pixels is None:
             raise CaptureError(f"{self.capture.folder} has no frame {view.name}.")
         return pixels
@@ -141,9 +141,9 @@ class Frames:
     def clean(self, view: View) -> Tensor | None:
         """Return the clean frame without borders; None where the capture has none."""
         if self.reference == "removed":
-            return self._display(view, "removed", self.capture.removed)
+            return self._load_display(view, "removed", self.capture.removed)
         if self.reference == "truth":
-            return self._display(view, "truth", self.capture.truth_scene)
+            return self._load_display(view, "truth", self.capture.truth_scene)
         return None
 
     def mask(self, view: View) -> Tensor | None:
@@ -151,39 +151,39 @@ class Frames:
         if self.capture.mask_path(view) is None:
             return None
         name = f"mask/{view.name}"
-        stored = self.cache.get(name)
-        if stored is None:
+        codes = self.cache.get(name)
+        if codes is None:
             mask = self.capture.mask(view, self.camera(view).size)
             assert mask is not None
-            stored = mask.astype(np.uint16)
-            self.cache.put(name, stored)
-        return torch.from_numpy((stored if self.picture_area is None else stored[self.picture_area.slices]) > 0)
+            codes = mask.astype(np.uint16)
+            self.cache.put(name, codes)
+        return torch.from_numpy((codes if self.picture_area is None else codes[self.picture_area.slices]) > 0)
 
-    def _display(self, view: View, kind: str,
-                 decode: Callable[[View, tuple[int, int]], Picture | None]) -> Tensor | None:
+    def _load_display(self, view: View, kind: str,
+                      decode: Callable[[View, tuple[int, int]], Picture | None]) -> Tensor | None:
         """Return a picture of a view without borders, display values (height, width, 3); None where there is none.
 
-        kind, decode: see `_stored`.
+        kind, decode: see `_load_codes`.
         """
-        stored = self._stored(view, kind, decode)
-        if stored is None:
+        codes = self._load_codes(view, kind, decode)
+        if codes is None:
             return None
         if self.picture_area is not None:
-            stored = stored[self.picture_area.slices]
-        return torch.from_numpy(stored.astype(np.float32)) / self._codes
+            codes = codes[self.picture_area.slices]
+        return torch.from_numpy(codes.astype(np.float32)) / self._codes_per_value
 
-    def _stored(self, view: View, kind: str,
-                decode: Callable[[View, tuple[int, int]], Picture | None]) -> NDArray[np.uint16] | None:
+    def _load_codes(self, view: View, kind: str,
+                    decode: Callable[[View, tuple[int, int]], Picture | None]) -> NDArray[np.uint16] | None:
         """Return the whole picture as 16 bit codes, from the cache if possible; None where there is none.
 
         kind: first part of its name in the cache. decode: reads the picture of a view at a size (width, height).
         """
         name = f"{kind}/{view.name}"
-        stored = self.cache.get(name)
-        if stored is None:
+        codes = self.cache.get(name)
+        if codes is None:
             picture = decode(view, self.camera(view).size)
             if picture is None:
                 return None
-            stored = (picture.display(self.display_white) * self._codes + 0.5).astype(np.uint16)
-            self.cache.put(name, stored)
-        return stored
+            codes = (picture.display(self.display_white) * self._codes_per_value + 0.5).astype(np.uint16)
+            self.cache.put(name, codes)
+        return codes

@@ -8,7 +8,7 @@ drawn at random in the cameras' view, as 3DGS does for synthetic scenes.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,11 +36,19 @@ NEAR_FACTOR, FAR_FACTOR = 0.3, 3.0
 Floats = NDArray[np.float64]
 
 
+class _Features(NamedTuple):
+    """Features of a frame: places (n, 2), pixels, SIFT descriptors, None without features, and colours (n, 3)."""
+
+    places: Floats
+    descriptors: Any
+    colours: NDArray[np.uint8]
+
+
 def ensure_points(capture: Capture, settings: FitSettings, progress: Progress) -> tuple[Capture, tuple[str, ...]]:
     """Return the capture with points, and a sentence where they had to be made. Raises Cancelled."""
     if len(capture.points) or settings.scene.start or settings.uses_plates:
         return capture, ()
-    xyz, rgb, observed = _triangulate(capture, progress)
+    xyz, rgb, observed = _triangulate_matches(capture, progress)
     source = f"{len(xyz)} points that were triangulated from matches of its frames"
     if len(xyz) < MIN_TRIANGULATED:
         random_xyz, random_rgb = _random_points(capture, xyz, settings.seed)
@@ -50,8 +58,8 @@ def ensure_points(capture: Capture, settings: FitSettings, progress: Progress) -
     return capture.with_points(cloud, observed), (f"{capture.folder} has no 3D points: the fit starts from {source}.",)
 
 
-def _triangulate(capture: Capture,
-                 progress: Progress) -> tuple[Floats, NDArray[np.uint8], dict[str, NDArray[np.int64]]]:
+def _triangulate_matches(capture: Capture,
+                         progress: Progress) -> tuple[Floats, NDArray[np.uint8], dict[str, NDArray[np.int64]]]:
     """Return points (n, 3), colours (n, 3), and the indices of those observed in each view, by its name.
 
     Each frame is matched with the next two; every sound match gives a point, in the colour of the first frame.
@@ -62,23 +70,23 @@ def _triangulate(capture: Capture,
     progress.stage("match frames for points", len(views))
     sift, matcher = cv2.SIFT.create(FEATURES), cv2.BFMatcher(cv2.NORM_L2)
     cameras: list[Camera] = []
-    features: list[tuple[Floats, Any, NDArray[np.uint8]]] = []
+    features: list[_Features] = []
     for view in views:
         cameras.append(view.camera.scaled(min(MATCHED_WIDTH, view.camera.width)))
-        features.append(_features(sift, capture.frame(view, cameras[-1].size)))
+        features.append(_detect_features(sift, capture.frame(view, cameras[-1].size)))
         progress.advance()
     xyz, rgb, observed = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], dict[str, list[NDArray[np.int64]]]()
     count = 0
     pairs = [*pairwise(range(len(views))), *((i, i + 2) for i in range(len(views) - 2))]
     for first, second in pairs:
-        chosen = _match(matcher, features[first][1], features[second][1])
-        if not len(chosen):
+        matches = _match_features(matcher, features[first].descriptors, features[second].descriptors)
+        if not len(matches):
             continue
-        ends = features[first][0][chosen[:, 0]], features[second][0][chosen[:, 1]]
-        points, usable = triangulate_pair(cameras[first], cameras[second], *ends)
-        xyz.append(points[usable])
-        rgb.append(features[first][2][chosen[usable, 0]])
-        indices = np.arange(count, count + int(usable.sum()))
+        points, is_sound = triangulate_pair(cameras[first], cameras[second], features[first].places[matches[:, 0]],
+                                            features[second].places[matches[:, 1]])
+        xyz.append(points[is_sound])
+        rgb.append(features[first].colours[matches[is_sound, 0]])
+        indices = np.arange(count, count + int(is_sound.sum()))
         count += len(indices)
         for index in (first, second):
             observed.setdefault(views[index].name, []).append(indices)
@@ -86,61 +94,63 @@ def _triangulate(capture: Capture,
             {name: np.unique(np.concatenate(parts)) for name, parts in observed.items() if count})
 
 
-def _features(sift: Any, picture: Picture) -> tuple[Floats, Any, NDArray[np.uint8]]:
-    """Return places (n, 2) in pixels, descriptors and colours (n, 3) of a frame's features."""
+def _detect_features(sift: Any, picture: Picture) -> _Features:
+    """Return the SIFT features of a frame."""
     import cv2
 
     codes = (picture.display() * 255 + 0.5).astype(np.uint8)
     keys, descriptors = sift.detectAndCompute(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), None)
     places = np.array([key.pt for key in keys], np.float64).reshape(-1, 2)
     x, y = np.minimum(np.rint(places).astype(int), np.array(picture.size) - 1).T
-    return places + 0.5, descriptors, codes[y, x]  # OpenCV's pixel centres are whole numbers
+    return _Features(places + 0.5, descriptors, codes[y, x])  # OpenCV's pixel centres are whole numbers
 
 
-def _match(matcher: Any, first: Any, second: Any) -> NDArray[np.int64]:
+def _match_features(matcher: Any, first: Any, second: Any) -> NDArray[np.int64]:
     """Return (n, 2) indices of features whose descriptors are nearest to each other, and by MATCH_RATIO nearer than to
     any third. first, second: descriptors of two frames, None without features."""
     if first is None or second is None or min(len(first), len(second)) < 2:
         return np.zeros((0, 2), np.int64)
-    forward = [(near.queryIdx, near.trainIdx) for near, other in matcher.knnMatch(first, second, 2)
-               if near.distance < MATCH_RATIO * other.distance]
-    back = {near.queryIdx: near.trainIdx for near in matcher.match(second, first)}
-    return np.array([pair for pair in forward if back.get(pair[1]) == pair[0]], np.int64).reshape(-1, 2)
+    forward = [(nearest.queryIdx, nearest.trainIdx) for nearest, second_nearest in matcher.knnMatch(first, second, 2)
+               if nearest.distance < MATCH_RATIO * second_nearest.distance]
+    backward = {nearest.queryIdx: nearest.trainIdx for nearest in matcher.match(second, first)}
+    return np.array([pair for pair in forward if backward.get(pair[1]) == pair[0]], np.int64).reshape(-1, 2)
 
 
-def triangulate_pair(first: Camera, second: Camera, pixels: Floats, others: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return points (n, 3) from pixels (n, 2) of two cameras, and which (n,) are sound.
+def triangulate_pair(first: Camera, second: Camera, pixels: Floats, other_pixels: Floats
+                     ) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return points (n, 3) from pixels (n, 2) of the first and other pixels (n, 2) of the second camera, and which (n,)
+    are sound.
 
     A point is where the two rays are nearest to each other. It is sound if it lies before both cameras, the rays differ
     by more than MIN_ANGLE, and it projects to less than MAX_ERROR_PX from both pixels.
     """
-    rays, other_rays = first.rays(pixels), second.rays(others)
+    rays, other_rays = first.rays(pixels), second.rays(other_pixels)
     baseline = second.position - first.position
     cosine = (rays * other_rays).sum(axis=1)
     denominator = np.maximum(1 - cosine * cosine, 1e-12)
     along = ((rays @ baseline) - cosine * (other_rays @ baseline)) / denominator
     along_other = (cosine * (rays @ baseline) - (other_rays @ baseline)) / denominator
     points = 0.5 * (first.position + along[:, None] * rays + second.position + along_other[:, None] * other_rays)
-    sound = (along > 0) & (along_other > 0) & (np.arccos(cosine.clip(-1, 1)) > MIN_ANGLE)
-    for camera, goal in ((first, pixels), (second, others)):
+    is_sound = (along > 0) & (along_other > 0) & (np.arccos(cosine.clip(-1, 1)) > MIN_ANGLE)
+    for camera, observed in ((first, pixels), (second, other_pixels)):
         places, depth = camera.project(points)
         with np.errstate(invalid="ignore"):
-            sound &= (depth > 0) & (np.linalg.norm(places - goal, axis=1) < MAX_ERROR_PX)
-    return points, sound
+            is_sound &= (depth > 0) & (np.linalg.norm(places - observed, axis=1) < MAX_ERROR_PX)
+    return points, is_sound
 
 
-def _random_points(capture: Capture, known: Floats, seed: int) -> tuple[Floats, NDArray[np.uint8]]:
+def _random_points(capture: Capture, triangulated: Floats, seed: int) -> tuple[Floats, NDArray[np.uint8]]:
     """Return points (n, 3) in the view of the cameras, with the colours (n, 3) of the frames where they were drawn.
 
-    Depths are log-uniform about what each camera looks at. known: (m, 3) triangulated points, which tell where that is.
+    Depths are log-uniform about that of what each camera looks at (`_subject_distance`). triangulated: points (m, 3).
     """
     generator = np.random.default_rng(seed)
     views = subsample(capture.views, MATCHED_VIEWS)
-    focus = None if capture.is_rotation_only else _focus([view.camera for view in views])
+    focus = None if capture.is_rotation_only else _focus_point([view.camera for view in views])
     xyz, rgb = [], []
     for view in views:
         camera = view.camera.scaled(min(MATCHED_WIDTH, view.camera.width))
-        distance = _distance(camera, known, focus, capture)
+        distance = _subject_distance(camera, triangulated, focus, capture)
         count = RANDOM_POINTS // len(views) + 1
         pixels = generator.random((count, 2)) * camera.size
         depth = distance * np.exp(generator.uniform(np.log(NEAR_FACTOR), np.log(FAR_FACTOR), count))
@@ -151,16 +161,16 @@ def _random_points(capture: Capture, known: Floats, seed: int) -> tuple[Floats, 
     return np.concatenate(xyz), np.concatenate(rgb)
 
 
-def _focus(cameras: list[Camera]) -> Floats | None:
-    """Return the point (3,) that is nearest to all optical axes; None where they are parallel."""
-    sums, right = np.zeros((3, 3)), np.zeros(3)
+def _focus_point(cameras: list[Camera]) -> Floats | None:
+    """Return the point (3,) that is nearest to all optical axes, by least squares; None where they are parallel."""
+    matrix, vector = np.zeros((3, 3)), np.zeros(3)
     for camera in cameras:
-        across = np.eye(3) - np.outer(camera.forward, camera.forward)
-        sums, right = sums + across, right + across @ camera.position
-    return None if np.linalg.cond(sums) > 1e6 else np.linalg.solve(sums, right)
+        perpendicular = np.eye(3) - np.outer(camera.forward, camera.forward)
+        matrix, vector = matrix + perpendicular, vector + perpendicular @ camera.position
+    return None if np.linalg.cond(matrix) > 1e6 else np.linalg.solve(matrix, vector)
 
 
-def _distance(camera: Camera, known: Floats, focus: Floats | None, capture: Capture) -> float:
+def _subject_distance(camera: Camera, known: Floats, focus: Floats | None, capture: Capture) -> float:
     """Return the distance, world units, of what a camera looks at: of known points (n, 3), the common focus (3,), or
     the capture's extent."""
     if len(known) >= 20:  # enough for a median

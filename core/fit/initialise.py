@@ -18,7 +18,7 @@ from ..images.picture import Picture
 from ..lights.snap import FlareView, flare_view, snap_lights
 from .far_layer import find_far_layer
 from .frames import Frames, subsample
-from .light_results import read_frame_lights
+from .light_results import make_frame_lights
 from .settings import FitSettings
 from .sky import add_sky_points
 
@@ -39,7 +39,10 @@ SNAP_WIDTH, SNAP_VIEWS = 160, 40
 def initial_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
     """Return the scene that a fit starts from: a scene trained elsewhere, or one Gaussian for each point of the
     capture, with near plane and white for its frames."""
-    scene = _load_scene(capture, settings, views, frames)
+    if settings.scene.start:
+        scene = _load_scene(settings, views)
+    else:
+        scene = _scene_from_points(capture, settings, views, frames)
     scene.near = min(scene.near, NEAR_PLANE_FACTOR * nearest_depth(capture))
     scene.display_white = settings.display_white
     return scene
@@ -53,22 +56,28 @@ def nearest_depth(capture: Capture) -> float:
     for camera in (view.camera for view in capture.views):
         pixels, depth = camera.project(points)
         depths.append(depth[camera.contains(pixels, depth)])
-    every = np.concatenate(depths) if depths else np.zeros(0)
-    return float(np.quantile(every, NEAREST_QUANTILE)) if len(every) else math.inf
+    all_depths = np.concatenate(depths) if depths else np.zeros(0)
+    return float(np.quantile(all_depths, NEAREST_QUANTILE)) if len(all_depths) else math.inf
 
 
-def _load_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
-    """Return a scene trained elsewhere, or one Gaussian for each point, before near plane and white are set."""
-    if settings.scene.start:
-        scene = read_ply(settings.scene.start)
-        if not len(scene):
-            raise CaptureError(f"{settings.scene.start} holds no Gaussians; export it again.")
-        _check_in_view(scene, views, settings.scene.start)
-        for parameter in scene.parameters():
-            parameter.requires_grad_(not settings.scene.frozen)
-        if not settings.scene.frozen:
-            scene.pixel_grid = None  # it learns another grid
-        return scene
+def _load_scene(settings: FitSettings, views: tuple[View, ...]) -> SceneGaussians:
+    """Read the scene to start from; a frozen one has no gradients. Raises CaptureError for a scene that is empty or of
+    another world."""
+    scene = read_ply(settings.scene.start)
+    if not len(scene):
+        raise CaptureError(f"{settings.scene.start} holds no Gaussians; export it again.")
+    _check_in_view(scene, views, settings.scene.start)
+    for parameter in scene.parameters():
+        parameter.requires_grad_(not settings.scene.frozen)
+    if not settings.scene.frozen:
+        scene.pixel_grid = None  # it learns another grid
+    return scene
+
+
+def _scene_from_points(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames
+                       ) -> SceneGaussians:
+    """Return one Gaussian for each point of the capture, with the far layer or the sky where the settings ask for one.
+    """
     if not len(capture.points):
         raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")
     layer = find_far_layer(capture, views, frames) if settings.scene.far_layer else None
@@ -82,15 +91,16 @@ def _load_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...]
 def _check_in_view(scene: SceneGaussians, views: tuple[View, ...], path: str) -> None:
     """Raise CaptureError where few views have a Gaussian of the scene on their frames: it is of another world."""
     means = scene.means.detach().numpy()
-    seeing = 0
+    seeing_views = 0
     # Some Gaussians suffice as a rule; all are projected only if those are on too few frames.
     for points in (means[::max(len(means) // SAMPLED_POINTS, 1)], means):
-        seeing = sum(bool(view.camera.contains(*view.camera.project(points)).any()) for view in views)
-        if seeing >= MIN_SHARE_OF_SEEING_VIEWS * len(views):
+        seeing_views = sum(bool(view.camera.contains(*view.camera.project(points)).any()) for view in views)
+        if seeing_views >= MIN_SHARE_OF_SEEING_VIEWS * len(views):
             return
-    raise CaptureError(f"{path} is of another world than the capture: {len(views) - seeing} of {len(views)} views have "
-                       f"none of its {len(scene)} Gaussians before them; export it in the world of the cameras (for "
-                       "nerfstudio: --orientation-method none --center-method none --auto-scale-poses False).")
+    raise CaptureError(f"{path} is of another world than the capture: {len(views) - seeing_views} of {len(views)} "
+                       f"views have none of its {len(scene)} Gaussians before them; export it in the world of the "
+                       "cameras (for nerfstudio: --orientation-method none --center-method none --auto-scale-poses "
+                       "False).")
 
 
 def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings) -> FlareModel:
@@ -105,9 +115,9 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
     names = [light.name for light in capture.lights]
     frame_lights = None
     if settings.uses_plates or has_frame_lights(capture):
-        frame_lights = read_frame_lights(capture, names)
+        frame_lights = make_frame_lights(capture, names)
     if frame_lights is None:
-        positions = _standing_positions(capture, views, frames, settings, generator)
+        positions = _static_positions(capture, views, frames, settings, generator)
     else:
         # Those of the middle frame, for cameras of other frames.
         positions = frame_lights.positions[len(frame_lights.positions) // 2].clone()
@@ -138,9 +148,9 @@ def has_frame_lights(capture: Capture) -> bool:
     return any(light.moves or light.keys for light in capture.lights)
 
 
-def _standing_positions(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings,
-                        generator: torch.Generator) -> torch.Tensor:
-    """Return the places (lights, 3) of lights that stand, moved to their flares where the settings say so."""
+def _static_positions(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings,
+                      generator: torch.Generator) -> torch.Tensor:
+    """Return the places (lights, 3) of static lights, world units, moved to their flares if the settings say so."""
     positions = torch.tensor([list(map(float, light.xyz)) for light in capture.lights], dtype=torch.float64)
     if not settings.flare.detection:
         # Paper, appendix: the centroid of the points, offset by uniform noise in [0, 1) along each axis.

@@ -56,25 +56,26 @@ def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, r
     lights = flare.frame_lights
     if lights is None:
         return
-    weight = lights.brightness.weight
+    brightness = lights.brightness.weight
     rows = [lights.rows[view.name] for view in views]
     solved, certainty = np.zeros((2, len(views), len(flare.names)))
     for number, (view, row) in enumerate(zip(views, rows, strict=True)):
-        start = weight[row].clamp(0, MAX_BRIGHTNESS).numpy().astype(np.float64)
-        weight[row] = 1.0  # so that the layers have their usual strength
+        start = brightness[row].clamp(0, MAX_BRIGHTNESS).numpy().astype(np.float64)
+        brightness[row] = 1.0  # so that the layers have their usual strength
         rendered = render_view(view)
         columns = [rendered.layers.flares[name].numpy() if name in rendered.layers.flares else None
                    for name in flare.names]
-        solved[number], certainty[number] = _solve(frames.targets(view), rendered.layers.scene.numpy(), columns, start)
+        scene = rendered.layers.scene.numpy()
+        solved[number], certainty[number] = _solve_frame(frames.targets(view), scene, columns, start)
     prior = lights.prior[rows].numpy().astype(np.float64)
     prior_certainty = np.isfinite(prior) / PRIOR_ERROR**2
     inside = np.array([_lights_in_frame(lights, view, EDGE_SHARE) for view in views])
     certainty = np.minimum(certainty, 1 / np.where(inside, FLARE_ERROR, OUTSIDE_ERROR) ** 2)
-    total = certainty + prior_certainty
-    solved = (certainty * solved + prior_certainty * np.nan_to_num(prior)) / np.maximum(total, 1e-9)
+    total_certainty = certainty + prior_certainty
+    solved = (certainty * solved + prior_certainty * np.nan_to_num(prior)) / np.maximum(total_certainty, 1e-9)
     for light in range(len(flare.names)):
-        smooth = smooth_with_steps(solved[:, light], total[:, light])
-        weight[rows, light] = torch.from_numpy(smooth.clip(0, MAX_BRIGHTNESS)).float()
+        smooth = smooth_with_steps(solved[:, light], total_certainty[:, light])
+        brightness[rows, light] = torch.from_numpy(smooth.clip(0, MAX_BRIGHTNESS)).float()
 
 
 def _lights_in_frame(lights: FrameLights, view: View, edge: float = 0.0) -> NDArray[np.bool_]:
@@ -107,19 +108,19 @@ def _solve_tridiagonal(weights: NDArray[np.float64], springs: NDArray[np.float64
     diagonal = weights.copy()
     diagonal[:-1] += springs
     diagonal[1:] += springs
-    right = target.copy()
+    rhs = target.copy()
     for index in range(1, len(target)):
         factor = springs[index - 1] / diagonal[index - 1]
         diagonal[index] -= factor * springs[index - 1]
-        right[index] += factor * right[index - 1]
-    solution = right / diagonal
+        rhs[index] += factor * rhs[index - 1]
+    solution = rhs / diagonal
     for index in range(len(target) - 2, -1, -1):
         solution[index] += springs[index] * solution[index + 1] / diagonal[index]
     return solution
 
 
-def _solve(targets: Targets, scene: NDArray[np.float32], flares: Sequence[NDArray[np.float32] | None],
-           start: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _solve_frame(targets: Targets, scene: NDArray[np.float32], flares: Sequence[NDArray[np.float32] | None],
+                 start: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the strengths (lights,) of flares (height, width, 3), linear light, in a frame over its scene, and their
     certainty, 1 / variance.
 
@@ -155,8 +156,8 @@ def normalise_brightness(flare: FlareModel, views: Sequence[View]) -> None:
     if lights is None:
         return
     for number, light in enumerate(flare.lights):
-        inside = [lights.rows[view.name] for view in views if _lights_in_frame(lights, view)[number]]
-        rows = inside or [lights.rows[view.name] for view in views]
+        rows_in_frame = [lights.rows[view.name] for view in views if _lights_in_frame(lights, view)[number]]
+        rows = rows_in_frame or [lights.rows[view.name] for view in views]
         brightest = float(lights.brightness.weight[rows, number].max())
         if brightest <= 0:
             continue
@@ -172,7 +173,7 @@ def _scale_colours(sh: torch.Tensor, head: nn.Linear, names: Sequence[str], widt
     """
     sh *= factor
     sh[:, :3] += (factor - 1) * 0.5 / C0
-    first = sum(widths[:names.index("sh")])
-    rows = slice(first, first + widths[names.index("sh")])
+    start = sum(widths[:names.index("sh")])
+    rows = slice(start, start + widths[names.index("sh")])
     head.weight[rows] *= factor
     head.bias[rows] *= factor

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,10 +33,22 @@ MIN_PRIOR_CONFIDENCE = 0.5
 """Confidence of a key of a light below which its brightness is only a first guess."""
 
 
+class FlareShare(NamedTuple):
+    """A light's share of all flare light, 0..1, and the peak of its flare in linear light."""
+
+    share: float
+    peak: float
+
+    @property
+    def is_visible(self) -> bool:
+        """True if the light counts as one that flares."""
+        return self.share >= MIN_SHARE and self.peak >= MIN_PEAK
+
+
 @torch.no_grad()
 def flare_shares(flare: FlareModel, views: Sequence[View], frames: Frames,
-                 render_view: RenderView) -> dict[str, tuple[float, float]]:
-    """Return (share of all flare light 0..1, peak in linear light) of each light's flare, by the light's name.
+                 render_view: RenderView) -> dict[str, FlareShare]:
+    """Return share and peak of each light's flare, by the light's name.
 
     Both are measured outside the lights' discs: the picture of a lamp is no flare.
     """
@@ -50,28 +62,22 @@ def flare_shares(flare: FlareModel, views: Sequence[View], frames: Frames,
                 sums[name] += float(light.mean())
                 peaks[name] = max(peaks[name], float(np.quantile(light, PEAK_QUANTILE)))
     total = sum(sums.values())
-    return {name: (sums[name] / total if total else 0.0, peaks[name]) for name in flare.names}
+    return {name: FlareShare(sums[name] / total if total else 0.0, peaks[name]) for name in flare.names}
 
 
-def select_flaring(shares: Mapping[str, tuple[float, float]]) -> list[str]:
+def select_flaring(shares: Mapping[str, FlareShare]) -> list[str]:
     """Return the names of the lights that flare; the one with the largest share if none does."""
-    flaring = [name for name in shares if _flares(shares[name])]
+    flaring = [name for name, share in shares.items() if share.is_visible]
     return flaring or [max(shares, key=lambda name: shares[name])]
 
 
-def _flares(share_and_peak: tuple[float, float]) -> bool:
-    """Return whether a light with this share of all flare light, and this peak, flares."""
-    share, peak = share_and_peak
-    return share >= MIN_SHARE and peak >= MIN_PEAK
-
-
-def share_sentences(shares: Mapping[str, tuple[float, float]], flaring: Sequence[str]) -> list[str]:
+def share_sentences(shares: Mapping[str, FlareShare], flaring: Sequence[str]) -> list[str]:
     """Return sentences for the user about the lights' shares. flaring: the lights that the .flare has."""
-    if not any(map(_flares, shares.values())):
+    if not any(share.is_visible for share in shares.values()):
         return [f"No light of the capture flares: the flare of each is below {MIN_PEAK:g} of white everywhere. The "
                 f"flare layers of this run are dark, and its .flare has {', '.join(flaring)} alone."]
-    listed = ", ".join(f"{name} {100 * share:.1f} %" for name, (share, _) in
-                       sorted(shares.items(), key=lambda item: -item[1][0]))
+    largest_first = sorted(shares, key=lambda name: -shares[name].share)
+    listed = ", ".join(f"{name} {100 * shares[name].share:.1f} %" for name in largest_first)
     sentences = [f"Shares of the flare by light: {listed}."]
     if left_out := [name for name in shares if name not in flaring]:
         sentences.append(f"Left out of the .flare, since they do not flare (less than {100 * MIN_SHARE:g} % of the "
@@ -79,8 +85,8 @@ def share_sentences(shares: Mapping[str, tuple[float, float]], flaring: Sequence
     return sentences
 
 
-def without_other_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:
-    """Return the model with only these lights, in the model's order."""
+def select_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:
+    """Return the model with only the lights of these names, in the model's order."""
     rows = [row for row, name in enumerate(flare.names) if name in names]
     lights = flare.frame_lights
     if lights is not None:
@@ -119,7 +125,7 @@ def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
     write_json(path, {"lights": entries})
 
 
-def read_frame_lights(capture: Capture, names: Sequence[str]) -> FrameLights:
+def make_frame_lights(capture: Capture, names: Sequence[str]) -> FrameLights:
     """Return places and brightness of these lights of a capture, in every view.
 
     An unknown brightness starts at 1. A fit starts from a doubtful one, but it has no prior (NaN), as an unknown one.

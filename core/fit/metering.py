@@ -38,6 +38,9 @@ MIN_LEVEL, MAX_LEVEL = 0.05, 0.9
 OUTLIER_SHARE = 0.1
 """Share of the frames, on either side, that the spread ignores."""
 MAX_ROUNDS, REFINEMENTS, TOLERANCE = 20, 3, 1e-3
+"""Bound of the rounds of an iteration, rounds between lines and luminances, and change in stops at which one ends."""
+MAX_CONDITION = 1e9
+"""Condition number above which the points of a view have one brightness, and a line is undetermined."""
 ERROR_FLOOR = 0.05
 """Linear light added to the base of relative errors: those of dark points are rounding."""
 MAX_WHITE = 64.0
@@ -55,15 +58,15 @@ def measure_exposures(capture: Capture, frames: Frames, progress: Progress | Non
     A view that cannot be measured takes the exposure of the nearest one, by name, that can. Raises Cancelled.
     """
     progress = progress or Progress()
-    stops = PointObservations.of(capture, subsample(capture.views, SAMPLED_VIEWS), frames, progress).stops()
+    stops = PointObservations.of(capture, subsample(capture.views, SAMPLED_VIEWS), frames, progress).estimate_stops()
     # All frames are measured only if some of the first differ.
-    if spread(stops) >= MIN_SPREAD and len(stops) < len(capture.views):
-        stops = PointObservations.of(capture, capture.views, frames, progress).stops()
-    if spread(stops) < MIN_SPREAD:
+    if exposure_spread(stops) >= MIN_SPREAD and len(stops) < len(capture.views):
+        stops = PointObservations.of(capture, capture.views, frames, progress).estimate_stops()
+    if exposure_spread(stops) < MIN_SPREAD:
         return {}
     filled = _fill_unmeasured(stops, [Path(view.name).parent for view in capture.views]) - np.nanmedian(stops)
-    times = 2 ** filled.clip(math.log2(MIN_EXPOSURE), -math.log2(MIN_EXPOSURE))
-    return {view.name: round(float(time), 6) for view, time in zip(capture.views, times, strict=True)}
+    exposures = 2 ** filled.clip(math.log2(MIN_EXPOSURE), -math.log2(MIN_EXPOSURE))
+    return {view.name: round(float(exposure), 6) for view, exposure in zip(capture.views, exposures, strict=True)}
 
 
 def _fill_unmeasured(stops: Floats, folders: Sequence[Path]) -> Floats:
@@ -77,7 +80,7 @@ def _fill_unmeasured(stops: Floats, folders: Sequence[Path]) -> Floats:
     return np.asarray(stops[[nearest(index) for index in range(len(stops))]])
 
 
-def spread(stops: Floats) -> float:
+def exposure_spread(stops: Floats) -> float:
     """Return the spread, stops, of exposures (n,) without the darkest and the brightest tenth; 0 if fewer than three,
     or fewer than half of all, are finite."""
     usable = stops[np.isfinite(stops)]
@@ -91,7 +94,7 @@ def exposure_warnings(exposures: Mapping[str, float]) -> tuple[str, ...]:
     """Return sentences for the user about exposures that differ."""
     if not exposures:
         return ()
-    stops = spread(np.log2(list(exposures.values())))
+    stops = exposure_spread(np.log2(list(exposures.values())))
     return (f"The frames' exposure changes, by about {stops:.1f} stops: each is fitted, baked and scored as it was "
             "exposed, and the flare is that of a frame in the middle.",)
 
@@ -123,14 +126,15 @@ class PointObservations:
             inside, observed = sample_colours(capture.points.xyz[chosen], camera, frame if clean is None else clean)
             usable = ((observed > MIN_LEVEL) & (observed < MAX_LEVEL)).all(-1)
             if (mask := frames.mask(view)) is not None:
-                usable &= sample_colours(capture.points.xyz[chosen], camera, mask)[1]
+                _, counts = sample_colours(capture.points.xyz[chosen], camera, mask)
+                usable &= counts
             points = chosen[inside][usable]
             light = linear_from_srgb(observed[usable]).astype(np.float64) @ LUMINANCE
             parts.append((np.full(len(points), number), points, light))
         numbers, points, light = (np.concatenate(part) for part in zip(*parts, strict=True))
         return cls(len(views), numbers, points, light)
 
-    def stops(self) -> Floats:
+    def estimate_stops(self) -> Floats:
         """Return the exposure of each view (count,), stops, not finite where it cannot be measured.
 
         In turn, the lines of the views are fitted to the points' luminances, and these are estimated by the lines.
@@ -140,7 +144,8 @@ class PointObservations:
             slopes, veils = self._fit_lines(luminances)
             exposed = (self.light - veils[self.views]) / slopes[self.views]
             luminances = _group_medians(exposed, self.points, len(luminances))
-        return np.log2(self._fit_lines(luminances)[0])
+        slopes, _ = self._fit_lines(luminances)
+        return np.log2(slopes)
 
     def _initial_luminances(self) -> Floats:
         """Estimate the luminance of each point in a view of the usual exposure, by the point's index, without veils.
@@ -159,17 +164,17 @@ class PointObservations:
     def _fit_lines(self, luminances: Floats) -> tuple[Floats, Floats]:
         """Return slope and veil of each view (count,) for the points' luminances; not finite where they cannot be
         measured."""
-        lines = np.full((2, self.count), np.nan)
+        slopes, veils = np.full((2, self.count), np.nan)
         for number in range(self.count):
             in_view = self.views == number
             known, observed = luminances[self.points[in_view]], self.light[in_view]
             finite = np.isfinite(known)
             if finite.sum() >= MIN_POINTS:
-                line, error = _fit_line(known[finite], observed[finite])
+                (slope, veil), error = _fit_line(known[finite], observed[finite])
                 # The relative error of a slope is its error in stops times ln 2.
-                if line[0] > 0 and error / line[0] < MAX_STANDARD_ERROR * np.log(2):
-                    lines[:, number] = line
-        return lines[0], lines[1]
+                if slope > 0 and error / slope < MAX_STANDARD_ERROR * np.log(2):
+                    slopes[number], veils[number] = slope, veil
+        return slopes, veils
 
 
 def _group_medians(values: Floats, groups: Indices, count: int) -> Floats:
@@ -177,10 +182,10 @@ def _group_medians(values: Floats, groups: Indices, count: int) -> Floats:
     finite = np.isfinite(values)
     values, groups = values[finite], groups[finite]
     order = np.lexsort((values, groups))
-    begins = np.searchsorted(groups[order], np.arange(count + 1))
-    first, sizes = begins[:-1], np.diff(begins)
+    starts = np.searchsorted(groups[order], np.arange(count + 1))
+    first_rows, sizes = starts[:-1], np.diff(starts)
     medians = np.full(count, np.nan)
-    medians[sizes > 0] = values[order][(first + (sizes - 1) // 2)[sizes > 0]]
+    medians[sizes > 0] = values[order][(first_rows + (sizes - 1) // 2)[sizes > 0]]
     return medians
 
 
@@ -198,7 +203,7 @@ def _fit_line(known: Floats, observed: Floats) -> tuple[Floats, float]:
         robust_weights = 1 / (1 + errors / (2.2 * np.median(errors) + 1e-12))
         weights = robust_weights * error_weights
         product = columns.T @ (weights[:, None] * columns)
-        if np.linalg.cond(product) > 1e9:  # points of one brightness
+        if np.linalg.cond(product) > MAX_CONDITION:
             return np.zeros(2), np.inf
         line = np.linalg.solve(product, columns.T @ (weights * observed))
     scatter = weights @ (observed - columns @ line) ** 2 / max(robust_weights.sum() - 2, 1)
@@ -219,11 +224,11 @@ def resolve_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings,
     files = [(capture.frame_path(view), capture.plate_space) for view in views]
     if capture.has_removed and settings.needs_clean_frames:
         files += [(capture.removed_path(view), capture.plate_space) for view in views]
-    clipped = next((path for path, space in files if not has_float_pixels(path, space)), None)
-    if clipped is not None:
+    clipped_file = next((path for path, space in files if not has_float_pixels(path, space)), None)
+    if clipped_file is not None:
         return replace(settings, white=1.0), (
-            f"The frames hold light above white (1.0), and {clipped} cannot: it is fitted as white, and flares that "
-            "are brighter come out wrong; EXR files for all would keep it.",)
+            f"The frames hold light above white (1.0), and {clipped_file} cannot: it is fitted as white, and flares "
+            "that are brighter come out wrong; EXR files for all would keep it.",)
     return replace(settings, white=MAX_WHITE), (
         f"The frames hold light above white (1.0); it is fitted up to {MAX_WHITE:g}.",)
 

@@ -123,23 +123,23 @@ class FlareOptimisers:
                 continue
             dense[name] = parameter
             # Names are "light's number.gaussians.rows" and "light's number.network.…".
-            last = name.rsplit(".", 1)[1]
-            rate = gaussian_rates[last] if ".gaussians." in name else rates.network
-            rate_by_name[name] = rate * (flare.lights[int(name.split(".")[0])].scale if last in PLANE_ROWS else 1)
+            row_name = name.rsplit(".", 1)[1]
+            rate = gaussian_rates[row_name] if ".gaussians." in name else rates.network
+            rate_by_name[name] = rate * (flare.lights[int(name.split(".")[0])].scale if row_name in PLANE_ROWS else 1)
         self.dense = Adam(dense, rate_by_name)
         self.grids = torch.optim.SparseAdam(tables, lr=rates.grids)
         lights = flare.frame_lights
         self.brightness = (None if lights is None else
                            torch.optim.SparseAdam([lights.brightness.weight], lr=rates.brightness))
-        self._first_rates = dict(self.dense.rates)
+        self._initial_rates = dict(self.dense.rates)
 
     def set_rates(self, progress: float) -> None:
         """Set the learning rates at a share of the fit, 0 to 1."""
         rates = self._rates
         decay = _decay(1.0, rates.final_ratio, 2 * progress - 1)  # 1 until the middle of the fit
-        for name, rate in self._first_rates.items():
-            position = name.endswith("gaussians.positions")
-            new_rate = _decay(rates.position, rates.position_final, progress) if position else rate * decay
+        for name, rate in self._initial_rates.items():
+            is_position = name.endswith("gaussians.positions")
+            new_rate = _decay(rates.position, rates.position_final, progress) if is_position else rate * decay
             self.dense.rates[name] = new_rate
         for group in self.grids.param_groups:
             group["lr"] = rates.grids * decay

@@ -39,10 +39,10 @@ def scene_loss(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor
     lights: (n, 3), world. discs: (height, width), the lights' clipped pixels, or None. progress: of the fit, 0..1; as
     it grows, brighter frames pull the scene up less, and the scene is held down more near the lights.
     """
-    share = _ramp(progress)
-    loss = settings.scene_weight * quantile_loss(scene, targets.frame, settings.excess_weight * (1 - share))
-    near = torch.from_numpy(light_proximity(targets.camera, lights, settings.light_radius))
-    loss = loss + settings.near_scene_penalty * share * (scene * near[..., None]).mean()
+    ramp = _ramp(progress)
+    loss = settings.scene_weight * quantile_loss(scene, targets.frame, settings.excess_weight * (1 - ramp))
+    proximity = torch.from_numpy(light_proximity(targets.camera, lights, settings.light_radius))
+    loss = loss + settings.near_scene_penalty * ramp * (scene * proximity[..., None]).mean()
     # In the discs, the scene is fitted to the frame.
     if discs is not None:
         loss = loss + ((scene - targets.frame).abs() * discs[..., None]).mean()
@@ -87,8 +87,8 @@ def quantile_loss(scene: Tensor, frame: Tensor, excess_weight: float) -> Tensor:
     It is the mean |scene - frame|, with `excess_weight` as the weight where the frame is brighter. Fitted to several
     frames, the scene is their excess_weight / (1 + excess_weight) quantile.
     """
-    more = frame - scene
-    return torch.where(more > 0, more * excess_weight, -more).mean()
+    excess = frame - scene
+    return torch.where(excess > 0, excess * excess_weight, -excess).mean()
 
 
 def excess_ratio(residuals: Iterable[Tensor]) -> float:
@@ -98,13 +98,14 @@ def excess_ratio(residuals: Iterable[Tensor]) -> float:
     The larger it is, the more of the excess is flare. residuals: frame - scene (height, width, 3) of some views,
     display values.
     """
-    more = less = 0.0
+    excess = deficit = 0.0
     for residual in residuals:
-        more += float(residual.clamp(min=0).square().mean())
-        less += float(residual.clamp(max=0).square().mean())
-    return more / less if more < MAX_EXCESS_RATIO * less else MAX_EXCESS_RATIO
+        excess += float(residual.clamp(min=0).square().mean())
+        deficit += float(residual.clamp(max=0).square().mean())
+    return excess / deficit if excess < MAX_EXCESS_RATIO * deficit else MAX_EXCESS_RATIO
 
 
 def light_proximity(camera: Camera, lights: ArrayLike, radius: float) -> NDArray[np.float32]:
-    """Return (height, width): 1 at a light (n, 3), world, and a half at `radius` (share of the width) from it."""
+    """Return (height, width), how near the lights (n, 3), world, are: 1 at a light, 1/2 at `radius`, a share of the
+    width, from it."""
     return 1 / (1 + squared_light_distances(camera, lights) / np.float32(radius**2))

@@ -44,10 +44,10 @@ def write_small_preview(path: Path, strip: NDArray[np.float32]) -> None:
     `preview_row`."""
     width = (strip.shape[1] - 3 * GAP) // 4
     composite, flare = (strip[:, index * (width + GAP):index * (width + GAP) + width] for index in (1, 3))
-    both = np.ascontiguousarray(np.concatenate([composite, flare]), np.float32)
-    share = min(MAX_SMALL_SIDE / max(both.shape[:2]), 1.0)
-    picture = Picture(both, "srgb").resized(max(round(both.shape[1] * share), 1), max(round(both.shape[0] * share), 1))
-    write_png(path, picture.pixels)
+    pictures = np.ascontiguousarray(np.concatenate([composite, flare]), np.float32)
+    scale = min(MAX_SMALL_SIDE / max(pictures.shape[:2]), 1.0)
+    height, width = (max(round(size * scale), 1) for size in pictures.shape[:2])
+    write_png(path, Picture(pictures, "srgb").resized(width, height).pixels)
 
 
 def spread_indices(count: int, number: int) -> list[int]:

@@ -97,8 +97,8 @@ def render(scene: Scene, flare: FlareModel | None, blend: Blend, camera: Camera,
         flares = {name: splat_flare(light_gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels,
                                     pixel_grid=pixel_grid, exposure=camera.exposure)
                   for name, light_gaussians in gaussians.items()}
-    parts = linear_layers(rendering.colour, flares, blend, scene.display_white)
-    return RenderedView(rendering, flares, encode(parts.composite.clamp_min(0)).clamp(0, 1), parts)
+    layers = linear_layers(rendering.colour, flares, blend, scene.display_white)
+    return RenderedView(rendering, flares, encode(layers.composite.clamp_min(0)).clamp(0, 1), layers)
 
 
 def render_scene(scene: SceneGaussians, camera: Camera, kernels: Kernels = "auto", *, sh_degree: int | None = None,

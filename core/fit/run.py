@@ -34,7 +34,7 @@ from ..system.progress import Progress
 from ..system.reading import MAX_PATH_BYTES, read_text
 from ..typed import is_utf8
 from .config import read_config, write_config
-from .light_results import read_frame_lights
+from .light_results import make_frame_lights
 from .plate_scene import PlateScene
 from .rendering import RenderedView, Scene, render
 from .settings import FitSettings
@@ -59,7 +59,7 @@ class Run:
         self.folder = folder
         self.settings = settings
         self.capture_folder = capture_folder
-        self._opened: Capture | None = None
+        self._last_opened: Capture | None = None
 
     @staticmethod
     def check_free(folder: Path) -> None:
@@ -71,11 +71,11 @@ class Run:
 
     @classmethod
     def create(cls, folder: Path | str, settings: FitSettings, capture_folder: Path,
-               exposed: Mapping[str, float] | None = None) -> Run:
+               exposure_by_view: Mapping[str, float] | None = None) -> Run:
         """Make a new run folder with its settings.
 
-        exposed: the exposures of the frames. Raises RunError if the folder holds a run, or the capture's name is not
-        UTF-8.
+        exposure_by_view: by the view's name, relative to the median frame. Raises RunError if the folder holds a run,
+        or the capture's name is not UTF-8.
         """
         folder = Path(folder)
         cls.check_free(folder)
@@ -85,8 +85,8 @@ class Run:
                            "written down; rename it.")
         write_text(folder / CAPTURE, f"{run.capture_folder}\n")
         remove_file(folder / exposures.FILE)  # of a fit that was killed as it began
-        if exposed:
-            write_json(folder / exposures.FILE, dict(exposed))
+        if exposure_by_view:
+            write_json(folder / exposures.FILE, dict(exposure_by_view))
         write_config(folder / CONFIG, settings)
         return run
 
@@ -99,14 +99,14 @@ class Run:
             raise RunError(f"{folder} is not the folder of a run (it has no {CONFIG}); name one that fit has written.")
         settings = read_config(folder / CONFIG, progress)
         try:
-            capture = Path(read_text(folder / CAPTURE, MAX_PATH_BYTES).removesuffix("\n"))
+            capture_folder = Path(read_text(folder / CAPTURE, MAX_PATH_BYTES).removesuffix("\n"))
         except OSError as problem:
             raise RunError(f"{folder / CAPTURE} cannot be read ({problem.strerror}); start the fit anew.") from problem
         except UnicodeDecodeError as problem:
             raise RunError(f"{folder / CAPTURE} is not UTF-8 text; start the fit anew.") from problem
-        if not capture.name:  # of an empty file it would be the working folder
+        if not capture_folder.name:  # of an empty file it would be the working folder
             raise RunError(f"{folder / CAPTURE} names no capture; start the fit anew.")
-        return cls(folder, settings, capture)
+        return cls(folder, settings, capture_folder)
 
     @cached_property
     def exposures(self) -> dict[str, float]:
@@ -123,7 +123,7 @@ class Run:
         """
         capture = Capture.open(self.find_capture(folder), need_frames=need_frames,
                                need_cameras=not self.settings.uses_plates).with_exposures(self.exposures)
-        self._opened = capture = self._with_lights(capture)
+        self._last_opened = capture = self._with_lights(capture)
         if not (self.folder / FLARE).is_file() or self.flare is None:
             return capture
         model, lens = self.flare.model, self.flare.camera
@@ -136,9 +136,9 @@ class Run:
         path = self.folder / FRAME_LIGHTS
         return capture.with_lights(read_lights(path)).with_frame_names() if path.is_file() else capture
 
-    def _capture(self) -> Capture:
+    def _opened_capture(self) -> Capture:
         """Return the capture that was opened last; opens it if there is none."""
-        return self._opened or self.capture(need_frames=False)
+        return self._last_opened or self.capture(need_frames=False)
 
     def find_capture(self, folder: Path | None) -> Path:
         """Return the folder of the capture: `folder`, else the one that was fitted. Raises RunError if that is missing.
@@ -167,7 +167,7 @@ class Run:
             return None
         flare = flare_file.load(self._require(FLARE))
         if (self.folder / FRAME_LIGHTS).is_file():
-            flare.model.frame_lights = read_frame_lights(self._capture(), flare.model.names)
+            flare.model.frame_lights = make_frame_lights(self._opened_capture(), flare.model.names)
         return flare
 
     @cached_property
@@ -177,7 +177,7 @@ class Run:
             return read_ply(self._require(SCENE))
         if not (self.folder / PLATES).is_dir():
             raise RunError(f"{self.folder} has no {PLATES}/ yet; finish the fit with --resume first.")
-        capture = self._capture()
+        capture = self._opened_capture()
         return PlateScene.from_folder(self.folder / PLATES, {view.name: view.camera for view in capture.views},
                                       self.settings.display_white, capture.plate_space)
 

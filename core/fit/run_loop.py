@@ -55,7 +55,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
                 progress.say(f"The fit in {folder} is finished already.")
             else:
                 capture, sentences = ensure_points(capture, run.settings, progress)
-                trainer = _trainer(capture, run.settings, run.exposures)
+                trainer = _make_trainer(capture, run.settings, run.exposures)
                 remove_partials_below(folder)
                 if (folder / CHECKPOINT).exists():
                     trainer.load_state(checkpoint.load(folder / CHECKPOINT))
@@ -65,7 +65,8 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
         return run
     settings, warnings = resolve_white(settings.validated(), capture)
     capture, sentences = ensure_points(capture, settings, progress)
-    trainer = _trainer(capture, settings, progress=progress)  # before anything is written: it may refuse the capture
+    # Made before anything is written: it may refuse the capture.
+    trainer = _make_trainer(capture, settings, progress=progress)
     with folder_lock(folder):
         run = Run.create(folder, settings, capture.folder, trainer.exposures)
         _report((*warnings, *sentences, *trainer.warnings), run, progress)
@@ -73,8 +74,8 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     return run
 
 
-def _trainer(capture: Capture, settings: FitSettings, exposures: Mapping[str, float] | None = None,
-             progress: Progress | None = None) -> FlareTrainer:
+def _make_trainer(capture: Capture, settings: FitSettings, exposures: Mapping[str, float] | None = None,
+                  progress: Progress | None = None) -> FlareTrainer:
     """Return the trainer for the kind of scene that the settings name."""
     return (PlateTrainer if settings.uses_plates else Trainer)(capture, settings, exposures, progress)
 
@@ -115,26 +116,26 @@ def _check_capture(run: Run, capture: Capture) -> None:
 
 def _train(trainer: FlareTrainer, run: Run, progress: Progress) -> None:
     """Run the remaining iterations, with metrics, previews and checkpoints at their intervals."""
-    settings, path = run.settings, run.folder / CHECKPOINT
-    saved, started, first = time.monotonic(), time.monotonic(), trainer.iteration
+    settings, checkpoint_path = run.settings, run.folder / CHECKPOINT
+    saved_at, started_at, first_iteration = time.monotonic(), time.monotonic(), trainer.iteration
     while trainer.iteration < settings.iterations:
-        figures = trainer.step()
+        metrics = trainer.step()
         iteration = trainer.iteration
         if iteration % METRICS_INTERVAL == 0 or iteration == settings.iterations:
             trainer.check_finite()
             counts = {"scene_gaussians": trainer.scene_size,
                       "flare_gaussians": trainer.flare.count if trainer.flare else 0}
-            pace = (time.monotonic() - started) / (iteration - first)
-            line = {"iteration": iteration, **figures, **counts, "seconds_per_iteration": round(pace, 5)}
+            pace = (time.monotonic() - started_at) / (iteration - first_iteration)
+            line = {"iteration": iteration, **metrics, **counts, "seconds_per_iteration": round(pace, 5)}
             append_text(run.folder / METRICS, json.dumps(line) + "\n")
-            figures = {**figures, **counts}
+            metrics = {**metrics, **counts}
         if iteration % settings.preview_every == 0:
             _write_previews(trainer, run)
         # Saved before `advance`, which raises Cancelled after a requested stop.
-        if time.monotonic() - saved > settings.checkpoint_every_s:
-            checkpoint.save(path, trainer.state())
-            saved = time.monotonic()
-        progress.advance(1, **figures)
+        if time.monotonic() - saved_at > settings.checkpoint_every_s:
+            checkpoint.save(checkpoint_path, trainer.state())
+            saved_at = time.monotonic()
+        progress.advance(1, **metrics)
 
 
 def _finish(trainer: FlareTrainer, run: Run, progress: Progress) -> None:
@@ -152,17 +153,17 @@ def _finish(trainer: FlareTrainer, run: Run, progress: Progress) -> None:
         lens = TrainedCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         poses = [torch.from_numpy(view.camera.world_to_camera) for view in trainer.views]
         training_views = trainer.flare.training_views(poses, [view.name for view in trainer.views])
-        with atomic_path(run.folder / FLARE) as unnamed:
-            flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, training_views=training_views,
-                                               pixel_grid=pixel_grid))
-            store_elements(unnamed)
+        with atomic_path(run.folder / FLARE) as temporary:
+            flare_file.save(temporary, FlareFile(trainer.flare, run.settings.blend, lens, training_views=training_views,
+                                                 pixel_grid=pixel_grid))
+            store_elements(temporary)
     with contextlib.suppress(OSError):  # a checkpoint that stays does no harm
         remove_file(run.folder / CHECKPOINT)
 
 
 @torch.no_grad()
 def _write_previews(trainer: FlareTrainer, run: Run) -> None:
-    """Write previews of some held-out views, or of some of all where none is held out."""
+    """Write previews of some held-out views, or of some training views where none is held out."""
     _, held_out = trainer.capture.split(run.settings.holdout)
     views = held_out or trainer.views
     rows = [preview_row(trainer.frames.frame(views[index]), trainer.render_view(views[index]))
@@ -173,7 +174,7 @@ def _write_previews(trainer: FlareTrainer, run: Run) -> None:
 
 
 def _truncate_metrics(path: Path, iteration: int) -> None:
-    """Drop the lines of metrics that a resumed fit writes again."""
+    """Drop the lines of metrics after `iteration`, which a resumed fit writes again."""
     if not path.exists():
         return
     lines = []

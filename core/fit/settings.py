@@ -265,8 +265,8 @@ class FitSettings:
             (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),
             (self.flare.form.is_consistent, "a form with arcs needs rings, and ellipses instead of solid Gaussians"),
         )
-        for good, sentence in checks:
-            if not good:
+        for is_met, sentence in checks:
+            if not is_met:
                 raise SettingsError(f"The settings cannot be used: {sentence}.")
         return self
 
@@ -422,9 +422,9 @@ def _shorten_schedule(settings: FitSettings, count: int, max_gaussians: int) -> 
     """
     length = settings.iterations
     every = max(round(length / 40), 20)
-    begin = settings.flare.scene_only_until
-    density = replace(settings.flare.density, start=max(round(length * (begin + 0.1)), every),
-                      stop=round(length * (begin * 0.6 + 0.6)), every=every, clone_ratio=0.1)
+    scene_only_until = settings.flare.scene_only_until
+    density = replace(settings.flare.density, start=max(round(length * (scene_only_until + 0.1)), every),
+                      stop=round(length * (scene_only_until * 0.6 + 0.6)), every=every, clone_ratio=0.1)
     rates = replace(settings.flare.rates, network=1e-3, grids=5e-3, position=1.6e-3, position_final=1.6e-5,
                     features=1e-2, scale=0.02, rotation=5e-3, ring=2e-2, arc=2e-2, final_ratio=FINAL_RATIO)
     classic = replace(settings.scene.classic, start=round(length * 0.05), stop=round(length * 0.6),
@@ -485,9 +485,9 @@ def override_settings(settings: FitSettings, values: Mapping[str, Any],
 
 def override_field(table: Any, keys: list[str], value: Any, name: str) -> Any:
     """Return a dataclass with the field at the end of `keys` replaced; `name` is for the message of a SettingsError."""
-    known = {entry.name for entry in fields(table)}
-    if keys[0] not in known:
-        raise SettingsError(f"There is no setting {name!r}; here there are {', '.join(sorted(known))}.")
+    field_names = {entry.name for entry in fields(table)}
+    if keys[0] not in field_names:
+        raise SettingsError(f"There is no setting {name!r}; here there are {', '.join(sorted(field_names))}.")
     current = getattr(table, keys[0])
     if len(keys) > 1:
         if not is_dataclass(current):

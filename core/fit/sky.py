@@ -30,9 +30,9 @@ def add_sky_points(capture: Capture, views: tuple[View, ...], frames: Frames) ->
     The points on the sphere have the colours of the frames at the usual exposure.
     """
     points = capture.points
-    middle = np.mean([view.camera.position for view in views], 0)
-    radius = RADIUS_FACTOR * float(np.quantile(np.linalg.norm(points.xyz - middle, axis=1), 0.95))
-    xyz = middle + radius * fibonacci_directions(SKY_POINTS)
+    centre = np.mean([view.camera.position for view in views], 0)
+    radius = RADIUS_FACTOR * float(np.quantile(np.linalg.norm(points.xyz - centre, axis=1), 0.95))
+    xyz = centre + radius * fibonacci_directions(SKY_POINTS)
     sampled = subsample(views, SAMPLED_VIEWS)
     view_colours = np.full((len(sampled), SKY_POINTS, 3), np.nan, np.float32)
     for row, view in zip(view_colours, sampled, strict=True):
@@ -40,7 +40,8 @@ def add_sky_points(capture: Capture, views: tuple[View, ...], frames: Frames) ->
         inside, observed = sample_colours(xyz, camera, frame)
         row[inside] = expose(torch.from_numpy(observed), 1 / camera.exposure).numpy()
         if (mask := frames.mask(view)) is not None:
-            row[np.flatnonzero(inside)[~sample_colours(xyz, camera, mask)[1]]] = np.nan
+            _, counts = sample_colours(xyz, camera, mask)
+            row[np.flatnonzero(inside)[~counts]] = np.nan
     is_seen = np.isfinite(view_colours[..., 0]).any(0)
     colours = np.nanquantile(view_colours[:, is_seen], COLOUR_QUANTILE, axis=0)
     rgb = np.concatenate([points.rgb, (colours.clip(0, 1) * 255 + 0.5).astype(np.uint8)])

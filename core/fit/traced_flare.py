@@ -64,10 +64,15 @@ SHARE_AT_LIGHT, SHARE_AT_GHOSTS = 0.35, 0.55
 the line."""
 RAY_LENGTHS = 0.004, 0.9
 """Smallest and largest distance of the rays from the light, relative to half the frame's width."""
+RAY_DEVIATIONS, MIN_RAY_DISTANCES = (0.35, 0.12), (2, 4)
+"""Standard deviations along and across a ray, relative to its distance from the light, and the smallest distances that
+count, in smallest RAY_LENGTHS: a ray is a needle, but the shortest ones are about as wide as long."""
 GAIN_STEPS = 6
 """Steps in which the ghosts' gain is found where some of them reach their limit."""
 CORE_GAUSSIANS, CORE_SIZES, CORE_OPACITY = 24, (0.3, 4.0), 0.2
 """Number, range of standard deviations (pixels) and opacity of the initial Gaussians in the light itself."""
+MAX_THREADS = 8
+"""Largest number of pictures that are traced at a time."""
 SQUARED_WEIGHT = 0.3
 """Weight of the relative error in linear light against that of the encoded light: highlights against faint ghosts."""
 ENCODING_OFFSET = 1e-3
@@ -84,12 +89,12 @@ class TracedPictures(NamedTuple):
 
 @dataclass(frozen=True)
 class TracedResult:
-    """The result of `make_flare`. error, worst: mean and largest relative L2 error along the path, linear light. count:
-    number of Gaussians."""
+    """The result of `make_flare`. error, max_error: mean and largest relative L2 error along the path, linear light.
+    count: number of Gaussians."""
 
     path: Path
     error: float
-    worst: float
+    max_error: float
     count: int
 
 
@@ -97,21 +102,21 @@ def make_flare(settings: TracedFlareSettings, out: Path, progress: Progress, *, 
                ) -> TracedResult:
     """Trace, fit, measure the error on a path that the fit did not see, and write a .flare at `out`.
 
-    notes: stored in the file; empty for those of `describe`. licence: stored, too.
+    notes: stored in the file; empty for those of `default_notes`. licence: stored, too.
 
     Raises SettingsError, and Cancelled where the progress stops it; then nothing is written.
     """
     settings = settings.validated()
-    camera, setup = traced_camera(settings), exposed_setup(settings)
+    camera, setup = traced_camera(settings), setup_with_ghost_gain(settings)
     traced = trace(settings, setup, spread_places(settings), progress, "trace")
     model = fit_traced(settings, setup, traced, progress)
-    path = trace(settings, setup, path_places(settings), progress, "measure")
-    errors = relative_errors(model, camera, path)
-    write_flare(out, model, camera, traced.places, notes or describe(settings), licence)
+    path_pictures = trace(settings, setup, path_places(settings), progress, "measure")
+    errors = relative_errors(model, camera, path_pictures)
+    write_flare(out, model, camera, traced.places, notes or default_notes(settings), licence)
     return TracedResult(out, float(np.mean(errors)), float(max(errors)), model.count)
 
 
-def describe(settings: TracedFlareSettings) -> str:
+def default_notes(settings: TracedFlareSettings) -> str:
     """Return the note of a file: the lens and how it was used."""
     f_number = settings.iris.f_number or 2 * find_lens(settings.lens).widest_f_number()
     return (f"Traced through {Path(settings.lens).stem}, {settings.used_focal_length:.0f} mm, f/{f_number:.2g}, "
@@ -125,7 +130,7 @@ def traced_camera(settings: TracedFlareSettings) -> Camera:
     return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
 
 
-def exposed_setup(settings: TracedFlareSettings) -> LensSetup:
+def setup_with_ghost_gain(settings: TracedFlareSettings) -> LensSetup:
     """Return the setup of the tracer with the gain that gives the ghosts their level, `settings.ghosts.level`.
 
     The gain is measured with the light at PROBES, on ghosts drawn more coarsely. Raises SettingsError where no ghost of
@@ -136,16 +141,17 @@ def exposed_setup(settings: TracedFlareSettings) -> LensSetup:
         return replace(setup, ghosts=replace(setup.ghosts, count=0))
     optics, pairs = build_optics(setup)
     camera = traced_camera(settings)
-    drawing = replace(setup.ghosts, bands=3 if settings.ghosts.dispersion else 1, supersample=1, limit=math.inf)
+    bands = 3 if settings.ghosts.dispersion else 1
+    drawing_settings = replace(setup.ghosts, bands=bands, supersample=1, limit=math.inf)
     # An anamorphic lens is a spherical one that sees x divided by the squeeze, as in `render_flare`.
-    pictures = np.stack([draw_ghosts(optics, pairs, drawing, (x / setup.squeeze, y),
+    pictures = np.stack([draw_ghosts(optics, pairs, drawing_settings, (x / setup.squeeze, y),
                                      (camera.fx * setup.squeeze, camera.fy), (camera.cx, camera.cy), camera.width,
-                                     camera.height) for x, y in _in_frame(settings, PROBES)])
-    strength = _root_mean_square(pictures)
-    if not strength > 0:
+                                     camera.height) for x, y in _to_normalised(settings, PROBES)])
+    level = _root_mean_square(pictures)
+    if not level > 0:
         raise SettingsError(f"No ghost of the lens {settings.lens} reaches the frame; check that its file lists clear "
                             "diameters, or set ghosts.level=0.")
-    gain = settings.ghosts.level / strength
+    gain = settings.ghosts.level / level
     for _ in range(GAIN_STEPS):  # what the limit takes, the rest has to make up for
         if gain * pictures.max() <= settings.ghosts.limit:
             break
@@ -158,7 +164,7 @@ def _root_mean_square(pictures: Pictures) -> float:
     return math.sqrt(float(np.mean([np.square(picture).mean() for picture in pictures])))
 
 
-def _in_frame(settings: TracedFlareSettings, fractions: Sequence[Sequence[float]] | Places) -> Places:
+def _to_normalised(settings: TracedFlareSettings, fractions: Sequence[Sequence[float]] | Places) -> Places:
     """Convert places relative to the frame's half width and height to normalised coordinates."""
     half = settings.reach * np.array([1.0, settings.height / settings.tracing.width])
     return np.asarray(fractions, np.float64) * half
@@ -169,15 +175,15 @@ def spread_places(settings: TracedFlareSettings) -> Places:
 
     They are denser towards the centre, where ghosts lie over each other and change fastest.
     """
-    numbers = np.arange(1, settings.tracing.positions + 1)[:, None] * np.array(PLACE_STEPS)
-    even = numbers % 1 * 2 - 1  # -1..1
-    far = np.abs(even).max(1, keepdims=True)
-    return _in_frame(settings, even * far ** (CENTRE_POWER - 1) * settings.tracing.field)
+    sequence = np.arange(1, settings.tracing.positions + 1)[:, None] * np.array(PLACE_STEPS)
+    square = sequence % 1 * 2 - 1  # -1..1
+    eccentricity = np.abs(square).max(1, keepdims=True)
+    return _to_normalised(settings, square * eccentricity ** (CENTRE_POWER - 1) * settings.tracing.field)
 
 
 def path_places(settings: TracedFlareSettings) -> Places:
     """Return the places of a path across the frame, normalised coordinates."""
-    return _in_frame(settings, np.linspace(*PATH_ENDS, PATH_LENGTH))
+    return _to_normalised(settings, np.linspace(*PATH_ENDS, PATH_LENGTH))
 
 
 def trace(settings: TracedFlareSettings, setup: LensSetup, places: Places, progress: Progress, stage: str
@@ -186,7 +192,7 @@ def trace(settings: TracedFlareSettings, setup: LensSetup, places: Places, progr
     camera = traced_camera(settings)
     progress.stage(stage, len(places))
     pictures = np.zeros((len(places), camera.height, camera.width, 3), np.float32)
-    with ThreadPoolExecutor(min(available_cores(), 8)) as pool:
+    with ThreadPoolExecutor(min(available_cores(), MAX_THREADS)) as pool:
         jobs = [pool.submit(render_flare, setup, camera, place, colour=settings.colour) for place in places]
         try:
             for number, job in enumerate(jobs):
@@ -220,82 +226,83 @@ def fit_traced(settings: TracedFlareSettings, setup: LensSetup, traced: TracedPi
     generator = torch.Generator().manual_seed(settings.fit.seed)
     with torch.random.fork_rng():  # torch's own generator draws the network's weights
         torch.manual_seed(settings.fit.seed)
-        model = _new_model(settings, setup, fit, traced, generator)
+        model = _initial_model(settings, setup, fit, traced, generator)
     flare, camera = model.lights[0], traced_camera(settings)
     optimisers = FlareOptimisers(model, fit.flare.rates)
-    names = {name: next(key for key in optimisers.dense.parameters if key.endswith(f"gaussians.{name}"))
-             for name in flare.gaussians}
+    optimiser_names = {name: next(key for key in optimisers.dense.parameters if key.endswith(f"gaussians.{name}"))
+                       for name in flare.gaussians}
     pictures = torch.from_numpy(traced.pictures)
     lights, intrinsics = torch.tensor(traced.places, dtype=torch.float32), _intrinsics(camera)
-    encoded, energies = _encode(pictures), pictures.square().sum((1, 2, 3)).clamp_min(1e-6)
+    encoded, energies = _encode_light(pictures), pictures.square().sum((1, 2, 3)).clamp_min(1e-6)
     order: list[int] = []
     random = np.random.default_rng(settings.fit.seed)
     progress.stage("fit", fit.iterations)
     for iteration in range(1, fit.iterations + 1):
         order = order or random.permutation(len(pictures)).tolist()
-        number = order.pop()
+        index = order.pop()
         optimisers.set_rates(iteration / fit.iterations)
-        drawn = _draw(flare, lights[number], intrinsics, camera)
+        drawn = _draw_flare(flare, lights[index], intrinsics, camera)
         # Under the root, 1e-4 bounds the slope where the error vanishes.
-        relative = (drawn - pictures[number]).square().sum() / energies[number]
-        loss = (_encode(drawn) - encoded[number]).abs().mean() + SQUARED_WEIGHT * (relative + 1e-4).sqrt()
+        squared_error = (drawn - pictures[index]).square().sum() / energies[index]
+        loss = (_encode_light(drawn) - encoded[index]).abs().mean() + SQUARED_WEIGHT * (squared_error + 1e-4).sqrt()
         loss.backward()
         optimisers.step()
         if fit.flare.density.is_due(iteration):
-            clone_and_prune(flare, optimisers.dense, names, fit.flare.density, generator)
+            clone_and_prune(flare, optimisers.dense, optimiser_names, fit.flare.density, generator)
         progress.advance(1, loss=float(loss.detach()), gaussians=flare.count)
     return model
 
 
-def _new_model(settings: TracedFlareSettings, setup: LensSetup, fit: FitSettings, traced: TracedPictures,
-               generator: torch.Generator) -> FlareModel:
+def _initial_model(settings: TracedFlareSettings, setup: LensSetup, fit: FitSettings, traced: TracedPictures,
+                   generator: torch.Generator) -> FlareModel:
     """Return the model before the fit, with the light on the camera's axis, and its Gaussians at light and ghosts and
     along the line. setup: the traced lens. fit: settings of the model."""
     cameras = torch.tensor([[-CAMERA_RANGE] * 3, [CAMERA_RANGE] * 3])
-    corner = math.hypot(settings.reach, settings.reach * settings.height / settings.tracing.width)
-    query_range = QueryRange.of(cameras, torch.tensor(traced.places, dtype=torch.float32), corner)
+    corner_radius = math.hypot(settings.reach, settings.reach * settings.height / settings.tracing.width)
+    query_range = QueryRange.of(cameras, torch.tensor(traced.places, dtype=torch.float32), corner_radius)
     flare = LightFlare(fit.flare.form, query_range, fit.flare.count, generator, fit.flare.opacity,
                        plane_scale(settings.reach))
-    order = torch.randperm(flare.count, generator=generator)
+    shuffled_rows = torch.randperm(flare.count, generator=generator)
     at_light, at_ghosts = (round(flare.count * share) for share in (SHARE_AT_LIGHT, SHARE_AT_GHOSTS))
-    _start_at_light(flare, order[:at_light], settings.reach, 2 * settings.reach / settings.tracing.width, generator)
+    pixel = 2 * settings.reach / settings.tracing.width
+    _start_at_light(flare, shuffled_rows[:at_light], settings.reach, pixel, generator)
     if setup.ghosts.count:
-        ghosts = measure_ghosts(setup, traced_camera(settings), _in_frame(settings, PROBES), settings.colour)
-        start_at_ghosts(flare, order[at_light:at_light + at_ghosts], ghosts, generator)
+        ghosts = measure_ghosts(setup, traced_camera(settings), _to_normalised(settings, PROBES), settings.colour)
+        start_at_ghosts(flare, shuffled_rows[at_light:at_light + at_ghosts], ghosts, generator)
     return FlareModel([LIGHT], torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), [flare])
 
 
-def _start_at_light(flare: LightFlare, chosen: Tensor, reach: float, pixel: float, generator: torch.Generator) -> None:
-    """Move the chosen rows of the initial Gaussians to the light, as rays at log-uniform distances, and scale all to
-    the frame.
+def _start_at_light(flare: LightFlare, rows: Tensor, reach: float, pixel: float, generator: torch.Generator) -> None:
+    """Move these rows of the initial Gaussians to the light, as rays at log-uniform distances, and scale all Gaussians
+    to the frame.
 
     Starburst and glow have most of a flare's light and stay at the light, where few of the Gaussians along the line
     would lie. The first CORE_GAUSSIANS rows lie in the light itself. reach: half the frame's width, pixel: width of a
     pixel of the traced pictures, normalised coordinates.
     """
-    rows = flare.gaussians
+    table = flare.gaussians
     with torch.no_grad():
-        rows["log_scales"] += math.log(reach / REFERENCE_REACH / flare.scale)
+        table["log_scales"] += math.log(reach / REFERENCE_REACH / flare.scale)
         low, high = (math.log(bound) for bound in RAY_LENGTHS)
-        distance = torch.exp(low + (high - low) * torch.rand(len(chosen), generator=generator)) * reach
-        angle = 2 * math.pi * torch.rand(len(chosen), generator=generator)
+        distance = torch.exp(low + (high - low) * torch.rand(len(rows), generator=generator)) * reach
+        angle = 2 * math.pi * torch.rand(len(rows), generator=generator)
         direction = torch.stack([angle.cos(), angle.sin()], -1)
-        rows["positions"][chosen] = 1.0
-        rows["offsets"][chosen] = direction * distance[:, None]
-        rows["rotations"][chosen] = direction
-        # Deviations along and across the ray: a needle, but the shortest rays are about as wide as long.
-        rows["log_scales"][chosen] = torch.log(torch.stack([0.35 * distance.clamp_min(RAY_LENGTHS[0] * reach * 2),
-                                                            0.12 * distance.clamp_min(RAY_LENGTHS[0] * reach * 4)], -1))
-        rows["rings"][chosen] = 0.0
+        table["positions"][rows] = 1.0
+        table["offsets"][rows] = direction * distance[:, None]
+        table["rotations"][rows] = direction
+        deviations = [deviation * distance.clamp_min(RAY_LENGTHS[0] * reach * min_distance)
+                      for deviation, min_distance in zip(RAY_DEVIATIONS, MIN_RAY_DISTANCES, strict=True)]
+        table["log_scales"][rows] = torch.log(torch.stack(deviations, -1))
+        table["rings"][rows] = 0.0
         # The light itself is a few pixels of many times white, which one Gaussian's colour would not reach.
-        core = chosen[:CORE_GAUSSIANS]
+        core = rows[:CORE_GAUSSIANS]
         low, high = (math.log(bound * pixel) for bound in CORE_SIZES)
-        rows["offsets"][core] = 0.0
-        rows["log_scales"][core] = low + (high - low) * torch.rand(len(core), 1, generator=generator)
-        rows["opacity_logits"][core] = math.log(CORE_OPACITY / (1 - CORE_OPACITY))
+        table["offsets"][core] = 0.0
+        table["log_scales"][core] = low + (high - low) * torch.rand(len(core), 1, generator=generator)
+        table["opacity_logits"][core] = math.log(CORE_OPACITY / (1 - CORE_OPACITY))
 
 
-def _encode(light: Tensor) -> Tensor:
+def _encode_light(light: Tensor) -> Tensor:
     """Encode linear light for the loss."""
     encoded: Tensor = (light.clamp_min(0) + ENCODING_OFFSET).sqrt()
     return encoded
@@ -305,7 +312,7 @@ def _intrinsics(camera: Camera) -> Tensor:
     return torch.tensor(camera.intrinsics, dtype=torch.float32)
 
 
-def _draw(flare: LightFlare, light: Tensor, intrinsics: Tensor, camera: Camera) -> Tensor:
+def _draw_flare(flare: LightFlare, light: Tensor, intrinsics: Tensor, camera: Camera) -> Tensor:
     """Return the flare (height, width, 3) of a light at normalised coordinates (2,), linear."""
     view = ViewOfLight(torch.zeros(3), torch.eye(3), light, 1.0)
     return splat_flare(flare(view), intrinsics, camera.width, camera.height, "add").colour
@@ -315,7 +322,7 @@ def _draw(flare: LightFlare, light: Tensor, intrinsics: Tensor, camera: Camera) 
 def draw_fitted(model: FlareModel, camera: Camera, places: Places) -> Pictures:
     """Return the fitted flares (n, height, width, 3) of lights at places (n, 2), linear."""
     lights, intrinsics = torch.tensor(places, dtype=torch.float32), _intrinsics(camera)
-    return np.stack([_draw(model.lights[0], light, intrinsics, camera).numpy() for light in lights])
+    return np.stack([_draw_flare(model.lights[0], light, intrinsics, camera).numpy() for light in lights])
 
 
 def relative_errors(model: FlareModel, camera: Camera, traced: TracedPictures) -> list[float]:
@@ -331,6 +338,6 @@ def write_flare(out: Path, model: FlareModel, camera: Camera, places: Places, no
     views = {LIGHT: [[0.0, 0.0, 0.0, round(float(x), 5), round(float(y), 5)] for x, y in places]}
     grid = PixelGrid.from_focal_lengths([camera.fx])
     out.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(out) as unnamed:
-        flare_file.save(unnamed, FlareFile(model, "add", lens, licence, notes, training_views=views, pixel_grid=grid))
-        store_elements(unnamed)
+    with atomic_path(out) as temporary:
+        flare_file.save(temporary, FlareFile(model, "add", lens, licence, notes, training_views=views, pixel_grid=grid))
+        store_elements(temporary)

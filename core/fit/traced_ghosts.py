@@ -32,8 +32,12 @@ MIN_SHARE, MAX_SHARE = 0.008, 0.15
 """Range of a ghost's share of the Gaussians."""
 OVERLAP = 0.75
 """Standard deviation of a Gaussian in a ghost, relative to the distance of its neighbours."""
+MIN_INNER_SHARE = 0.3
+"""Smallest radius of the disc over which the centres of a ghost's Gaussians are spread, relative to the ghost's."""
 OPACITIES = 0.002, 0.3
 """Range of the first opacities."""
+CODE_SCALE = 0.3
+"""Scale of the numbers of the first latent codes."""
 
 
 @dataclass(frozen=True)
@@ -66,30 +70,31 @@ def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Seq
     drawing = replace(setup.ghosts, bands=min(setup.ghosts.bands, 3), supersample=1)
     ghosts = []
     for pair in pairs:
-        seen, weights = [], []
+        measurements, lights_over_frame = [], []
         for light in lights:
             # An anamorphic lens sees x divided by the squeeze.
             picture = draw_ghosts(optics, [pair], drawing, (light[0] / setup.squeeze, light[1]),
                                   (focal[0] * setup.squeeze, focal[1]), centre, CANVAS_WIDTH, height)
             picture = picture.astype(np.float64) * np.asarray(colour)
-            inside = math.sqrt(float(np.square(picture[is_in_frame]).mean()))
+            light_over_frame = math.sqrt(float(np.square(picture[is_in_frame]).mean()))
             total = picture.sum(-1)
-            if inside <= MIN_LIGHT or total.sum() <= 0:
+            if light_over_frame <= MIN_LIGHT or total.sum() <= 0:
                 continue
             share = total / total.sum()
-            middle = np.array([(share * x).sum(), (share * y).sum()])
-            variance = float((share * ((x - middle[0]) ** 2 + (y - middle[1]) ** 2)).sum()) / 2
+            centroid = np.array([(share * x).sum(), (share * y).sum()])
+            variance = float((share * ((x - centroid[0]) ** 2 + (y - centroid[1]) ** 2)).sum()) / 2
             mean_level = (picture * share[..., None]).sum((0, 1))
-            seen.append([middle @ light, light @ light, variance, *mean_level])
-            weights.append(inside)
-        if seen:
-            rows, mix = np.array(seen), np.array(weights)
-            along, squared, variance, *level = (mix[:, None] * rows).sum(0) / mix.sum()
+            measurements.append([centroid @ light, light @ light, variance, *mean_level])
+            lights_over_frame.append(light_over_frame)
+        if measurements:
+            weights = np.array(lights_over_frame)
+            along, squared, variance, *level = (weights[:, None] * np.array(measurements)).sum(0) / weights.sum()
             # The place on the line is a least squares fit of centroid = place * light. An even disc of radius r has a
             # variance of r^2 / 4 along each axis; half a pixel of the canvas is its least deviation.
             pixel = 0.5 / focal[0]
             ghosts.append(MeasuredGhost(float(along / max(squared, 1e-12)), 2 * math.sqrt(max(variance, pixel**2)),
-                                        (level[0], level[1], level[2]), float(np.sqrt((mix**2).sum() / len(lights)))))
+                                        (level[0], level[1], level[2]),
+                                        float(np.sqrt((weights**2).sum() / len(lights)))))
     return sorted(ghosts, key=lambda ghost: -ghost.light)
 
 
@@ -116,19 +121,20 @@ def start_at_ghosts(flare: LightFlare, rows: torch.Tensor, ghosts: Sequence[Meas
                 continue
             index = torch.arange(count) + 0.5  # a spiral by the golden angle fills a unit disc evenly
             radius, angle = (index / count).sqrt(), index * (math.pi * (3 - math.sqrt(5)))
-            place = radius[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
+            disc_place = radius[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
             size = OVERLAP * ghost.radius * math.sqrt(math.pi / count)
-            inner = max(ghost.radius - size, 0.3 * ghost.radius)  # the outermost Gaussians reach the ghost's edge
+            # The outermost Gaussians reach the ghost's edge.
+            inner_radius = max(ghost.radius - size, MIN_INNER_SHARE * ghost.radius)
             level = np.maximum(ghost.level, 1e-6)
             # A disc of level L: opacity x colour x 2 pi size^2 x count = L pi radius^2, with colours about 0.5.
             brightness = float(level.mean()) * ghost.radius**2 / (2 * size**2 * count)
             opacity = min(max(2 * brightness, OPACITIES[0]), OPACITIES[1])
             table["positions"][part] = ghost.place
-            table["offsets"][part] = inner * place
+            table["offsets"][part] = inner_radius * disc_place
             table["log_scales"][part] = math.log(size)
             table["opacity_logits"][part] = math.log(opacity / (1 - opacity))
             table["rings"][part] = 0.0
             table["sh"][part, :3] = torch.tensor((0.5 * level / level.mean() - 0.5) / C0, dtype=torch.float32)
             code = torch.randn(table["latent"].shape[1], generator=generator)
-            table["latent"][part] = 0.3 * code
-            table["latent"][part, -2:] = 0.3 * place
+            table["latent"][part] = CODE_SCALE * code
+            table["latent"][part, -2:] = CODE_SCALE * disc_place

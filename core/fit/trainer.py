@@ -103,7 +103,7 @@ class Trainer(FlareTrainer):
 
         # Optimisers and strategy hold the parameters of the models.
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
-        self.strategy = self._strategy()
+        self.strategy = self._make_strategy()
 
     @property
     def scene(self) -> SceneGaussians:
@@ -134,30 +134,32 @@ class Trainer(FlareTrainer):
         scene = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)
         scene_picture = self._clip_as_filmed(scene.colour)
         self._update_clear_visibility()
-        self._test_scene_converged()
+        self._measure_excess_ratio()
         scene_only = self._is_scene_only(targets)
         flare = None if scene_only else render_flare(self.flare, settings.blend, targets.camera, settings.kernels,
                                                      scene=self.scene, visibility=settings.flare.active_visibility)
         light_discs = self._light_disc_mask(targets)
-        picture = composite(self._flare_background(targets, scene_picture, light_discs), flare, settings.blend,
-                            self.frames.display_white)
+        background = self._flare_background(targets, scene_picture, light_discs)
+        composite_picture = composite(background, flare, settings.blend, self.frames.display_white)
         # The losses of composite and scene, and the penalties.
-        weight = 1 - settings.ssim_share
-        joint_target = self._joint_target(targets, picture.detach(), light_discs)
+        l1_weight = 1 - settings.ssim_share
+        composite_target = self._composite_target(targets, composite_picture.detach(), light_discs)
         loss = (scene_picture.new_zeros(()) if scene_only else
-                l1_ssim(masked(picture, joint_target, mask), joint_target, weight))
-        figures = {} if scene_only else {"loss": float(loss.detach())}
-        clean = self._scene_target(targets, picture, scene_picture)
-        if clean is not None and self.fits_scene:
-            scene_term = l1_ssim(masked(scene_picture, clean, mask), clean, weight)
-            figures["scene_loss"] = float(scene_term.detach())
+                l1_ssim(masked(composite_picture, composite_target, mask), composite_target, l1_weight))
+        metrics = {} if scene_only else {"loss": float(loss.detach())}
+        scene_term = None
+        if self.fits_scene:
+            scene_target = self._scene_target(targets, composite_picture, scene_picture)
+            if scene_target is not None:
+                scene_term = l1_ssim(masked(scene_picture, scene_target, mask), scene_target, l1_weight)
+            elif settings.uses_parallax:
+                scene_term = self._parallax_loss(targets, masked(scene_picture, targets.frame, mask), flare,
+                                                 light_discs)
+        if scene_term is not None:
+            metrics["scene_loss"] = float(scene_term.detach())
             loss = loss + scene_term
-        elif settings.uses_parallax and self.fits_scene:
-            scene_term = self._parallax_loss(targets, masked(scene_picture, targets.frame, mask), flare, light_discs)
-            figures["scene_loss"] = float(scene_term.detach())
-            loss = loss + scene_term
-        self.losses[view.name] = sum(figures.values())
-        if not all(map(math.isfinite, figures.values())):
+        self.losses[view.name] = sum(metrics.values())
+        if not all(map(math.isfinite, metrics.values())):
             raise RunError(f"The fit diverged at iteration {self.iteration}; start it anew with lower learning rates.")
         if self.fits_scene:
             loss = loss + self.strategy.regulariser()
@@ -183,15 +185,15 @@ class Trainer(FlareTrainer):
             self._reorder_scene()
         if not scene_only:  # before, flare Gaussians are untrained, and their opacities say nothing
             self._change_flare_density()
-        return figures
+        return metrics
 
     @torch.no_grad()
-    def _turn_far_layer(self, rows: Tensor, before: Tensor) -> None:
-        """Turn far Gaussians (rows), which were at `before`, by the angle that the optimiser's step has at the distance
-        of one extent."""
+    def _turn_far_layer(self, rows: Tensor, old_means: Tensor) -> None:
+        """Turn far Gaussians (rows), which were at `old_means` (m, 3) before the optimiser's step, by the angle that
+        the step has at the distance of one extent."""
         if self.scene.far is not None and self.fits_scene and len(rows):
             steps = self.optimisers.scene.last_step("means", rows) * (self.scene.far.radius / self.extent)
-            self.scene.means[rows] = self.scene.far.move(before, steps)
+            self.scene.means[rows] = self.scene.far.move(old_means, steps)
 
     def _clip_as_filmed(self, scene: Tensor) -> Tensor:
         """Clip a scene's picture where the frame clips; with equal exposures the picture already does."""
@@ -216,19 +218,19 @@ class Trainer(FlareTrainer):
                                                   [camera.frame for camera in cameras]))
 
     @torch.no_grad()
-    def _test_scene_converged(self) -> None:
-        """Measure the excess ratio of the scene in the iteration in which the flare starts, in a fit by parallax."""
+    def _measure_excess_ratio(self) -> None:
+        """Measure `_excess_ratio` in the iteration in which the flare starts, in a fit by parallax; else do nothing."""
         if not self.settings.uses_parallax or not 1 <= self._scene_only_iterations == self.iteration - 1:
             return
 
-        def excess(view: View) -> Tensor:
+        def residual(view: View) -> Tensor:
+            """Return frame minus scene of a view, (height, width, 3) display values, 0 where the mask is black."""
             targets = self.frames.targets(view)
             scene = render_scene(self.scene, targets.camera, self.settings.kernels, sh_degree=self._sh_degree(),
                                  depth=False)
             return targets.frame - masked(self._clip_as_filmed(scene.colour), targets.frame, self.frames.mask(view))
 
-        residuals = (excess(view) for view in subsample(self.views, SAMPLED_VIEWS))
-        self._excess_ratio = excess_ratio(residuals)
+        self._excess_ratio = excess_ratio(residual(view) for view in subsample(self.views, SAMPLED_VIEWS))
 
     def _occlusion_loss(self, targets: Targets) -> Tensor | None:
         """Return the loss of a scene that hides a light, which the frame shows, from everywhere; None if there is no
@@ -236,10 +238,10 @@ class Trainer(FlareTrainer):
         visibility = self.settings.flare.active_visibility
         if self.flare is None or visibility is None or not self.fits_scene or bool((self.flare.clear > 0).all()):
             return None
-        visible = [light for light in self.flare.positions_in(targets.camera.frame)[self.flare.clear <= 0]
-                   if light_disc_mask(targets.frame.numpy(), targets.camera, light[None].numpy()).any()]
+        visible_lights = [light for light in self.flare.positions_in(targets.camera.frame)[self.flare.clear <= 0]
+                          if light_disc_mask(targets.frame.numpy(), targets.camera, light[None].numpy()).any()]
         eye = torch.from_numpy(targets.camera.position)
-        return occlusion_loss(self.scene, eye, visible, visibility, self.settings.kernels)
+        return occlusion_loss(self.scene, eye, visible_lights, visibility, self.settings.kernels)
 
     def _is_scene_only(self, targets: Targets) -> bool:
         """True while the scene is fitted alone, so that it hides lights by the time their flares are fitted."""
@@ -278,7 +280,7 @@ class Trainer(FlareTrainer):
                                                  self.flare.positions_in(targets.camera.frame).numpy()))
         return discs if self.frames.display_white == 1 else discs & (targets.frame - clean < MIN_DIFFERENCE).all(-1)
 
-    def _joint_target(self, targets: Targets, picture: Tensor, light_discs: Tensor | None) -> Tensor:
+    def _composite_target(self, targets: Targets, picture: Tensor, light_discs: Tensor | None) -> Tensor:
         """Return the target of the composite: the frame. If frames go above white, a light's disc only has to be white
         or brighter: there the target is the composite itself (`picture`), but 1 at least."""
         if self.frames.display_white == 1 or light_discs is None:
@@ -325,7 +327,7 @@ class Trainer(FlareTrainer):
 
     # ---- density ----------------------------------------------------------------------------------
 
-    def _strategy(self) -> Strategy:
+    def _make_strategy(self) -> Strategy:
         settings, adam, generator = self.settings.scene, self.optimisers.scene, self._generator(0, 0)
         if settings.strategy == "mcmc":
             return Mcmc(self.scene, adam, generator, settings.mcmc, self.extent)

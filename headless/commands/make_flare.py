@@ -82,11 +82,11 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     settings = read_settings(args)
     result = make_flare(settings, args.out, progress, notes=args.notes, licence=args.licence)
     progress.say(f"The flare is {args.out}: {result.count} Gaussians, error {result.error:.3f} (relative L2 in linear "
-                 f"light, mean over a path that the fit did not see; largest {result.worst:.3f}).")
+                 f"light, mean over a path that the fit did not see; largest {result.max_error:.3f}).")
     if result.error > TARGET_ERROR:
         progress.say(f"The error is above {TARGET_ERROR}; a longer fit lowers it: "
                      f"--set fit.iterations={2 * settings.fit.iterations}.")
-    return {"flare": str(args.out), "error": result.error, "largest_error": result.worst, "gaussians": result.count}
+    return {"flare": str(args.out), "error": result.error, "largest_error": result.max_error, "gaussians": result.count}
 
 
 def read_settings(args: argparse.Namespace) -> TracedFlareSettings:

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from core.capture import Capture, View
-from core.fit.cache import DISK_LEFT, PictureCache
+from core.fit.cache import MIN_FREE_DISK, PictureCache
 from core.fit.frames import Frames
 from core.images.picture import Picture
 from tests.core.captures import make_capture
@@ -46,7 +46,7 @@ def test_arrays_beyond_the_memory_limit_are_dropped_without_a_folder() -> None:
 
 
 def test_the_cache_leaves_free_space_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    free = DISK_LEFT + codes(0).nbytes
+    free = MIN_FREE_DISK + codes(0).nbytes
     monkeypatch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=free))
     cache = PictureCache(0)
     with cache.overflowing_into(tmp_path):

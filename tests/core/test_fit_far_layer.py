@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from core.capture import Camera, Capture
 from core.capture.colmap import PointCloud
 from core.fit import checkpoint
-from core.fit.far_layer import SweepView, decide_patches, find_far_layer
+from core.fit.far_layer import SweepView, classify_patches, find_far_layer
 from core.fit.frames import Frames
 from core.fit.initialise import initial_scene
 from core.fit.settings import override_settings, preset
@@ -72,12 +72,12 @@ def exterior(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def test_a_surrounding_without_parallax_is_far_and_a_room_is_not() -> None:
-    patches = decide_patches(sweep(1e6))
+    patches = classify_patches(sweep(1e6))
     assert patches is not None
-    assert patches.contain(np.array([[0.5, 0.05, 0.9], [-0.5, 0.0, 0.9], [0.0, -0.35, 0.95]])).all()
-    assert decide_patches(sweep(8.0)) is None
-    assert decide_patches(sweep(70.0)) is None, "a parallax of two pixels is one"
-    assert decide_patches(sweep(8.0, plain=True)) is None, "a plain wall says nothing"
+    assert patches.are_far(np.array([[0.5, 0.05, 0.9], [-0.5, 0.0, 0.9], [0.0, -0.35, 0.95]])).all()
+    assert classify_patches(sweep(8.0)) is None
+    assert classify_patches(sweep(70.0)) is None, "a parallax of two pixels is one"
+    assert classify_patches(sweep(8.0, plain=True)) is None, "a plain wall says nothing"
 
 
 def test_a_board_in_front_of_a_far_surrounding_is_not_far(exterior: Capture) -> None:

@@ -144,7 +144,7 @@ def test_unmeasured_exposures_come_from_the_same_folder() -> None:
 def test_measured_exposures_can_be_read_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Even where the solve makes nonsense of it."""
     capture = wall(tmp_path / "a", lambda number, light: light * 2.0 ** (number % 2))
-    monkeypatch.setattr(metering.PointObservations, "stops", lambda _: np.linspace(-30, 30, COUNT))
+    monkeypatch.setattr(metering.PointObservations, "estimate_stops", lambda _: np.linspace(-30, 30, COUNT))
     run = Run.create(tmp_path / "run", quick(10), capture.folder, found(capture))
     assert len(Run.open(run.folder).exposures) == COUNT
 

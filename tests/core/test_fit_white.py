@@ -146,13 +146,13 @@ def test_a_light_disc_above_white_is_kept_where_frames_differ(bright: Capture) -
     above_white.clean[at], above_white.frame[at] = 2.0, 2.4
     sources = trainer._light_disc_mask(above_white)
     assert sources is not None and not sources.any(), "the flare is what the frame has more"
-    assert torch.equal(trainer._joint_target(above_white, picture, sources), above_white.frame)
+    assert torch.equal(trainer._composite_target(above_white, picture, sources), above_white.frame)
     above_white.frame[at] = 2.0
     sources = trainer._light_disc_mask(above_white)
     assert sources is not None and sources[at] and sources.sum() == 1
     assert not trainer._flare_background(above_white, torch.ones_like(picture), sources)[at].any()
     for drawn, wanted in ((0.5, 1.0), (3.0, 3.0)):  # at least white, and as bright as what is round it makes it
-        target = trainer._joint_target(above_white, torch.full_like(picture, drawn), sources)
+        target = trainer._composite_target(above_white, torch.full_like(picture, drawn), sources)
         assert (target[at] == wanted).all()
         target[at] = above_white.frame[at]
         assert torch.equal(target, above_white.frame)

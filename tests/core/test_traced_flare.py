@@ -34,7 +34,7 @@ def test_the_error_falls_with_the_length_of_the_fit(made: tuple[Path, traced_fla
                                                     tmp_path: Path) -> None:
     short = make_flare(TracedFlareSettings().override({**SMALL, "fit.iterations": 2}), tmp_path / "b.flare", Progress())
     assert made[1].error < 0.6 * short.error
-    assert made[1].worst >= made[1].error
+    assert made[1].max_error >= made[1].error
 
 
 def test_a_long_lens_is_fitted_as_well_as_a_short_one(made: tuple[Path, traced_flare.TracedResult],
@@ -87,7 +87,7 @@ def test_a_stopped_fit_leaves_no_file(tmp_path: Path) -> None:
 
 def test_ghosts_have_their_level() -> None:
     settings = TracedFlareSettings().override({**SMALL, "ghosts.level": 0.05})
-    setup, camera = traced_flare.exposed_setup(settings), traced_flare.traced_camera(settings)
+    setup, camera = traced_flare.setup_with_ghost_gain(settings), traced_flare.traced_camera(settings)
     optics, pairs = build_optics(setup)
     half = settings.reach * np.array([1, settings.height / 64])
     squares = [np.square(draw_ghosts(optics, pairs, setup.ghosts, tuple(half * probe), (camera.fx, camera.fy),
@@ -98,8 +98,8 @@ def test_ghosts_have_their_level() -> None:
 def test_ghosts_in_focus_have_a_limit_and_the_same_level() -> None:
     """At 64 pixels the level alone would give this lens pixels of five times white."""
     values = {**SMALL, "ghosts.level": 0.1}
-    free = traced_flare.exposed_setup(TracedFlareSettings().override({**values, "ghosts.limit": 1e6}))
-    setup = traced_flare.exposed_setup(TracedFlareSettings().override({**values, "ghosts.limit": 0.2}))
+    free = traced_flare.setup_with_ghost_gain(TracedFlareSettings().override({**values, "ghosts.limit": 1e6}))
+    setup = traced_flare.setup_with_ghost_gain(TracedFlareSettings().override({**values, "ghosts.limit": 0.2}))
     assert setup.ghosts.gain > 1.02 * free.ghosts.gain
     light = np.array([[[0.1, 0.4, 0.2]], [[0.1, 0.1, 0.2]]], np.float32)
     np.testing.assert_allclose(limited(light, 0.2), [[[0.05, 0.2, 0.1]], [[0.1, 0.1, 0.2]]], rtol=1e-6)

@@ -20,7 +20,7 @@ SMALL = {"lens": "US1998704", "tracing.width": 64, "tracing.bands": 1, "ghosts.c
 
 def test_a_measured_ghost_is_where_it_is_drawn() -> None:
     settings = TracedFlareSettings().override(SMALL)
-    setup, camera = traced_flare.exposed_setup(settings), traced_flare.traced_camera(settings)
+    setup, camera = traced_flare.setup_with_ghost_gain(settings), traced_flare.traced_camera(settings)
     lights = np.array([[0.04, 0.02], [-0.03, 0.03], [0.05, -0.02]])
     ghosts = measure_ghosts(setup, camera, lights, settings.colour)
     assert 3 <= len(ghosts) <= 6
@@ -58,7 +58,7 @@ def test_the_first_gaussians_of_a_ghost_are_its_disc() -> None:
         for layer in (flare.network.head,):
             layer.weight *= 0
             layer.bias *= 0
-        drawn = traced_flare._draw(flare, light, traced_flare._intrinsics(camera), camera).numpy()
+        drawn = traced_flare._draw_flare(flare, light, traced_flare._intrinsics(camera), camera).numpy()
     weight = drawn.sum(-1)
     y, x = np.mgrid[:camera.height, :camera.width] + 0.5
     centre = np.array([(weight * (x - camera.cx)).sum(), (weight * (y - camera.cy)).sum()]) / weight.sum() / camera.fx

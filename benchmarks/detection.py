@@ -29,7 +29,7 @@ from benchmarks.light_composer import LitPicture, compose_lights
 from core.capture import Capture
 from core.errors import EngineError, FitFlareError
 from core.images.read import read_picture
-from core.lights import Detection, Detector, detector_for, find_lights, union_mask
+from core.lights import Detection, Detector, find_lights, make_detector, union_mask
 from core.removal.training.backgrounds import PHOTO_SUFFIXES, list_pictures
 
 THRESHOLDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -128,7 +128,7 @@ def main() -> None:
     args = parser.parse_args()
     for method in args.method or ["exposure", "grounded"]:
         try:
-            detector = detector_for(method, THRESHOLDS[0], args.boxes, args.masks)
+            detector = make_detector(method, THRESHOLDS[0], args.boxes, args.masks)
         except EngineError as problem:
             print(f"{method}: skipped. {problem}")
             continue
@@ -140,7 +140,7 @@ def main() -> None:
                 tallies = detect_in_pictures(detector, photos, args.pictures, args.seed)
                 _print_picture_scores(method, tallies, args.pictures)
         if args.capture:
-            print_capture_errors(args.capture, detector_for(method, None, args.boxes, args.masks))
+            print_capture_errors(args.capture, make_detector(method, None, args.boxes, args.masks))
     if args.photos is None and not args.capture:
         print("Nothing to measure: give --photos FOLDER, --capture FOLDER or both.")
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from .detection import Detection, Detector, union_mask
 from .exposure import ExposureDetector
-from .find import Findings, detector_for, find_lights, write_findings
+from .find import Findings, find_lights, make_detector, write_findings
 from .found_light import FoundLight
 from .triangulation import TriangulationSettings, triangulate_lights
 
@@ -25,8 +25,8 @@ __all__ = [
            "Findings",
            "FoundLight",
            "TriangulationSettings",
-           "detector_for",
            "find_lights",
+           "make_detector",
            "triangulate_lights",
            "union_mask",
            "write_findings",

@@ -29,6 +29,10 @@ UNLIKELY_GATE = 0.4
 MAX_WAIT, MAX_GAP = 2, 24
 """Number of frames without a source after which a track still waits for the next one, and the largest gap, frames,
 over which two tracks are joined."""
+MAX_GROWTH = 1.3
+"""Largest ratio of a source's radius to that of the lamp before it, where the source hardly looks like a lamp."""
+SINGLE_COST = 0.2
+"""Cost of joining a chain of one source, which predicts its place without a velocity."""
 SIZE_COST, COLOUR_COST, EVIDENCE_COST, GAP_COST = 0.4, 0.3, 0.5, 0.06
 """Weights of the change of size (logarithm), colour and evidence, and of a frame without a source, beside distance over
 gate."""
@@ -67,13 +71,13 @@ class Chain:
         return float(np.quantile([source.evidence for source in self.sources], 0.7))
 
     def velocity(self, at_end: bool) -> Floats:
-        """Return (2,) pixels per frame at the last or first frame; 0 for a single frame."""
+        """Return (2,) pixels per frame, at the last frame if `at_end`, else at the first one; 0 for a single frame."""
         if len(self.frames) < 2:
             return np.zeros(2)
-        index = (-1, -2) if at_end else (1, 0)
-        step = self.frames[index[0]] - self.frames[index[1]]
+        later, earlier = (-1, -2) if at_end else (1, 0)
+        step = self.frames[later] - self.frames[earlier]
         places = self.places
-        return np.asarray((places[index[0]] - places[index[1]]) / step)
+        return np.asarray((places[later] - places[earlier]) / step)
 
     def predict(self, frame: int) -> Floats:
         """Return (2,) the place in a frame after the last or before the first one, at constant velocity."""
@@ -89,42 +93,42 @@ class Chain:
         of the frames, pixels.
         """
         places, frames = self.places, np.array(self.frames)
-        least, most = MIN_ACCELERATION * diagonal, MAX_ACCELERATION * diagonal
+        low, high = MIN_ACCELERATION * diagonal, MAX_ACCELERATION * diagonal
         if len(frames) < 3:
-            return least
+            return low
         rates = np.diff(places, axis=0) / np.diff(frames)[:, None]
         changes = np.linalg.norm(np.diff(rates, axis=0), axis=1) / (0.5 * (frames[2:] - frames[:-2]))
-        return float(np.clip(1.5 * np.quantile(changes, 0.8), least, most))
+        return float(np.clip(1.5 * np.quantile(changes, 0.8), low, high))
 
 
-def follow(sources: Sequence[Sequence[Source]], diagonal: float) -> list[Chain]:
+def follow_sources(sources: Sequence[Sequence[Source]], diagonal: float) -> list[Chain]:
     """Return the chains of the sources of consecutive frames, the longest first. diagonal: of the frames, pixels."""
     open_chains: list[Chain] = []
     closed: list[Chain] = []
-    for frame, in_frame in enumerate(sources):
-        pairs = sorted((cost, chain, number) for chain, other in enumerate(open_chains)
-                       for number, source in enumerate(in_frame)
-                       if (cost := _cost(other, frame, source, diagonal)) is not None)
+    for frame, frame_sources in enumerate(sources):
+        pairs = sorted((cost, chain_index, source_index) for chain_index, chain in enumerate(open_chains)
+                       for source_index, source in enumerate(frame_sources)
+                       if (cost := _link_cost(chain, frame, source, diagonal)) is not None)
         used_chains: set[int] = set()
         used_sources: set[int] = set()
-        for _, chain, number in pairs:
-            if chain not in used_chains and number not in used_sources:
-                used_chains.add(chain)
-                used_sources.add(number)
-                open_chains[chain].append(frame, in_frame[number])
+        for _, chain_index, source_index in pairs:
+            if chain_index not in used_chains and source_index not in used_sources:
+                used_chains.add(chain_index)
+                used_sources.add(source_index)
+                open_chains[chain_index].append(frame, frame_sources[source_index])
         closed += [chain for chain in open_chains if frame - chain.frames[-1] > _patience(chain)]
         open_chains = [chain for chain in open_chains if frame - chain.frames[-1] <= _patience(chain)]
-        open_chains += [Chain([frame], [source]) for number, source in enumerate(in_frame)
-                        if number not in used_sources]
-    return _join(closed + open_chains, diagonal)
+        open_chains += [Chain([frame], [source]) for source_index, source in enumerate(frame_sources)
+                        if source_index not in used_sources]
+    return _join_chains(closed + open_chains, diagonal)
 
 
 def _patience(chain: Chain) -> int:
-    """Return the number of frames that a chain waits for its source; longer gaps are closed by `_join`."""
+    """Return the number of frames that a chain waits for its source; longer gaps are closed by `_join_chains`."""
     return MAX_WAIT if chain.evidence >= LIKELY else 1
 
 
-def _cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | None:
+def _link_cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | None:
     """Return the cost of joining a chain to a source of a later frame; None beyond the gate.
 
     The gate is the largest distance, pixels, of a source from the predicted place. diagonal: of the frames, pixels.
@@ -139,26 +143,25 @@ def _cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | 
         gate = (FIRST_GATE if likely else FAINT_FIRST_GATE) * diagonal * gap
     else:
         speed = float(np.linalg.norm(chain.velocity(at_end=True)))
-        before = chain.frames[-1] - chain.frames[-2]
+        previous_gap = chain.frames[-1] - chain.frames[-2]
         # Acceleration adds to the gate where frames are missing, in this gap or in the one that gave the velocity.
         gate = (BASE_GATE * diagonal + SPEED_GATE * speed
-                + 0.5 * chain.acceleration(diagonal) * (gap * gap - 1 + (before - 1) * gap))
+                + 0.5 * chain.acceleration(diagonal) * (gap * gap - 1 + (previous_gap - 1) * gap))
     if chain.evidence >= LIKELY > source.evidence:
         # A lamp that something begins to hide looks less like one: such a source counts only in the very next frame,
         # near the predicted place, and if it has not grown.
-        if gap > 1 or source.detection.radius > 1.3 * last.detection.radius:
+        if gap > 1 or source.detection.radius > MAX_GROWTH * last.detection.radius:
             return None
         gate *= UNLIKELY_GATE
     elif source.evidence >= LIKELY > chain.evidence:
         gate *= UNLIKELY_GATE
-    difference = _difference(last, source)
+    difference = _appearance_difference(last, source)
     if distance > gate or difference > MAX_DIFFERENCE:
         return None
-    # A chain of one source predicts its place without a velocity, so longer chains come first.
-    return distance / gate + difference + GAP_COST * (gap - 1) + 0.2 * (len(chain.frames) < 2)
+    return distance / gate + difference + GAP_COST * (gap - 1) + SINGLE_COST * (len(chain.frames) < 2)
 
 
-def _difference(first: Source, second: Source) -> float:
+def _appearance_difference(first: Source, second: Source) -> float:
     """Return how much two sources differ in size, colour and evidence; one that the frame's edge cuts has no size."""
     one, two = first.detection, second.detection
     cut = one.is_cut or two.is_cut
@@ -167,7 +170,7 @@ def _difference(first: Source, second: Source) -> float:
             + EVIDENCE_COST * abs(first.evidence - second.evidence))
 
 
-def _join(chains: list[Chain], diagonal: float) -> list[Chain]:
+def _join_chains(chains: list[Chain], diagonal: float) -> list[Chain]:
     """Join chains where one ends before another begins and both extrapolations meet, the best pair first.
 
     Only chains that look like lamps are joined. Returns all chains, the longest first.
@@ -176,18 +179,18 @@ def _join(chains: list[Chain], diagonal: float) -> list[Chain]:
     others = [chain for number, chain in enumerate(chains) if number not in likely]
     costs = {(i, j): cost for i, first in likely.items() for j, second in likely.items()
              if i != j and (cost := _join_cost(first, second, diagonal)) is not None}
-    following = len(chains)  # number of the next joined chain
+    next_number = len(chains)  # number of the next joined chain
     while costs:
         i, j = min(costs, key=lambda pair: (costs[pair], pair))
         first, second = likely.pop(i), likely.pop(j)
         joined = Chain(first.frames + second.frames, first.sources + second.sources)
         costs = {pair: cost for pair, cost in costs.items() if i not in pair and j not in pair}
         for number, chain in likely.items():
-            for pair, ends in (((following, number), (joined, chain)), ((number, following), (chain, joined))):
+            for pair, ends in (((next_number, number), (joined, chain)), ((number, next_number), (chain, joined))):
                 if (cost := _join_cost(*ends, diagonal)) is not None:
                     costs[pair] = cost
-        likely[following] = joined
-        following += 1
+        likely[next_number] = joined
+        next_number += 1
     return sorted([*likely.values(), *others], key=lambda chain: -len(chain.frames))
 
 
@@ -211,16 +214,17 @@ def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
         gate += 0.5 * gap * max(speeds)
     # Half the way by each: the velocities need not agree, only the places in the middle.
     middle = first.frames[-1] + gap / 2
-    forth = first.places[-1] + first.velocity(at_end=True) * (middle - first.frames[-1])
-    back = second.places[0] - second.velocity(at_end=False) * (second.frames[0] - middle)
-    distance = float(np.linalg.norm(forth - back))
-    difference = _difference(_typical(first, at_end=True), _typical(second, at_end=False))
+    middle_by_first = first.places[-1] + first.velocity(at_end=True) * (middle - first.frames[-1])
+    middle_by_second = second.places[0] - second.velocity(at_end=False) * (second.frames[0] - middle)
+    distance = float(np.linalg.norm(middle_by_first - middle_by_second))
+    difference = _appearance_difference(_typical_source(first, at_end=True), _typical_source(second, at_end=False))
     if distance > gate or difference > MAX_DIFFERENCE:
         return None
     return distance / gate + distance / (DISTANCE_SCALE * diagonal) + difference + GAP_COST * gap
 
 
-def _typical(chain: Chain, at_end: bool) -> Source:
-    """Return the source of median size among the last or first few of a chain: the very last may be half hidden."""
+def _typical_source(chain: Chain, at_end: bool) -> Source:
+    """Return the source of median size among the last few of a chain, or the first few: the very last may be half
+    hidden."""
     near = chain.sources[-TYPICAL:] if at_end else chain.sources[:TYPICAL]
     return sorted(near, key=lambda source: source.detection.radius)[len(near) // 2]

@@ -117,15 +117,15 @@ def _triangulate(observations: Observations, first: NDArray[np.int64], second: N
     first, second: the detections of each pair (n,). Zeros for rays that are parallel, or that are nearest behind one of
     the cameras.
     """
-    a, b = observations.position[observations.view[first]], observations.position[observations.view[second]]
-    d, e = observations.ray[first], observations.ray[second]
-    cosine, base = (d * e).sum(axis=1), b - a
+    origin, other_origin = (observations.position[observations.view[index]] for index in (first, second))
+    ray, other_ray = observations.ray[first], observations.ray[second]
+    cosine, baseline = (ray * other_ray).sum(axis=1), other_origin - origin
     squared_sine = 1.0 - cosine ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        s = ((base * d).sum(axis=1) - cosine * (base * e).sum(axis=1)) / squared_sine
-        t = (cosine * (base * d).sum(axis=1) - (base * e).sum(axis=1)) / squared_sine
-        midpoint = 0.5 * (a + s[:, None] * d + b + t[:, None] * e)
-    valid = (squared_sine > 1e-8) & (s > 0) & (t > 0)
+        along = ((baseline * ray).sum(axis=1) - cosine * (baseline * other_ray).sum(axis=1)) / squared_sine
+        along_other = (cosine * (baseline * ray).sum(axis=1) - (baseline * other_ray).sum(axis=1)) / squared_sine
+        midpoint = 0.5 * (origin + along[:, None] * ray + other_origin + along_other[:, None] * other_ray)
+    valid = (squared_sine > 1e-8) & (along > 0) & (along_other > 0)
     return np.concatenate([np.where(valid[:, None], midpoint, 0.0), valid[:, None].astype(float)], axis=1)
 
 

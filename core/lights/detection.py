@@ -87,7 +87,7 @@ def measure_detection(mask: Mask, corner: tuple[int, int], picture: Picture, dis
 
 
 def _glow_colour(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.float64]:
-    """Return the colour of the glow: the light just round the disc minus the light farther out.
+    """Return the colour of the glow: the light within half a radius of the disc minus that two to three radii away.
 
     (3,) linear, the largest channel 1; white where no glow can be measured. At most half is subtracted, so that some
     glow is left beside a bright surface. mask: (h, w) of the disc at `corner` (x, y).

@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,41 +57,56 @@ def check_replaceable(path: Path) -> None:
 
 def write_lights(path: Path, lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
                  keep: bool = False, tracked: Sequence[TrackedLight] = ()) -> list[dict[str, Any]]:
-    """Write lights.json and return its entries.
+    """Write lights.json and return its entries: existing ones if `keep`, and lights that are not among them.
 
     keep: see the module's head. views: names and cameras, by which lights count as the same. tracked: lights on paths.
     Raises CaptureError where an existing file is to be kept and cannot be read.
     """
-    entries: list[dict[str, Any]] = []
-    found_before: list[Any] = []
-    paths_before: list[dict[str, Any]] = []
-    if keep and path.exists():
-        read_lights(path)  # checks it
-        data = read_json(path, CaptureError)
-        entries, found_before = list(data["lights"]), _read_earlier_places(data, path)
-        paths_before = _read_earlier_paths(data, path)
-        for entry in entries:
-            _check_writable(entry, path)
-    known = [*(entry["xyz"] for entry in entries if "xyz" in entry), *found_before]
+    earlier = _read_earlier(path) if keep and path.exists() else _EarlierLights([], [], [])
+    entries = list(earlier.entries)
+    known_places = [*(entry["xyz"] for entry in entries if "xyz" in entry), *earlier.places]
     for light in lights:
-        if any(_is_same_light(light.xyz, xyz, views) for xyz in known):
-            continue
-        entries.append(_to_entry(light, _free_name({entry["name"] for entry in entries})))
+        if not any(_is_same_light(light.xyz, xyz, views) for xyz in known_places):
+            entries.append(_to_entry(light, _free_name({entry["name"] for entry in entries})))
     # For `found`: all places of this run, written or not, and those of earlier ones that it did not find again.
     places = [[round_for_text(float(x)) for x in light.xyz] for light in lights]
-    places += [xyz for xyz in found_before if not any(_is_same_light(place, xyz, views) for place in places)]
-    known_paths = [*(_places_by_frame(entry) for entry in entries if "frames" in entry), *paths_before]
-    paths = [*paths_before]
-    for track in tracked:
-        entry = _to_track_entry(track, _free_name({entry["name"] for entry in entries}))
-        places_by_frame = _places_by_frame(entry)
-        if any(_is_same_path(places_by_frame, other, views[0][1]) for other in known_paths):
-            continue
-        entries.append(entry)
-        paths.append(places_by_frame)
+    places += [xyz for xyz in earlier.places if not any(_is_same_light(place, xyz, views) for place in places)]
+    paths = [*earlier.paths, *_add_tracks(entries, tracked, earlier, views)]
     found: dict[str, Any] = {"lights": entries, "found": places}
     write_json(follow_link(path), {**found, "found_paths": paths} if paths else found)
     return entries
+
+
+class _EarlierLights(NamedTuple):
+    """An existing lights.json: its entries, and the places and paths that earlier runs wrote."""
+
+    entries: list[dict[str, Any]]
+    places: list[list[float]]
+    paths: list[dict[str, Any]]
+
+
+def _read_earlier(path: Path) -> _EarlierLights:
+    """Read a lights.json that is to be kept. Raises CaptureError where that cannot be done."""
+    read_lights(path)  # checks it
+    data = read_json(path, CaptureError)
+    earlier = _EarlierLights(data["lights"], _read_earlier_places(data, path), _read_earlier_paths(data, path))
+    for entry in earlier.entries:
+        _check_writable(entry, path)
+    return earlier
+
+
+def _add_tracks(entries: list[dict[str, Any]], tracked: Sequence[TrackedLight], earlier: _EarlierLights,
+                views: Sequence[tuple[str, Camera]]) -> list[dict[str, Any]]:
+    """Append to `entries` the lights on paths that are not known yet; return their paths, places by frame."""
+    known_paths = [*(_places_by_frame(entry) for entry in entries if "frames" in entry), *earlier.paths]
+    new_paths = []
+    for track in tracked:
+        entry = _to_track_entry(track, _free_name({entry["name"] for entry in entries}))
+        path = _places_by_frame(entry)
+        if not any(_is_same_path(path, known_path, views[0][1]) for known_path in known_paths):
+            entries.append(entry)
+            new_paths.append(path)
+    return new_paths
 
 
 def _places_by_frame(entry: dict[str, Any]) -> dict[str, Any]:

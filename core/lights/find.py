@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..capture import LIGHTS, Capture, read_lights
+from ..capture import LIGHTS, Camera, Capture, read_lights
 from ..errors import SettingsError
 from ..system.files import write_json
 from ..system.progress import Progress
@@ -59,11 +59,11 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
     views = [(view.name, view.camera) for view in capture.views]
     detections: list[list[Detection]] = []
     progress.stage("look for lights", len(views))
-    maps: dict[str, NDArray[np.bool_]] = {}
+    brightness_maps: dict[str, NDArray[np.bool_]] = {}
     for view in capture.views:
         frame = capture.frame(view)
         detections.append(detector.detect(frame))
-        maps[view.name] = brightness_map(frame)
+        brightness_maps[view.name] = brightness_map(frame)
         progress.advance(1, found=sum(map(len, detections)))
     views_with_lights = sum(bool(in_view) for in_view in detections)
     messages = [f"{sum(map(len, detections))} detections in {views_with_lights} of {len(views)} views."]
@@ -72,15 +72,13 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
         lights = lift_to_gaussians(views, detections, *gaussians, capture.extent, max(min_views, 2))
         doubtful: list[FoundLight] = []
     elif len(views) == 1:
-        lights, doubtful = _from_one_view(capture, detections[0]), []
+        lights, doubtful = _lights_from_one_view(capture, detections[0]), []
         if lights:
             messages.append("A single view gives directions only; distances are those of nearby points, or guesses.")
     else:
-        # Everything that two views agree on; what lacks support is reported as doubtful.
-        permissive = replace(settings, min_views=2, max_nfa=np.inf, min_share=0.0)
-        candidates = triangulate_lights(views, detections, capture.extent, permissive)
+        candidates = _triangulate_any(views, detections, capture.extent, settings)
         supported = [light for light in candidates if _is_well_supported(light, min_views, settings)]
-        lights, gaps = split_gaps(supported, dict(views), maps)
+        lights, gaps = split_gaps(supported, dict(views), brightness_maps)
         doubtful = [*gaps, *(light for light in candidates if not _is_well_supported(light, min_views, settings))]
         if gaps:
             messages.append(f"{len(gaps)} places are no lights but gaps through which a bright far surrounding shows; "
@@ -95,15 +93,22 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
     return Findings(lights, doubtful, detections, messages)
 
 
+def _triangulate_any(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[Detection]], extent: float,
+                     settings: TriangulationSettings) -> list[FoundLight]:
+    """Triangulate every place that two views agree on; the caller sorts out what lacks support."""
+    return triangulate_lights(views, detections, extent, replace(settings, min_views=2, max_nfa=np.inf, min_share=0.0))
+
+
 def _is_well_supported(light: FoundLight, min_views: int, settings: TriangulationSettings) -> bool:
     return (len(light.support) >= max(min_views, settings.min_share * light.visible)
             and light.nfa <= settings.max_nfa)
 
 
-def moving_lights(capture: Capture, standing: Sequence[FoundLight], progress: Progress | None = None) -> TrackFindings:
-    """Follow the lights of a solved capture whose frames are consecutive; return those that do not stand.
+def track_moving_lights(capture: Capture, standing: Sequence[FoundLight], progress: Progress | None = None
+                        ) -> TrackFindings:
+    """Follow the lights of a solved capture whose frames are consecutive; return those that move.
 
-    A light that keeps to the projections of a standing one is left out.
+    A light that keeps to the projections of one of `standing`, the lights with one place, is left out.
     """
     findings = track_lights(capture, progress)
     moving = [light for light in findings.lights if not _stands(capture, light, standing)]
@@ -116,10 +121,10 @@ def _stands(capture: Capture, light: TrackedLight, standing: Sequence[FoundLight
     """True if a light that was followed keeps to the projections of a standing one."""
     views = [(view.name, view.camera) for view in capture.views if view.name in light.support]
     pixels = np.array([light.keys[name].xy for name, _ in views])
-    for found in standing:
+    for standing_light in standing:
         distances = []
         for (_, camera), pixel in zip(views, pixels, strict=True):
-            projected, depth = camera.project(found.xyz)
+            projected, depth = camera.project(standing_light.xyz)
             distances.append(float(np.linalg.norm(projected[0] - pixel)) if depth[0] > 0 else np.inf)
         if np.median(distances) < STANDING * float(np.hypot(*views[0][1].size)) + 0.5 * light.radius:
             return True
@@ -203,7 +208,7 @@ def _light_of_entry(entry: dict[str, Any], lights: Sequence[FoundLight]) -> Foun
     return FoundLight(xyz, False, (), 0, 0.0, 0.0, np.ones(3), 0.0, how="by hand")
 
 
-def _from_one_view(capture: Capture, detections: Sequence[Detection]) -> list[FoundLight]:
+def _lights_from_one_view(capture: Capture, detections: Sequence[Detection]) -> list[FoundLight]:
     """Place each detection of a single view at the median depth of the points around it in the picture.
 
     Without a point within 5 % of the diagonal it is placed far away. The uncertainty is
@@ -236,8 +241,8 @@ def _find_by_ghosts(capture: Capture, progress: Progress, seed: int) -> list[Fou
     return locate_by_ghosts([(view.name, view.camera) for view in capture.views], blobs, capture.extent, seed, progress)
 
 
-def detector_for(method: str, threshold: float | None = None, boxes: str | Path | None = None,
-                 masks: str | Path | None = None) -> Detector:
+def make_detector(method: str, threshold: float | None = None, boxes: str | Path | None = None,
+                  masks: str | Path | None = None) -> Detector:
     """Make the detector "exposure" or "grounded".
 
     threshold: least score of a detection, 0..1; None for the method's own. boxes, masks: weights of "grounded", folders

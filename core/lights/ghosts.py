@@ -32,6 +32,14 @@ MIN_MOTION = 0.01
 """Motion of a ghost, in diagonals; what keeps its place in the frame is dirt."""
 MAX_BLOBS = 20
 """Blobs of a picture, the strongest."""
+WORKING_SIZE = 480
+"""Largest side of the picture in which blobs are found, pixels."""
+BLOB_RADII = np.exp(np.linspace(np.log(0.007), np.log(0.06), 6))
+"""Radii of blobs that are tested, relative to the diagonal."""
+MIN_STRENGTH = 0.004
+"""Strength of a blob, see `Blob`, up to which it is noise."""
+MAX_VISIBLE_SHARE = 0.2
+"""Share of the views with a light well inside the frame from which it is not out of frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +57,9 @@ class Blob:
 def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
     """Find bright spots, strongest first, by difference of Gaussians over scales.
 
-    Their radii are 0.7 to 6 % of the diagonal, and their strength is above 0.004; MAX_BLOBS at most are returned.
-    They are found in the square root of linear light. With `clean`, the clean frame, they are found in the light that
-    the frame has beyond it.
+    Their radii are near BLOB_RADII, their strength is above MIN_STRENGTH; MAX_BLOBS at most are returned. They are
+    found in the square root of linear light, and with `clean`, the clean frame, in the light that the frame has beyond
+    it.
     """
     import cv2
 
@@ -59,21 +67,22 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
     if clean is not None:
         light = np.maximum(light - clean.linear().max(axis=2), 0.0)
     width, height = picture.size
-    scale = min(1.0, 480 / max(width, height))
+    scale = min(1.0, WORKING_SIZE / max(width, height))
     size = (max(8, round(width * scale)), max(8, round(height * scale)))
     small = np.sqrt(np.asarray(cv2.resize(np.minimum(light, 4.0), size, interpolation=cv2.INTER_AREA), np.float32))
     diagonal = float(np.hypot(*size))
     candidates: list[Blob] = []
-    for radius in np.exp(np.linspace(np.log(0.007), np.log(0.06), 6)) * diagonal:
+    for radius in BLOB_RADII * diagonal:
         sigma = radius / 1.6
         inner = cv2.GaussianBlur(small, (0, 0), sigma)
         # At a ratio of 1.6 the difference is close to a Laplacian of Gaussian (Marr and Hildreth 1980).
-        stands_out = np.asarray(inner - cv2.GaussianBlur(small, (0, 0), 1.6 * sigma))
+        difference = np.asarray(inner - cv2.GaussianBlur(small, (0, 0), 1.6 * sigma))
         window = 2 * max(1, round(radius)) + 1
-        peak = (stands_out == cv2.dilate(stands_out, np.ones((window, window), np.uint8))) & (stands_out > 0.004)
-        for y, x in np.argwhere(peak):
+        is_largest = difference == cv2.dilate(difference, np.ones((window, window), np.uint8))
+        is_peak = is_largest & (difference > MIN_STRENGTH)
+        for y, x in np.argwhere(is_peak):
             xy = np.array([(x + 0.5) / size[0] * width, (y + 0.5) / size[1] * height])
-            candidates.append(Blob(xy, float(radius / scale), float(stands_out[y, x])))
+            candidates.append(Blob(xy, float(radius / scale), float(difference[y, x])))
     strongest: list[Blob] = []
     for blob in sorted(candidates, key=lambda blob: -blob.strength):
         if all(np.linalg.norm(blob.xy - other.xy) > 0.7 * other.radius for other in strongest):
@@ -110,7 +119,8 @@ def locate_by_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequen
 
 
 def _rank(light: FoundLight, ratio: float) -> tuple[int, float]:
-    """Support first, then how well the blobs meet their predicted places, in pixels of the ghost."""
+    """Return the sort key of a light at a ratio: support first, then how well the blobs meet their predicted places, in
+    pixels of the ghost."""
     return len(light.support), -light.residual * abs(ratio)
 
 
@@ -134,7 +144,7 @@ def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequenc
         # A light that many views would show themselves is not out of frame.
         moved = np.ptp([detection.xy * ratio for _, detection in light.detections], axis=0).max()
         visible = sum(_is_well_inside(camera, light.xyz) for _, camera in views)
-        if visible < 0.2 * len(views) and moved > MIN_MOTION * diagonal:
+        if visible < MAX_VISIBLE_SHARE * len(views) and moved > MIN_MOTION * diagonal:
             return light
     return None
 

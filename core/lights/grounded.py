@@ -72,11 +72,11 @@ class GroundedDetector:
         with torch.inference_mode():
             inputs = self._box_processor(images=image, text=PROMPT, return_tensors="pt").to(self._device)
             # A text threshold of 0: the words that a box matches are not used.
-            answer = self._box_processor.post_process_grounded_object_detection(
+            output = self._box_processor.post_process_grounded_object_detection(
                 self._box_model(**inputs), inputs["input_ids"], threshold=self.threshold, text_threshold=0.0,
                 target_sizes=[(height, width)])[0]
-            boxes = answer["boxes"].cpu().double().numpy().reshape(-1, 4)
-            scores = answer["scores"].cpu().double().numpy()
+            boxes = output["boxes"].cpu().double().numpy().reshape(-1, 4)
+            scores = output["scores"].cpu().double().numpy()
             if not len(boxes):
                 return boxes, [], scores
             return boxes, self._predict_masks(image, boxes), scores
@@ -97,9 +97,9 @@ class GroundedDetector:
         mean, deviation = (torch.tensor(values).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_DEVIATION))
         pixels = (pixels - mean) / deviation
         scaled = torch.from_numpy(boxes * (side / width, side / height, side / width, side / height)).float()
-        answer = self._mask_model(pixel_values=pixels.to(self._device), input_boxes=scaled[None].to(self._device),
+        output = self._mask_model(pixel_values=pixels.to(self._device), input_boxes=scaled[None].to(self._device),
                                   multimask_output=False)
-        resized = interpolate(answer.pred_masks[0].cpu().float(), (height, width), mode="bilinear")
+        resized = interpolate(output.pred_masks[0].cpu().float(), (height, width), mode="bilinear")
         return [np.asarray(mask[0] > 0) for mask in resized.numpy()]
 
 

@@ -47,30 +47,46 @@ def find_highlights(linear: NDArray[np.float32], threshold: float = 0.95, gain: 
     rows, columns = np.nonzero(np.isfinite(luminance) & (luminance > threshold))
     if not len(rows):
         return Highlights(np.zeros((0, 2)), np.zeros((0, 3)))
-    # Smoothstep of the part above the threshold, so that no pixel appears at once.
-    t = np.clip((luminance[rows, columns].astype(np.float64) / threshold - 1) / SOFTNESS, 0, 1)
-    colours = np.maximum(linear[rows, columns], 0).astype(np.float64) * (t * t * (3 - 2 * t))[:, None]
+    # The part above the threshold, so that no pixel appears at once.
+    weights = _smoothstep((luminance[rows, columns].astype(np.float64) / threshold - 1) / SOFTNESS)
+    colours = np.maximum(linear[rows, columns], 0).astype(np.float64) * weights[:, None]
     xy = np.stack([columns + 0.5, rows + 0.5], -1)
+    light, places, strengths = _share_among_nodes(xy, colours, width, height)
+    # Faint nodes fade out in the same way.
+    shares = strengths / strengths.sum() if strengths.any() else strengths
+    node_weights = _smoothstep((shares - FAINTEST[0]) / (FAINTEST[1] - FAINTEST[0]))
+    chosen = np.flatnonzero(node_weights > 0)
+    scale = gain * node_weights[chosen, None] / (REFERENCE_AREA * width * height)
+    return Highlights(places[chosen] / strengths[chosen, None], light[chosen] * scale)
+
+
+def _share_among_nodes(xy: Floats, colours: Floats, width: int, height: int) -> tuple[Floats, Floats, Floats]:
+    """Share the light of pixels at `xy` (n, 2), with these colours (n, 3), among the nodes of the grid.
+
+    Returns for each node the light (nodes, 3), the sum of the pixels' places by strength (nodes, 2), and the strength
+    (nodes,), the sum of the light's channels. width, height: of the picture, pixels.
+    """
     spacing = max(width, height) / (NODES - 1)
-    # Nodes across and down, numbered by row. `low` is the node above and left of each pixel.
-    shape = np.array([int(width / spacing) + 2, int(height / spacing) + 2])
-    at = xy / spacing
-    low = np.floor(at).astype(int)
-    light, places, strengths = (np.zeros((int(shape.prod()), size)) for size in (3, 2, 1))
+    # Nodes across and down, numbered by row.
+    across, down = int(width / spacing) + 2, int(height / spacing) + 2
+    grid_xy = xy / spacing
+    upper_left = np.floor(grid_xy).astype(int)
+    light, places, strengths = np.zeros((across * down, 3)), np.zeros((across * down, 2)), np.zeros(across * down)
     for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
         # Bilinear: 1 at the node, 0 at its neighbours.
-        share = np.prod(np.where(corner, at - low, 1 - (at - low)), axis=1)
-        node = (low[:, 1] + corner[1]) * shape[0] + low[:, 0] + corner[0]
-        lit = colours * share[:, None]
-        strength = lit.sum(1)
+        share = np.prod(np.where(corner, grid_xy - upper_left, 1 - (grid_xy - upper_left)), axis=1)
+        node = (upper_left[:, 1] + corner[1]) * across + upper_left[:, 0] + corner[0]
+        shared = colours * share[:, None]
+        strength = shared.sum(1)
         for column in range(3):
-            light[:, column] += np.bincount(node, lit[:, column], len(light))
+            light[:, column] += np.bincount(node, shared[:, column], len(light))
         for column in range(2):
             places[:, column] += np.bincount(node, strength * xy[:, column], len(light))
-        strengths[:, 0] += np.bincount(node, strength, len(light))
-    # Faint nodes fade out in the same way.
-    part = strengths[:, 0] / strengths.sum() if strengths.any() else strengths[:, 0]
-    t = np.clip((part - FAINTEST[0]) / (FAINTEST[1] - FAINTEST[0]), 0, 1)
-    chosen = np.flatnonzero(t > 0)
-    scale = gain * (t * t * (3 - 2 * t))[chosen, None] / (REFERENCE_AREA * width * height)
-    return Highlights(places[chosen] / strengths[chosen], light[chosen] * scale)
+        strengths += np.bincount(node, strength, len(light))
+    return light, places, strengths
+
+
+def _smoothstep(values: Floats) -> Floats:
+    """Return 0 for values of 0 and below, 1 for 1 and above, smooth between."""
+    t = np.clip(values, 0, 1)
+    return np.asarray(t * t * (3 - 2 * t))

@@ -77,22 +77,23 @@ def _visible_points(camera: Camera, pixels: Floats, depth: Floats) -> NDArray[np
 
 
 def _cluster(xyz: Floats, reach: float) -> list[NDArray[np.int64]]:
-    """Return index sets of points linked by steps shorter than `reach`, three points or more."""
+    """Return the clusters of points (n, 3) that steps shorter than `reach` link, three points or more each, as arrays
+    of indices."""
     remaining = np.ones(len(xyz), bool)
     clusters = []
     while remaining.any():
         members = np.zeros(len(xyz), bool)
-        edge = np.flatnonzero(remaining)[:1]
-        while len(edge):
-            members[edge] = True
-            remaining[edge] = False
-            rest = np.flatnonzero(remaining)
-            if not len(rest):
+        frontier = np.flatnonzero(remaining)[:1]
+        while len(frontier):
+            members[frontier] = True
+            remaining[frontier] = False
+            others = np.flatnonzero(remaining)
+            if not len(others):
                 break
-            near = np.zeros(len(rest), bool)
-            for point in xyz[edge]:
-                near |= ((xyz[rest] - point) ** 2).sum(axis=1) < reach ** 2
-            edge = rest[near]
+            near = np.zeros(len(others), bool)
+            for point in xyz[frontier]:
+                near |= ((xyz[others] - point) ** 2).sum(axis=1) < reach ** 2
+            frontier = others[near]
         if members.sum() >= 3:
             clusters.append(np.flatnonzero(members))
     return clusters

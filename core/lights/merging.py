@@ -10,6 +10,13 @@ import numpy as np
 from ..capture.camera import Camera
 from .found_light import FoundLight
 
+GHOST_TOLERANCE, RADIUS_SHARE = 0.006, 0.25
+"""Distance of a ghost from its predicted place, frame diagonals, to which this share of its radius is added."""
+MIN_VIEWS, MIN_MOTION = 3, 8
+"""Smallest number of views of a ghost, and its motion in tolerances: a spot that hardly moves fits any ratio."""
+MIN_RATIO_OFFSET = 0.05
+"""Distance of a ghost's ratio from 1, which is that of the light itself."""
+
 
 def merge_duplicates(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
                      extent: float) -> list[FoundLight]:
@@ -50,23 +57,23 @@ def _by_support(lights: Sequence[FoundLight]) -> list[FoundLight]:
 
 def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) -> bool:
     """True if the detections of `light` are a ghost of `other`, see `remove_ghosts`. cameras: by the views' names."""
-    ghost, source, tolerance = [], [], []
+    ghosts, sources, tolerances = [], [], []
     for name, detection in light.detections:
         camera = cameras[name]
         pixel, depth = camera.project(other.xyz[None])
         if depth[0] > 0:
             centre = np.array([camera.cx, camera.cy])
-            ghost.append(detection.xy - centre)
-            source.append(pixel[0] - centre)
-            tolerance.append(0.006 * float(np.hypot(*camera.size)) + 0.25 * detection.radius)
-    if len(ghost) < 3:
+            ghosts.append(detection.xy - centre)
+            sources.append(pixel[0] - centre)
+            tolerances.append(GHOST_TOLERANCE * float(np.hypot(*camera.size)) + RADIUS_SHARE * detection.radius)
+    if len(ghosts) < MIN_VIEWS:
         return False
-    g, s = np.array(ghost), np.array(source)
-    ratio = float((g * s).sum() / (s * s).sum())
-    distance = np.linalg.norm(g - ratio * s, axis=1) / tolerance
-    motion = float(np.linalg.norm(np.ptp(g, axis=0))) / float(np.median(tolerance))
-    # A spot that hardly moves could lie at any ratio; one at a ratio of 1 is the light itself.
-    return bool(np.median(distance) < 1 and motion > 8 and abs(ratio - 1) > 0.05)
+    # Offsets from the principal point; their ratio is a least squares fit.
+    ghost, source = np.array(ghosts), np.array(sources)
+    ratio = float((ghost * source).sum() / (source * source).sum())
+    distances = np.linalg.norm(ghost - ratio * source, axis=1) / tolerances
+    motion = float(np.linalg.norm(np.ptp(ghost, axis=0))) / float(np.median(tolerances))
+    return bool(np.median(distances) < 1 and motion > MIN_MOTION and abs(ratio - 1) > MIN_RATIO_OFFSET)
 
 
 def _is_same_light(light: FoundLight, other: FoundLight, views: Sequence[tuple[str, Camera]], extent: float) -> bool:

@@ -60,7 +60,8 @@ class Observations:
             detection=[detection for _, detection in flat])
 
     def project(self, places: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Homogeneous places (n, 4) to pixels (n, v, 2) in every view, and whether they lie in front (n, v)."""
+        """Project homogeneous places (n, 4) to pixels (n, v, 2) in every view; return also (n, v) whether they lie in
+        front."""
         local = np.einsum("vij,nvj->nvi", self.rotation, places[:, None, :3] - places[:, None, 3:] * self.position)
         front = local[..., 2] > MIN_DEPTH
         depth = np.where(front, local[..., 2], 1.0)[..., None]

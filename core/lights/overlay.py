@@ -28,17 +28,17 @@ def write_overlay_sheets(folder: Path, capture: Capture, detections: Sequence[Se
     """
     for old in folder.glob("sheet*.png"):
         remove_file(old)
-    each = COLUMNS * ROWS
+    tiles_per_sheet = COLUMNS * ROWS
     paths = []
-    for start in range(0, len(capture.views), each):
+    for start in range(0, len(capture.views), tiles_per_sheet):
         tiles = [_draw_tile(capture, i, detections[i], lights)
-                 for i in range(start, min(start + each, len(capture.views)))]
+                 for i in range(start, min(start + tiles_per_sheet, len(capture.views)))]
         height = max(tile.shape[0] for tile in tiles)
         tiles = [np.pad(tile, ((0, height - tile.shape[0]), (0, 0), (0, 0))) for tile in tiles]
         blank = np.zeros_like(tiles[0])
         tiles += [blank] * (-len(tiles) % COLUMNS)
         rows = [np.concatenate(tiles[i:i + COLUMNS], axis=1) for i in range(0, len(tiles), COLUMNS)]
-        path = folder / f"sheet{start // each + 1}.png"
+        path = folder / f"sheet{start // tiles_per_sheet + 1}.png"
         write_png(path, np.concatenate(rows, axis=0))
         paths.append(path)
     return paths

@@ -109,12 +109,12 @@ def _residuals(observations: Observations, inliers: NDArray[np.int64], place: In
     depth = np.maximum(local[:, 2], 1e-9)
     residual = (local[:, :2] / depth[:, None] * observations.focal[view] + observations.centre[view]
                 - observations.pixel[inliers])
-    by_local = np.zeros((len(view), 2, 3))
-    by_local[:, 0, 0], by_local[:, 1, 1] = 1 / depth, 1 / depth
-    by_local[:, :, 2] = -local[:, :2] / depth[:, None] ** 2
-    by_local *= observations.focal[view][:, :, None]
-    by_state = np.concatenate([rotation @ basis, np.einsum("nij,nj->ni", rotation, shift)[:, :, None]], axis=2)
-    return residual, by_local @ by_state
+    pixel_by_local = np.zeros((len(view), 2, 3))
+    pixel_by_local[:, 0, 0], pixel_by_local[:, 1, 1] = 1 / depth, 1 / depth
+    pixel_by_local[:, :, 2] = -local[:, :2] / depth[:, None] ** 2
+    pixel_by_local *= observations.focal[view][:, :, None]
+    local_by_state = np.concatenate([rotation @ basis, np.einsum("nij,nj->ni", rotation, shift)[:, :, None]], axis=2)
+    return residual, pixel_by_local @ local_by_state
 
 
 def _tangent_basis(direction: Floats) -> Floats:

@@ -94,11 +94,11 @@ def snap_lights(views: Sequence[FlareView], lights: ArrayLike) -> Floats:
     """Return the positions of the lights (n, 3), world coordinates, on their flares; unchanged where there is no clear
     peak."""
     initial = np.array(lights, np.float64).reshape(-1, 3)
-    positions, is_on_peak = initial.copy(), _are_on_peaks(views, initial) | _are_unobserved(views, initial)
-    for first in reversed(range(len(WINDOWS) - 2)):  # from the narrowest three windows alone to all
+    positions, is_on_peak = initial.copy(), _are_on_peaks(views, initial) | _are_in_clipped_sky(views, initial)
+    for widest in reversed(range(len(WINDOWS) - 2)):  # from the narrowest three windows alone to all
         if is_on_peak.all():
             break
-        moved = _mean_shift(views, positions, ~is_on_peak, WINDOWS[first:])
+        moved = _mean_shift(views, positions, ~is_on_peak, WINDOWS[widest:])
         accepted = (~is_on_peak & _are_on_peaks(views, moved) & ~_are_merged(views, moved)
                     & _are_in_reach(views, initial, moved))
         positions[accepted], is_on_peak = moved[accepted], is_on_peak | accepted
@@ -114,15 +114,15 @@ def _mean_shift(views: Sequence[FlareView], positions: Floats, free: NDArray[np.
     positions = positions.copy()
     for window in windows:
         for _ in range(MAX_STEPS):
-            farthest = 0.0
+            largest_motion = 0.0
             for light, observations in enumerate(_observe(views, positions, window)):
                 if not free[light] or len(observations) < 2:
                     continue
                 step = _least_squares_step(observations)
                 positions[light] += step
                 motions = (float(np.linalg.norm(observation.jacobian @ step)) for observation in observations)
-                farthest = max(farthest, *motions)
-            if farthest < 0.05:  # pixels
+                largest_motion = max(largest_motion, *motions)
+            if largest_motion < 0.05:  # pixels
                 break
     return positions
 
@@ -141,10 +141,10 @@ def _are_on_peaks(views: Sequence[FlareView], positions: Floats) -> NDArray[np.b
     return on_peak
 
 
-def _are_unobserved(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
+def _are_in_clipped_sky(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
     """Return (n,), True for each light that lies in clipped sky in most of its views: those that have it in the frame,
-    and a flare of at least MIN_FLARE of the mean."""
-    unobserved = np.zeros(len(positions), bool)
+    and a flare of at least MIN_FLARE of the mean over all views."""
+    in_sky = np.zeros(len(positions), bool)
     levels = [float(view.flare.mean()) for view in views]
     flaring = [view for view, level in zip(views, levels, strict=True) if level >= MIN_FLARE * np.mean(levels)]
     for light, position in enumerate(positions):
@@ -154,8 +154,8 @@ def _are_unobserved(views: Sequence[FlareView], positions: Floats) -> NDArray[np
             if camera.contains(pixel, depth)[0]:
                 x, y = np.minimum(pixel[0].astype(int), np.array(flare.shape[::-1]) - 1)
                 hidden.append(observed is not None and not observed[y, x])
-        unobserved[light] = bool(hidden) and float(np.mean(hidden)) > MAX_HIDDEN_SHARE
-    return unobserved
+        in_sky[light] = bool(hidden) and float(np.mean(hidden)) > MAX_HIDDEN_SHARE
+    return in_sky
 
 
 class _Observation(NamedTuple):

@@ -87,18 +87,18 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
         if area < min_area:
             continue
         region = labels[top:top + height, left:left + width] == label
-        for mask, corner in _parts(region, MAX_AREA_SHARE * clipped.size):
+        for mask, corner in _thick_parts(region, MAX_AREA_SHARE * clipped.size):
             corner = (left + corner[0], top + corner[1])
             shape = shape_score(mask, corner, scaled)
             soft = smoothstep(_softness(mask, corner, luminance, diagonal / REFERENCE), HARD, SOFT)
-            found = measure_detection(mask, corner, picture, scaled, shape)
+            detection = measure_detection(mask, corner, picture, scaled, shape)
             if picture.encoding == "linear":
-                found = _at_flux(found, linear)
-            sources.append(Source(found, shape * soft * _roundness(mask), measure_profile(luminance, found.xy)))
+                detection = _with_flux_centroid(detection, linear)
+            sources.append(Source(detection, shape * soft * _roundness(mask), measure_profile(luminance, detection.xy)))
     return sorted(sources, key=lambda source: (-source.evidence, -source.detection.radius))[:MAX_SOURCES]
 
 
-def _parts(region: Mask, largest: float) -> Iterator[tuple[Mask, tuple[int, int]]]:
+def _thick_parts(region: Mask, largest: float) -> Iterator[tuple[Mask, tuple[int, int]]]:
     """Yield the thick parts of a spot, without spikes, with their corners (x, y) in it.
 
     region: mask (h, w) of the spot. Nothing is yielded where a disc with an area of more than `largest` px² fits in.
@@ -112,52 +112,50 @@ def _parts(region: Mask, largest: float) -> Iterator[tuple[Mask, tuple[int, int]
     thickest = float(thickness.max())
     if np.pi * thickest ** 2 > largest:
         return
-    # A small disc separates the parts. Several are trimmed below, each by its own thickness. A single one is opened by
-    # the larger disc of the second pass.
-    for ratio in (MIN_THICKNESS, OPENING_RATIO):
-        reach = int(ratio * thickest)
-        opened = open_by_disc(padded, reach) if reach >= 1 else padded
-        if ratio == MIN_THICKNESS:
-            count, labels = cv2.connectedComponents(opened, connectivity=4)
-            if count > 2:  # several parts: label 0 is the background
-                break
-    else:
-        yield _trimmed(opened, (1, 1))
+    # A small disc separates the parts; spikes are removed by a larger one, of each part by its own thickness.
+    count, labels = cv2.connectedComponents(_open(padded, MIN_THICKNESS * thickest), connectivity=4)
+    if count <= 2:  # one part: label 0 is the background
+        yield _largest_part(_open(padded, OPENING_RATIO * thickest))
         return
     for label in range(1, count):
         part = (np.asarray(labels) == label).astype(np.uint8)
-        reach = int(OPENING_RATIO * float(cv2.distanceTransform(part, cv2.DIST_L2, 5).max()))
-        trimmed = open_by_disc(part, reach) if reach >= 1 else part
-        if trimmed.any():
-            yield _trimmed(trimmed, (1, 1))
+        opened = _open(part, OPENING_RATIO * float(cv2.distanceTransform(part, cv2.DIST_L2, 5).max()))
+        if opened.any():
+            yield _largest_part(opened)
 
 
-def _trimmed(mask: NDArray[np.uint8], padding: tuple[int, int]) -> tuple[Mask, tuple[int, int]]:
-    """Return the largest connected part of a mask within its box, and the box's corner without the padding."""
+def _open(mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
+    """Remove the parts of a mask that are too narrow for a disc of this radius, pixels, rounded down."""
+    reach = int(radius)
+    return open_by_disc(mask, reach) if reach >= 1 else mask
+
+
+def _largest_part(mask: NDArray[np.uint8]) -> tuple[Mask, tuple[int, int]]:
+    """Return the largest connected part of a mask within its box, and the box's corner (x, y), without the pixel of
+    padding on each side of the mask."""
     import cv2
 
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
     label = 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA])) if count > 1 else 0
     left, top, width, height = map(int, boxes[label][:4])
-    return (np.asarray(labels[top:top + height, left:left + width] == label),
-            (left - padding[0], top - padding[1]))
+    return np.asarray(labels[top:top + height, left:left + width] == label), (left - 1, top - 1)
 
 
-def _at_flux(found: Detection, linear: NDArray[np.float32]) -> Detection:
+def _with_flux_centroid(detection: Detection, linear: NDArray[np.float32]) -> Detection:
     """Return a detection at the flux centroid of its pixels above half its peak.
 
     linear: the frame, (height, width, 3). A detection whose peak is at most twice white is returned unchanged.
     """
     from dataclasses import replace
 
-    left, top, right, bottom = found.box
-    light = linear[top:bottom, left:right].mean(axis=2) * found.mask
+    left, top, right, bottom = detection.box
+    light = linear[top:bottom, left:right].mean(axis=2) * detection.mask
     peak = float(light.max())
     if peak <= 2.0:
-        return found
+        return detection
     weight = np.maximum(light - 0.5 * peak, 0)
     v, u = np.mgrid[top:bottom, left:right] + 0.5
-    return replace(found, xy=np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum())
+    return replace(detection, xy=np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum())
 
 
 def _softness(mask: Mask, corner: tuple[int, int], luminance: NDArray[np.float32], scale: float) -> float:
@@ -227,9 +225,9 @@ def measure_profile(luminance: NDArray[np.float32], xy: Floats) -> Floats:
     count = np.bincount(index, minlength=len(profile) * SECTORS).reshape(len(profile), SECTORS)
     total = np.bincount(index, pixels, minlength=len(profile) * SECTORS).reshape(len(profile), SECTORS)
     for number in range(len(profile)):
-        seen = count[number] > 0
-        if seen.sum() >= SECTORS // 2:
-            profile[number] = float(np.median(total[number][seen] / count[number][seen]))
+        covered = count[number] > 0
+        if covered.sum() >= SECTORS // 2:
+            profile[number] = float(np.median(total[number][covered] / count[number][covered]))
     # The ring beyond the clipped ones holds the disc's own edge, whose size says nothing about the glow.
     clipped = np.flatnonzero(profile >= CLIPPED_RING)
     profile[:clipped[-1] + 2 if len(clipped) else 0] = np.nan

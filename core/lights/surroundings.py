@@ -51,25 +51,25 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
     """
     if light.far:
         return None
-    bright = []
+    is_bright = []
     for name, detection in light.detections:
         direction = cameras[name].rays(detection.xy[None])[0]
         for other, camera in cameras.items():
             if other == name:
                 continue
-            at = _project_direction(camera, direction)
-            if at is None:
+            pixel = _project_direction(camera, direction)
+            if pixel is None:
                 continue
             place, depth = camera.project(light.xyz[None])
             clearance = max(SEPARATION * light.radius * camera.width / cameras[name].width,
                             MIN_SEPARATION * camera.width)
             # Both fall on one spot, so that a bright one does not tell a lamp from a far surrounding.
-            if depth[0] > 0 and np.linalg.norm(place[0] - at) < clearance:
+            if depth[0] > 0 and np.linalg.norm(place[0] - pixel) < clearance:
                 continue
             height, width = maps[other].shape
-            x, y = (at / camera.size * (width, height)).astype(int)
-            bright.append(bool(maps[other][min(y, height - 1), min(x, width - 1)]))
-    return float(np.mean(bright)) if len(bright) >= MIN_TESTS else None
+            x, y = (pixel / camera.size * (width, height)).astype(int)
+            is_bright.append(bool(maps[other][min(y, height - 1), min(x, width - 1)]))
+    return float(np.mean(is_bright)) if len(is_bright) >= MIN_TESTS else None
 
 
 def split_gaps(lights: Sequence[FoundLight], cameras: Mapping[str, Camera],

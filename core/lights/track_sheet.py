@@ -30,15 +30,15 @@ def write_track_sheets(folder: Path, capture: Capture, sources: Sequence[Sequenc
     states = [[capture.light_state(light, view) for light in capture.lights] for view in capture.views]
     for old in folder.glob("sheet*.png"):
         remove_file(old)
-    each, paths = COLUMNS * ROWS, []
-    for start in range(0, len(capture.views), each):
+    tiles_per_sheet, paths = COLUMNS * ROWS, []
+    for start in range(0, len(capture.views), tiles_per_sheet):
         tiles = [_draw_tile(capture, index, sources[index], states)
-                 for index in range(start, min(start + each, len(capture.views)))]
+                 for index in range(start, min(start + tiles_per_sheet, len(capture.views)))]
         height = max(tile.shape[0] for tile in tiles)
         tiles = [np.pad(tile, ((0, height - tile.shape[0]), (0, 0), (0, 0))) for tile in tiles]
         tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
         rows = [np.concatenate(tiles[i:i + COLUMNS], axis=1) for i in range(0, len(tiles), COLUMNS)]
-        path = folder / f"sheet{start // each + 1}.png"
+        path = folder / f"sheet{start // tiles_per_sheet + 1}.png"
         write_png(path, np.concatenate(rows, axis=0))
         paths.append(path)
     return paths

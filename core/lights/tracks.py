@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from ..capture import Capture
 from ..capture.camera import Floats
 from ..capture.lights import DOUBTFUL, LightKey
 from ..system.progress import Progress
-from .association import Chain, follow
+from .association import Chain, follow_sources
 from .sources import CLIPPED, Source, find_sources, measure_profile
 
 MIN_EVIDENCE = 0.3
@@ -35,6 +36,8 @@ TOLERATED_ERROR = 3.0
 RECOVERY, MAX_RECOVERY = 0.012, 0.06
 """Distance from a light's path within which a spot is the light, in addition to the path's expected error, and the
 largest sum of both; diagonals."""
+MIN_RECOVERED_SCORE, RECOVERED_SIZES = 0.5, (0.4, 1.5)
+"""Smallest score of such a spot, and the range of its radius relative to the median of the light's."""
 MAX_BEYOND = 12
 """Number of frames by which a path continues before and after those that show the light."""
 OUT_MARGIN = 0.25
@@ -88,25 +91,25 @@ def track_lights(capture: Capture, progress: Progress | None = None) -> TrackFin
     progress = progress or Progress()
     views = capture.views
     progress.stage("look for lights", len(views))
-    clipped = clip_level(capture)
+    clip_value = clip_level(capture)
     sources: list[list[Source]] = []
     for view in views:
-        sources.append(find_sources(capture.frame(view), clipped))
+        sources.append(find_sources(capture.frame(view), clip_value))
         progress.advance(1, found=sum(map(len, sources)))
     camera = views[0].camera
     diagonal = float(np.hypot(*camera.size))
-    chains = follow(sources, diagonal)
-    recover(chains, sources, np.array(camera.size, np.float64), diagonal)
+    chains = follow_sources(sources, diagonal)
+    recover_sources(chains, sources, np.array(camera.size, np.float64), diagonal)
     # A shot shorter than MIN_FRAMES cannot show a light in so many.
-    enough = max(MIN_FRAMES, len(views) // 10) if len(views) >= MIN_FRAMES else 1
-    long = [chain for chain in chains if len(chain.frames) >= enough]
-    lamps = [chain for chain in long if chain.evidence >= MIN_EVIDENCE]
+    min_frames = max(MIN_FRAMES, len(views) // 10) if len(views) >= MIN_FRAMES else 1
+    long_chains = [chain for chain in chains if len(chain.frames) >= min_frames]
+    lamps = [chain for chain in long_chains if chain.evidence >= MIN_EVIDENCE]
     ghosts = [chain for chain in lamps if _is_ghost(chain, lamps, np.array([camera.cx, camera.cy]), diagonal)]
     lamps = [chain for chain in lamps if chain not in ghosts]
-    unsure = [chain for chain in long if MIN_EVIDENCE > chain.evidence >= 0.5 * MIN_EVIDENCE]
-    progress.stage("follow lights", len(lamps) + len(unsure))
+    doubtful_chains = [chain for chain in long_chains if MIN_EVIDENCE > chain.evidence >= 0.5 * MIN_EVIDENCE]
+    progress.stage("follow lights", len(lamps) + len(doubtful_chains))
     tracked = []
-    for chain in [*lamps, *unsure]:
+    for chain in [*lamps, *doubtful_chains]:
         tracked.append(_to_light(chain, capture, diagonal))
         progress.advance()
     lights, doubtful = tracked[:len(lamps)], tracked[len(lamps):]
@@ -156,18 +159,19 @@ def _is_ghost(chain: Chain, lamps: Sequence[Chain], centre: Floats, diagonal: fl
         shared = sorted(set(chain.frames) & set(light.frames))
         if light is chain or len(shared) < max(3, 0.7 * len(chain.frames)):
             continue
-        ghost, source = (np.array([each.sources[each.frames.index(frame)].xy for frame in shared]) - centre
-                         for each in (chain, light))
-        radius, other = (np.median([each.sources[each.frames.index(frame)].detection.radius for frame in shared])
-                         for each in (chain, light))
-        if radius > 0.9 * other or np.ptp(source, axis=0).max() < MIN_GHOST_MOTION * diagonal:
+        ghost_sources, light_sources = ([path.sources[path.frames.index(frame)] for frame in shared]
+                                        for path in (chain, light))
+        ghost, source = (np.array([each.xy for each in sources]) - centre for sources in (ghost_sources, light_sources))
+        radius, light_radius = (np.median([each.detection.radius for each in sources])
+                                for sources in (ghost_sources, light_sources))
+        if radius > 0.9 * light_radius or np.ptp(source, axis=0).max() < MIN_GHOST_MOTION * diagonal:
             continue
         # To third order in the field angle, a ghost lies at (a + b field²) of the way to its light.
         field = (source ** 2).sum(axis=1, keepdims=True) / diagonal ** 2
         terms = np.stack([source.ravel(), (field * source).ravel()], axis=1)
         ratios = np.linalg.lstsq(terms, ghost.ravel(), rcond=None)[0]
-        left = (ghost.ravel() - terms @ ratios).reshape(-1, 2)
-        error = float(np.median(np.linalg.norm(left, axis=1)))
+        residual = (ghost.ravel() - terms @ ratios).reshape(-1, 2)
+        error = float(np.median(np.linalg.norm(residual, axis=1)))
         # What lies at a ratio of 1 is part of the light itself.
         if error < GHOST_ERROR * diagonal and abs(ratios[0] - 1) > 0.05:
             return True
@@ -177,11 +181,11 @@ def _is_ghost(chain: Chain, lamps: Sequence[Chain], centre: Floats, diagonal: fl
 def _to_light(chain: Chain, capture: Capture, diagonal: float) -> TrackedLight:
     """Return the light of a chain with its keys in all frames that its path reaches."""
     size = np.array(capture.views[0].camera.size, np.float64)
-    frames, places, errors = _fill(chain, len(capture.views), size, diagonal)
-    shown = dict(zip(chain.frames, chain.sources, strict=True))
+    frames, places, errors = _fill_path(chain, len(capture.views), size, diagonal)
+    source_by_frame = dict(zip(chain.frames, chain.sources, strict=True))
     profiles = []
     for frame, place in zip(frames, places, strict=True):
-        source = shown.get(frame)
+        source = source_by_frame.get(frame)
         if source is not None:
             profiles.append(source.profile)
         elif ((place > 0) & (place < size)).all():
@@ -189,15 +193,17 @@ def _to_light(chain: Chain, capture: Capture, diagonal: float) -> TrackedLight:
             profiles.append(measure_profile(pixels, place))
         else:
             profiles.append(np.full(len(chain.sources[0].profile), np.nan))
-    brightness = fit_brightness(np.array(profiles), np.array([frame in shown for frame in frames]))
+    brightness = fit_brightness(np.array(profiles), np.array([frame in source_by_frame for frame in frames]))
     tolerated = TOLERATED_ERROR * diagonal / 550.0
     keys = {}
     for frame, place, error, on in zip(frames, places, errors, brightness, strict=True):
         confidence = 1 / (1 + (error / tolerated) ** 2)
         inside = bool(((place > 0) & (place < size)).all())
         measured = None if np.isnan(on) else float(on) if on >= DARK else 0.0
-        if frame in shown:  # a detected light clips, so it is on; of one that the edge cuts, the profile is not known
-            measured = None if measured is None or shown[frame].detection.is_cut else max(measured, CLIPPED_ON)
+        if frame in source_by_frame:
+            # A detected light clips, so it is on; the profile of one that the edge cuts is not known.
+            is_cut = source_by_frame[frame].detection.is_cut
+            measured = None if measured is None or is_cut else max(measured, CLIPPED_ON)
         else:
             # Not detected here. At a doubtful place the glow may be another light's, so the light counts as out.
             measured = (0.0 if measured is None or confidence < DOUBTFUL else measured) if inside else None
@@ -208,53 +214,64 @@ def _to_light(chain: Chain, capture: Capture, diagonal: float) -> TrackedLight:
                         float(np.median([source.detection.radius for source in chain.sources])))
 
 
-def recover(chains: Sequence[Chain], sources: Sequence[Sequence[Source]], size: Floats, diagonal: float) -> None:
+class _Recovery(NamedTuple):
+    """A source that a chain may take in a frame. distance: from the chain's path, relative to the largest one."""
+
+    distance: float
+    frame: int
+    source: Source
+
+
+def recover_sources(chains: Sequence[Chain], sources: Sequence[Sequence[Source]], size: Floats, diagonal: float
+                    ) -> None:
     """Add to chains of lamps, in place, the unused sources that lie on their paths, such as half hidden lamps.
 
     sources: of each frame of the shot. size (2,), diagonal: of the frames, pixels.
     """
     lamps = [chain for chain in chains if chain.evidence >= MIN_EVIDENCE and len(chain.frames) >= MIN_FRAMES]
-    used = {id(source) for chain in lamps for source in chain.sources}
+    used_ids = {id(source) for chain in lamps for source in chain.sources}
     for chain in lamps:
         radius = float(np.median([source.detection.radius for source in chain.sources]))
         while True:  # each source makes the path to the next one more certain
-            frames, places, errors = _fill(chain, len(sources), size, diagonal)
-            best: tuple[float, int, Source] | None = None
+            frames, places, errors = _fill_path(chain, len(sources), size, diagonal)
+            nearest: _Recovery | None = None
             for frame, place, error in zip(frames, places, errors, strict=True):
                 if frame in chain.frames:
                     continue
                 reach = min(RECOVERY * diagonal + error, MAX_RECOVERY * diagonal)
                 for source in sources[frame]:
                     spot = source.detection
-                    away = float(np.linalg.norm(source.xy - place)) / reach
-                    fits = spot.score >= 0.5 and (spot.is_cut or 0.4 * radius < spot.radius < 1.5 * radius)
-                    if id(source) not in used and fits and away < 1 and (best is None or away < best[0]):
-                        best = (away, frame, source)
-            if best is None:
+                    distance = float(np.linalg.norm(source.xy - place)) / reach
+                    is_alike = spot.score >= MIN_RECOVERED_SCORE and (
+                        spot.is_cut or RECOVERED_SIZES[0] * radius < spot.radius < RECOVERED_SIZES[1] * radius)
+                    is_nearest = distance < 1 and (nearest is None or distance < nearest.distance)
+                    if id(source) not in used_ids and is_alike and is_nearest:
+                        nearest = _Recovery(distance, frame, source)
+            if nearest is None:
                 break
-            used.add(id(best[2]))
-            index = int(np.searchsorted(chain.frames, best[1]))
-            chain.frames.insert(index, best[1])
-            chain.sources.insert(index, best[2])
+            used_ids.add(id(nearest.source))
+            index = int(np.searchsorted(chain.frames, nearest.frame))
+            chain.frames.insert(index, nearest.frame)
+            chain.sources.insert(index, nearest.source)
 
 
-def _fill(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple[list[int], Floats, Floats]:
+def _fill_path(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple[list[int], Floats, Floats]:
     """Return the frames of a chain's path, places (n, 2) and expected errors (n,) in pixels.
 
     count: number of frames of the shot. size (2,), diagonal: of the frames, pixels. Sources that the frame's edge cuts
     count as missing where their path is known.
     """
-    whole = _without_cut(chain)
+    uncut = _without_cut(chain)
     acceleration = chain.acceleration(diagonal)
     measured = dict(zip(chain.frames, chain.sources, strict=True))
     first, last = max(chain.frames[0] - MAX_BEYOND, 0), min(chain.frames[-1] + MAX_BEYOND, count - 1)
     frames, places, errors = [], [], []
-    knots, points = np.array(whole.frames), whole.places
+    knots, points = np.array(uncut.frames), uncut.places
     rates = _velocities(knots, points)
     for frame in range(first, last + 1):
         after = int(np.searchsorted(knots, frame))
         if after < len(knots) and knots[after] == frame:
-            place, error = points[after], _outlier(whole, after, acceleration)
+            place, error = points[after], _expected_error(uncut, after, acceleration)
         elif 0 < after < len(knots):  # between two measured frames; else before the first or after the last
             low, high = after - 1, after
             span = float(knots[high] - knots[low])
@@ -280,11 +297,11 @@ def _fill(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple[list
 
 def _without_cut(chain: Chain) -> Chain:
     """Return the chain without sources that the frame's edge cuts; the whole chain where too few are left."""
-    kept = [(frame, source) for frame, source in zip(chain.frames, chain.sources, strict=True)
-            if not source.detection.is_cut]
-    if len(kept) < 2:
+    uncut = [(frame, source) for frame, source in zip(chain.frames, chain.sources, strict=True)
+             if not source.detection.is_cut]
+    if len(uncut) < 2:
         return chain
-    return Chain([frame for frame, _ in kept], [source for _, source in kept])
+    return Chain([frame for frame, _ in uncut], [source for _, source in uncut])
 
 
 def _velocities(frames: Floats, places: Floats) -> Floats:
@@ -322,7 +339,7 @@ def _hermite(part: float, span: float, start: Floats, out: Floats, end: Floats, 
                       + (3 * square - 2 * cube) * end + (cube - square) * span * into)
 
 
-def _outlier(chain: Chain, index: int, acceleration: float) -> float:
+def _expected_error(chain: Chain, index: int, acceleration: float) -> float:
     """Return the expected error, pixels, of the measured place `index` of a chain.
 
     It is 0.5, plus how much farther the place is from the straight line between its neighbours than acceleration can
@@ -337,38 +354,39 @@ def _outlier(chain: Chain, index: int, acceleration: float) -> float:
     return 0.5 + max(float(np.linalg.norm(places[index] - middle)) - acceleration * span * span / 8, 0.0)
 
 
-def fit_brightness(profiles: Floats, shown: NDArray[np.bool_]) -> Floats:
+def fit_brightness(profiles: Floats, is_detected: NDArray[np.bool_]) -> Floats:
     """Return the brightness (n,) of a light from its profiles (n, rings): 0..1, NaN where no ring is usable.
 
-    shown: (n,) frames in which the light is seen; only they shape the common profile, and the 90th percentile of their
-    brightness is 1. The background is the median of the outer rings. Where the glow hardly stands out of it, the
-    brightness is drawn to the median of the shown frames, or to 0 in a frame that does not show the light. If no shown
-    frame has a usable ring, the brightness is 1 wherever a ring is usable.
+    is_detected: (n,) frames in which the light was detected; only they shape the common profile, and the 90th
+    percentile of their brightness is 1. The background is the median of the outer rings. Where the glow hardly stands
+    out of it, the brightness is drawn to the median of the frames with a detection, or to 0 in a frame without one. If
+    no frame with a detection has a usable ring, the brightness is 1 wherever a ring is usable.
     """
     outer = profiles[:, -BACKGROUND_RINGS:]
-    seen = np.isfinite(outer).any(axis=1)
+    has_background = np.isfinite(outer).any(axis=1)
     background = np.full(len(profiles), np.nan)
-    background[seen] = np.nanmedian(outer[seen], axis=1)
+    background[has_background] = np.nanmedian(outer[has_background], axis=1)
     light = profiles[:, :-BACKGROUND_RINGS] - background[:, None]
     usable = np.isfinite(light)
     brightness = np.where(usable.any(axis=1), 1.0, np.nan)
-    if not (usable & shown[:, None]).any():
+    if not (usable & is_detected[:, None]).any():
         return brightness
     filled = np.where(usable, light, 0.0)
     # Inverse variance of each ring, and in the loop `precision`: that of each frame's brightness.
     weight = usable / (BACKGROUND_NOISE ** 2 + (GLOW_NOISE * filled) ** 2)
-    shaping = weight * shown[:, None]
-    shape = np.full(light.shape[1], 0.1)
+    profile_weight = weight * is_detected[:, None]
+    profile = np.full(light.shape[1], 0.1)
     precision = np.zeros(len(profiles))
     for _ in range(BRIGHTNESS_STEPS):
         gain = np.nan_to_num(brightness)[:, None]
-        shape = np.maximum((shaping * gain * filled).sum(0) / np.maximum((shaping * gain * gain).sum(0), 1e-9), 0)
-        precision = (weight * shape * shape).sum(1)
+        energy = np.maximum((profile_weight * gain * gain).sum(0), 1e-9)
+        profile = np.maximum((profile_weight * gain * filled).sum(0) / energy, 0)
+        precision = (weight * profile * profile).sum(1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            brightness = np.where(usable.any(axis=1),
-                                  np.maximum((weight * filled * shape).sum(1), 0) / np.maximum(precision, 1e-9), np.nan)
-        brightest = brightness[shown & np.isfinite(brightness)]
+            fitted = np.maximum((weight * filled * profile).sum(1), 0) / np.maximum(precision, 1e-9)
+            brightness = np.where(usable.any(axis=1), fitted, np.nan)
+        brightest = brightness[is_detected & np.isfinite(brightness)]
         brightness = brightness / max(float(np.quantile(brightest, 0.9)) if len(brightest) else 1.0, 1e-9)
-    prior = np.where(shown, float(np.nanmedian(np.where(shown, brightness, np.nan))), 0.0)
-    drawn = (precision * np.minimum(brightness, 1.2) + prior / PRIOR ** 2) / (precision + 1 / PRIOR ** 2)
-    return np.where(np.isfinite(brightness), np.clip(drawn, 0, 1), np.nan)
+    prior = np.where(is_detected, float(np.nanmedian(np.where(is_detected, brightness, np.nan))), 0.0)
+    shrunk = (precision * np.minimum(brightness, 1.2) + prior / PRIOR ** 2) / (precision + 1 / PRIOR ** 2)
+    return np.where(np.isfinite(brightness), np.clip(shrunk, 0, 1), np.nan)

@@ -55,7 +55,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Find the lights as the arguments say. Raises SettingsError and CaptureError."""
     from ...core.capture import Capture
-    from ...core.lights import TriangulationSettings, detector_for
+    from ...core.lights import TriangulationSettings, make_detector
     from ...core.lights.file import check_replaceable
 
     if args.method != "grounded" and (args.boxes or args.masks):
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     tallies.report_capture(capture, progress)
     if not capture.has_cameras:
         return _follow(capture, args, progress)
-    detector = detector_for(args.method, args.threshold, args.boxes, args.masks)
+    detector = make_detector(args.method, args.threshold, args.boxes, args.masks)
     settings = TriangulationSettings(min_views=args.min_views, seed=args.seed)
     gaussians = _read_gaussians(args.scene) if args.scene else None
     if not args.keep:
@@ -120,7 +120,7 @@ def _follow_and_record(capture: Capture, progress: Progress, keep: bool = False)
 
 def with_lights(capture: Capture, progress: Progress) -> Capture:
     """Return the capture with its lights; they are found and written to its folder where lights.json is missing."""
-    from ...core.lights import detector_for
+    from ...core.lights import make_detector
 
     if capture.lights or (capture.folder / LIGHTS).exists():
         return capture
@@ -128,7 +128,7 @@ def with_lights(capture: Capture, progress: Progress) -> Capture:
     if not capture.has_cameras:
         _follow_and_record(capture, progress)
         return capture.reopen()
-    _find_and_record(capture, detector_for("exposure"), progress)
+    _find_and_record(capture, make_detector("exposure"), progress)
     return capture.reopen()
 
 
@@ -143,11 +143,11 @@ def _find_and_record(capture: Capture, detector: Detector, progress: Progress,
     Raises CaptureError, before the search, where the folder cannot be written.
     """
     from ...core.lights import find_lights, write_findings
-    from ...core.lights.find import REPORT, SHEETS, moving_lights
+    from ...core.lights.find import REPORT, SHEETS, track_moving_lights
 
     _check_writable(capture)
     findings = find_lights(capture, detector, progress, settings, gaussians=gaussians)
-    tracked = moving_lights(capture, findings.lights, progress) if follow else None
+    tracked = track_moving_lights(capture, findings.lights, progress) if follow else None
     report = write_findings(capture, findings, keep=keep, tracked=tracked)
     for sentence in [*findings.messages, *(tracked.messages if tracked else [])]:
         progress.say(sentence)

@@ -18,7 +18,7 @@ from core.errors import CaptureError
 from core.images.picture import Picture
 from core.images.write import write_png
 from core.lights.file import check_replaceable
-from core.lights.find import moving_lights, write_tracks
+from core.lights.find import track_moving_lights, write_tracks
 from core.lights.found_light import FoundLight
 from core.lights.sources import find_sources
 from core.lights.tracks import TrackFindings, fit_brightness, track_lights
@@ -140,7 +140,7 @@ def test_in_a_solved_capture_only_lights_that_move_get_a_path(tmp_path: Path) ->
         write_png(capture.frame_path(view), srgb_from_linear(np.clip(light, 0, 1)))
     capture = capture.reopen()
     found = FoundLight(standing, False, (), 12, 0.0, 0.0, np.ones(3), 4.0)
-    findings = moving_lights(capture, [found])
+    findings = track_moving_lights(capture, [found])
     (light,) = findings.lights
     np.testing.assert_allclose(places(findings)[[0, -1]], [(40, 130), (260, 86)], atol=1)
     assert "1 that were followed stand" in findings.messages[0]

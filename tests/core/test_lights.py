@@ -20,8 +20,8 @@ from core.lights import (
     Detection,
     ExposureDetector,
     TriangulationSettings,
-    detector_for,
     find_lights,
+    make_detector,
     triangulate_lights,
     union_mask,
     write_findings,
@@ -29,7 +29,7 @@ from core.lights import (
 from core.lights.candidates import MAX_LISTED_PAIRS
 from core.lights.exposure import MAX_MORPHOLOGY_COST
 from core.lights.file import check_replaceable, write_lights
-from core.lights.find import _from_one_view
+from core.lights.find import _lights_from_one_view
 from core.lights.found_light import FoundLight
 from core.lights.ghosts import find_blobs, locate_by_ghosts
 from core.lights.lifted import lift_to_gaussians
@@ -496,9 +496,9 @@ class TestFind:
 
     def test_invalid_settings_are_refused(self, tmp_path: Path) -> None:
         with pytest.raises(SettingsError, match="0 and 1"):
-            detector_for("exposure", 2.0)
+            make_detector("exposure", 2.0)
         with pytest.raises(SettingsError, match="magic"):
-            detector_for("magic")
+            make_detector("magic")
         with pytest.raises(SettingsError, match="at least 1"):
             find_lights(Capture.open(make_capture(tmp_path / "c")), ExposureDetector(),
                         settings=TriangulationSettings(min_views=0))
@@ -506,7 +506,7 @@ class TestFind:
 
 def test_the_grounded_detector_names_missing_libraries_and_weights(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match="exposure method"):
-        detector_for("grounded", boxes=tmp_path / "none", masks=tmp_path / "none")
+        make_detector("grounded", boxes=tmp_path / "none", masks=tmp_path / "none")
 
 
 def test_a_deleted_light_stays_deleted_after_a_search_that_missed_it(tmp_path: Path) -> None:
@@ -526,4 +526,4 @@ def test_a_light_of_one_view_has_the_depth_of_the_points() -> None:
     capture = SimpleNamespace(views=[SimpleNamespace(name="a", camera=camera)], extent=1.0,
                               points=SimpleNamespace(xyz=place[None]))
     one = SimpleNamespace(xy=camera.project([place])[0][0], colour=np.ones(3), radius=2.0)
-    np.testing.assert_allclose(_from_one_view(capture, [one])[0].xyz, place, atol=1e-6)  # type: ignore[arg-type, list-item]
+    np.testing.assert_allclose(_lights_from_one_view(capture, [one])[0].xyz, place, atol=1e-6)  # type: ignore[arg-type, list-item]

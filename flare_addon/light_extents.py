@@ -30,8 +30,8 @@ def extent_of(item: Any, depsgraph: Any, matrix: Any) -> LightExtent | None:
     evaluated = target.evaluated_get(depsgraph)
     try:
         if target.type == "LIGHT":
-            return _of_lamp(evaluated.data, linear)
-        return _of_shape(evaluated, linear)
+            return _extent_of_lamp(evaluated.data, linear)
+        return _extent_of_geometry(evaluated, linear)
     except ValueError as problem:
         raise CaptureError(f"{target.name!r} cannot flare as an area ({problem}); choose Point as its extent."
                            ) from problem
@@ -43,7 +43,7 @@ def is_point(item: Any) -> bool:
     return bool(item.extent == "point" or item.target.type == "EMPTY" or (item.extent == "auto" and not is_area))
 
 
-def _of_lamp(data: Any, linear: Floats) -> LightExtent | None:
+def _extent_of_lamp(data: Any, linear: Floats) -> LightExtent | None:
     """Return the extent of a lamp's data; linear: the 3x3 of its matrix_world."""
     if data.type == "AREA":
         wide = data.size
@@ -61,7 +61,7 @@ def _of_lamp(data: Any, linear: Floats) -> LightExtent | None:
     return LightExtent.sphere(radius) if radius > 0 and math.isfinite(radius) else None
 
 
-def _of_shape(evaluated: Any, linear: Floats) -> LightExtent:
+def _extent_of_geometry(evaluated: Any, linear: Floats) -> LightExtent:
     """Return the extent of a mesh or curve object: points spread evenly over its faces, or along its vertices if it has
     none. linear: (3, 3) of the object's matrix. Raises ValueError if it has no area or no length."""
     mesh = evaluated.to_mesh()

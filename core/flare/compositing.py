@@ -84,16 +84,16 @@ class _AddLight(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, scene: Tensor, light: Tensor, white: float) -> Tensor:
-        linear, within = decode_with_slope(scene.clamp(0, white))  # within: slope of decode
-        display, slope = encode_with_slope(linear.add_(light))
-        ctx.save_for_backward(within if ctx.needs_input_grad[0] else None, slope)
+        linear, decode_slope = decode_with_slope(scene.clamp(0, white))
+        display, encode_slope = encode_with_slope(linear.add_(light))
+        ctx.save_for_backward(decode_slope if ctx.needs_input_grad[0] else None, encode_slope)
         return display.clamp_(0, white)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, None]:
-        within, slope = ctx.saved_tensors
-        of_light = gradient * slope
-        return None if within is None else of_light * within, of_light, None
+        decode_slope, encode_slope = ctx.saved_tensors
+        light_gradient = gradient * encode_slope
+        return None if decode_slope is None else light_gradient * decode_slope, light_gradient, None
 
 
 class LinearLayers(NamedTuple):
@@ -115,15 +115,15 @@ def linear_layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend, whi
     """
     display = scene.clamp(0, white)
     scene_linear = decode(display)
-    parts: dict[str, Tensor] = {}
+    flare_layers: dict[str, Tensor] = {}
     if blend == "add":
-        parts = {name: splats.colour for name, splats in flares.items()}
-        total = sum(parts.values(), torch.zeros_like(scene_linear))
-        return LinearLayers(scene_linear + total, scene_linear, total, parts)
+        flare_layers = {name: splats.colour for name, splats in flares.items()}
+        total = sum(flare_layers.values(), torch.zeros_like(scene_linear))
+        return LinearLayers(scene_linear + total, scene_linear, total, flare_layers)
     below, picture = scene_linear, display
     for name, splats in reversed(list(flares.items())):  # the first light lies in front
         picture = over(splats, picture)
         above = decode(picture.clamp_min(0))
-        parts[name] = above - below
+        flare_layers[name] = above - below
         below = above
-    return LinearLayers(below, scene_linear, below - scene_linear, {name: parts[name] for name in flares})
+    return LinearLayers(below, scene_linear, below - scene_linear, {name: flare_layers[name] for name in flares})

@@ -77,16 +77,16 @@ class DeformationNetwork(nn.Module):
         super().__init__()
         self.light_grid = HashGrid(LIGHT_BITS, LIGHT_GROWTH, levels, base=base)
         self.camera_grid = HashGrid(CAMERA_BITS, CAMERA_GROWTH, levels, base=base)
-        view = 2 * 2 * levels  # two grids of two features on each level
+        view_width = 2 * 2 * levels  # two grids of two features on each level
         # The two halves of the first layer add up, so one bias is enough.
-        self.view_layer = nn.Linear(view, HIDDEN_WIDTH)
+        self.view_layer = nn.Linear(view_width, HIDDEN_WIDTH)
         self.gaussian_layer = nn.Linear(2 * BANDS * positions + latent, HIDDEN_WIDTH, bias=False)
         self.layers = nn.ModuleList(nn.Linear(HIDDEN_WIDTH, HIDDEN_WIDTH) for _ in range(HIDDEN_LAYERS - 1))
         self.names, self.widths = list(heads), list(heads.values())
         # One matrix holds every head: the same function, one product instead of many.
         self.head = nn.Linear(HIDDEN_WIDTH, sum(self.widths))
         correction_head = nn.Linear(HIDDEN_WIDTH, 2)
-        self.correction = nn.Sequential(nn.Linear(view, HIDDEN_WIDTH), nn.ReLU(), correction_head)
+        self.correction = nn.Sequential(nn.Linear(view_width, HIDDEN_WIDTH), nn.ReLU(), correction_head)
         # All offsets start at nothing: the first picture is the canonical flare.
         for layer in (self.head, correction_head):
             nn.init.zeros_(layer.weight)

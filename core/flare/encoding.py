@@ -43,23 +43,24 @@ class HashGrid(nn.Module):
         # Zero, not noise: gradients reach the table through the network, and a file need hold touched rows only.
         nn.init.zeros_(self.table.weight)
 
-        def constant(name: str, values: list[int]) -> None:
+        def register_constant(name: str, values: list[int]) -> None:
             self.register_buffer(name, torch.tensor(values, dtype=torch.int64), persistent=False)
 
-        constant("_resolutions", resolutions)
-        constant("_starts", starts)
-        constant("_rows", rows)
-        constant("_primes", PRIMES.tolist())
+        register_constant("_resolutions", resolutions)
+        register_constant("_starts", starts)
+        register_constant("_rows", rows)
+        register_constant("_primes", PRIMES.tolist())
         self.register_buffer("_corners", torch.from_numpy(CORNERS.copy()), persistent=False)
 
     def forward(self, point: Tensor) -> Tensor:
         """Interpolate the grid at a point (3,) in 0..1."""
-        indices, weights = self._cell(point.detach())
+        indices, weights = self._corner_rows(point.detach())
         rows = self.table(indices)  # (levels, 8, features)
         return (rows * weights[..., None]).sum(1).reshape(-1)
 
-    def _cell(self, point: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the table's rows of the corners around a point (3,), and their trilinear weights, (levels, 8) each."""
+    def _corner_rows(self, point: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the table's rows of the corners of the cell around a point (3,), and their trilinear weights, (levels,
+        8) each."""
         resolutions, rows, primes, corners = self._resolutions, self._rows, self._primes, self._corners
         scaled = point.clamp(0, 1)[None] * resolutions[:, None]
         low = torch.minimum(scaled.floor(), resolutions[:, None] - 1.0)  # 1 lies in the last cell

@@ -109,9 +109,9 @@ def _unpack(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Fl
             raise ValueError(f"{name} holds values that are not finite")
     flares, names, positions, clear = [], [], [], []
     for light in description["lights"]:
-        low, high, reach = (_to_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
+        low, high, light_high = (_to_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
         # The generator draws first values only, which the file's replace below.
-        flares.append(LightFlare(FlareForm(**light["form"]), QueryRange(low, high, reach), int(light["count"]),
+        flares.append(LightFlare(FlareForm(**light["form"]), QueryRange(low, high, light_high), int(light["count"]),
                                  torch.Generator()))
         names.append(str(light["name"]))
         positions.append(_to_triple(light["xyz"]))

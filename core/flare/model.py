@@ -28,6 +28,11 @@ MIN_TRAINING_VISIBILITY = 0.2
 
 RING_INTERVAL = 4
 """One Gaussian in this many is a ring at first, where the form has rings."""
+LINE_RANGE = -1.2, 1.4
+"""Places on the line over which Gaussians are spread at first: from beyond the light's mirror image (-1) to beyond the
+light (1)."""
+INITIAL_CODE_SCALE = 0.1
+"""Standard deviation of the latent codes at first."""
 INITIAL_SIZES = 0.01, 0.06
 """Range of the Gaussians' standard deviations at first, in the normalised plane of a frame of FULL_SCALE_REACH."""
 FULL_SCALE_REACH = 0.36
@@ -112,18 +117,18 @@ class LightFlare(nn.Module):
         form, rows = self.form, self.gaussians
         features = self.network.view_features(view.camera, view.light)
         latent = rows["latent"] if form.latent else None
-        change = self.network(rows["positions"], latent, features)
+        deltas = self.network(rows["positions"], latent, features)  # delta_x of the paper, by the name of x
 
         def deformed(name: str) -> Tensor:
             """Return canonical rows plus the network's offsets for this view."""
-            return rows[name] + change[name]
+            return rows[name] + deltas[name]
 
         light = view.light
         if form.light_correction:
             light = light + self.scale * self.network.light_correction(features)
         means = placement.on_line(deformed("positions"), light) if form.line else deformed("positions")
-        if "plane_offset" in change:
-            means = means + self.scale * change["plane_offset"]
+        if "plane_offset" in deltas:
+            means = means + self.scale * deltas["plane_offset"]
         if form.static_offset:
             means = means + rows["offsets"]
         scales, rotations = deformed("log_scales"), deformed("rotations")
@@ -133,7 +138,7 @@ class LightFlare(nn.Module):
             covariances = placement.covariance_of_ellipse(scales, rotations)
         opacities, rings, arcs = deformed("opacity_logits").sigmoid()[:, 0], None, None
         if form.rings:
-            rings = _rings(deformed("rings"))
+            rings = _to_rings(deformed("rings"))
         if form.arcs and rings is not None:
             opacities = opacities * placement.opacity_gain(deformed("arcs"), rings)
             arcs = placement.arcs_of_ellipse(deformed("arcs"), scales, rotations)
@@ -146,12 +151,12 @@ class LightFlare(nn.Module):
         if self.scale == 1:
             return state
         names, widths = self.network.names, self.network.widths
-        head = torch.ones(sum(widths))
+        head_factors = torch.ones(sum(widths))
         if "plane_offset" in names:
-            first = sum(widths[:names.index("plane_offset")])
-            head[first:first + 2] = self.scale
+            start = sum(widths[:names.index("plane_offset")])
+            head_factors[start:start + 2] = self.scale
         # "correction.2" is the last layer of the network's Sequential `correction`.
-        for layer, factor in (("head", head), ("correction.2", torch.full((2,), self.scale))):
+        for layer, factor in (("head", head_factors), ("correction.2", torch.full((2,), self.scale))):
             for part, values in (("weight", factor[:, None]), ("bias", factor)):
                 state[f"network.{layer}.{part}"] = state[f"network.{layer}.{part}"] * values
         return state
@@ -162,7 +167,7 @@ class LightFlare(nn.Module):
         return colours(rays @ rotation, sh.unflatten(-1, (-1, 3)), self.form.sh_degree)
 
 
-def _rings(raw: Tensor) -> Tensor:
+def _to_rings(raw: Tensor) -> Tensor:
     """Return rings (n, 2) as r0 and w from raw rows of r0 and log w. log w is kept in -3..3, so that a ring is wide
     enough for the pixel grid of a picture."""
     return torch.stack([raw[:, 0], raw[:, 1].clamp(-3, 3).exp()], -1)
@@ -172,11 +177,11 @@ def _initial_gaussians(form: FlareForm, count: int, opacity: float, scale: float
                        ) -> dict[str, Tensor]:
     """Return the rows of `count` Gaussians, by name, of log-uniform INITIAL_SIZES that leave most of the frame free.
 
-    They are spread along the line, from beyond the light's mirror image (-1) to beyond the light (1), or at random over
-    a square with sides of `scale` about the principal point.
+    They are spread over LINE_RANGE, or without the line at random over a square with sides of `scale` about the
+    principal point.
     """
     if form.line:
-        positions = torch.linspace(-1.2, 1.4, count)[:, None]
+        positions = torch.linspace(*LINE_RANGE, count)[:, None]
     else:
         positions = scale * (torch.rand(count, 2, generator=generator) - 0.5)
     fraction = torch.rand(count, 1, generator=generator)
@@ -204,7 +209,7 @@ def _initial_gaussians(form: FlareForm, count: int, opacity: float, scale: float
     if form.arcs:
         rows["arcs"] = torch.zeros(count, 2)
     if form.latent:
-        rows["latent"] = 0.1 * torch.randn(count, form.latent, generator=generator)
+        rows["latent"] = INITIAL_CODE_SCALE * torch.randn(count, form.latent, generator=generator)
     return rows
 
 

@@ -65,14 +65,14 @@ def relative_to_clear(visibility: Tensor, clear: Tensor | float) -> Tensor:
 
 
 @torch.no_grad()
-def visibility_from(scene: SceneGaussians, camera: NDArray[np.float64], light: NDArray[np.float64],
+def visibility_from(scene: SceneGaussians, eye: NDArray[np.float64], light: NDArray[np.float64],
                     settings: VisibilitySettings, clear: float = 1.0) -> float:
-    """Return the visibility, 0..1, of a light at `light` (3,) from a camera at `camera` (3,), world units, relative to
+    """Return the visibility, 0..1, of a light at `light` (3,) from a camera at `eye` (3,), world units, relative to
     `clear`.
 
     `clear` (`FlareModel.clear`) is 1 for a scene other than that of the fit.
     """
-    visibility = light_visibility(scene, torch.from_numpy(camera), torch.from_numpy(light), settings)
+    visibility = light_visibility(scene, torch.from_numpy(eye), torch.from_numpy(light), settings)
     return float(relative_to_clear(visibility, clear))
 
 
@@ -91,14 +91,14 @@ def visibility_behind(scene: SceneGaussians, world_to_camera: NDArray[np.float64
     sampled = light.extent.sampled(light.xyz, pose)
     shares = []
     for cell, centre in enumerate(sampled.centres):
-        own = 1.0 if light.shares is None else light.shares[cell]
-        if own > 0:
+        share = 1.0 if light.shares is None else light.shares[cell]
+        if share > 0:
             offsets = np.linalg.norm(sampled.points[sampled.cells == cell] - centre, axis=1)
             distance = max(float(np.linalg.norm(centre - eye)), 1e-9)
             # The standard deviation of the cell's points along one axis across the line of sight.
             radius = min(max(float(np.sqrt((offsets**2).mean() / 2)) / distance, MIN_RADIUS), MAX_RADIUS)
-            own *= visibility_from(scene, eye, centre, replace(settings, radius=radius), clear)
-        shares.append(own)
+            share *= visibility_from(scene, eye, centre, replace(settings, radius=radius), clear)
+        shares.append(share)
     return 1.0, tuple(shares)
 
 
@@ -123,27 +123,27 @@ def clear_visibilities(scene: SceneGaussians, model: FlareModel, poses: Sequence
     return clear.masked_fill(clear < MIN_CLEAR, 0)
 
 
-def occlusion_loss(scene: SceneGaussians, camera: Tensor, lights: Sequence[Tensor], settings: VisibilitySettings,
+def occlusion_loss(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor], settings: VisibilitySettings,
                    kernels: Kernels = "auto") -> Tensor | None:
-    """Return the loss of a scene that hides lights (3,), which the frame of the camera at `camera` (3,) shows.
+    """Return the loss of a scene that hides lights (3,), which the frame of the camera at `eye` (3,) shows.
 
     It makes Gaussians in front of the lights more transparent, such as a sky at a wrong distance. It uses the logarithm
     of the visibilities: behind many layers, the visibility itself hardly changes with a single one. None without a
     light.
     """
-    visibilities = [light_visibility(scene, camera, light, settings, kernels) for light in lights]
+    visibilities = [light_visibility(scene, eye, light, settings, kernels) for light in lights]
     return -OCCLUSION_WEIGHT * (torch.stack(visibilities) + MIN_VISIBILITY).log().sum() if visibilities else None
 
 
-def light_visibility(scene: SceneGaussians, camera: Tensor, light: Tensor, settings: VisibilitySettings | None = None,
+def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings | None = None,
                      kernels: Kernels = "auto") -> Tensor:
-    """Return the visibility (scalar, 0..1) of a light at `light` (3,) from a camera at `camera` (3,); world units."""
+    """Return the visibility (scalar, 0..1) of a light at `light` (3,) from a camera at `eye` (3,); world units."""
     settings = settings or VisibilitySettings()
-    direction = (light - camera).float()
+    direction = (light - eye).float()
     distance = float(direction.norm())
     if distance <= 0:
         return torch.ones(())
-    pose = _look_along(camera.float(), direction / distance)
+    pose = _look_along(eye.float(), direction / distance)
     rows = _occluders(scene, pose, distance, settings)
     size, half = settings.pixels, settings.pixels / 2
     # The picture's edge is at twice the disk's radius, which is the window's standard deviation.

@@ -45,10 +45,10 @@ def read_compressed(path: Path) -> SceneGaussians:
     try:
         elements = _read_elements(read_bytes(path))
         chunks, vertices = elements["chunk"], elements["vertex"]
-        n = len(vertices)
-        if len(chunks) * CHUNK < n:
-            raise ValueError(f"{len(chunks)} chunks for {n} Gaussians")
-        chunk_of = np.arange(n) // CHUNK
+        count = len(vertices)
+        if len(chunks) * CHUNK < count:
+            raise ValueError(f"{len(chunks)} chunks for {count} Gaussians")
+        chunk_of = np.arange(count) // CHUNK
         position, rotation, scale, colour = (vertices[name].astype(np.uint32) for name in PACKED)
         means = _dequantise(chunks, chunk_of, _unpack(position, 11, 10, 11), "{}_x", "{}_y", "{}_z")
         log_scales = _dequantise(chunks, chunk_of, _unpack(scale, 11, 10, 11), "{}_scale_x", "{}_scale_y", "{}_scale_z")
@@ -57,15 +57,15 @@ def read_compressed(path: Path) -> SceneGaussians:
         if "min_r" in (chunks.dtype.names or ()):
             rgb = _dequantise(chunks, chunk_of, rgb, "{}_r", "{}_g", "{}_b")
         opacity = np.clip(rgba[:, 3], 0.5 / 255, 254.5 / 255)  # the ends have no finite logit
-        sh = torch.zeros(n, COEFFICIENTS, 3)
+        sh = torch.zeros(count, COEFFICIENTS, 3)
         sh[:, 0] = dc_from_colour(torch.from_numpy(rgb))
         if "sh" in elements and (names := elements["sh"].dtype.names):
-            rest = _harmonics(np.stack([elements["sh"][f"f_rest_{i}"] for i in range(len(names))], -1))
+            rest = _dequantise_harmonics(np.stack([elements["sh"][f"f_rest_{i}"] for i in range(len(names))], -1))
             per_channel = len(names) // 3
-            sh[:, 1:1 + per_channel] = torch.from_numpy(rest).reshape(n, 3, per_channel).transpose(1, 2)
+            sh[:, 1:1 + per_channel] = torch.from_numpy(rest).reshape(count, 3, per_channel).transpose(1, 2)
         logits = np.log(opacity / (1 - opacity))
         scene = SceneGaussians(torch.from_numpy(means), torch.from_numpy(log_scales),
-                               torch.from_numpy(_quaternions(rotation)), torch.from_numpy(logits), sh)
+                               torch.from_numpy(_unpack_quaternions(rotation)), torch.from_numpy(logits), sh)
     except (KeyError, ValueError, RuntimeError) as problem:
         raise FlareFileError(f"{path} is a damaged compressed PLY ({problem}); export it again.") from problem
     if not all(parameter.isfinite().all() for parameter in scene.parameters()):
@@ -108,7 +108,7 @@ def _dequantise(chunks: NDArray[Any], chunk_of: NDArray[np.int64], fraction: Flo
     return np.asarray(low + fraction * (high - low), np.float32)
 
 
-def _quaternions(packed: NDArray[np.uint32]) -> Floats:
+def _unpack_quaternions(packed: NDArray[np.uint32]) -> Floats:
     """Unpack (n,) to unit quaternions (n, 4), w x y z: the components but the largest lie within ±1 / sqrt(2)."""
     largest = (packed >> np.uint32(30)).astype(np.int64)
     stored = (_unpack(packed & np.uint32((1 << 30) - 1), 2, 10, 10, 10)[:, 1:] - np.float32(0.5)) * np.float32(
@@ -120,7 +120,7 @@ def _quaternions(packed: NDArray[np.uint32]) -> Floats:
     return quaternions
 
 
-def _harmonics(stored: NDArray[np.uint8]) -> Floats:
+def _dequantise_harmonics(stored: NDArray[np.uint8]) -> Floats:
     """Map bytes to -4..4, each to the middle of its step, 0 and 255 to the ends."""
     fraction = (stored.astype(np.float32) + 0.5) / 256
     fraction = np.where(stored == 0, 0, np.where(stored == 255, 1, fraction))

@@ -48,6 +48,7 @@ class ClassicSettings:
     start: int = 500
     stop: int = 15_000
     every: int = 100
+    """Iterations between refinements (gsplat: refine_every)."""
     gradient: float = 2e-4
     """Mean norm of the gradient by the centre above which a Gaussian is densified, in normalised device coordinates
     (gsplat: grow_grad2d)."""
@@ -101,36 +102,36 @@ class Classic:
     def update(self, iteration: int) -> bool:
         """Every `every` iterations clone, split and prune; every `reset_every` iterations reset the opacities. Return
         whether rows were added or removed."""
-        s = self.settings
-        if iteration > s.stop:
+        settings = self.settings
+        if iteration > settings.stop:
             return False
         changed = False
-        if iteration > s.start and iteration % s.every == 0:
-            self._refine(prune_large=iteration > s.reset_every)
+        if iteration > settings.start and iteration % settings.every == 0:
+            self._refine(prune_large=iteration > settings.reset_every)
             self._reset_statistics()
             changed = True
         # Not at `stop`: later iterations have to restore the opacities that are needed.
-        if iteration % s.reset_every == 0 and iteration < s.stop:
-            self.scene.opacity_logits.clamp_(max=math.log(s.reset_to / (1 - s.reset_to)))
+        if iteration % settings.reset_every == 0 and iteration < settings.stop:
+            self.scene.opacity_logits.clamp_(max=math.log(settings.reset_to / (1 - settings.reset_to)))
             self.optimiser.reset_moments("opacity_logits")
         return changed
 
     def _refine(self, prune_large: bool) -> None:
-        """Clone small and split large Gaussians of high gradient, and prune faint ones; `prune_large` prunes large ones
-        too."""
-        s, scene = self.settings, self.scene
+        """Clone small and split large Gaussians of high gradient, and prune faint ones; with `prune_large` prune very
+        large ones too (gsplat: _grow_gs and _prune_gs)."""
+        settings, scene = self.settings, self.scene
         size = scene.scales.amax(-1) / scene.units(self.extent)
-        removed = scene.opacities < s.faint
+        removed = scene.opacities < settings.faint
         if prune_large:
-            removed |= size > s.large * self.extent
-        score = self.gradients / self.views.clamp(min=1)
-        grown = (score > s.gradient) & ~removed
-        if s.cap is not None:
-            free = max(0, s.cap - int((~removed).sum()))
+            removed |= size > settings.large * self.extent
+        mean_gradient = self.gradients / self.views.clamp(min=1)
+        grown = (mean_gradient > settings.gradient) & ~removed
+        if settings.cap is not None:
+            free = max(0, settings.cap - int((~removed).sum()))
             if int(grown.sum()) > free:  # a clone and a split each add one Gaussian
-                first = torch.argsort(score.masked_fill(~grown, -1), descending=True, stable=True)[:free]
-                grown = torch.zeros_like(grown).index_fill_(0, first, True)
-        split = grown & (size > s.small * self.extent)
+                highest = torch.argsort(mean_gradient.masked_fill(~grown, -1), descending=True, stable=True)[:free]
+                grown = torch.zeros_like(grown).index_fill_(0, highest, True)
+        split = grown & (size > settings.small * self.extent)
         clones = {name: p.detach()[grown & ~split] for name, p in scene.named_parameters()}
         halves = self._split(split)
         self.optimiser.keep_rows(torch.nonzero(~removed & ~split)[:, 0])
@@ -171,6 +172,7 @@ class McmcSettings:
     start: int = 500
     stop: int = 25_000
     every: int = 100
+    """Iterations between refinements (gsplat: refine_every)."""
     growth: float = 1.05
     """Factor of the number of Gaussians at each refinement, until the cap."""
     faint: float = 0.005
@@ -199,9 +201,9 @@ class Mcmc:
 
     def regulariser(self) -> Tensor:
         """Return the penalty on opacities and scales (the paper's eq. 12), a scalar for the loss."""
-        s, units = self.settings, self.scene.units(self.extent)
+        settings, units = self.settings, self.scene.units(self.extent)
         scales = self.scene.scales if isinstance(units, float) else self.scene.scales / units[:, None]
-        return s.opacity_weight * self.scene.opacities.mean() + s.scale_weight * scales.mean()
+        return settings.opacity_weight * self.scene.opacities.mean() + settings.scale_weight * scales.mean()
 
     def observe(self, rendering: Rendering) -> None:
         """Do nothing: this strategy needs no statistics."""
@@ -209,11 +211,11 @@ class Mcmc:
     @torch.no_grad()
     def update(self, iteration: int) -> bool:
         """Every `every` iterations relocate and add Gaussians; in each inject noise. Return whether rows changed."""
-        s = self.settings
-        changed = s.start < iteration <= s.stop and iteration % s.every == 0
+        settings = self.settings
+        changed = settings.start < iteration <= settings.stop and iteration % settings.every == 0
         if changed:
             self._relocate()
-            self._add()
+            self._add_copies()
         self._inject_noise()
         return changed
 
@@ -230,13 +232,13 @@ class Mcmc:
             parameter[targets] = parameter[sources]
             self.optimiser.reset_moments(name, torch.cat([sources, targets]))
 
-    def _add(self) -> None:
+    def _add_copies(self) -> None:
         """Add Gaussians as copies of others drawn by opacity, up to `growth` and `cap`."""
         n = len(self.scene)
-        new = min(self.settings.cap, int(n * self.settings.growth)) - n
-        if new <= 0:
+        added = min(self.settings.cap, int(n * self.settings.growth)) - n
+        if added <= 0:
             return
-        sources = self._sample_rows(self.scene.opacities, new)
+        sources = self._sample_rows(self.scene.opacities, added)
         self._split_opacity(sources)
         for name in dict(self.scene.named_parameters()):
             self.optimiser.reset_moments(name, sources)
@@ -287,13 +289,13 @@ class Mcmc:
 
 def relocated_opacity_and_scale(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     """Return opacity and scale factor of `copies` Gaussians in one place that together render as one of `opacity`; all
-    (n,).
+    (n,). It is gsplat's compute_relocation.
 
     For N copies, o' = 1 - (1 - o)^(1/N) preserves the centre; o / sum_{j=1..N} (-1)^(j-1) C(N, j) o'^j / sqrt(j), the
     integral along a line through it (Kheradmand et al. 2024, eq. 8, with its double sum over binomials in closed form).
     """
     o, count = opacity.double(), copies.double()
-    new = 1 - (1 - o) ** (1 / count)
+    new_opacity = 1 - (1 - o) ** (1 / count)
     j = torch.arange(1, int(copies.max()) + 1 if len(copies) else 1, dtype=torch.float64, device=o.device)
     log_binomial = (
         torch.lgamma(count + 1)[:, None]
@@ -301,9 +303,9 @@ def relocated_opacity_and_scale(opacity: Tensor, copies: Tensor) -> tuple[Tensor
         - torch.lgamma((count[:, None] - j + 1).clamp(min=1))
     )
     # The last factor is (-1)^(j-1).
-    terms = torch.exp(log_binomial + j * new.log()[:, None]) / j.sqrt() * (1 - 2 * ((j - 1) % 2))
+    terms = torch.exp(log_binomial + j * new_opacity.log()[:, None]) / j.sqrt() * (1 - 2 * ((j - 1) % 2))
     total = torch.where(j <= count[:, None], terms, 0).sum(-1)
-    return new.to(opacity), (o / total).to(opacity)
+    return new_opacity.to(opacity), (o / total).to(opacity)
 
 
 def _randn(shape: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:

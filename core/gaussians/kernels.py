@@ -123,8 +123,8 @@ def _fastest(like: Tensor) -> str:
     preferred = {"cuda": "cuda", "cpu": "cpu"}.get(like.device.type, "tiles")
     if like.dtype != torch.float32:
         return "tiles"  # the faster ones compute in float32 alone
-    reason = _load(preferred)
-    if isinstance(reason, ImportError):
-        _warn_once(f"The {preferred} kernels cannot be used here ({reason}); slower torch ones take their place.")
+    kernels = _load(preferred)
+    if isinstance(kernels, ImportError):
+        _warn_once(f"The {preferred} kernels cannot be used here ({kernels}); slower torch ones take their place.")
         return "tiles"
     return preferred

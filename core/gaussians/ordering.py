@@ -56,16 +56,17 @@ def nearest_distances(points: Tensor, neighbours: int = 3) -> Tensor:
     half_width = BLOCK + 2 * k
     for block_number, (start, block) in enumerate(zip(starts, blocks, strict=True)):
         around = points[order[max(0, start - half_width) : start + half_width]]  # at least k + 1 points
-        bound = _kth(block, around, k)[:, -1].amax()  # no k-th neighbour of this block's points is farther
+        bound = _other_distances(block, around, k)[:, -1].amax()  # no k-th neighbour of this block's points is farther
         # Along each axis, between this block's box and all boxes; 0 where they overlap.
         gaps = (lows - highs[block_number]).clamp(min=0) + (lows[block_number] - highs).clamp(min=0)
         near = torch.nonzero(torch.linalg.vector_norm(gaps, dim=-1) <= bound)[:, 0].tolist()
-        distances = _kth(block, torch.cat([blocks[other] for other in near]), k)
+        distances = _other_distances(block, torch.cat([blocks[other] for other in near]), k)
         result[order[start : start + BLOCK]] = distances
     return result
 
 
-def _kth(queries: Tensor, points: Tensor, k: int) -> Tensor:
-    """Return (q, k) distances to the nearest points, without the query itself, which is among them at distance 0."""
+def _other_distances(queries: Tensor, points: Tensor, k: int) -> Tensor:
+    """Return (q, k) distances of queries (q, 3) to their nearest points, ascending, without the query itself, which is
+    among the points (p, 3) at distance 0."""
     distances = torch.cdist(queries, points, compute_mode="donot_use_mm_for_euclid_dist")
     return distances.topk(min(k + 1, len(points)), largest=False).values[:, 1:]

@@ -72,7 +72,8 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
          *(np.asarray(column, "<f4")[:, None] for column in extra.values())], 1
     )
     scene_comments = ((NEAR_COMMENT, scene.near, NEAR), (WHITE_COMMENT, scene.display_white, 1.0))
-    comments = [*comments, *(f"{word} {number:.9g}" for word, number, usual in scene_comments if number != usual)]
+    comments = [*comments, *(f"{keyword} {number:.9g}" for keyword, number, default in scene_comments
+                             if number != default)]
     if scene.pixel_grid is not None:
         grid = scene.pixel_grid
         comments.append(f"{FOCAL_COMMENT} {grid.min_focal_length:.9g} {grid.max_focal_length:.9g}")
@@ -99,7 +100,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
         if is_compressed(path):
             return read_compressed(path)
         with open_regular(path) as file:
-            header = _header(path, file.read(MAX_HEADER_BYTES))
+            header = _parse_header(path, file.read(MAX_HEADER_BYTES))
             n, row = header.vertices, header.row
             if path.stat().st_size - header.start < n * row.itemsize:
                 raise FlareFileError(f"{path} is cut short: it announces {n} Gaussians; copy it again.")
@@ -156,7 +157,7 @@ class _Header(NamedTuple):
     far: FarSphere | None
 
 
-def _header(path: Path, head: bytes) -> _Header:
+def _parse_header(path: Path, head: bytes) -> _Header:
     """Parse the header of a scene's PLY. Raises FlareFileError."""
     parsed = ply.read_header(head)
     if parsed is None:
@@ -175,27 +176,27 @@ def _header(path: Path, head: bytes) -> _Header:
         raise FlareFileError(f"{path} is not a PLY file of Gaussians; export the scene as one.")
     near, display_white, pixel_grid = NEAR, 1.0, None
     far: FarSphere | None = None
-    for words in parsed.comments:  # a comment that is no number, or out of range, leaves the default
+    for comment in parsed.comments:  # a comment that is no number, or out of range, leaves the default
         with contextlib.suppress(ValueError):
-            match words:
-                case [word, number] if word == NEAR_COMMENT:
+            match comment:
+                case [keyword, number] if keyword == NEAR_COMMENT:
                     near = float(number) if 0 < float(number) < NEAR else NEAR
-                case [word, number] if word == WHITE_COMMENT:
+                case [keyword, number] if keyword == WHITE_COMMENT:
                     display_white = float(number) if 1 < float(number) < MAX_WHITE else 1.0
-                case [word, least, most] if word == FOCAL_COMMENT:
-                    pixel_grid = PixelGrid(float(least), float(most))
-                case [word, x, y, z, radius] if word == FAR_COMMENT:
+                case [keyword, low, high] if keyword == FOCAL_COMMENT:
+                    pixel_grid = PixelGrid(float(low), float(high))
+                case [keyword, x, y, z, radius] if keyword == FAR_COMMENT:
                     far = FarSphere.parse(float(x), float(y), float(z), float(radius))
     antialiased = any(map(_is_mip_comment, parsed.comments))
     return _Header(vertices.rows, vertices.row(ORDERS[parsed.format]), parsed.start, near, display_white, pixel_grid,
                    antialiased, far)
 
 
-def _is_mip_comment(words: Sequence[str]) -> bool:
+def _is_mip_comment(comment: Sequence[str]) -> bool:
     """True for a comment that names a mip filter: "SplatRenderMode: mip", "antialiased 1", "mip_filter: true"."""
-    text = " ".join(words).replace(":", " ").replace("=", " ").lower().split()
-    if len(text) != 2:
+    tokens = " ".join(comment).replace(":", " ").replace("=", " ").lower().split()
+    if len(tokens) != 2:
         return False
-    if text[0] in ("splatrendermode", "rendermode", "rasterize_mode", "render_mode"):
-        return text[1] in ("mip", "mip-splatting", "antialiased")
-    return text[0] in ("antialiased", "mip", "mip_filter", "mip_splatting") and text[1] in ("1", "true", "yes")
+    if tokens[0] in ("splatrendermode", "rendermode", "rasterize_mode", "render_mode"):
+        return tokens[1] in ("mip", "mip-splatting", "antialiased")
+    return tokens[0] in ("antialiased", "mip", "mip_filter", "mip_splatting") and tokens[1] in ("1", "true", "yes")

@@ -103,15 +103,15 @@ def bin_tiles(
     low, span = _tile_span(centres, half, radii, columns, rows, size)
     counts = span.prod(-1)
 
-    # One entry for each tile of each box, then drop those that the ellipse inside the box misses.
-    # number: of the tile within its box, row by row.
+    # One entry for each tile of each box, numbered row by row within its box; then drop those that the ellipse inside
+    # the box misses.
     entries = torch.repeat_interleave(counts)
-    number = torch.arange(len(entries), device=centres.device) - (counts.cumsum(0) - counts)[entries]
-    across = span[entries, 0]
-    x, y = low[entries, 0] + number % across, low[entries, 1] + number // across
+    tile_number = torch.arange(len(entries), device=centres.device) - (counts.cumsum(0) - counts)[entries]
+    box_columns = span[entries, 0]
+    x, y = low[entries, 0] + tile_number % box_columns, low[entries, 1] + tile_number // box_columns
     distances = _min_squared_distance(centres[entries], whitening[entries], torch.stack([x, y], -1) * size, size)
-    hit = distances <= (radii * (1 + REACH_MARGIN) + REACH_MARGIN)[entries] ** 2
-    tiles, entries = (y * columns + x)[hit], entries[hit]
+    is_touched = distances <= (radii * (1 + REACH_MARGIN) + REACH_MARGIN)[entries] ** 2
+    tiles, entries = (y * columns + x)[is_touched], entries[is_touched]
 
     order = torch.argsort(tiles, stable=True)
     starts = torch.searchsorted(tiles[order], torch.arange(columns * rows + 1, device=centres.device))
@@ -123,17 +123,17 @@ def _min_squared_distance(centres: Tensor, whitening: Tensor, corners: Tensor, s
     (m, 2): 0 if the centre is inside, else attained on one of the two edges that face it. size: of a tile, px."""
     low = corners - centres
     high = low + size
-    # The coordinates of the tile's point nearest to the centre: on the lines of the two edges.
-    bx, by = torch.zeros_like(low).clamp(low, high).unbind(-1)
+    # The tile's point nearest to the centre, from the centre: its coordinates are those of the lines of the two edges.
+    nearest_x, nearest_y = torch.zeros_like(low).clamp(low, high).unbind(-1)
     w_xx, w_yx, w_yy = whitening.unbind(-1)
     slope = w_yx / w_yy  # v = w_yy (dy + slope dx)
 
     def distance(dx: Tensor, dy: Tensor) -> Tensor:
         return (w_xx * dx) ** 2 + (w_yy * dy + w_yx * dx) ** 2
 
-    on_vertical = distance(bx, (-slope * bx).clamp(low[:, 1], high[:, 1]))
-    a = w_xx**2 + w_yx**2
-    on_horizontal = distance((-w_yx * w_yy * by / a).clamp(low[:, 0], high[:, 0]), by)
+    on_vertical = distance(nearest_x, (-slope * nearest_x).clamp(low[:, 1], high[:, 1]))
+    x_coefficient = w_xx**2 + w_yx**2
+    on_horizontal = distance((-w_yx * w_yy * nearest_y / x_coefficient).clamp(low[:, 0], high[:, 0]), nearest_y)
     return torch.minimum(on_vertical, on_horizontal)
 
 

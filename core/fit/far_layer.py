@@ -155,8 +155,8 @@ def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats, Float
         cost, visible = _disagreement(views, directions, parallax / focal / _camera_spread(cameras))
         sums = np.bincount(patch_of, np.where(visible, cost, 0), len(patch_directions))
         visible_counts = np.bincount(patch_of, visible, len(patch_directions))
-        is_seen = (visible_counts > 0) & (visible_counts >= MIN_VISIBLE_SHARE * sizes)
-        row[:] = np.where(is_seen, sums / np.maximum(visible_counts, 1), np.nan)
+        is_visible = (visible_counts > 0) & (visible_counts >= MIN_VISIBLE_SHARE * sizes)
+        row[:] = np.where(is_visible, sums / np.maximum(visible_counts, 1), np.nan)
     # Known on the infinite sphere, on that of bare parallax, and on some near one.
     usable = np.isfinite(costs[:2]).all(0) & np.isfinite(costs[2:]).any(0)
     return patch_directions[usable], *costs[:2, usable], np.nanmedian(costs[2:, usable], axis=0)

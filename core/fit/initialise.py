@@ -103,14 +103,19 @@ def _check_in_view(scene: SceneGaussians, views: tuple[View, ...], path: str) ->
                        "False).")
 
 
+def _check_has_lights(capture: Capture) -> None:
+    """Raise CaptureError for a capture without lights."""
+    if capture.lights:
+        return
+    if (capture.folder / LIGHTS).exists():
+        raise CaptureError(f"{capture.folder / LIGHTS} lists no light; add one by hand, or fit with --mode 3dgs.")
+    raise CaptureError(f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
+
+
 def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings) -> FlareModel:
     """Return the flare model that a fit starts from. Raises CaptureError without lights, or if one is behind all
     cameras."""
-    if not capture.lights:
-        is_listed = (capture.folder / LIGHTS).exists()
-        raise CaptureError(f"{capture.folder / LIGHTS} lists no light; add one by hand, or fit with --mode 3dgs."
-                           if is_listed else
-                           f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
+    _check_has_lights(capture)
     generator = torch.Generator().manual_seed(settings.seed)
     names = [light.name for light in capture.lights]
     frame_lights = None
@@ -134,12 +139,12 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
         if not in_front:
             raise CaptureError(f"The light {light.name!r} is behind the camera in every view of {capture.folder}; "
                                "correct or remove it in lights.json.")
-        query = QueryRange.of(torch.stack([view.camera for view in in_front]),
-                              torch.stack([view.light for view in in_front]), corner_radius)
+        query_range = QueryRange.of(torch.stack([view.camera for view in in_front]),
+                                    torch.stack([view.light for view in in_front]), corner_radius)
         if settings.uses_plates:
-            query = replace(query, camera_low=(-CAMERA_RANGE,) * 3, camera_high=(CAMERA_RANGE,) * 3)
-        flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator, settings.flare.opacity,
-                                 scale))
+            query_range = replace(query_range, camera_low=(-CAMERA_RANGE,) * 3, camera_high=(CAMERA_RANGE,) * 3)
+        flares.append(LightFlare(settings.flare.form, query_range, settings.flare.count, generator,
+                                 settings.flare.opacity, scale))
     return FlareModel(names, positions, flares, frame_lights)
 
 

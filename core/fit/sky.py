@@ -42,11 +42,11 @@ def add_sky_points(capture: Capture, views: tuple[View, ...], frames: Frames) ->
         if (mask := frames.mask(view)) is not None:
             _, counts = sample_colours(xyz, camera, mask)
             row[np.flatnonzero(inside)[~counts]] = np.nan
-    is_seen = np.isfinite(view_colours[..., 0]).any(0)
-    colours = np.nanquantile(view_colours[:, is_seen], COLOUR_QUANTILE, axis=0)
+    is_visible = np.isfinite(view_colours[..., 0]).any(0)
+    colours = np.nanquantile(view_colours[:, is_visible], COLOUR_QUANTILE, axis=0)
     rgb = np.concatenate([points.rgb, (colours.clip(0, 1) * 255 + 0.5).astype(np.uint8)])
-    return PointCloud(np.concatenate([points.xyz, xyz[is_seen].astype(np.float32)]), rgb,
-                      np.concatenate([points.error, np.zeros(int(is_seen.sum()), np.float32)]))
+    return PointCloud(np.concatenate([points.xyz, xyz[is_visible].astype(np.float32)]), rgb,
+                      np.concatenate([points.error, np.zeros(int(is_visible.sum()), np.float32)]))
 
 
 def fibonacci_directions(count: int, lowest: float = -1) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -77,14 +78,10 @@ def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Seq
                                   (focal[0] * setup.squeeze, focal[1]), centre, CANVAS_WIDTH, height)
             picture = picture.astype(np.float64) * np.asarray(colour)
             light_over_frame = math.sqrt(float(np.square(picture[is_in_frame]).mean()))
-            total = picture.sum(-1)
-            if light_over_frame <= MIN_LIGHT or total.sum() <= 0:
+            if light_over_frame <= MIN_LIGHT or picture.sum(-1).sum() <= 0:
                 continue
-            share = total / total.sum()
-            centroid = np.array([(share * x).sum(), (share * y).sum()])
-            variance = float((share * ((x - centroid[0]) ** 2 + (y - centroid[1]) ** 2)).sum()) / 2
-            mean_level = (picture * share[..., None]).sum((0, 1))
-            measurements.append([centroid @ light, light @ light, variance, *mean_level])
+            moments = _measure_moments(picture, x, y)
+            measurements.append([moments.centroid @ light, light @ light, moments.variance, *moments.level])
             lights_over_frame.append(light_over_frame)
         if measurements:
             weights = np.array(lights_over_frame)
@@ -96,6 +93,24 @@ def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Seq
                                         (level[0], level[1], level[2]),
                                         float(np.sqrt((weights**2).sum() / len(lights)))))
     return sorted(ghosts, key=lambda ghost: -ghost.light)
+
+
+class _Moments(NamedTuple):
+    """Means over a ghost's picture, weighted by its light: centroid (2,) and variance along an axis, normalised
+    coordinates, and level (3,), linear RGB."""
+
+    centroid: Floats
+    variance: float
+    level: Floats
+
+
+def _measure_moments(picture: Floats, x: Floats, y: Floats) -> _Moments:
+    """Measure a picture (height, width, 3) of a ghost. x, y: (height, width), the pixels' normalised coordinates."""
+    total = picture.sum(-1)
+    share = total / total.sum()
+    centroid = np.array([(share * x).sum(), (share * y).sum()])
+    variance = float((share * ((x - centroid[0]) ** 2 + (y - centroid[1]) ** 2)).sum()) / 2
+    return _Moments(centroid, variance, (picture * share[..., None]).sum((0, 1)))
 
 
 def start_at_ghosts(flare: LightFlare, rows: torch.Tensor, ghosts: Sequence[MeasuredGhost],

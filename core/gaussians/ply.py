@@ -99,17 +99,12 @@ def read_ply(path: Path | str) -> SceneGaussians:
     try:
         if is_compressed(path):
             return read_compressed(path)
-        with open_regular(path) as file:
-            header = _parse_header(path, file.read(MAX_HEADER_BYTES))
-            n, row = header.vertices, header.row
-            if path.stat().st_size - header.start < n * row.itemsize:
-                raise FlareFileError(f"{path} is cut short: it announces {n} Gaussians; copy it again.")
-            file.seek(header.start)
-            table = np.frombuffer(file.read(n * row.itemsize), row)
+        header, table = _read_table(path)
     except OSError as problem:
         raise FlareFileError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
 
-    present = set(row.names or ())
+    n = len(table)
+    present = set(header.row.names or ())
     rest_names = _rest_names(sum(name.startswith("f_rest_") for name in present))
     if len(rest_names) not in (0, 9, 24, 45):
         raise FlareFileError(
@@ -142,6 +137,17 @@ def read_ply(path: Path | str) -> SceneGaussians:
     scene.near, scene.display_white, scene.pixel_grid = header.near, header.display_white, header.pixel_grid
     scene.antialiased, scene.far = header.antialiased, header.far
     return scene
+
+
+def _read_table(path: Path) -> tuple[_Header, NDArray[Any]]:
+    """Read the header and the rows of the vertices, a structured array. Raises FlareFileError and OSError."""
+    with open_regular(path) as file:
+        header = _parse_header(path, file.read(MAX_HEADER_BYTES))
+        size = header.vertices * header.row.itemsize
+        if path.stat().st_size - header.start < size:
+            raise FlareFileError(f"{path} is cut short: it announces {header.vertices} Gaussians; copy it again.")
+        file.seek(header.start)
+        return header, np.frombuffer(file.read(size), header.row)
 
 
 class _Header(NamedTuple):

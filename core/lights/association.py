@@ -163,10 +163,10 @@ def _link_cost(chain: Chain, frame: int, source: Source, diagonal: float) -> flo
 
 def _appearance_difference(first: Source, second: Source) -> float:
     """Return how much two sources differ in size, colour and evidence; one that the frame's edge cuts has no size."""
-    one, two = first.detection, second.detection
-    cut = one.is_cut or two.is_cut
-    size = 0.0 if cut else abs(float(np.log(one.radius / two.radius)))
-    return (SIZE_COST * size + COLOUR_COST * float(np.abs(one.colour - two.colour).mean())
+    first_detection, second_detection = first.detection, second.detection
+    is_cut = first_detection.is_cut or second_detection.is_cut
+    size = 0.0 if is_cut else abs(float(np.log(first_detection.radius / second_detection.radius)))
+    return (SIZE_COST * size + COLOUR_COST * float(np.abs(first_detection.colour - second_detection.colour).mean())
             + EVIDENCE_COST * abs(first.evidence - second.evidence))
 
 

@@ -72,8 +72,8 @@ def write_lights(path: Path, lights: Sequence[FoundLight], views: Sequence[tuple
     places = [[round_for_text(float(x)) for x in light.xyz] for light in lights]
     places += [xyz for xyz in earlier.places if not any(_is_same_light(place, xyz, views) for place in places)]
     paths = [*earlier.paths, *_add_tracks(entries, tracked, earlier, views)]
-    found: dict[str, Any] = {"lights": entries, "found": places}
-    write_json(follow_link(path), {**found, "found_paths": paths} if paths else found)
+    contents: dict[str, Any] = {"lights": entries, "found": places}
+    write_json(follow_link(path), {**contents, "found_paths": paths} if paths else contents)
     return entries
 
 

@@ -23,7 +23,7 @@ from ..capture.camera import Floats
 from ..capture.lights import DOUBTFUL, LightKey
 from ..system.progress import Progress
 from .association import Chain, follow_sources
-from .sources import CLIPPED, Source, find_sources, measure_profile
+from .sources import CLIPPED, REFERENCE, Source, find_sources, measure_profile
 
 MIN_EVIDENCE = 0.3
 """Evidence of a chain from which it is a light; chains down to half of it are doubtful."""
@@ -32,7 +32,7 @@ MIN_FRAMES = 4
 GHOST_ERROR, MIN_GHOST_MOTION = 0.008, 0.03
 """Largest median distance of a ghost from the line through its light, and the least motion of that light, diagonals."""
 TOLERATED_ERROR = 3.0
-"""Expected error, pixels of a frame with a diagonal of 550, at which a place is as good as doubtful."""
+"""Expected error, pixels of a frame with a diagonal of REFERENCE, at which a place is as good as doubtful."""
 RECOVERY, MAX_RECOVERY = 0.012, 0.06
 """Distance from a light's path within which a spot is the light, in addition to the path's expected error, and the
 largest sum of both; diagonals."""
@@ -183,35 +183,43 @@ def _to_light(chain: Chain, capture: Capture, diagonal: float) -> TrackedLight:
     size = np.array(capture.views[0].camera.size, np.float64)
     frames, places, errors = _fill_path(chain, len(capture.views), size, diagonal)
     source_by_frame = dict(zip(chain.frames, chain.sources, strict=True))
+    is_inside = ((places > 0) & (places < size)).all(axis=1)
     profiles = []
-    for frame, place in zip(frames, places, strict=True):
-        source = source_by_frame.get(frame)
-        if source is not None:
-            profiles.append(source.profile)
-        elif ((place > 0) & (place < size)).all():
+    for frame, place, inside in zip(frames, places, is_inside, strict=True):
+        if frame in source_by_frame:
+            profiles.append(source_by_frame[frame].profile)
+        elif inside:
             pixels = np.minimum(capture.frame(capture.views[frame]).linear(), 1).mean(axis=2)
             profiles.append(measure_profile(pixels, place))
         else:
             profiles.append(np.full(len(chain.sources[0].profile), np.nan))
     brightness = fit_brightness(np.array(profiles), np.array([frame in source_by_frame for frame in frames]))
-    tolerated = TOLERATED_ERROR * diagonal / 550.0
+    tolerated = TOLERATED_ERROR * diagonal / REFERENCE
     keys = {}
-    for frame, place, error, on in zip(frames, places, errors, brightness, strict=True):
+    for frame, place, error, on, inside in zip(frames, places, errors, brightness, is_inside, strict=True):
         confidence = 1 / (1 + (error / tolerated) ** 2)
-        inside = bool(((place > 0) & (place < size)).all())
-        measured = None if np.isnan(on) else float(on) if on >= DARK else 0.0
-        if frame in source_by_frame:
-            # A detected light clips, so it is on; the profile of one that the edge cuts is not known.
-            is_cut = source_by_frame[frame].detection.is_cut
-            measured = None if measured is None or is_cut else max(measured, CLIPPED_ON)
-        else:
-            # Not detected here. At a doubtful place the glow may be another light's, so the light counts as out.
-            measured = (0.0 if measured is None or confidence < DOUBTFUL else measured) if inside else None
-        keys[capture.views[frame].name] = LightKey(None, place, measured, float(confidence))
+        known_brightness = _known_brightness(on, source_by_frame.get(frame), confidence, inside)
+        keys[capture.views[frame].name] = LightKey(None, place, known_brightness, float(confidence))
     colour = np.median([source.detection.colour for source in chain.sources], axis=0)
     return TrackedLight(keys, tuple(capture.views[frame].name for frame in chain.frames), chain.evidence,
                         colour / max(float(colour.max()), 1e-6),
                         float(np.median([source.detection.radius for source in chain.sources])))
+
+
+def _known_brightness(fitted: float, source: Source | None, confidence: float, is_inside: bool) -> float | None:
+    """Return the brightness of a light in a frame; None where it is not known.
+
+    fitted: by `fit_brightness`. source: of the light in the frame, None if it was not detected. confidence: of its
+    place. is_inside: True if the place is in the frame.
+    """
+    brightness = None if np.isnan(fitted) else float(fitted) if fitted >= DARK else 0.0
+    if source is not None:
+        # A detected light clips, so it is on; the profile of one that the edge cuts is not known.
+        return None if brightness is None or source.detection.is_cut else max(brightness, CLIPPED_ON)
+    if not is_inside:
+        return None
+    # At a doubtful place the glow may be another light's, so the light counts as out.
+    return 0.0 if brightness is None or confidence < DOUBTFUL else brightness
 
 
 class _Recovery(NamedTuple):
@@ -269,16 +277,16 @@ def _fill_path(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple
     knots, points = np.array(uncut.frames), uncut.places
     rates = _velocities(knots, points)
     for frame in range(first, last + 1):
-        after = int(np.searchsorted(knots, frame))
-        if after < len(knots) and knots[after] == frame:
-            place, error = points[after], _expected_error(uncut, after, acceleration)
-        elif 0 < after < len(knots):  # between two measured frames; else before the first or after the last
-            low, high = after - 1, after
+        index = int(np.searchsorted(knots, frame))  # of the first knot that is not before the frame
+        if index < len(knots) and knots[index] == frame:
+            place, error = points[index], _expected_error(uncut, index, acceleration)
+        elif 0 < index < len(knots):  # between two knots; else before the first or after the last
+            low, high = index - 1, index
             span = float(knots[high] - knots[low])
             place = _hermite((frame - knots[low]) / span, span, points[low], rates[low], points[high], rates[high])
             error = acceleration * span * span / 16  # half of what a straight line would miss in the middle
         else:
-            end = -1 if after else 0
+            end = -1 if index else 0
             step = float(frame - knots[end])
             place, error = points[end] + step * rates[end], 0.5 * acceleration * step * step
         source = measured.get(frame)

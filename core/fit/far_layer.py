@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -126,21 +127,27 @@ class Patches:
 
 def classify_patches(views: list[SweepView]) -> Patches | None:
     """Return which patches of directions are far; None where too few are for a far layer."""
-    directions, infinite_costs, bare_costs, near_costs = sweep_patches(views)
+    costs = sweep_patches(views)
     # The patches that are certainly far decide whether there is a far layer; then every patch is decided anew.
-    has_contrast = near_costs >= MIN_CONTRAST
-    is_far = has_contrast & (infinite_costs < DECISIVE_RATIO * near_costs) & (infinite_costs <= bare_costs)
+    has_contrast = costs.near >= MIN_CONTRAST
+    is_far = has_contrast & (costs.infinite < DECISIVE_RATIO * costs.near) & (costs.infinite <= costs.bare)
     if is_far.sum() < max(MIN_FAR_PATCHES, MIN_FAR_SHARE * has_contrast.sum()):
         return None
-    return Patches(directions, _classify_by_neighbours(directions, infinite_costs, near_costs))
+    return Patches(costs.directions, _classify_by_neighbours(costs))
 
 
-def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats, Floats]:
-    """Sweep spheres about the cameras of views.
+class SweepCosts(NamedTuple):
+    """Directions (n, 3) of patches, and the share (n,) of the views that differ there: on the infinite sphere, on that
+    of bare parallax, and the median of the near ones."""
 
-    Returns directions (n, 3) of patches, and the share (n,) of the views that differ there: on the infinite sphere, on
-    that of bare parallax, and the median of the near ones.
-    """
+    directions: Floats
+    infinite: Floats
+    bare: Floats
+    near: Floats
+
+
+def sweep_patches(views: list[SweepView]) -> SweepCosts:
+    """Sweep spheres about the cameras of views; patches that too few views see are left out."""
     cameras = [view.camera for view in views]
     focal = float(np.median([camera.focal_length for camera in cameras]))
     pitch = PITCH_PX / focal
@@ -159,23 +166,24 @@ def sweep_patches(views: list[SweepView]) -> tuple[Floats, Floats, Floats, Float
         row[:] = np.where(is_visible, sums / np.maximum(visible_counts, 1), np.nan)
     # Known on the infinite sphere, on that of bare parallax, and on some near one.
     usable = np.isfinite(costs[:2]).all(0) & np.isfinite(costs[2:]).any(0)
-    return patch_directions[usable], *costs[:2, usable], np.nanmedian(costs[2:, usable], axis=0)
+    infinite, bare = costs[:2, usable]
+    return SweepCosts(patch_directions[usable], infinite, bare, np.nanmedian(costs[2:, usable], axis=0))
 
 
-def _classify_by_neighbours(directions: Floats, infinite_costs: Floats, near_costs: Floats) -> Booleans:
+def _classify_by_neighbours(costs: SweepCosts) -> Booleans:
     """Return which patches (n,) are far, each by the nearest patches that are not plain, weighted by their contrast.
 
-    A patch that is not plain is far, too, if its own cost on the infinite sphere is below MAX_COST. infinite_costs,
-    near_costs: shares (n,) of the views that differ on the infinite sphere, and on near ones.
+    A patch that is not plain is far, too, if its own cost on the infinite sphere is below MAX_COST.
     """
-    has_contrast = near_costs >= MIN_CONTRAST
+    has_contrast = costs.near >= MIN_CONTRAST
+    directions, infinite, near = (values[has_contrast] for values in (costs.directions, costs.infinite, costs.near))
     count = min(NEIGHBOURS, int(has_contrast.sum()))
-    is_far = np.zeros(len(directions), bool)
-    for index, direction in enumerate(directions):
-        nearest = np.argpartition(-(directions[has_contrast] @ direction), count - 1)[:count]
-        gain = near_costs[has_contrast][nearest] - infinite_costs[has_contrast][nearest]
-        is_far[index] = gain.sum() > MIN_GAIN * near_costs[has_contrast][nearest].sum()
-    return is_far | has_contrast & (infinite_costs < MAX_COST)
+    is_far = np.zeros(len(costs.directions), bool)
+    for index, direction in enumerate(costs.directions):
+        nearest = np.argpartition(-(directions @ direction), count - 1)[:count]
+        gain = near[nearest] - infinite[nearest]
+        is_far[index] = gain.sum() > MIN_GAIN * near[nearest].sum()
+    return is_far | has_contrast & (costs.infinite < MAX_COST)
 
 
 def _make_sweep_view(view: View, frames: Frames) -> SweepView:

@@ -11,6 +11,7 @@ import torch
 from ..capture import LIGHTS, Capture, View
 from ..errors import CaptureError
 from ..flare.deformation import QueryRange
+from ..flare.frame_lights import FrameLights
 from ..flare.model import FlareModel, LightFlare, ViewOfLight, plane_scale
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
@@ -131,11 +132,7 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
     scale = plane_scale(max(camera.width / 2 / camera.fx for camera in cameras))
     flares = []
     for number, light in enumerate(capture.lights):
-        light_views = [
-            ViewOfLight.of(torch.from_numpy(camera.world_to_camera), positions[number] if frame_lights is None else
-                           frame_lights.positions[frame_lights.rows[view.name], number])
-            for view, camera in zip(views, cameras, strict=True)]
-        in_front = [view for view in light_views if view.depth > 0]
+        in_front = _views_in_front(number, views, positions, frame_lights)
         if not in_front:
             raise CaptureError(f"The light {light.name!r} is behind the camera in every view of {capture.folder}; "
                                "correct or remove it in lights.json.")
@@ -146,6 +143,19 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
         flares.append(LightFlare(settings.flare.form, query_range, settings.flare.count, generator,
                                  settings.flare.opacity, scale))
     return FlareModel(names, positions, flares, frame_lights)
+
+
+def _views_in_front(number: int, views: tuple[View, ...], positions: torch.Tensor, frame_lights: FrameLights | None
+                    ) -> list[ViewOfLight]:
+    """Return the light of this number as seen from the views that have it in front of the camera.
+
+    positions: (lights, 3), world units, for lights without places by frame.
+    """
+    light_views = []
+    for view in views:
+        xyz = (positions if frame_lights is None else frame_lights.positions[frame_lights.rows[view.name]])[number]
+        light_views.append(ViewOfLight.of(torch.from_numpy(view.camera.world_to_camera), xyz))
+    return [light_view for light_view in light_views if light_view.depth > 0]
 
 
 def has_frame_lights(capture: Capture) -> bool:

@@ -26,6 +26,13 @@ MAX_MORPHOLOGY_COST = 1e10
 """Largest region times structuring element, px², for morphology: a quarter of a second."""
 MAX_AREA_SHARE = 0.025
 """Share of the frame from which a clipped region is no light."""
+GROUP_DISTANCE = 0.015
+"""Distance, frame diagonals, below which clipped regions are one group."""
+ATTACHED_SHARES, GROUP_EXCESSES = (0.4, 0.1), (5.0, 1.5)
+SOLIDITIES, SIDE_RATIOS, AREA_SHARES = (0.84, 0.95), (9.0, 5.0), (MAX_AREA_SHARE, 0.005)
+WHITENESSES, SURROUNDING_LEVELS = (0.78, 0.97), (0.97, 0.9)
+"""Values of each criterion at which its factor of the score is 0 and 1: see `ExposureDetector.detect`, `shape_score`.
+"""
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,7 @@ class ExposureDetector:
         display = picture.display()
         clipped = (display.max(axis=2) >= self.clipped).astype(np.uint8)
         number, labels, boxes, _ = cv2.connectedComponentsWithStats(clipped, connectivity=8)
-        group_areas = _neighbourhood_area(clipped)
+        group_areas = _group_areas(clipped)
         detections = []
         for label in range(1, number):
             left, top, width, height, area = map(int, boxes[label])
@@ -54,8 +61,9 @@ class ExposureDetector:
                 continue
             # Clipped pixels of the region's group beside it, relative to its own.
             group_excess = float(group_areas[top:top + height, left:left + width][mask].max()) / float(mask.sum()) - 1
-            score = (shape_score(mask, (left, top), display) * smoothstep(_attached_share(mask, region), 0.4, 0.1)
-                     * smoothstep(group_excess, 5.0, 1.5))
+            score = (shape_score(mask, (left, top), display)
+                     * smoothstep(_attached_share(mask, region), *ATTACHED_SHARES)
+                     * smoothstep(group_excess, *GROUP_EXCESSES))
             if score >= self.threshold:
                 rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
                 tight = mask[rows[0]:rows[-1] + 1, columns[0]:columns[-1] + 1]
@@ -64,26 +72,25 @@ class ExposureDetector:
         return sorted(detections, key=lambda detection: -detection.score)
 
 
-def _neighbourhood_area(clipped: NDArray[np.uint8]) -> NDArray[np.int64]:
+def _group_areas(clipped: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Return (h, w), the number of clipped pixels in each pixel's group.
 
-    Regions nearer to each other than 1.5 % of the diagonal form one group.
-
-    Groups are the panes of a window, the letters of a sign, the flecks of a bright cloth.
+    Regions nearer to each other than GROUP_DISTANCE form one group: the panes of a window, the letters of a sign, the
+    flecks of a bright cloth.
     """
     import cv2
 
-    reach = max(1, round(0.0075 * math.hypot(*clipped.shape)))
+    reach = max(1, round(GROUP_DISTANCE / 2 * math.hypot(*clipped.shape)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     _, groups = cv2.connectedComponents(cv2.dilate(clipped, disc), connectivity=8)
     members: NDArray[np.int64] = np.bincount(np.asarray(groups).ravel(), clipped.ravel()).astype(np.int64)
     return members[groups]
 
 
-def _main_body(mask: NDArray[np.bool_], largest: float) -> NDArray[np.bool_] | None:
+def _main_body(mask: NDArray[np.bool_], max_area: float) -> NDArray[np.bool_] | None:
     """Return the mask with holes filled and without thin parts, such as spikes of a starburst or a bright bracket.
 
-    Discs, ellipses and bars are unchanged. None where a disc of more than `largest` pixels fits in.
+    Discs, ellipses and bars are unchanged. None where a disc of more than `max_area` pixels fits in.
     """
     import cv2
 
@@ -91,7 +98,7 @@ def _main_body(mask: NDArray[np.bool_], largest: float) -> NDArray[np.bool_] | N
     outline, _ = cv2.findContours(padded, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(padded, outline, -1, (1.0,), cv2.FILLED)
     thickest = float(cv2.distanceTransform(padded, cv2.DIST_L2, 5).max())
-    if math.pi * thickest ** 2 > largest:
+    if math.pi * thickest ** 2 > max_area:
         return None
     reach = int(OPENING_RATIO * thickest)
     if reach >= 1:
@@ -157,10 +164,10 @@ def shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArr
     solid = area / (cv2.contourArea(hull) + 0.5 * cv2.arcLength(hull, True) + 1.0)
     sides = np.sort(np.asarray(cv2.minAreaRect(hull)[1]) + 1.0)
     colours = display[corner[1]:corner[1] + mask.shape[0], corner[0]:corner[0] + mask.shape[1]][mask]
-    return (smoothstep(solid, 0.84, 0.95) * smoothstep(sides[1] / sides[0], 9.0, 5.0)
-            * smoothstep(area / (width * height), MAX_AREA_SHARE, 0.005)
-            * smoothstep(float(colours.min(axis=1).mean()), 0.78, 0.97)
-            * smoothstep(_surrounding_level(mask, corner, display), 0.97, 0.9))
+    return (smoothstep(solid, *SOLIDITIES) * smoothstep(sides[1] / sides[0], *SIDE_RATIOS)
+            * smoothstep(area / (width * height), *AREA_SHARES)
+            * smoothstep(float(colours.min(axis=1).mean()), *WHITENESSES)
+            * smoothstep(_surrounding_level(mask, corner, display), *SURROUNDING_LEVELS))
 
 
 def _surrounding_level(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:

@@ -26,8 +26,8 @@ WINDOWS = (0.12, 0.08, 0.05, 0.03, 0.02, 0.013)
 """
 MAX_OFFSET = 1.5
 """Largest error of a light in the median view, in units of the widest window."""
-MAX_STEPS = 12
-"""Steps under each window."""
+MAX_STEPS, MIN_MOTION_PX = 12, 0.05
+"""Largest number of steps under each window, and the motion, pixels, below which no more are made."""
 PEAK_WINDOW, MIN_PEAK_RATIO, MAX_SHIFT = 0.02, 1.5, 0.3
 """Criterion of a peak.
 
@@ -94,14 +94,14 @@ def snap_lights(views: Sequence[FlareView], lights: ArrayLike) -> Floats:
     """Return the positions of the lights (n, 3), world coordinates, on their flares; unchanged where there is no clear
     peak."""
     initial = np.array(lights, np.float64).reshape(-1, 3)
-    positions, is_on_peak = initial.copy(), _are_on_peaks(views, initial) | _are_in_clipped_sky(views, initial)
+    positions, is_done = initial.copy(), _are_on_peaks(views, initial) | _are_in_clipped_sky(views, initial)
     for widest in reversed(range(len(WINDOWS) - 2)):  # from the narrowest three windows alone to all
-        if is_on_peak.all():
+        if is_done.all():
             break
-        moved = _mean_shift(views, positions, ~is_on_peak, WINDOWS[widest:])
-        accepted = (~is_on_peak & _are_on_peaks(views, moved) & ~_are_merged(views, moved)
+        moved = _mean_shift(views, positions, ~is_done, WINDOWS[widest:])
+        accepted = (~is_done & _are_on_peaks(views, moved) & ~_are_merged(views, moved)
                     & _are_in_reach(views, initial, moved))
-        positions[accepted], is_on_peak = moved[accepted], is_on_peak | accepted
+        positions[accepted], is_done = moved[accepted], is_done | accepted
     return positions
 
 
@@ -122,7 +122,7 @@ def _mean_shift(views: Sequence[FlareView], positions: Floats, free: NDArray[np.
                 positions[light] += step
                 motions = (float(np.linalg.norm(observation.jacobian @ step)) for observation in observations)
                 largest_motion = max(largest_motion, *motions)
-            if largest_motion < 0.05:  # pixels
+            if largest_motion < MIN_MOTION_PX:
                 break
     return positions
 

@@ -98,10 +98,10 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
     return sorted(sources, key=lambda source: (-source.evidence, -source.detection.radius))[:MAX_SOURCES]
 
 
-def _thick_parts(region: Mask, largest: float) -> Iterator[tuple[Mask, tuple[int, int]]]:
+def _thick_parts(region: Mask, max_area: float) -> Iterator[tuple[Mask, tuple[int, int]]]:
     """Yield the thick parts of a spot, without spikes, with their corners (x, y) in it.
 
-    region: mask (h, w) of the spot. Nothing is yielded where a disc with an area of more than `largest` px² fits in.
+    region: mask (h, w) of the spot. Nothing is yielded where a disc with an area of more than `max_area` px² fits in.
     """
     import cv2
 
@@ -110,7 +110,7 @@ def _thick_parts(region: Mask, largest: float) -> Iterator[tuple[Mask, tuple[int
     cv2.drawContours(padded, outline, -1, (1.0,), cv2.FILLED)
     thickness = np.asarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5))
     thickest = float(thickness.max())
-    if np.pi * thickest ** 2 > largest:
+    if np.pi * thickest ** 2 > max_area:
         return
     # A small disc separates the parts; spikes are removed by a larger one, of each part by its own thickness.
     count, labels = cv2.connectedComponents(_open(padded, MIN_THICKNESS * thickest), connectivity=4)

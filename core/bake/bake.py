@@ -129,11 +129,11 @@ def bake(renderer: RunRenderer, frames: Sequence[NumberedFrame], cameras: Mappin
 
 
 def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras: Mapping[str, Camera], out: Path | str,
-                renderer_of: Callable[[NumberedFrame], FrameRenderer], settings: BakeSettings | None = None,
+                renderer_for: Callable[[NumberedFrame], FrameRenderer], settings: BakeSettings | None = None,
                 progress: Progress | None = None, *, overwrite: bool = False) -> dict[str, Any]:
     """Write the layers of `frames`, each by its own renderer, under `out`; return the content of bake.json.
 
-    cameras: by the view's name, at the size of the frames.
+    cameras: by the view's name, at the size of the frames. renderer_for: returns the renderer of a frame.
 
     Frames that an earlier bake with the same settings finished are kept, and stay in the manifest. Raises RunError if
     `out` holds layers made with other settings, unless `overwrite`, or another bake starts to write such there;
@@ -142,60 +142,61 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
     settings, progress, out = settings or BakeSettings(), progress or Progress(), Path(out)
     keyed, lights, elements = settings.keyed.with_always(settings.edits), source.lights, source.elements
 
-    def edits_of(frame: NumberedFrame) -> LookEdits:
-        keyed_edits, frame_edits = keyed.edits_at(frame.number, lights, elements), renderer_of(frame).edit_texts
+    def parse_edits(frame: NumberedFrame) -> LookEdits:
+        keyed_edits, frame_edits = keyed.edits_at(frame.number, lights, elements), renderer_for(frame).edit_texts
         return LookEdits.parse([*frame_edits, *keyed_edits.texts()], lights, elements) if frame_edits else keyed_edits
 
-    edits = {frame.view: edits_of(frame) for frame in frames}  # invalid edits raise before any file is deleted
+    edits = {frame.view: parse_edits(frame) for frame in frames}  # invalid edits raise before any file is deleted
     space = settings.colour_space()
     cache_key = _cache_key(source.fingerprint, settings, keyed)
-    names = layer_names(lights)
-    _claim_folder(out, cache_key, names, overwrite)
+    layer_by_light = layer_names(lights)
+    _claim_folder(out, cache_key, layer_by_light, overwrite)
 
     def header_notes(frame: NumberedFrame) -> dict[str, Any]:
         """Return the entries of a frame's header, by which `_is_up_to_date` knows the frame again."""
-        inputs = renderer_of(frame).fingerprint
+        inputs = renderer_for(frame).fingerprint
         frame_edits = {"inputs": inputs} if inputs else {}
         return {"view": frame.view, "frame": frame.number, **frame_edits, **cache_key}
 
-    done = [frame for frame in frames if _is_up_to_date(out / frame.file, header_notes(frame))
-            and all(path.is_file() for path in renderer_of(frame).extra_files)]
-    manifest = _add_to_manifest(out, cache_key, names,
-                                [_entry(out, frame, renderer_of(frame).extra_files) for frame in done])
-    progress.stage("bake", len(frames), len(done))
+    finished = [frame for frame in frames if _is_up_to_date(out / frame.file, header_notes(frame))
+                and all(path.is_file() for path in renderer_for(frame).extra_files)]
+    manifest = _add_to_manifest(out, cache_key, layer_by_light,
+                                [_manifest_entry(out, frame, renderer_for(frame).extra_files) for frame in finished])
+    progress.stage("bake", len(frames), len(finished))
 
     def render(frame: NumberedFrame) -> FrameLayers:
-        camera, renderer = settings.scaled(cameras[frame.view]), renderer_of(frame)
-        return renderer.finish(_layers(renderer, camera, edits[frame.view], lights).in_space(space), camera)
+        camera, renderer = settings.scaled(cameras[frame.view]), renderer_for(frame)
+        return renderer.finish(_render_layers(renderer, camera, edits[frame.view], lights).in_space(space), camera)
 
     @contextlib.contextmanager
     def commit_lock() -> Iterator[None]:
         """While a frame takes its name: nobody else writes here, and the folder is still this bake's."""
         with file_lock(out / LOCK):
-            _check_is_current(out, cache_key, names)
+            _check_is_current(out, cache_key, layer_by_light)
             yield
 
     for frame in frames:
-        if frame in done:
+        if frame in finished:
             continue
         path = out / frame.file
-        _check_is_current(out, cache_key, names)  # before it is rendered in vain
+        _check_is_current(out, cache_key, layer_by_light)  # before it is rendered in vain
         # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
         write_layers(path, render(frame), half=settings.half, chromaticities=space.chromaticities,
                      notes=header_notes(frame),
                      pixel_aspect=settings.scaled(cameras[frame.view]).pixel_aspect, commit_lock=commit_lock())
-        manifest = _add_to_manifest(out, cache_key, names, [_entry(out, frame, renderer_of(frame).extra_files)])
+        manifest = _add_to_manifest(out, cache_key, layer_by_light,
+                                    [_manifest_entry(out, frame, renderer_for(frame).extra_files)])
         progress.advance()
     return manifest
 
 
-def _layers(renderer: CameraRenderer, camera: Camera, edits: LookEdits, lights: Sequence[str]) -> FrameLayers:
-    """Render one frame. The colour of whole lights is applied to the layers afterwards, which is exact for any blend.
-    """
-    colours = edits.colour_matrices(lights)
+def _render_layers(renderer: CameraRenderer, camera: Camera, edits: LookEdits, lights: Sequence[str]) -> FrameLayers:
+    """Render the layers of one frame. The colours of whole lights are applied to the finished layers, which is exact
+    for any blend."""
+    matrices = edits.colour_matrices(lights)
     if edits.changes_light_colours_only:
-        return to_layers(renderer.render(camera), colours)
-    return to_layers(renderer.render(camera, edits.without_light_colours()), colours)
+        return to_layers(renderer.render(camera), matrices)
+    return to_layers(renderer.render(camera, edits.without_light_colours()), matrices)
 
 
 def _cache_key(fingerprint: str, settings: BakeSettings, keyed: KeyedEdits) -> dict[str, Any]:
@@ -229,29 +230,30 @@ def frames_to_delete(out: Path | str, fingerprint: Callable[[], str], lights: It
     return [] if (manifest["made_from"], manifest["layers"]) == (default, layer_names(lights)) else others
 
 
-def _claim_folder(out: Path, cache_key: dict[str, Any], names: dict[str, str], overwrite: bool) -> None:
-    """Prepare the folder for this bake: refuse layers of another bake, or delete them with `overwrite`."""
+def _claim_folder(out: Path, cache_key: dict[str, Any], layer_by_light: dict[str, str], overwrite: bool) -> None:
+    """Prepare the folder for this bake, and write its empty manifest. Deletes the layers of another bake if
+    `overwrite`, else raises RunError."""
     with file_lock(out / LOCK):
         manifest = read_manifest(out) if (out / MANIFEST).exists() else None
-        if manifest is not None and (manifest["made_from"], manifest["layers"]) == (cache_key, names):
+        if manifest is not None and (manifest["made_from"], manifest["layers"]) == (cache_key, layer_by_light):
             return
         if manifest is not None and manifest["frames"] and not overwrite:
             if manifest["made_from"] == cache_key:
                 raise RunError(f"{out} holds layers of the lights {', '.join(manifest['layers'])}, and these frames "
-                               f"have {', '.join(names) or 'none'}: one sequence has the same in all frames. Give all "
-                               "frames at once, or another folder, or overwrite them (--overwrite).")
+                               f"have {', '.join(layer_by_light) or 'none'}: one sequence has the same in all frames. "
+                               "Give all frames at once, or another folder, or overwrite them (--overwrite).")
             raise RunError(f"{out} holds layers that were baked from another fit or with other settings; "
                            "choose another folder, or overwrite them (--overwrite).")
         for entry in manifest["frames"] if manifest is not None else ():  # a mixture would pass for one sequence
             for file in (entry["file"], *entry.get("rest", ())):
                 remove_file(out / file)
-        write_json(out / MANIFEST, {"version": VERSION, "made_from": cache_key, "layers": names, "frames": []})
+        write_json(out / MANIFEST, {"version": VERSION, "made_from": cache_key, "layers": layer_by_light, "frames": []})
 
 
 def _is_up_to_date(path: Path, expected: Mapping[str, Any]) -> bool:
     """True if the file is whole and its own header has the `expected` entries: the frame and its settings.
 
-    bake.json does not tell, since other tasks of a farm write here too."""
+    bake.json does not show it, since other tasks of a farm write here too."""
     try:
         if is_exr_truncated(path):
             return False
@@ -261,38 +263,38 @@ def _is_up_to_date(path: Path, expected: Mapping[str, Any]) -> bool:
     return all(notes.get(name) == value for name, value in expected.items())
 
 
-def _entry(out: Path, frame: NumberedFrame, extra_files: Sequence[Path]) -> dict[str, Any]:
+def _manifest_entry(out: Path, frame: NumberedFrame, extra_files: Sequence[Path]) -> dict[str, Any]:
     """Return the entry of a finished frame in bake.json."""
     with open_regular(out / frame.file) as stream:
         width, height = exr_header.windows(stream)["dataWindow"]
-    beside = {"rest": [path.relative_to(out).as_posix() for path in extra_files]} if extra_files else {}
-    return {"file": frame.file, "frame": frame.number, "view": frame.view, "width": width, "height": height, **beside}
+    rest = {"rest": [path.relative_to(out).as_posix() for path in extra_files]} if extra_files else {}
+    return {"file": frame.file, "frame": frame.number, "view": frame.view, "width": width, "height": height, **rest}
 
 
-def _check_is_current(out: Path, cache_key: dict[str, Any], names: dict[str, str]) -> None:
+def _check_is_current(out: Path, cache_key: dict[str, Any], layer_by_light: dict[str, str]) -> None:
     """Raise RunError if a bake with other settings has started in the folder since this one did."""
     if not (out / MANIFEST).exists():
         return
     manifest = read_manifest(out)
-    if (manifest["made_from"], manifest["layers"]) != (cache_key, names):
+    if (manifest["made_from"], manifest["layers"]) != (cache_key, layer_by_light):
         raise RunError(f"Another bake, of another fit or with other settings, writes to {out} meanwhile; choose "
                        "another folder for this one.")
 
 
-def _add_to_manifest(out: Path, cache_key: dict[str, Any], names: dict[str, str],
+def _add_to_manifest(out: Path, cache_key: dict[str, Any], layer_by_light: dict[str, str],
                      entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Add entries to bake.json beside those of other writers.
 
     Raises RunError if it lists frames that were made with other settings since this bake started.
     """
     with file_lock(out / LOCK):
-        _check_is_current(out, cache_key, names)
+        _check_is_current(out, cache_key, layer_by_light)
         existing = read_manifest(out) if (out / MANIFEST).exists() else {}
         # Entries whose files are gone are dropped.
-        known = {entry["file"]: entry for entry in existing.get("frames", []) if (out / entry["file"]).is_file()}
-        known.update({entry["file"]: entry for entry in entries})
-        frames = sorted(known.values(), key=lambda entry: (Path(entry["file"]).parent.as_posix(), entry["frame"]))
-        manifest = {"version": VERSION, "made_from": cache_key, "layers": names, "frames": frames}
+        by_file = {entry["file"]: entry for entry in existing.get("frames", []) if (out / entry["file"]).is_file()}
+        by_file.update({entry["file"]: entry for entry in entries})
+        frames = sorted(by_file.values(), key=lambda entry: (Path(entry["file"]).parent.as_posix(), entry["frame"]))
+        manifest = {"version": VERSION, "made_from": cache_key, "layers": layer_by_light, "frames": frames}
         if manifest != existing:
             write_json(out / MANIFEST, manifest)
     return manifest

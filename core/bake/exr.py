@@ -72,11 +72,11 @@ def read_layers(path: Path | str) -> FrameLayers:
     lights = read_description(path)["lights"]
     channels = read_exr(path)
 
-    def colour(layer: str) -> Pixels:
+    def stack_colour(layer: str) -> Pixels:
         return np.stack([channels[f"{layer}.{name}"] for name in "RGB"], axis=-1)
 
     try:
-        return FrameLayers(colour("scene"), {light: colour(layer) for layer, light in lights.items()},
+        return FrameLayers(stack_colour("scene"), {light: stack_colour(layer) for layer, light in lights.items()},
                            channels["depth.Z"], read_data_window(path))
     except KeyError as problem:
         raise FrameError(f"{path} lacks the channel {problem}; bake it again.") from problem

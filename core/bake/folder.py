@@ -40,13 +40,13 @@ class LayerFolder:
             if match and not path.name.startswith("."):
                 sequences.setdefault(match[1], {})[int(match[2])] = path
         if not sequences:
-            below = sorted({path.parent.name for path in folder.glob("*/*") if _NUMBERED.fullmatch(path.name)})
-            if below:
-                raise FrameError(f"{folder} holds its layers in {', '.join(below)}; choose one of these.")
+            subfolders = sorted({path.parent.name for path in folder.glob("*/*") if _NUMBERED.fullmatch(path.name)})
+            if subfolders:
+                raise FrameError(f"{folder} holds its layers in {', '.join(subfolders)}; choose one of these.")
             raise FrameError(f"{folder} holds no baked layers (files such as layers.0001.exr); bake into it first.")
         if len(sequences) > 1:
-            heads = " and ".join(f"{head}*.exr" for head in sorted(sequences)[:2])
-            raise FrameError(f"{folder} holds more than one sequence ({heads}); keep each in a folder of its own.")
+            prefixes = " and ".join(f"{prefix}*.exr" for prefix in sorted(sequences)[:2])
+            raise FrameError(f"{folder} holds more than one sequence ({prefixes}); keep each in a folder of its own.")
         files = next(iter(sequences.values()))
         files = dict(sorted(files.items()))
         layers = {path: _read_layer_names(path) for path in files.values()}

@@ -109,8 +109,8 @@ def layer_names(lights: Iterable[str]) -> dict[str, str]:
     names: dict[str, str] = {}
     used: set[str] = set()
     for light in lights:
-        plain = unicodedata.normalize("NFKD", light).encode("ascii", "ignore").decode()
-        safe = re.sub(r"[^A-Za-z0-9_-]+", "_", plain).strip("_")[:_MAX_NAME] or "light"
+        ascii_name = unicodedata.normalize("NFKD", light).encode("ascii", "ignore").decode()
+        safe = re.sub(r"[^A-Za-z0-9_-]+", "_", ascii_name).strip("_")[:_MAX_NAME] or "light"
         name, count = safe, 1
         while name.casefold() in used:
             count += 1
@@ -120,12 +120,12 @@ def layer_names(lights: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def to_layers(rendering: RenderedLayers, colours: Mapping[str, Any] | None = None) -> FrameLayers:
-    """Convert a rendering to layers, each light's flare under its colour matrix (3, 3) (`LookEdits.matrices`).
+def to_layers(rendering: RenderedLayers, matrices: Mapping[str, Any] | None = None) -> FrameLayers:
+    """Convert a rendering to layers, each light's flare under its colour matrix (3, 3) (`LookEdits.colour_matrices`).
 
     Light that saturation would make negative becomes 0.
     """
-    colours = colours or {}
-    flares = {light: _apply_colour(layer, colours[light]) if light in colours else np.asarray(layer, np.float32)
+    matrices = matrices or {}
+    flares = {light: _apply_colour(layer, matrices[light]) if light in matrices else np.asarray(layer, np.float32)
               for light, layer in rendering.flare_by_light.items()}
     return FrameLayers(np.asarray(rendering.scene, np.float32), flares, np.asarray(rendering.depth, np.float32))

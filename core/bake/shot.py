@@ -32,7 +32,8 @@ class ShotRenderer(ShotSource):
         self.run = Run.open(shot.run) if shot.run else None
         model = self.run.flare.model if self.run is not None and self.run.flare is not None else None
         # Visibility of each unoccluded light through the scene of the fit, by name.
-        self._clear = dict(zip(model.names, model.clear.tolist(), strict=True)) if model is not None else {}
+        self._clear_visibilities = ({} if model is None else
+                                    dict(zip(model.names, model.clear.tolist(), strict=True)))
 
     @property
     def fingerprint(self) -> str:
@@ -45,19 +46,19 @@ class ShotRenderer(ShotSource):
 
         placed = [self._occlude(light, camera) for light in shot_frame.lights]
         with torch.no_grad():
-            by_light = self.look.evaluate_lights(camera.world_to_camera, placed, edits, self.shot.query)
-            flares = {name: splat_look(self.look, gaussians, camera) for name, gaussians in by_light.items()}
-            dark = torch.zeros(camera.height, camera.width, 3)
+            gaussians_by_light = self.look.evaluate_lights(camera.world_to_camera, placed, edits, self.shot.query)
+            flares = {name: splat_look(self.look, gaussians, camera) for name, gaussians in gaussians_by_light.items()}
+            black = torch.zeros(camera.height, camera.width, 3)
             scene, white = (None, 1.0) if self.run is None else (render_scene(self.run.gaussians, camera),
                                                                  self.run.gaussians.display_white)
-            parts = linear_layers(dark if scene is None else scene.colour, flares, self.look.blend, white)
+            linear = linear_layers(black if scene is None else scene.colour, flares, self.look.blend, white)
         # Without a scene an added layer is light alone, as `draw_layers` draws it. With the blend "over" a layer is
         # negative where its light covers a brighter flare, since the layers sum to the picture.
         is_light_alone = scene is None and self.look.blend == "add"
         layers = {name: np.maximum(layer.numpy(), 0) if is_light_alone else layer.numpy()
-                  for name, layer in parts.flares.items()}
-        depth = dark[..., 0] if scene is None else scene.depth
-        return ViewLayers(parts.scene.numpy(), {name: layers.get(name, dark.numpy()) for name in self.lights},
+                  for name, layer in linear.flares.items()}
+        depth = black[..., 0] if scene is None else scene.depth
+        return ViewLayers(linear.scene.numpy(), {name: layers.get(name, black.numpy()) for name in self.lights},
                           depth.detach().numpy())
 
     def _occlude(self, light: PlacedLight, camera: Camera) -> PlacedLight:
@@ -70,7 +71,7 @@ class ShotRenderer(ShotSource):
         if self.run is None or settings is None:
             return light
         visibility, shares = visibility_behind(self.run.gaussians, camera.world_to_camera, light, settings,
-                                               self._clear.get(light.source, 1.0))
+                                               self._clear_visibilities.get(light.source, 1.0))
         return replace(light, visibility=light.visibility * visibility, shares=shares)
 
 

@@ -47,8 +47,8 @@ class ShotSource(ABC):
     @property
     def elements(self) -> Mapping[str, list[str]]:
         """Names of each placed light's elements."""
-        of_source = self.look.element_names
-        return {light.name: of_source.get(light.source, [])
+        names_by_source = self.look.element_names
+        return {light.name: names_by_source.get(light.source, [])
                 for shot_frame in self.shot.frames for light in shot_frame.lights}
 
     @property
@@ -75,9 +75,9 @@ class LookRenderer(ShotSource):
         flares = self.look.evaluate_lights(camera.world_to_camera, shot_frame.lights, edits, self.shot.query)
         exposed = {name: gaussians.with_exposure(camera.exposure, self.look.blend)
                    for name, gaussians in flares.items()}
-        dark = np.zeros((camera.height, camera.width, 3), np.float32)
+        black = np.zeros((camera.height, camera.width, 3), np.float32)
         layers = draw_layers(self.look, exposed, camera.intrinsics, camera.width, camera.height)
-        return ShotLayers(dark, {name: layers.get(name, dark) for name in self.lights}, dark[..., 0])
+        return ShotLayers(black, {name: layers.get(name, black) for name in self.lights}, black[..., 0])
 
 
 @dataclass(frozen=True)

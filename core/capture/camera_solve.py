@@ -157,7 +157,7 @@ def _index_pictures(root: Path, folders: list[Path]) -> PictureIndex:
 
 
 def _describe_matches(solve: CameraSolve, files: dict[str, Path], missing: list[str], unposed: list[str],
-              renamed: list[str]) -> list[str]:
+                      renamed: list[str]) -> list[str]:
     """Return sentences for the user on frames without a pose, poses without a frame, and frames of another name.
 
     files, missing, unposed: as of `MatchedFrames`. renamed: "file for name" of each frame of another name.

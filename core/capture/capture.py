@@ -173,7 +173,7 @@ class Capture:
         """Return a copy with the views' exposures, by name; 1 for views without."""
         result = copy(self)
         result.views = tuple(replace(view, camera=replace(view.camera, exposure=exposures.get(view.name, 1.0)))
-                           for view in self.views)
+                             for view in self.views)
         return result
 
     def with_frame_names(self) -> Capture:

@@ -157,7 +157,7 @@ class Network:
         """tensors: by their names in the file, without the light's number. heads: width of each offset by name.
         levels, base: see `FlareForm`. encoded: (n, d) frequency-encoded canonical positions, then latent codes."""
         self._tensors = {name: np.asarray(tensor, np.float32) for name, tensor in tensors.items()
-                   if not name.endswith(".rows")}
+                         if not name.endswith(".rows")}
         self._heads, self._range = dict(heads), query_range
 
         def read_grid(name: str, bits: int, growth: float) -> HashGrid:
@@ -167,7 +167,7 @@ class Network:
         self._light_grid = read_grid("light_grid", LIGHT_BITS, LIGHT_GROWTH)
         self._camera_grid = read_grid("camera_grid", CAMERA_BITS, CAMERA_GROWTH)
         self._hidden_layers = sorted(name[:-len(".weight")] for name in self._tensors
-                              if name.startswith("network.layers.") and name.endswith(".weight"))
+                                     if name.startswith("network.layers.") and name.endswith(".weight"))
         self._encoded, self._number = encoded, next(_numbers)
         if self._tensors["network.head.weight"].shape[0] != sum(self._heads.values()):
             raise ValueError("the network's heads do not fit the form")

@@ -38,38 +38,38 @@ def flare_scene(
     Gaussian; with arcs also arc_0 and arc_1, in standard deviations along the first and second axis.
     """
     gaussians = concatenate(list(flares.values())) or _no_gaussians()
-    n = len(gaussians)
-    depth = PLANE_DEPTH * (1 + _DEPTH_STEP * np.arange(n))
-    local = np.concatenate([gaussians.means, np.ones((n, 1))], 1) * depth[:, None]
+    count = len(gaussians)
+    depth = PLANE_DEPTH * (1 + _DEPTH_STEP * np.arange(count))
+    camera_points = np.concatenate([gaussians.means, np.ones((count, 1))], 1) * depth[:, None]
     to_world = camera.world_to_camera[:3, :3].T
-    means = local @ to_world.T + camera.position
+    means = camera_points @ to_world.T + camera.position
     extra_variance = max(dilation(pixel_grid, camera.focal_length) - DILATION, 0.0)
     xx, xy, yy = gaussians.covariances.T.astype(np.float64)
     xx, yy = xx + extra_variance / camera.fx**2, yy + extra_variance / camera.fy**2
     variances, axes = np.linalg.eigh(np.stack([xx, xy, xy, yy], -1).reshape(-1, 2, 2))
     deviations = np.sqrt(np.maximum(variances, 1e-14)) * depth[:, None]
     scales = np.concatenate([deviations, _THICKNESS * depth[:, None]], 1)
-    rotations = np.zeros((n, 3, 3))
+    rotations = np.zeros((count, 3, 3))
     rotations[:, :2, :2] = axes
     rotations[:, 2, 2] = np.linalg.det(axes)  # a rotation, not a mirror image
-    quaternions = np.array([quaternion_from_rotation(to_world @ rotation) for rotation in rotations]).reshape(n, 4)
+    quaternions = np.array([quaternion_from_rotation(to_world @ rotation) for rotation in rotations]).reshape(count, 4)
     # An opacity above the maximum of 3DGS is multiplied into the colour.
     gain = np.maximum(gaussians.opacities / OPACITY_MAX, 1)
     opacities = np.clip(gaussians.opacities / gain, 1e-6, OPACITY_MAX)
-    sh = torch.zeros(n, COEFFICIENTS, 3)
+    sh = torch.zeros(count, COEFFICIENTS, 3)
     sh[:, 0] = dc_from_colour(torch.from_numpy(np.asarray(gaussians.colours * gain[:, None], np.float32)))
 
-    def tensor(values: NDArray[Any]) -> torch.Tensor:
+    def to_tensor(values: NDArray[Any]) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, np.float32))
 
-    scene = SceneGaussians(tensor(means), tensor(np.log(scales)), tensor(quaternions),
-                           tensor(np.log(opacities / (1 - opacities))), sh)
-    rings = np.tile(np.array([0.0, 1.0], np.float32), (n, 1)) if gaussians.rings is None else gaussians.rings
-    extra = {"ring_r0": rings[:, 0], "ring_w": rings[:, 1]}
+    scene = SceneGaussians(to_tensor(means), to_tensor(np.log(scales)), to_tensor(quaternions),
+                           to_tensor(np.log(opacities / (1 - opacities))), sh)
+    rings = np.tile(np.array([0.0, 1.0], np.float32), (count, 1)) if gaussians.rings is None else gaussians.rings
+    extra_properties = {"ring_r0": rings[:, 0], "ring_w": rings[:, 1]}
     if gaussians.arcs is not None:
         scaled_arcs = np.einsum("nxa,nx->na", axes, gaussians.arcs) / np.sqrt(np.maximum(variances, 1e-14))
-        extra |= {"arc_0": scaled_arcs[:, 0], "arc_1": scaled_arcs[:, 1]}
-    return scene, {name: np.asarray(values, np.float32) for name, values in extra.items()}
+        extra_properties |= {"arc_0": scaled_arcs[:, 0], "arc_1": scaled_arcs[:, 1]}
+    return scene, {name: np.asarray(values, np.float32) for name, values in extra_properties.items()}
 
 
 def _no_gaussians() -> PlaneGaussians:
@@ -89,8 +89,8 @@ def write_flare_ply(path: Path | str, flares: Mapping[str, PlaneGaussians], came
         f"lights {' '.join(' '.join(name.split()) for name in flares)}"))  # a line of the header is one comment
 
 
-def preset(look: Look, views: Mapping[str, ViewOfLight], edits: LookEdits | None = None,
-           camera: Camera | None = None) -> dict[str, Any]:
+def make_preset(look: Look, views: Mapping[str, ViewOfLight], edits: LookEdits | None = None,
+                camera: Camera | None = None) -> dict[str, Any]:
     """Return the look as a preset of elements for procedural flare tools, for one view of each light.
 
     views: by the light's name. camera: of the picture, by default the training camera. The parts of an element:
@@ -105,8 +105,8 @@ def preset(look: Look, views: Mapping[str, ViewOfLight], edits: LookEdits | None
     arc         of a ring with a brighter side: `towards` which, degrees as `rotation`, and `share`, the light of the
                 opposite side relative to it
     """
-    lens, exposure = (look.camera, 1.0) if camera is None else (camera, camera.exposure)
-    width = lens.width / lens.fx  # of the picture, on the normalised plane
+    picture_camera, exposure = (look.camera, 1.0) if camera is None else (camera, camera.exposure)
+    width = picture_camera.width / picture_camera.fx  # of the picture, on the normalised plane
     lights = []
     for light in look.lights:
         if light.name not in views or (edits is not None and not edits.is_visible(light.name, views)):
@@ -117,7 +117,7 @@ def preset(look: Look, views: Mapping[str, ViewOfLight], edits: LookEdits | None
         gaussians = gaussians.with_exposure(exposure, look.blend)
         light_position = views[light.name].light.astype(np.float64)
         elements = [{"name": element.name, "kind": element.kind,
-                     "parts": [_part(gaussians, row, light_position, width) for row in rows]}
+                     "parts": [_element_part(gaussians, row, light_position, width) for row in rows]}
                     for element, rows in _visible_elements(light, edits, len(gaussians))]
         lights.append({"name": light.name, "at": (light_position / width).tolist(), "elements": elements})
     return {"version": PRESET_VERSION, "made_by": "Fit Flare", "blend": look.blend, "unit": "picture width",
@@ -127,8 +127,8 @@ def preset(look: Look, views: Mapping[str, ViewOfLight], edits: LookEdits | None
 
 def write_preset(path: Path | str, look: Look, views: Mapping[str, ViewOfLight], edits: LookEdits | None = None,
                  camera: Camera | None = None) -> None:
-    """Write `preset` as JSON."""
-    write_json(path, preset(look, views, edits, camera))
+    """Write `make_preset` as JSON."""
+    write_json(path, make_preset(look, views, edits, camera))
 
 
 def _visible_elements(light: LightLook, edits: LookEdits | None, count: int) -> Iterator[tuple[Element, list[int]]]:
@@ -141,8 +141,8 @@ def _visible_elements(light: LightLook, edits: LookEdits | None, count: int) -> 
             yield element, np.searchsorted(remaining, element.members).tolist()
 
 
-def _part(gaussians: PlaneGaussians, row: int, light: NDArray[np.float64], width: float) -> dict[str, Any]:
-    """Return one Gaussian as a part of a preset's element, as `preset` describes it.
+def _element_part(gaussians: PlaneGaussians, row: int, light: NDArray[np.float64], width: float) -> dict[str, Any]:
+    """Return one Gaussian as a part of a preset's element, as `make_preset` describes it.
 
     row: its number. light (2,): position of the light; width: of the picture; both on the normalised plane."""
     distance = max(float(np.linalg.norm(light)), 1e-6)
@@ -150,24 +150,24 @@ def _part(gaussians: PlaneGaussians, row: int, light: NDArray[np.float64], width
     mean = gaussians.means[row].astype(np.float64)
     xx, xy, yy = (float(value) for value in gaussians.covariances[row])
     variances, axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
-    short, long = np.sqrt(np.maximum(variances, 0)) / width
+    minor, major = np.sqrt(np.maximum(variances, 0)) / width
     x, y = axes[:, 1]
     rotation = math.degrees(math.atan2(axis[0] * y - axis[1] * x, axis[0] * x + axis[1] * y))
     colour = np.maximum(gaussians.colours[row].astype(np.float64), 0) * float(gaussians.opacities[row])
     peak = float(colour.max())
     part: dict[str, Any] = {
         "offset": 1 - float(mean @ axis) / distance, "aside": float(axis[0] * mean[1] - axis[1] * mean[0]) / width,
-        "size": [float(long), float(short)], "rotation": (rotation + 90) % 180 - 90, "intensity": peak,
+        "size": [float(major), float(minor)], "rotation": (rotation + 90) % 180 - 90, "intensity": peak,
         "colour": (colour / peak).tolist() if peak > 0 else [1.0, 1.0, 1.0],
-        "shape": "streak" if long > 4 * short else "glow"}
+        "shape": "streak" if major > 4 * minor else "glow"}
     if gaussians.rings is not None:
         r0, w = (float(value) for value in gaussians.rings[row])
         # A ring whose line is thinner than a third of its radius has a dark middle; a thicker one looks like a disc.
         if r0 > w:
-            part |= {"shape": "ring" if r0 > 3 * w else "disc", "radius": [r0 * float(long), r0 * float(short)],
-                     "thickness": [w * float(long), w * float(short)]}
+            part |= {"shape": "ring" if r0 > 3 * w else "disc", "radius": [r0 * float(major), r0 * float(minor)],
+                     "thickness": [w * float(major), w * float(minor)]}
         elif r0 != 0 or w != 1:  # approximated by a plain profile of about the same width
-            part["size"] = [(max(r0, 0) + w) * float(long), (max(r0, 0) + w) * float(short)]
+            part["size"] = [(max(r0, 0) + w) * float(major), (max(r0, 0) + w) * float(minor)]
         if gaussians.arcs is not None and gaussians.arcs[row].any():
             x, y = (float(value) for value in gaussians.arcs[row])
             towards = math.degrees(math.atan2(axis[0] * y - axis[1] * x, axis[0] * x + axis[1] * y))

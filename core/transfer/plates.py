@@ -51,9 +51,9 @@ class ColouredPlate:
         stored = self.plate.extras.get("channels", {}).get("A") if self.plate.alpha is None else self.plate.alpha
         if stored is None:
             return None
-        top = np.float32(np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1)
-        values = np.nan_to_num(stored.astype(np.float32) / top, nan=1.0)
-        return apply_orientation(np.clip(values, 0, 1), self.orientation)
+        max_value = np.float32(np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1)
+        alpha = np.nan_to_num(stored.astype(np.float32) / max_value, nan=1.0)
+        return apply_orientation(np.clip(alpha, 0, 1), self.orientation)
 
     @property
     def has_straight_alpha(self) -> bool:
@@ -75,7 +75,7 @@ class ColouredPlate:
         """Return whether the file has 32 bit floats, which 16 bit layers would round."""
         return bool(self.plate.codes.dtype == np.float32)
 
-    def with_light(self, light: Pixels) -> tuple[NDArray[Any], NDArray[Any] | None]:
+    def codes_with_light(self, light: Pixels) -> tuple[NDArray[Any], NDArray[Any] | None]:
         """Return codes and alpha as stored, of the plate with light (height, width, 3) in linear Rec. 709.
 
         The light is added to the picture over black (premultiplied). Where it exceeds what an integer plate can show
@@ -85,33 +85,37 @@ class ColouredPlate:
         is_lit = undo_orientation((light != 0).any(-1, keepdims=True), self.orientation)
         alpha, stored_alpha = self.alpha, self.plate.alpha
         if stored_alpha is not None and alpha is not None:
-            lit = np.maximum(self.linear + light, 0)
-            grown = alpha_with_light(alpha, lit)
-            top = np.float32(np.iinfo(stored_alpha.dtype).max if stored_alpha.dtype.kind == "u" else 1)
+            lit_picture = np.maximum(self.linear + light, 0)
+            lit_alpha = alpha_with_light(alpha, lit_picture)
+            max_value = np.float32(np.iinfo(stored_alpha.dtype).max if stored_alpha.dtype.kind == "u" else 1)
             if stored_alpha.dtype.kind == "u":  # the colours belong to the alpha as it is stored
-                grown = np.ceil(grown * top - np.float32(1e-3)) / top  # a rounding error must not add a code
-            values = self.space.from_linear(lit / np.maximum(grown, 1e-6)[..., None])
+                # A rounding error must not add a code.
+                lit_alpha = np.ceil(lit_alpha * max_value - np.float32(1e-3)) / max_value
+            values = self.space.from_linear(lit_picture / np.maximum(lit_alpha, 1e-6)[..., None])
             if self.plate.straight_alpha is None:  # the file's colours are multiplied by it
-                values = values * grown[..., None]
-            new_alpha = undo_orientation(grown, self.orientation) * top
-            new_alpha = np.round(new_alpha) if top > 1 else new_alpha
+                values = values * lit_alpha[..., None]
+            new_alpha = undo_orientation(lit_alpha, self.orientation) * max_value
+            new_alpha = np.round(new_alpha) if max_value > 1 else new_alpha
             stored_alpha = np.where(is_lit[..., 0], np.maximum(new_alpha.astype(stored_alpha.dtype), stored_alpha),
                                     stored_alpha)
         elif self.space.is_linear:
             values = self.values + self.space.from_linear(light)
         else:
             values = self.space.from_linear(self.linear + light)
-        codes, values = self.plate.codes, undo_orientation(values, self.orientation)
-        if codes.dtype.kind == "u":
-            stored = np.clip(np.round(values * self.plate.max_code), 0, self.plate.max_code).astype(codes.dtype)
-        else:
-            limit = 65504 if codes.dtype == np.float16 else np.finfo(np.float32).max
-            stored = np.clip(values, -limit, limit).astype(codes.dtype)
-        return np.where(is_lit, stored, codes), stored_alpha
+        return np.where(is_lit, self._to_codes(values), self.plate.codes), stored_alpha
+
+    def _to_codes(self, values: Pixels) -> NDArray[Any]:
+        """Return upright values in the plate's space as codes, in the orientation and type of the file, clipped to its
+        range."""
+        values, dtype = undo_orientation(values, self.orientation), self.plate.codes.dtype
+        if dtype.kind == "u":
+            return np.clip(np.round(values * self.plate.max_code), 0, self.plate.max_code).astype(dtype)
+        limit = 65504 if dtype == np.float16 else np.finfo(np.float32).max
+        return np.clip(values, -limit, limit).astype(dtype)
 
     def write(self, path: Path, light: Pixels) -> None:
-        """Write `with_light` in the plate's own file type, bit depth, colour space and orientation."""
-        codes, alpha = self.with_light(light)
+        """Write `codes_with_light` in the plate's own file type, bit depth, colour space and orientation."""
+        codes, alpha = self.codes_with_light(light)
         write_plate(path, self.plate, codes, alpha)
 
     def _straight_values(self, alpha: Pixels) -> Pixels:

@@ -65,10 +65,10 @@ def training_views(path: Path | str, lights: Sequence[LightLook],
     """Return the training views of each light: those that the .flare lists, else from the training poses (4, 4).
 
     Omits lights for which there is neither. Raises FlareFileError for an invalid file."""
-    listed = read_description(path).get("seen", {})
+    stored = read_description(path).get("seen", {})
     by_light: dict[str, TrainingViews] = {}
     for light in lights:
-        rows: Any = listed.get(light.name) if isinstance(listed, Mapping) else None
+        rows: Any = stored.get(light.name) if isinstance(stored, Mapping) else None
         if not rows and poses is not None:
             views = [ViewOfLight.of(pose, light.xyz) for pose in poses]
             rows = [[*view.camera, *view.light] for view in views if view.depth > 0]
@@ -106,15 +106,15 @@ def fixed_view(light: LightLook, views: Sequence[ViewOfLight], distances: Sequen
 
     It is the most similar one to the shot's median view; None if the light is never in front of the camera.
     """
-    front = [(view, distance) for view, distance in zip(views, distances, strict=True) if view.depth > 0]
-    if not front:
+    in_front = [(view, distance) for view, distance in zip(views, distances, strict=True) if view.depth > 0]
+    if not in_front:
         return None
-    position = np.median([view.light for view, _ in front], axis=0)
+    position = np.median([view.light for view, _ in in_front], axis=0)
     if training is None:
         camera = (light.query_range.camera_low + light.query_range.camera_high) / 2
-        return replace(front[0][0], camera=camera, light=light.query_range.clip(camera, position)[1])
-    best = int(training.dissimilarity(position, float(np.median([distance for _, distance in front]))).argmin())
-    return replace(front[0][0], camera=training.cameras[best].astype(np.float32),
+        return replace(in_front[0][0], camera=camera, light=light.query_range.clip(camera, position)[1])
+    best = int(training.dissimilarity(position, float(np.median([distance for _, distance in in_front]))).argmin())
+    return replace(in_front[0][0], camera=training.cameras[best].astype(np.float32),
                    light=training.lights[best].astype(np.float32))
 
 
@@ -138,18 +138,18 @@ def _weighted_queries(light: LightLook, view: ViewOfLight, xyz: Floats, query: F
         return [(1.0, replace(view, camera=camera))]
     if query == "source" and fixed is not None:
         return [(1.0, fixed)]
-    inside, position = light.query_range.clip(camera, view.light)
+    clipped_camera, clipped_light = light.query_range.clip(camera, view.light)
     if training is None or is_same_world:
-        return [(1.0, replace(view, camera=inside, light=position))]
-    dissimilarity = training.dissimilarity(position, distance)
-    order = np.argsort(dissimilarity)[:NEIGHBOURS + 1]
+        return [(1.0, replace(view, camera=clipped_camera, light=clipped_light))]
+    dissimilarity = training.dissimilarity(clipped_light, distance)
+    nearest = np.argsort(dissimilarity)[:NEIGHBOURS + 1]
     # The most dissimilar one has no weight, so that weights change continuously when the neighbours change.
-    edge = dissimilarity[order[-1]] if len(order) > NEIGHBOURS else 2 * dissimilarity[order[-1]] + 1e-6
+    cutoff = dissimilarity[nearest[-1]] if len(nearest) > NEIGHBOURS else 2 * dissimilarity[nearest[-1]] + 1e-6
     # The small term gives a single view, or several equal ones, a weight.
-    weights = np.maximum(1 - (dissimilarity[order] / max(edge, 1e-9)) ** 2, 0) ** 2 + 1e-12
+    weights = np.maximum(1 - (dissimilarity[nearest] / max(cutoff, 1e-9)) ** 2, 0) ** 2 + 1e-12
     weights /= weights.sum()
-    return [(float(weight), replace(view, camera=training.cameras[row].astype(np.float32), light=position))
-            for weight, row in zip(weights, order, strict=True) if weight > 1e-6]
+    return [(float(weight), replace(view, camera=training.cameras[row].astype(np.float32), light=clipped_light))
+            for weight, row in zip(weights, nearest, strict=True) if weight > 1e-6]
 
 
 def _average(parts: Sequence[PlaneGaussians], weights: Sequence[float]) -> PlaneGaussians | None:

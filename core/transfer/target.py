@@ -128,31 +128,27 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
     paths = list(dict.fromkeys(paths))
     by_name = {path.name: path for path in paths}
     if len(by_name) < len(paths):
-        twin = next(path for path in paths if by_name[path.name] != path)
-        raise SettingsError(f"{twin} and {by_name[twin.name]} have one name; put the flare on them one after the "
-                            "other, each with an --out of its own.")
+        duplicate = next(path for path in paths if by_name[path.name] != path)
+        raise SettingsError(f"{duplicate} and {by_name[duplicate.name]} have one name; put the flare on them one after "
+                            "the other, each with an --out of its own.")
     frames, unlit = [], []
     for frame in number_views(by_name):
         path = by_name[frame.view]
         orientation = read_exif(path)[0]
         window = plate_window(path, orientation)
-        width, height = window.frame
-        larger = look.camera.pixel_ratio(width, height)
-        fx = focal or look.camera.fx * larger
-        fy = (focal or look.camera.fy * larger) * window.aspect
-        cx, cy = centre or (width / 2, height / 2)
-        camera = Camera(width, height, fx, fy, cx, cy, np.eye(4))
-        positions = dict(lights) or _detected(path, detector, orientation, space)
+        camera = _picture_camera(look, window, focal, centre)
+        positions = dict(lights) or _detect_positions(path, detector, orientation, space)
         if not positions:
             unlit.append(path.name)
         sources_by_light = {name: source for name, source in requested.items() if name in positions}
+        plane_positions = {name: ((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+                           for name, (x, y) in positions.items()}
         if not lights:
-            plane_positions = {name: ((x - cx) / fx, (y - cy) / fy) for name, (x, y) in positions.items()}
             sources_by_light = {**_most_similar_sources(plane_positions, training or {}), **sources_by_light}
         sources = assign_sources(list(positions), look.names, sources_by_light)
         placed = []
-        for name, (x, y) in positions.items():
-            ray = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
+        for name, plane_position in plane_positions.items():
+            ray = np.array([*plane_position, 1.0])
             placed.append(PlacedLight(name, sources[name], ray / np.linalg.norm(ray) * distances[sources[name]]))
         frames.append(TargetFrame(frame, ShotFrame(frame.number, frame.view, camera, tuple(placed)), path,
                                   window=window, orientation=orientation))
@@ -166,8 +162,19 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
     return target
 
 
-def _detected(path: Path, detector: Detector | None, orientation: int,
-              space: ColourSpace | None) -> dict[str, tuple[float, float]]:
+def _picture_camera(look: Look, window: DataWindow, focal: float | None,
+                    centre: tuple[float, float] | None) -> Camera:
+    """Return the camera of a picture's frame, at the origin. focal, centre: as of `picture_target`."""
+    width, height = window.frame
+    pixel_ratio = look.camera.pixel_ratio(width, height)
+    fx = focal or look.camera.fx * pixel_ratio
+    fy = (focal or look.camera.fy * pixel_ratio) * window.aspect
+    cx, cy = centre or (width / 2, height / 2)
+    return Camera(width, height, fx, fy, cx, cy, np.eye(4))
+
+
+def _detect_positions(path: Path, detector: Detector | None, orientation: int,
+                      space: ColourSpace | None) -> dict[str, tuple[float, float]]:
     """Return the position, px, of each light that the detector finds in a picture, by name; {} without a detector."""
     if detector is None:
         return {}
@@ -184,12 +191,12 @@ def _most_similar_sources(
     Uses each source once if there are enough."""
     chosen: dict[str, str] = {}
     # Every light with every source, the most similar first.
-    pairs = sorted((float(np.linalg.norm(views.lights - position, axis=1).min()), name, source)
-                   for name, position in positions.items() for source, views in training.items())
-    while pairs and len(chosen) < len(positions):
+    ranked = sorted((float(np.linalg.norm(views.lights - position, axis=1).min()), name, source)
+                    for name, position in positions.items() for source, views in training.items())
+    while ranked and len(chosen) < len(positions):
         used = set(chosen.values())
-        free = [pair for pair in pairs if pair[1] not in chosen]
-        _, name, source = next((pair for pair in free if pair[2] not in used), free[0])
+        free = [(name, source) for _, name, source in ranked if name not in chosen]
+        name, source = next(((name, source) for name, source in free if source not in used), free[0])
         chosen[name] = source
     return chosen
 
@@ -204,24 +211,25 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
 
     Raises CaptureError without lights.
     """
-    known = read_lights(lights) if lights else capture.lights
+    target_lights = read_lights(lights) if lights else capture.lights
     if lights and not lights.is_file():
         raise CaptureError(f"{lights} is missing.")
-    if not known:
+    if not target_lights:
         raise CaptureError(f"{capture.folder} has no lights; run lights on it, or name a lights.json with --lights.")
-    lit = capture.with_lights(known)
-    sources = assign_sources([light.name for light in known], look.names, requested)
+    lit_capture = capture.with_lights(target_lights)
+    sources = assign_sources([light.name for light in target_lights], look.names, requested)
     views = {view.name: view for view in capture.views}
     frames = []
     for frame in number_views(views):
         view = views[frame.view]
         path = None if scene_is_background else capture.frame_path(view)
-        is_stored_as_seen = view.lens is None and not view.upright
-        undistorted = None if is_stored_as_seen or path is None else _undistorted(capture, view)
+        file_matches_view = view.lens is None and not view.upright
+        undistorted = None if file_matches_view or path is None else _undistorted_reader(capture, view)
         window = camera_window(view.camera, path) if undistorted is None and path is not None else None
-        states = [lit.light_state(light, view) for light in known]  # a light of unknown brightness counts as on
+        states = [lit_capture.light_state(light, view) for light in target_lights]
+        # A light of unknown brightness counts as on.
         placed = tuple(PlacedLight(state.name, sources[state.name], state.xyz, 1.0 if state.on is None else state.on,
-                                   light.extent) for light, state in zip(known, states, strict=True))
+                                   light.extent) for light, state in zip(target_lights, states, strict=True))
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)
         frames.append(TargetFrame(frame, shot, path, undistorted, window, space=capture.plate_space))
     return Target(_share_windows(frames), _scene_in_view(scene, frames) if scene else None, scene_is_background)
@@ -239,7 +247,7 @@ def _scene_in_view(path: Path, frames: Sequence[TargetFrame]) -> SceneGaussians:
                        f"have none of its {len(scene)} Gaussians before them; export it in the world of the cameras.")
 
 
-def _undistorted(capture: Capture, view: View) -> Callable[[ColourSpace | None], Picture]:
+def _undistorted_reader(capture: Capture, view: View) -> Callable[[ColourSpace | None], Picture]:
     """Return `TargetFrame.undistorted` for a view."""
     return lambda space: capture.frame(view) if space is None else capture.frame_in_space(view, space)
 
@@ -269,8 +277,8 @@ def shot_target(shot: Shot, look: Look, requested: SourceNames, *, plates: Path 
     plates_by_frame = _plates_by_number(plates) if plates else {}
     # The shot's own sources are used, unless others are requested or this look lacks them.
     sources_by_light = {light.name: light.source for shot_frame in shot.frames for light in shot_frame.lights}
-    known = {name: source for name, source in sources_by_light.items() if source in look.names}
-    sources = assign_sources(list(sources_by_light), look.names, {**known, **requested})
+    available_sources = {name: source for name, source in sources_by_light.items() if source in look.names}
+    sources = assign_sources(list(sources_by_light), look.names, {**available_sources, **requested})
     frames, folders = [], shot.folders
     for shot_frame in sorted(shot.frames, key=lambda each: (each.name, each.frame)):
         name, number = shot_frame.name, shot_frame.frame
@@ -367,7 +375,8 @@ def resized(target: Target, width: int | None, height: int | None) -> Target:
     return replace(target, frames=tuple(frames))
 
 
-def background(frame: TargetFrame, size: tuple[int, int], space: ColourSpace | None) -> NDArray[np.float32] | None:
+def undistorted_background(frame: TargetFrame, size: tuple[int, int],
+                           space: ColourSpace | None) -> NDArray[np.float32] | None:
     """Return the undistorted plate in linear Rec. 709 at `size`; None if the plate's file is not distorted. space: the
     plate's colour space, None to use that of its capture or file."""
     if frame.undistorted is None:

@@ -42,7 +42,7 @@ from ..system.reading import read_bytes
 from . import query as queries
 from .highlights import at_highlights
 from .plates import AUTO, ColouredPlate, alpha_with_light
-from .target import Target, TargetFrame, background, plate_window
+from .target import Target, TargetFrame, plate_window, undistorted_background
 from .visibility import smooth_visibility
 
 VISIBILITY_MARGIN = 0.02
@@ -96,13 +96,13 @@ class Transfer:
         """A hash that changes whenever all pictures would; a frame renderer's fingerprint covers the single frame."""
         digest = hashlib.sha256(read_bytes(self.flare))
         digest.update(self.target.fingerprint().encode())
-        meaning = self.plate_space.fingerprint if self.plate_space is not None else ""
-        digest.update(repr((self.settings, self.config, meaning, sorted(self.training_views))).encode())
+        space_fingerprint = self.plate_space.fingerprint if self.plate_space is not None else ""
+        digest.update(repr((self.settings, self.config, space_fingerprint, sorted(self.training_views))).encode())
         if self.settings.highlights is not None:
             digest.update(repr((self.settings.highlights, self.settings.highlight_gain)).encode())
         return digest.hexdigest()[:16]
 
-    def fingerprint_of(self, index: int) -> str:
+    def frame_fingerprint(self, index: int) -> str:
         """Return a hash of a frame and of the neighbours that the visibility of its lights depends on."""
         radius = 2 * self.settings.smooth  # see `smooth_visibility`
         neighbours = self.target.frames[max(index - radius, 0):index + radius + 1]
@@ -132,8 +132,8 @@ class Transfer:
         scene (height, width, 3): linear light of the frame at the camera's size, in which highlights are found."""
         lights: Sequence[PlacedLight] = self.target.frames[index].shot.lights
         if self.settings.highlights is not None and scene is not None:
-            found = find_highlights(scene, self.settings.highlights, self.settings.highlight_gain)
-            lights = [at_highlights(light, found, camera) for light in lights] if len(found) else []
+            highlights = find_highlights(scene, self.settings.highlights, self.settings.highlight_gain)
+            lights = [at_highlights(light, highlights, camera) for light in lights] if len(highlights) else []
         splats: dict[str, Splats] = {}
         for light, source in self.look.visible_lights(lights, edits):
             def evaluate(view: ViewOfLight, visibility: float, light: PlacedLight = light, source: LightLook = source
@@ -164,15 +164,15 @@ class Transfer:
         key = (index, light)
         if key not in self._visibilities:
             shot = self.target.frames[index].shot
-            placed = next((item for item in shot.lights if item.name == light), None)
+            placed = next((shot_light for shot_light in shot.lights if shot_light.name == light), None)
             visibility, shares = (0.0, None) if placed is None else (placed.visibility, placed.shares)
             if placed is not None and visibility > 0 and self.target.scene is not None:
                 source = self.sources[placed.source]
-                is_own_scene = np.allclose(placed.xyz, source.xyz, rtol=1e-6, atol=1e-9)  # the scene of the fit
-                behind, shares = visibility_behind(self.target.scene, shot.camera.world_to_camera, placed,
-                                                   self.settings.visibility,
-                                                   source.clear_visibility if is_own_scene else 1.0)
-                visibility *= _without_margin(behind)
+                is_fit_scene = np.allclose(placed.xyz, source.xyz, rtol=1e-6, atol=1e-9)  # the scene of the fit
+                scene_visibility, shares = visibility_behind(self.target.scene, shot.camera.world_to_camera, placed,
+                                                             self.settings.visibility,
+                                                             source.clear_visibility if is_fit_scene else 1.0)
+                visibility *= _without_margin(scene_visibility)
                 shares = shares and tuple(map(_without_margin, shares))
             self._visibilities[key] = visibility, shares
         return self._visibilities[key]
@@ -204,15 +204,13 @@ class Transfer:
         """Return the view of each light for the query `source`, by name; without lights that are never in front."""
         fixed = {}
         for name in self.lights:
-            placed: list[tuple[ViewOfLight, float, PlacedLight]] = []
-            for frame in self.target.frames:
-                for light in frame.shot.lights:
-                    if light.name == name:
-                        distance = float(np.linalg.norm(frame.shot.camera.position - light.xyz)) / self.settings.scale
-                        placed.append((ViewOfLight.of(frame.shot.camera.world_to_camera, light.xyz), distance, light))
-            source = placed[0][2].source
-            view = queries.fixed_view(self.sources[source], [entry[0] for entry in placed],
-                                      [entry[1] for entry in placed], self.training_views.get(source))
+            placed = [(frame.shot.camera, light) for frame in self.target.frames for light in frame.shot.lights
+                      if light.name == name]
+            views = [ViewOfLight.of(camera.world_to_camera, light.xyz) for camera, light in placed]
+            distances = [float(np.linalg.norm(camera.position - light.xyz)) / self.settings.scale
+                         for camera, light in placed]
+            source = placed[0][1].source
+            view = queries.fixed_view(self.sources[source], views, distances, self.training_views.get(source))
             if view is not None:
                 fixed[name] = view
         return fixed
@@ -259,11 +257,11 @@ class Transfer:
 
     def _has_full_float(self) -> bool:
         """Return whether a plate has 32 bit floats, judged by the first plate of each file type."""
-        by_suffix: dict[str, TargetFrame] = {}
+        frame_by_suffix: dict[str, TargetFrame] = {}
         for frame in self.target.frames:
             if frame.plate is not None:
-                by_suffix.setdefault(frame.plate.suffix.lower(), frame)
-        return any(self.plate(frame).is_full_float for frame in by_suffix.values())
+                frame_by_suffix.setdefault(frame.plate.suffix.lower(), frame)
+        return any(self.plate(frame).is_full_float for frame in frame_by_suffix.values())
 
     def plate(self, frame: TargetFrame) -> ColouredPlate:
         """The frame's plate in its own space."""
@@ -295,8 +293,8 @@ class _FrameRenderer:
 
     @property
     def fingerprint(self) -> str:
-        """See `Transfer.fingerprint_of`."""
-        return self._transfer.fingerprint_of(self._index)
+        """See `Transfer.frame_fingerprint`."""
+        return self._transfer.frame_fingerprint(self._index)
 
     @property
     def edit_texts(self) -> Sequence[str]:
@@ -306,8 +304,8 @@ class _FrameRenderer:
     @property
     def extra_files(self) -> Sequence[Path]:
         """Path of the plate with its flare, if one is written."""
-        target = self._frame.plate_with_flare_path(self._out) if self._out is not None else None
-        return [] if target is None else [target]
+        path = self._frame.plate_with_flare_path(self._out) if self._out is not None else None
+        return [] if path is None else [path]
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
         """Render scene, flare of each light, and depth; scene-linear Rec. 709."""
@@ -326,15 +324,15 @@ class _FrameRenderer:
         target, frame = self._transfer.target, self._frame
         no_depth = np.zeros((camera.height, camera.width), np.float32)
         if frame.plate is not None:
-            undistorted = background(frame, camera.size, self._transfer.plate_space)
+            undistorted = undistorted_background(frame, camera.size, self._transfer.plate_space)
             if undistorted is not None:
                 return undistorted, no_depth
             plate = self._transfer.plate(frame)
-            stored = plate_window(frame.plate, frame.orientation)
+            stored_window = plate_window(frame.plate, frame.orientation)
             if frame.window is not None and frame.window.size == camera.size:
                 self._plate = plate  # for `finish`
-                return move_to_window(plate.linear, stored, frame.window), no_depth
-            picture = Picture(crop_to_display_window(plate.linear, stored), "linear")
+                return move_to_window(plate.linear, stored_window, frame.window), no_depth
+            picture = Picture(crop_to_display_window(plate.linear, stored_window), "linear")
             return np.asarray(picture.resized(*camera.size).pixels, np.float32), no_depth
         if target.scene is not None and target.scene_is_background:
             rendering = render_scene(target.scene, camera)
@@ -347,18 +345,18 @@ class _FrameRenderer:
         frame, plate = self._frame, self._plate
         if plate is None or frame.plate is None or frame.window is None or frame.window.size != camera.size:
             return layers
-        stored = plate_window(frame.plate, frame.orientation)
-        target = frame.plate_with_flare_path(self._out) if self._out is not None else None
-        if target is not None:
-            plate.write(target, move_to_window(self._space.to_linear(layers.flare), frame.window, stored))
+        stored_window = plate_window(frame.plate, frame.orientation)
+        path = frame.plate_with_flare_path(self._out) if self._out is not None else None
+        if path is not None:
+            plate.write(path, move_to_window(self._space.to_linear(layers.flare), frame.window, stored_window))
             if plate.plate.warning:
                 self._progress.say(plate.plate.warning)
         layers = replace(layers, window=frame.window)
         plate_matrix, matrix = plate.space.matrix, self._space.matrix  # None for a space that is not linear
         if plate_matrix is not None and matrix is not None and np.allclose(plate_matrix, matrix, atol=1e-9)\
                 and not plate.has_straight_alpha:
-            layers = replace(layers, scene=move_to_window(plate.values, stored, frame.window))
+            layers = replace(layers, scene=move_to_window(plate.values, stored_window, frame.window))
         if plate.alpha is None:
             return layers
-        alpha = alpha_with_light(move_to_window(plate.alpha, stored, frame.window), layers.composite)
+        alpha = alpha_with_light(move_to_window(plate.alpha, stored_window, frame.window), layers.composite)
         return replace(layers, alpha=alpha)

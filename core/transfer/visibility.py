@@ -18,7 +18,7 @@ MAX_STEP = 0.05
 
 def are_consecutive(frame: ShotFrame, next_frame: ShotFrame, light: str) -> bool:
     """Return whether two frames are consecutive on one path, so that the light's visibility is continuous."""
-    xyz, next_xyz = (next((item.xyz for item in each.lights if item.name == light), None)
+    xyz, next_xyz = (next((placed.xyz for placed in each.lights if placed.name == light), None)
                      for each in (frame, next_frame))
     if next_frame.frame - frame.frame != 1 or frame.name != next_frame.name or xyz is None or next_xyz is None:
         return False
@@ -41,18 +41,18 @@ def smooth_visibility(frames: Sequence[ShotFrame], index: int, light: str, radiu
             neighbour = index + side * distance
             if not 0 <= neighbour < len(frames):
                 break
-            first, second = sorted((neighbour, neighbour - side))
-            if not are_consecutive(frames[first], frames[second], light):
+            earlier, later = sorted((neighbour, neighbour - side))
+            if not are_consecutive(frames[earlier], frames[later], light):
                 break
             values[side * distance] = visibility_of(neighbour)
     weights = np.array([1.0])
     for _ in range(2 * radius):
         weights = np.convolve(weights, [0.5, 0.5])
-    total = value = 0.0
+    weight_sum = weighted_sum = 0.0
     for offset in range(-radius, radius + 1):
         if offset in values:  # 0 always is
             window = range(offset - radius, offset + radius + 1)
-            lowest = min(values[other] for other in window if other in values)
-            value += weights[offset + radius] * lowest
-            total += weights[offset + radius]
-    return value / total
+            minimum = min(values[other] for other in window if other in values)
+            weighted_sum += weights[offset + radius] * minimum
+            weight_sum += weights[offset + radius]
+    return weighted_sum / weight_sum

@@ -328,6 +328,6 @@ def test_fall_off_of_a_transfer_starts_at_the_distance_of_the_first_frame(tmp_pa
     assert dimmed[0] == pytest.approx(plain[0], rel=1e-3)
     assert dimmed[1] == pytest.approx(plain[1] * (first / second) ** 2, rel=1e-3)
     assert named[0] == pytest.approx(4 * plain[0], rel=1e-3)
-    texts = {Transfer(tmp_path / "a.flare", target, TransferSettings(fall_off=value)).fingerprint_of(1)
+    texts = {Transfer(tmp_path / "a.flare", target, TransferSettings(fall_off=value)).frame_fingerprint(1)
              for value in (None, 0.0, 2 * first)}
     assert len(texts) == 3  # layers of other settings are not mistaken for these

@@ -36,11 +36,11 @@ from core.transfer.sources import assign_sources, parse_assignments
 from core.transfer.target import (
     Target,
     _most_similar_sources,
-    background,
     capture_target,
     picture_target,
     resized,
     shot_target,
+    undistorted_background,
 )
 from core.transfer.transfer import Transfer, TransferSettings
 from tests.core.captures import make_capture
@@ -594,7 +594,7 @@ def test_a_distorted_exr_is_converted_once(space: str, look: Look, tmp_path: Pat
                   half=False, header={"chromaticities": colour_space("acescg").chromaticities})
     one = capture_target(Capture.open(folder), look, {}).frames[1]
     assert one.plate is not None
-    straight = background(one, one.shot.camera.size, None if space == "auto" else colour_space(space))
+    straight = undistorted_background(one, one.shot.camera.size, None if space == "auto" else colour_space(space))
     assert straight is not None
     expected = ColouredPlate.read(one.plate, None if space == "auto" else colour_space(space)).linear[0, 0]
     np.testing.assert_allclose(straight, np.broadcast_to(expected, straight.shape), atol=1e-5)
@@ -675,7 +675,7 @@ def test_a_frame_is_rendered_again_when_a_smoothing_neighbour_changes(flare: Pat
     def prints(*shares: float) -> list[str]:
         target = shot_target(shot(flare, look, cameras(5), shares=list(shares)), look, {})
         transfer = Transfer(flare, target, TransferSettings(smooth=1))
-        return [transfer.fingerprint_of(number) for number in range(5)]
+        return [transfer.frame_fingerprint(number) for number in range(5)]
 
     same = [a == b for a, b in zip(prints(1, 1, 1, 1, 1), prints(1, 1, 1, 1, 0), strict=True)]
     assert same == [True, True, False, False, False], "the share is smoothed, then its step: two frames to each side"
@@ -683,6 +683,6 @@ def test_a_frame_is_rendered_again_when_a_smoothing_neighbour_changes(flare: Pat
 
 def test_a_half_float_plate_is_clamped_below_infinity() -> None:
     plate = ColouredPlate(Plate(Path("a.exr"), np.full((2, 2, 3), 60000, np.float16), "linear"), colour_space("linear"))
-    stored, _ = plate.with_light(np.full((2, 2, 3), 30000, np.float32))
+    stored, _ = plate.codes_with_light(np.full((2, 2, 3), 30000, np.float32))
     assert stored.dtype == np.float16
     assert (stored == 65504).all()

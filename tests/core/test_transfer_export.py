@@ -18,7 +18,7 @@ from core.gaussians.ply import read_ply
 from core.gaussians.projection import rotation_matrices
 from core.gaussians.rendering import ALPHA_MIN
 from core.look import LookEdits, PlaneGaussians, ViewOfLight, draw, read_look
-from core.transfer.export import _part, flare_scene, preset, write_flare_ply, write_preset
+from core.transfer.export import _element_part, flare_scene, make_preset, write_flare_ply, write_preset
 from tests.core.flared import cameras
 from tests.core.test_look import saved
 
@@ -105,7 +105,7 @@ def test_a_preset_has_position_and_intensity(tmp_path: Path, monkeypatch: pytest
     view = {look.names[0]: ViewOfLight(np.zeros(3, np.float32), np.eye(3, dtype=np.float32), light, 1.0)}
     write_preset(tmp_path / "a.json", look, view)
     made = json.loads((tmp_path / "a.json").read_text())
-    assert made == preset(look, view)
+    assert made == make_preset(look, view)
     rows = [row for element in look.lights[0].elements for row in element.members]
     listed = [part for element in made["lights"][0]["elements"] for part in element["parts"]]
     parts = [part for _, part in sorted(zip(rows, listed, strict=True), key=lambda pair: pair[0])]
@@ -128,7 +128,7 @@ def test_a_preset_has_the_visible_lights_at_the_frame_s_exposure(blend: str, tmp
     look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
     edits = LookEdits.parse(["lamp 0.mute=1"], look.names)
-    usual, exposed = (preset(look, view, edits, replace(camera, exposure=times)) for times in (1.0, 0.5))
+    usual, exposed = (make_preset(look, view, edits, replace(camera, exposure=times)) for times in (1.0, 0.5))
     assert [light["name"] for light in usual["lights"]] == [light["name"] for light in exposed["lights"]] == ["lamp 1"]
     before, after = ([part["intensity"] for element in one["lights"][0]["elements"] for part in element["parts"]]
                      for one in (usual, exposed))
@@ -142,13 +142,13 @@ def test_a_preset_omits_exactly_the_hidden_elements(word: str, tmp_path: Path) -
     look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     light = look.lights[0]
     view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz)}
-    everything = {one["name"]: one for one in preset(look, view)["lights"][0]["elements"]}
+    everything = {one["name"]: one for one in make_preset(look, view)["lights"][0]["elements"]}
     assert len(everything) == len(light.elements) > 2
     for element in light.elements:
         edits = LookEdits.parse([f"{light.name}/{element.name}.{word}=1"], look.names,
                                 {light.name: [one.name for one in light.elements]})
         left = set(everything) - {element.name} if word == "mute" else {element.name}
-        found = preset(look, view, edits)["lights"][0]["elements"]
+        found = make_preset(look, view, edits)["lights"][0]["elements"]
         assert found == [everything[name] for name in everything if name in left]
 
 
@@ -157,7 +157,7 @@ def test_a_preset_is_in_picture_widths(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", OURS, 1)
     look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
-    wide, tele = (preset(look, view, camera=replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom))["lights"][0]
+    wide, tele = (make_preset(look, view, camera=replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom))["lights"][0]
                   for zoom in (1, 2))
     pixel = camera.project(look.lights[0].xyz[None])[0][0]
     np.testing.assert_allclose(wide["at"], (pixel - [camera.cx, camera.cy]) / camera.width, rtol=1e-4)
@@ -176,6 +176,6 @@ def test_a_preset_has_side_and_rotation_of_a_part() -> None:
     mean = (0.25 * along + 0.1 * aside)[None].astype(np.float32)
     one = PlaneGaussians(mean, np.array([[spread[0, 0], spread[0, 1], spread[1, 1]]], np.float32),
                          np.ones(1, np.float32), np.ones((1, 3), np.float32))
-    part = _part(one, 0, 0.5 * along, 1.0)
+    part = _element_part(one, 0, 0.5 * along, 1.0)
     assert part["rotation"] == pytest.approx(30, abs=0.01)
     assert (part["offset"], part["aside"]) == pytest.approx((0.5, 0.1), abs=1e-6)

@@ -44,11 +44,11 @@ def write_capture(sources: Sequence[SourceFrame], solved: Solved, out: Path, wor
         _write_frame(source, frame, camera, work / "images" / names[frame.index])
         # One object for all frames of a lens and size: the model then has one camera for them.
         lens = lenses.setdefault((frame.lens, size_px), Lens("PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy),
-                                                            *size_px))
+                                                             *size_px))
         pixels = frame.lens.undistort(frame.pixels) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         valid = np.isfinite(pixels).all(axis=1)
         observed_frames.append(ObservedFrame(names[frame.index], lens, frame.world_to_camera, pixels[valid],
-                                     frame.points[valid]))
+                                             frame.points[valid]))
         progress.advance()
     # Errors are in pixels of the small pictures; the model has them in pixels of the frames.
     scale = sum(frame.lens.width for frame in observed_frames) / sum(frame.lens.width for frame in solved.frames)

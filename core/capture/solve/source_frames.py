@@ -154,7 +154,7 @@ def _to_upright(picture: Picture, orientation: int) -> Picture:
 
 
 def _prepare_folder(source: Path, work: Path, number: int, size: int,
-                 progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
+                    progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
     """Prepare the frames of a folder; see `prepare_frames`."""
     named_space = colour_space(*space) if space[0] else None
     files = pictures_in(source)
@@ -200,7 +200,7 @@ def _prepare_folder(source: Path, work: Path, number: int, size: int,
 
 
 def _prepare_video(source: Path, work: Path, number: int, size: int,
-                progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
+                   progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
     """Prepare the frames of a video; see `prepare_frames`.
 
     It is read twice: for the sharpness of every frame, then for the chosen ones.

@@ -9,6 +9,11 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+EDGE_STEPS = 1440
+"""Directions of the edge that `transmission` computes: steps of a quarter of a degree."""
+MIN_FACING = 0.05
+"""Cosine of 87 degrees: the largest angle between a direction and the normal of a blade that bounds it."""
+
 
 @dataclass(frozen=True)
 class Aperture:
@@ -36,9 +41,9 @@ def edge_radius(aperture: Aperture, sectors: int) -> Array:
     angles = np.arange(sectors) / sectors * 2 * np.pi
     normals = np.radians(aperture.turn) + (np.arange(aperture.blades) + 0.5) / aperture.blades * 2 * np.pi
     apothem = np.cos(np.pi / aperture.blades) * (1 + aperture.uneven * rng.standard_normal(aperture.blades))
-    # A blade is a straight line at its apothem; it bounds the directions that it faces, within 87 degrees.
+    # A blade is a straight line at its apothem; it bounds the directions that it faces.
     facing = np.cos(angles[:, None] - normals)
-    straight = np.where(facing > 0.05, apothem / np.maximum(facing, 0.05), np.inf).min(axis=1)
+    straight = np.where(facing > MIN_FACING, apothem / np.maximum(facing, MIN_FACING), np.inf).min(axis=1)
     return (1 - aperture.curved) * straight + aperture.curved
 
 
@@ -49,18 +54,19 @@ def transmission(aperture: Aperture, size: int, fill: float) -> Array:
     axis = (np.arange(size) + 0.5) / size * 2 - 1
     x, y = np.meshgrid(axis / fill, axis / fill)
     radius, angle = np.hypot(x, y), np.arctan2(y, x)
-    table = edge_radius(aperture, 1440)  # in steps of a quarter of a degree
-    edge = np.interp(angle % (2 * np.pi), np.arange(1441) / 1440 * 2 * np.pi, np.append(table, table[0]))
+    edge_table = edge_radius(aperture, EDGE_STEPS)
+    table_angles = np.arange(EDGE_STEPS + 1) / EDGE_STEPS * 2 * np.pi
+    edge = np.interp(angle % (2 * np.pi), table_angles, np.append(edge_table, edge_table[0]))
     mask = np.clip((edge - radius) * fill * size / 2 + 0.5, 0, 1)  # distances in pixels: an edge is one pixel wide
     rng = np.random.default_rng(aperture.seed + 1)
     for _ in range(aperture.dust):
-        far, azimuth, speck = np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi), rng.uniform(0.004, 0.02)
-        distance = np.hypot(x - far * np.cos(azimuth), y - far * np.sin(azimuth))
-        mask *= 1 - 0.9 * np.clip((speck - distance) * fill * size / 2 + 0.5, 0, 1)
+        offset, azimuth, speck_radius = np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi), rng.uniform(0.004, 0.02)
+        distance = np.hypot(x - offset * np.cos(azimuth), y - offset * np.sin(azimuth))
+        mask *= 1 - 0.9 * np.clip((speck_radius - distance) * fill * size / 2 + 0.5, 0, 1)
     for _ in range(aperture.scratches):
         rotation, offset, width = rng.uniform(0, np.pi), rng.uniform(-0.9, 0.9), rng.uniform(0.002, 0.006)
-        middle, half = rng.uniform(-0.6, 0.6), rng.uniform(0.1, 0.8)
+        centre, half_length = rng.uniform(-0.6, 0.6), rng.uniform(0.1, 0.8)
         along, across = x * np.cos(rotation) + y * np.sin(rotation), y * np.cos(rotation) - x * np.sin(rotation)
-        distance = np.maximum(np.abs(across - offset) - width, np.abs(along - middle) - half)
+        distance = np.maximum(np.abs(across - offset) - width, np.abs(along - centre) - half_length)
         mask *= 1 - 0.9 * np.clip(0.5 - distance * fill * size / 2, 0, 1)
     return mask

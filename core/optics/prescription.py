@@ -31,10 +31,13 @@ from ..system.reading import read_text
 
 Array = NDArray[np.float64]
 
+INDEX, DIAMETER = 2, 4
+"""Columns of a surface's line."""
 LINE_F, LINE_D, LINE_C = 0.4861, 0.5876, 0.6563
 """Fraunhofer lines, micrometres."""
 CHANNEL_WAVELENGTHS = (0.61, 0.54, 0.46)
 """Of the red, green and blue channel, micrometres."""
+MAGNESIUM_FLUORIDE_INDEX = 1.38
 HALF_DIAGONAL = 21.6
 """Half the diagonal of the 24 x 36 mm frame, mm: the unit of the canvas."""
 
@@ -54,8 +57,9 @@ class Prescription:
     def indices(self, wavelength: float) -> Array:
         """Return the refractive index behind each surface at a wavelength in micrometres: Cauchy's first two terms,
         through the index at the d line and the Abbe number; Abbe number 0 is glass without dispersion."""
-        slope = np.where(self.abbe > 0, (self.index - 1) / np.maximum(self.abbe, 1e-6) / (LINE_F**-2 - LINE_C**-2), 0.0)
-        return self.index + slope * (wavelength**-2 - LINE_D**-2)
+        mean_dispersion = (self.index - 1) / np.maximum(self.abbe, 1e-6)
+        dispersion = np.where(self.abbe > 0, mean_dispersion / (LINE_F**-2 - LINE_C**-2), 0.0)
+        return self.index + dispersion * (wavelength**-2 - LINE_D**-2)
 
     def focal_length(self) -> float:
         """Return the paraxial focal length, mm, at the d line; infinite for an afocal system."""
@@ -69,12 +73,13 @@ class Prescription:
 
     def widest_f_number(self) -> float:
         """Return the f-number with the stop fully open: focal length / diameter of the entrance pupil, paraxially."""
-        system, before, index = np.eye(2), 1.0, self.indices(LINE_D)
+        system, index_before, index = np.eye(2), 1.0, self.indices(LINE_D)
         for k in range(self.stop):  # a ray parallel to the axis meets the stop at system[0, 0] times its height
-            system = _transfer(self.thickness[k], index[k]) @ _refraction(before, index[k], self.curvature[k]) @ system
-            before = index[k]
-        entrance = float(self.semi_aperture[self.stop] / max(abs(system[0, 0]), 1e-9))
-        return self.focal_length() / (2 * min(entrance, float(self.semi_aperture[0])))
+            refraction = _refraction(index_before, index[k], self.curvature[k])
+            system = _transfer(self.thickness[k], index[k]) @ refraction @ system
+            index_before = index[k]
+        pupil_radius = float(self.semi_aperture[self.stop] / max(abs(system[0, 0]), 1e-9))
+        return self.focal_length() / (2 * min(pupil_radius, float(self.semi_aperture[0])))
 
     def scaled(self, factor: float) -> Prescription:
         """Return the lens with all lengths multiplied by a factor."""
@@ -88,12 +93,12 @@ class Prescription:
 
     def _system_matrix(self, index: Array) -> Array:
         """Return the matrix (2, 2) from before the first surface to behind the last, for these indices."""
-        system, before = np.eye(2), 1.0
+        system, index_before = np.eye(2), 1.0
         for k in range(len(index)):
-            system = _refraction(before, index[k], self.curvature[k]) @ system
+            system = _refraction(index_before, index[k], self.curvature[k]) @ system
             if k + 1 < len(index):
                 system = _transfer(self.thickness[k], index[k]) @ system
-            before = index[k]
+            index_before = index[k]
         return system
 
 
@@ -113,13 +118,13 @@ class GhostPath:
     contrast: Array
 
 
-def _refraction(before: float, after: float, curvature: float) -> Array:
-    """Return the matrix of a surface on (height, reduced slope: index times slope); before, after: indices."""
-    return np.array([[1.0, 0.0], [-(after - before) * curvature, 1.0]])
+def _refraction(index_before: float, index_after: float, curvature: float) -> Array:
+    """Return the matrix (2, 2) of a surface on (height, reduced slope: index times slope)."""
+    return np.array([[1.0, 0.0], [-(index_after - index_before) * curvature, 1.0]])
 
 
 def _transfer(length: float, index: float) -> Array:
-    """Return the matrix of a gap on (height, reduced slope)."""
+    """Return the matrix (2, 2) of a gap of this length, mm, on (height, reduced slope)."""
     return np.array([[1.0, length / index], [0.0, 1.0]])
 
 
@@ -133,11 +138,11 @@ def trace_ghost_pairs(lens: Prescription) -> list[GhostPath]:
     for i in refracting:
         for j in refracting:
             if j > i:
-                rows = [_trace_path(lens, index, i, j, focus) for index in indices_by_channel]
+                systems = [_trace_path(lens, index, i, j, focus) for index in indices_by_channel]
                 contrast = np.array([[_index_before(index, i), index[i], _index_before(index, j), index[j]]
                                      for index in indices_by_channel])
-                paths.append(GhostPath((i, j), np.array([row[0] for row in rows]), np.array([row[1] for row in rows]),
-                                       np.array([row[2] for row in rows]), contrast))
+                stop, last_stop, sensor = (np.array(system) for system in zip(*systems, strict=True))
+                paths.append(GhostPath((i, j), stop, last_stop, sensor, contrast))
     return paths
 
 
@@ -153,30 +158,30 @@ def _trace_path(lens: Prescription, index: Array, i: int, j: int, focus: float) 
     sensor, mm."""
     system = np.eye(2)
     crossings = []
-    c, t, last = lens.curvature, lens.thickness, len(index) - 1
+    curvature, thickness, last = lens.curvature, lens.thickness, len(index) - 1
 
     def forward(system: Array, first: int, end: int) -> Array:
         """Refract at `first`..`end` - 1, each followed by its gap."""
         for k in range(first, end):
-            system = _refraction(_index_before(index, k), index[k], c[k]) @ system
+            system = _refraction(_index_before(index, k), index[k], curvature[k]) @ system
             if k == lens.stop:
                 crossings.append(system[0])
             if k < last:
-                system = _transfer(t[k], index[k]) @ system
+                system = _transfer(thickness[k], index[k]) @ system
         return system
 
     system = forward(system, 0, j)
     # Reflected at j, back to i, reflected there, and on to the sensor. Backwards, curvatures change their signs.
-    system = np.array([[1.0, 0.0], [2 * _index_before(index, j) * c[j], 1.0]]) @ system
+    system = np.array([[1.0, 0.0], [2 * _index_before(index, j) * curvature[j], 1.0]]) @ system
     for k in range(j - 1, i, -1):
-        system = _transfer(t[k], index[k]) @ system
+        system = _transfer(thickness[k], index[k]) @ system
         if k == lens.stop:
             crossings.append(system[0])
-        system = _refraction(index[k], _index_before(index, k), -c[k]) @ system
-    system = _transfer(t[i], index[i]) @ system
-    system = np.array([[1.0, 0.0], [-2 * index[i] * c[i], 1.0]]) @ system
+        system = _refraction(index[k], _index_before(index, k), -curvature[k]) @ system
+    system = _transfer(thickness[i], index[i]) @ system
+    system = np.array([[1.0, 0.0], [-2 * index[i] * curvature[i], 1.0]]) @ system
     if i < last:
-        system = _transfer(t[i], index[i]) @ system
+        system = _transfer(thickness[i], index[i]) @ system
     system = forward(system, i + 1, last + 1)
     sensor = (_transfer(focus, 1.0) @ system)[0]
     return crossings[0], crossings[-1], sensor
@@ -191,11 +196,11 @@ def reflectance(n0: Array, n2: Array, wavelengths: Array, coating: float) -> Arr
     bare: Array = np.square((n0 - n2) / (n0 + n2))
     if coating <= 0 or min(float(np.min(n0)), float(np.min(n2))) > 1.01:
         return bare
-    n1 = 1.38  # magnesium fluoride
+    n1 = MAGNESIUM_FLUORIDE_INDEX
     r01, r12 = (n0 - n1) / (n0 + n1), (n1 - n2) / (n1 + n2)
     phase = np.cos(np.pi * coating / wavelengths)
-    top = r01**2 + r12**2 + 2 * r01 * r12 * phase
-    return top / (1 + (r01 * r12) ** 2 + 2 * r01 * r12 * phase)
+    numerator = r01**2 + r12**2 + 2 * r01 * r12 * phase
+    return numerator / (1 + (r01 * r12) ** 2 + 2 * r01 * r12 * phase)
 
 
 def read_prescription(path: Path | str) -> Prescription:
@@ -210,7 +215,7 @@ def read_prescription(path: Path | str) -> Prescription:
 
 def parse_prescription(text: str, name: str, where: str = "The lens") -> Prescription:
     """Parse the text format of the module's head; `where` begins the message of a SettingsError."""
-    rows: list[list[float]] = []
+    surfaces: list[list[float]] = []
     stop = -1
     for number, line in enumerate(text.splitlines(), 1):
         content = line.split("#")[0]
@@ -218,21 +223,21 @@ def parse_prescription(text: str, name: str, where: str = "The lens") -> Prescri
         if not columns or ":" in content:
             continue
         if columns[0] == "stop":
-            stop, columns[0] = len(rows), "0"
+            stop, columns[0] = len(surfaces), "0"
         try:
-            row = [float(column) for column in columns[:5]]
+            surface = [float(column) for column in columns[:5]]
         except ValueError:
-            row = []
-        if len(row) < 5 or not all(map(math.isfinite, row)) or row[2] < 0.9 or row[4] <= 0:
+            surface = []
+        if len(surface) < 5 or not all(map(math.isfinite, surface)) or surface[INDEX] < 0.9 or surface[DIAMETER] <= 0:
             raise SettingsError(f"{where}, line {number}, is not a surface; give radius, thickness, index, Abbe "
                                 "number, clear diameter.")
-        rows.append(row)
-    if len(rows) < 3:
+        surfaces.append(surface)
+    if len(surfaces) < 3:
         raise SettingsError(f"{where} is not a lens; it needs two surfaces at least and a line that starts with stop.")
     if stop < 0:
         raise SettingsError(f"{where} has no line that starts with stop, like converters, attachments and mirror "
                             "lenses; add the aperture stop, or choose another lens.")
-    radius, thickness, index, abbe, diameter = np.array(rows).T
+    radius, thickness, index, abbe, diameter = np.array(surfaces).T
     curvature = np.divide(1.0, radius, out=np.zeros_like(radius), where=radius != 0)
     return Prescription(name, curvature, thickness, index, abbe, diameter / 2, stop)
 

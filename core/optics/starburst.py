@@ -27,6 +27,8 @@ REFERENCE_WAVELENGTH = 0.55
 """Wavelength at which sizes of starburst and ring are given, micrometres."""
 BANDS = 25
 """Number of wavelengths that a starburst is summed over."""
+MIRROR_POSITION = -0.7
+"""Position that a streak's mirror image passes through, relative to the light's."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Ring:
 class Streak:
     """A streak: a line through the light at `turn` degrees, gain / (1 + (along / length)^2)^power along it, a Gaussian
     of standard deviation `width` (tan) across it. colour: linear RGB. mirror: brightness of a second
-    streak, relative to the first; it passes through -0.7 times the light's position."""
+    streak, relative to the first; it passes through MIRROR_POSITION times the light's position."""
 
     gain: float = 0.6
     length: float = 0.12
@@ -96,12 +98,12 @@ def starburst_texture(aperture: Aperture, settings: Starburst) -> Pixels:
     for wavelength, share in zip(wavelengths(BANDS), responses(BANDS), strict=True):
         scale = np.float32(REFERENCE_WAVELENGTH / wavelength)
         # A pattern that is wider by 1 / scale is fainter by scale^2: its light stays the same.
-        wide = cv2.remap(power, columns * scale + centre, rows * scale + centre, cv2.INTER_LINEAR)
-        texture += (wide * scale**2)[..., None] * share.astype(np.float32)
+        scaled_power = cv2.remap(power, columns * scale + centre, rows * scale + centre, cv2.INTER_LINEAR)
+        texture += (scaled_power * scale**2)[..., None] * share.astype(np.float32)
     sigma = settings.core / settings.extent * centre
     texture = cv2.GaussianBlur(texture, (0, 0), sigma).astype(np.float32)
-    reach = np.hypot(rows, columns) / centre
-    fade = np.clip((1 - reach) / 0.25, 0, 1)  # over the outer quarter, so that no edge shows
+    radius = np.hypot(rows, columns) / centre
+    fade = np.clip((1 - radius) / 0.25, 0, 1)  # over the outer quarter, so that no edge shows
     texture *= (settings.gain * fade * fade * (3 - 2 * fade))[..., None]
     return texture / (1 + texture.max(axis=2, keepdims=True) / settings.peak)
 
@@ -109,36 +111,36 @@ def starburst_texture(aperture: Aperture, settings: Starburst) -> Pixels:
 def draw_starburst(aperture: Aperture, settings: Starburst, x: Pixels, y: Pixels) -> Pixels:
     """Return the pattern (height, width, 3) at offsets (x, y) from the light (tan), each (height, width)."""
     texture = starburst_texture(aperture, settings)
-    half = TEXTURE_SIZE // 2
-    scale = half / settings.extent
-    columns, rows = (x * scale + half).astype(np.float32), (y * scale + half).astype(np.float32)
-    drawn = cv2.remap(texture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0,))
-    return drawn.astype(np.float32)
+    centre = TEXTURE_SIZE // 2
+    scale = centre / settings.extent
+    columns, rows = (x * scale + centre).astype(np.float32), (y * scale + centre).astype(np.float32)
+    pattern = cv2.remap(texture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0,))
+    return pattern.astype(np.float32)
 
 
 def draw_glow(settings: Glow, x: Pixels, y: Pixels) -> Pixels:
     """Return the white glow at offsets (x, y) from the light, (height, width, 3)."""
-    squared = x * x + y * y
-    veil = settings.gain / (1 + squared / settings.radius**2) ** settings.power
-    veil += settings.wide_gain / (1 + squared / settings.wide_radius**2) ** 2 + settings.floor
-    return np.repeat(veil[..., None], 3, axis=2).astype(np.float32)
+    squared_distance = x * x + y * y
+    glow = settings.gain / (1 + squared_distance / settings.radius**2) ** settings.power
+    glow += settings.wide_gain / (1 + squared_distance / settings.wide_radius**2) ** 2 + settings.floor
+    return np.repeat(glow[..., None], 3, axis=2).astype(np.float32)
 
 
 def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) -> Pixels:
     """Return a ring at image coordinates (x, y), (height, width, 3). x, y and light: tan from the principal point."""
     u, v = x - settings.follow * light[0], y - settings.follow * light[1]
     distance = np.hypot(u, v)
-    field = math.hypot(*light)
+    field_tan = math.hypot(*light)
     # Cosine of the angle to the light's direction; it fades for a light near the principal point, which
     # has none: to 0.7 of itself at a field angle of tan 0.22.
-    side = (u * light[0] + v * light[1]) / np.maximum(distance, 1e-6) / math.sqrt(field**2 + 0.05)
-    bright = settings.gain * np.maximum(1 - settings.lean * side, 0)
+    light_cosine = (u * light[0] + v * light[1]) / np.maximum(distance, 1e-6) / math.sqrt(field_tan**2 + 0.05)
+    brightness = settings.gain * np.maximum(1 - settings.lean * light_cosine, 0)
     ring = np.zeros((*x.shape, 3), np.float32)
     for wavelength, rgb in zip(wavelengths(BANDS), responses(BANDS), strict=True):
         stretch = 1 + settings.dispersion * (wavelength / REFERENCE_WAVELENGTH - 1)
-        radius = (settings.radius + settings.grow * field) * stretch
-        bell = np.exp(-0.5 * ((distance - radius) / (settings.width * radius)) ** 2) / stretch
-        ring += (bright * bell)[..., None] * rgb.astype(np.float32)
+        radius = (settings.radius + settings.grow * field_tan) * stretch
+        profile = np.exp(-0.5 * ((distance - radius) / (settings.width * radius)) ** 2) / stretch
+        ring += (brightness * profile)[..., None] * rgb.astype(np.float32)
     return ring
 
 
@@ -147,9 +149,9 @@ def draw_streak(settings: Streak, light: tuple[float, float], x: Pixels, y: Pixe
     `draw_ring`."""
     cosine, sine = math.cos(math.radians(settings.turn)), math.sin(math.radians(settings.turn))
     total = np.zeros(x.shape, np.float32)
-    for side, share in ((1.0, 1.0), (-0.7, settings.mirror)):
-        u, v = x - side * light[0], y - side * light[1]
+    for position_factor, streak_gain in ((1.0, 1.0), (MIRROR_POSITION, settings.mirror)):
+        u, v = x - position_factor * light[0], y - position_factor * light[1]
         along, across = cosine * u + sine * v, cosine * v - sine * u
-        line = np.exp(-0.5 * (across / settings.width) ** 2)
-        total += share * settings.gain * line / (1 + (along / settings.length) ** 2) ** settings.power
+        profile = np.exp(-0.5 * (across / settings.width) ** 2)
+        total += streak_gain * settings.gain * profile / (1 + (along / settings.length) ** 2) ** settings.power
     return total[..., None] * np.array(settings.colour, np.float32)

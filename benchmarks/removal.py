@@ -428,7 +428,7 @@ def print_coverage(sheet: Path | None = None, count: int = 400) -> None:
     from core.removal.synthesis.flare import FLARE_CLASSES, add_aspheric_ghosts, synthesise_flare
 
     lenses = built_in_lenses()
-    shares = [coverage(synthesise_flare((1, number), 160, lenses).whole) for number in range(count)]
+    shares = [coverage(synthesise_flare((1, number), 160, lenses).total) for number in range(count)]
     counts, edges = np.histogram(shares, [0, 0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1])
     for low, high, value in zip(edges[:-1], edges[1:], counts, strict=True):
         print(f"{low:5.1%} to {high:6.1%}  {value / count:6.1%}  {'#' * round(100 * value / count)}")
@@ -438,7 +438,7 @@ def print_coverage(sheet: Path | None = None, count: int = 400) -> None:
         rows = [[synthesise_flare((5, number), 256, lenses, kind) for number in range(9)] for kind in FLARE_CLASSES]
         rows.append([add_aspheric_ghosts(synthesise_flare((5, number), 256, lenses, "glow"), (5, number, 3))
                      for number in range(9)])
-        tiles = [np.concatenate([np.clip(flare.whole + flare.light, 0, 1) ** (1 / 2.2) for flare in row], 1)
+        tiles = [np.concatenate([np.clip(flare.total + flare.light, 0, 1) ** (1 / 2.2) for flare in row], 1)
                  for row in rows]
         import cv2
 

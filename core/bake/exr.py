@@ -51,7 +51,7 @@ def read_description(path: Path | str) -> dict[str, Any]:
         with open_regular(path) as stream:
             if stream.read(4) != exr_header.MAGIC or exr_header.is_truncated(stream):
                 raise FrameError(f"{path} is damaged or truncated; bake it again.")
-            text = exr_header.string_places(stream).get(HEADER_ATTRIBUTE, (0, b""))[1]
+            text = exr_header.locate_strings(stream).get(HEADER_ATTRIBUTE, (0, b""))[1]
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     try:

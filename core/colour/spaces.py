@@ -125,8 +125,8 @@ def space_of_chromaticities(chromaticities: Chromaticities) -> ColourSpace:
 
     Raises SettingsError where they span no space.
     """
-    for name, known in _LINEAR.items():
-        if np.abs(np.subtract(chromaticities, known)).max() < CHROMATICITY_TOLERANCE:
+    for name, built_in in _LINEAR.items():
+        if np.abs(np.subtract(chromaticities, built_in)).max() < CHROMATICITY_TOLERANCE:
             return colour_space(name)
     try:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -153,8 +153,8 @@ def colour_space(name: str, config: Path | str | None = None) -> ColourSpace:
         return ocio_space(name, config)
     normalised = _normalise_name(name)
     if normalised in _ALIASES:
-        known = _ALIASES[normalised]
-        return (_BUILT_IN.get(known) or _CURVED[known])()
+        space_name = _ALIASES[normalised]
+        return (_BUILT_IN.get(space_name) or _CURVED[space_name])()
     from .ocio import camera_space, has_configuration, ocio_space
 
     if normalised in _CAMERAS:

@@ -113,7 +113,7 @@ class Frames:
             codes = self._load_codes(view, "frame", self.capture.frame)
             if codes is None or codes.max() <= MAX_BORDER_LEVEL * self._codes_per_value:  # faded out
                 continue
-            borders = Borders.of(codes, lambda line: line / self._codes_per_value)
+            borders = Borders.measure(codes, lambda line: line / self._codes_per_value)
             shared_borders = borders if shared_borders is None else shared_borders.intersection(borders)
             if max(shared_borders) < MIN_BORDER_LINES:
                 return None

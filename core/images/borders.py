@@ -34,7 +34,7 @@ class Borders(NamedTuple):
     right: int
 
     @classmethod
-    def of(cls, picture: NDArray[Any], to_display: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray) -> Borders:
+    def measure(cls, picture: NDArray[Any], to_display: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray) -> Borders:
         """Measure the borders of a picture (height, width, 3). to_display: converts a line to display values 0..1."""
         height, width = picture.shape[:2]
         top, bottom = _count_border_lines(lambda row: to_display(picture[row]), height)
@@ -51,8 +51,8 @@ class Borders(NamedTuple):
         Facing borders count by the narrower one: a night sky makes one of them wider, and is no border by itself.
         An area with a side below MIN_AREA_SIDE becomes the whole picture.
         """
-        top, bottom = _symmetric(self.top, self.bottom)
-        left, right = _symmetric(self.left, self.right)
+        top, bottom = _match_facing(self.top, self.bottom)
+        left, right = _match_facing(self.left, self.right)
         area = PictureArea(top + margin * (top > 0), height - bottom - margin * (bottom > 0),
                            left + margin * (left > 0), width - right - margin * (right > 0))
         return area if min(area.size) >= MIN_AREA_SIDE else PictureArea(0, height, 0, width)
@@ -81,36 +81,37 @@ def find_picture_area(picture: NDArray[Any],
                       to_display: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray) -> PictureArea:
     """Find the area inside the borders of a picture (height, width, 3). to_display: converts a line to display values
     0..1."""
-    return Borders.of(picture, to_display).area(picture.shape[1], picture.shape[0])
+    return Borders.measure(picture, to_display).area(picture.shape[1], picture.shape[0])
 
 
-def _symmetric(first: int, last: int) -> tuple[int, int]:
-    """Return the line counts of two facing borders: both the lower one where they differ by more than MIN_BORDER_LINES,
-    zeros where either is no border."""
+def _match_facing(first: int, last: int) -> tuple[int, int]:
+    """Return the numbers of lines of two facing borders: the lower one for both where they differ by more than
+    MIN_BORDER_LINES, zeros where either is no border."""
     if min(first, last) < MIN_BORDER_LINES:
         return 0, 0
     return (first, last) if abs(first - last) <= MIN_BORDER_LINES else (min(first, last),) * 2
 
 
-def _count_border_lines(line: Callable[[int], NDArray[Any]], count: int) -> tuple[int, int]:
-    """Count the black lines at both ends; none in a picture that is black all over."""
-    first, last = (_count_leading_lines(line, order) for order in (range(count), range(count - 1, -1, -1)))
+def _count_border_lines(read_line: Callable[[int], NDArray[Any]], count: int) -> tuple[int, int]:
+    """Count the black lines at both ends; none in a picture that is black all over. read_line: as for
+    `_count_leading_lines`. count: number of lines."""
+    first, last = (_count_leading_lines(read_line, order) for order in (range(count), range(count - 1, -1, -1)))
     return (first, last) if first + last < count else (0, 0)
 
 
-def _count_leading_lines(line: Callable[[int], NDArray[Any]], order: Iterable[int]) -> int:
+def _count_leading_lines(read_line: Callable[[int], NDArray[Any]], positions: Iterable[int]) -> int:
     """Count the even, black lines in this order, up to the first other one.
 
-    line: returns the pixels (length, 3) at a position, as display values. All must have the first one's colour.
+    read_line: returns the pixels (length, 3) at a position, as display values. All must have the first one's colour.
     """
-    colour, number = None, -1
-    for number, position in enumerate(order):
-        pixels = line(position)
+    colour, index = None, -1
+    for index, position in enumerate(positions):
+        pixels = read_line(position)
         if colour is None:
             colour = np.median(pixels, 0)
             if not colour.max() <= MAX_BORDER_LEVEL:  # so written, NaN is no border
                 return 0
         difference = np.abs(pixels - colour).max(-1)
         if (difference <= LEVEL_TOLERANCE).mean() < MIN_EVEN_SHARE or not difference.max() <= 3 * LEVEL_TOLERANCE:
-            return number
-    return number + 1
+            return index
+    return index + 1

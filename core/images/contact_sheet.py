@@ -22,6 +22,6 @@ def add_label(text: str, picture: Pixels) -> Pixels:
     """Add a line of text above a picture."""
     import cv2
 
-    head = np.zeros((LABEL_HEIGHT, picture.shape[1], 3), np.float32)
-    cv2.putText(head, text, (4, LABEL_HEIGHT - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0.85,) * 3, 1, cv2.LINE_AA)
-    return np.concatenate([head, picture])
+    label = np.zeros((LABEL_HEIGHT, picture.shape[1], 3), np.float32)
+    cv2.putText(label, text, (4, LABEL_HEIGHT - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0.85,) * 3, 1, cv2.LINE_AA)
+    return np.concatenate([label, picture])

@@ -64,18 +64,18 @@ def _png_space(path: Path) -> ColourSpace | None:
     """Return the space of a PNG; None for none. The first of these chunks counts, by the order of the specification
     (third edition, 4.3): cICP, iCCP, sRGB, then gAMA with cHRM."""
     with open_regular(path) as stream:
-        contents = dict(png.chunks(stream, (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM"), before_pixels=True))
-    points = contents.get(b"cICP", b"")
-    if len(points) == 4 and (space := space_of_code_points(points[0], points[1])) is not None:
+        chunks = dict(png.chunks(stream, (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM"), before_pixels=True))
+    code_points = chunks.get(b"cICP", b"")
+    if len(code_points) == 4 and (space := space_of_code_points(code_points[0], code_points[1])) is not None:
         return space
-    if b"iCCP" in contents:
-        space = profile_space(path, _inflate(contents[b"iCCP"].partition(b"\0")[2][1:]))  # behind name and method
+    if b"iCCP" in chunks:
+        space = profile_space(path, _inflate(chunks[b"iCCP"].partition(b"\0")[2][1:]))  # behind name and method
         if space is not None:
             return space
-    if b"sRGB" in contents:
+    if b"sRGB" in chunks:
         return colour_space("srgb")
-    gamma = int.from_bytes(contents.get(b"gAMA", b""), "big")  # 100 000 times the exponent that encodes
-    primaries = _chromaticities(contents.get(b"cHRM", b""))
+    gamma = int.from_bytes(chunks.get(b"gAMA", b""), "big")  # 100 000 times the exponent that encodes; 0 for none
+    primaries = _parse_chromaticities(chunks.get(b"cHRM", b""))
     if not gamma and primaries is None:
         return None
     if not gamma or _SRGB_GAMMAS[0] <= gamma <= _SRGB_GAMMAS[1]:
@@ -86,16 +86,16 @@ def _png_space(path: Path) -> ColourSpace | None:
     return curved_space(f"gamma {100_000 / gamma:.3g}", *power_curve(100_000 / gamma), primaries or REC_709)
 
 
-def _chromaticities(chunk: bytes) -> Chromaticities | None:
+def _parse_chromaticities(chunk: bytes) -> Chromaticities | None:
     """Return the primaries of cHRM in EXR's order; None where it is missing, spans no space, or is Rec. 709."""
     if len(chunk) != 32:
         return None
-    white_x, white_y, *rest = (np.frombuffer(chunk, ">u4") / 100_000).tolist()
-    values: Chromaticities = (*rest, white_x, white_y)
+    white_x, white_y, *primaries = (np.frombuffer(chunk, ">u4") / 100_000).tolist()
+    values: Chromaticities = (*primaries, white_x, white_y)
     if np.abs(np.subtract(values, REC_709)).max() < CHROMATICITY_TOLERANCE:
         return None
     # Its determinant is twice the area between the primaries.
-    triangle = np.array([[*rest[0:2], 1], [*rest[2:4], 1], [*rest[4:6], 1]])
+    triangle = np.array([[*primaries[0:2], 1], [*primaries[2:4], 1], [*primaries[4:6], 1]])
     return values if min(values[1::2]) > 0 and abs(np.linalg.det(triangle)) > 0.01 else None
 
 

@@ -86,23 +86,23 @@ def describe(path: Path, kind: Kind) -> Description:
     if kind == "raw":
         with _open_raw(path) as raw:
             sizes = raw.sizes
-            turned = sizes.flip in (5, 6)  # LibRaw's numbers of the quarter turns, which `_decode_raw` applies
-            width, height = (sizes.height, sizes.width) if turned else (sizes.width, sizes.height)
+            is_turned = sizes.flip in (5, 6)  # LibRaw's numbers of the quarter turns, which `_decode_raw` applies
+            width, height = (sizes.height, sizes.width) if is_turned else (sizes.width, sizes.height)
             return Description(width, height, colour_space("linear"))
     with _open_by_pillow(path, kind) as picture:
         width, height = picture.size
         profile = picture.info.get("icc_profile") or b""
         nclx = picture.info.get("nclx_profile")
-        points = (int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])) if nclx else None
+        code_points = (int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])) if nclx else None
         if kind == "avif":
             if _avif_orientation(picture) in SWAPS_SIDES:
                 width, height = height, width
-            if not profile and (frame := _av1_frame(path)) is not None:
-                points = int(frame.raw.color_primaries), int(frame.raw.color_trc)  # Pillow does not give them
-        space = profile_space(path, profile) or (space_of_code_points(*points) if points else None)
+            if not profile and (frame := _read_av1_frame(path)) is not None:
+                code_points = int(frame.raw.color_primaries), int(frame.raw.color_trc)  # Pillow does not give them
+        space = profile_space(path, profile) or (space_of_code_points(*code_points) if code_points else None)
         exif, xmp = (bytes(picture.info.get(name) or b"") for name in ("exif", "xmp"))
         # Orientation 1: `decode_foreign` turns these formats upright.
-        return Description(width, height, space, 1, profile, points, exif.removeprefix(b"Exif\0\0"), xmp)
+        return Description(width, height, space, 1, profile, code_points, exif.removeprefix(b"Exif\0\0"), xmp)
 
 
 def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
@@ -115,26 +115,26 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
     if kind == "raw":
         return _decode_raw(path)
     if kind == "jp2":
-        return _guarded(_decode_by_opencv, path)
+        return _decode_in_child(_decode_by_opencv, path)
     if kind == "heif":
         return _decode_heif(path)
     with _open_by_pillow(path, kind) as picture:
         if getattr(picture, "n_frames", 1) > 1:
             raise FrameError(f"{path} has {picture.n_frames} frames; export them as files of their own.")
         orientation = _avif_orientation(picture) if kind == "avif" else 1
-        frame = _av1_frame(path) if kind == "avif" and picture.mode == "RGB" else None  # without alpha
+        frame = _read_av1_frame(path) if kind == "avif" and picture.mode == "RGB" else None  # without alpha
         if frame is not None and frame.colour.bits > 8 and (frame.raw.width, frame.raw.height) == picture.size:
-            return _bgr(apply_orientation(frame.stored_codes(), orientation))  # Pillow would round to 8 bits
+            return _to_bgr(apply_orientation(frame.stored_codes(), orientation))  # Pillow would round to 8 bits
         is_transparent = picture.has_transparency_data
         mode = "RGBA" if is_transparent else picture.mode if picture.mode in ("L", "RGB") else "RGB"
         try:
             pixels = np.asarray(picture.convert(mode))
         except Exception as problem:  # the plug-ins raise what their libraries do
-            raise _damaged(path, "" if kind == "jxl" else problem) from problem
-    return _bgr(apply_orientation(pixels, orientation))
+            raise _damaged_file(path, "" if kind == "jxl" else problem) from problem
+    return _to_bgr(apply_orientation(pixels, orientation))
 
 
-def _av1_frame(path: Path) -> VideoFrame | None:
+def _read_av1_frame(path: Path) -> VideoFrame | None:
     """Return the picture of an AVIF by PyAV, which knows its code points and more than the 8 bits of Pillow; None where
     it cannot be read so."""
     from .video import Video
@@ -170,7 +170,7 @@ def profile_space(path: Path, profile: bytes) -> ColourSpace | None:
                          "--plate-space.") from problem
 
 
-def _bgr(pixels: NDArray[Any]) -> NDArray[Any]:
+def _to_bgr(pixels: NDArray[Any]) -> NDArray[Any]:
     """Return R G B (A) as B G R (A), grey as (height, width), grey with alpha as three equal channels and alpha."""
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         return np.ascontiguousarray(pixels[..., 0])
@@ -180,7 +180,7 @@ def _bgr(pixels: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(pixels[..., order])
 
 
-def _library(name: str, path: Path) -> ModuleType:
+def _import_library(name: str, path: Path) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as problem:
@@ -189,37 +189,37 @@ def _library(name: str, path: Path) -> ModuleType:
                          f"{group} -c constraints.txt`, or save the picture as PNG, TIFF or EXR.") from problem
 
 
-def _damaged(path: Path, problem: object) -> FrameError:
+def _damaged_file(path: Path, problem: object) -> FrameError:
     reason = " ".join(str(problem).split())[:160]
     return FrameError(f"{path} is damaged or truncated{f' ({reason})' if reason else ''}; export it again.")
 
 
 def open_oiio(path: Path) -> Any:
     """Open a file with OpenImageIO, for its alpha and colours as stored. Raises FrameError; the caller closes it."""
-    oiio = _library("OpenImageIO", path)
+    oiio = _import_library("OpenImageIO", path)
     check_regular(path)
     _check_stated_size(path)
     oiio.attribute("limits:imagesize_MB", 8192)  # MAX_PIXELS of four floats
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
-    opened = oiio.ImageInput.open(str(path), settings)
-    if opened is None:
-        raise _damaged(path, oiio.geterror())
-    return opened
+    image_input = oiio.ImageInput.open(str(path), settings)
+    if image_input is None:
+        raise _damaged_file(path, oiio.geterror())
+    return image_input
 
 
 def _describe_by_oiio(path: Path, kind: Kind) -> Description:
     """Read the header of a file with OpenImageIO. Raises FrameError."""
-    opened = open_oiio(path)
+    image_input = open_oiio(path)
     try:
-        spec = opened.spec()
+        spec = image_input.spec()
         profile = spec.getattribute("ICCProfile")
-        data = bytes(np.asarray(profile, np.uint8)) if profile is not None else b""
-        space = profile_space(path, data) or _oiio_space(spec, kind)
+        profile_bytes = bytes(np.asarray(profile, np.uint8)) if profile is not None else b""
+        space = profile_space(path, profile_bytes) or _oiio_space(spec, kind)
         orientation = spec.get_int_attribute("Orientation", 1) if kind in ("webp", "tiff", "psd") else 1
-        return Description(spec.width, spec.height, space, orientation if 1 <= orientation <= 8 else 1, data)
+        return Description(spec.width, spec.height, space, orientation if 1 <= orientation <= 8 else 1, profile_bytes)
     finally:
-        opened.close()
+        image_input.close()
 
 
 def _oiio_space(spec: Any, kind: Kind) -> ColourSpace | None:
@@ -245,13 +245,13 @@ def _check_stated_size(path: Path) -> None:
     with open_regular(path) as stream:
         head = stream.read(36)
         size = stream.seek(0, 2)
-    place = _STATED_SIZES.get(head[:4]) or _STATED_SIZES.get(head[3::-1])
-    if place is None:
+    offsets = _STATED_SIZES.get(head[:4]) or _STATED_SIZES.get(head[3::-1])
+    if offsets is None:
         return
     order: Literal["big", "little"] = "big" if head[:4] in _STATED_SIZES else "little"
-    stated, user_data = (int.from_bytes(head[at:at + 4], order) for at in place)
-    if size < stated < 0xFFFFFFFF or size < user_data < 0xFFFFFFFF:  # all bits set: not stated
-        raise _damaged(path, f"it has {size} of {max(stated, user_data)} bytes")
+    stated_size, user_data = (int.from_bytes(head[offset:offset + 4], order) for offset in offsets)
+    if size < stated_size < 0xFFFFFFFF or size < user_data < 0xFFFFFFFF:  # all bits set: not stated
+        raise _damaged_file(path, f"it has {size} of {max(stated_size, user_data)} bytes")
 
 
 def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
@@ -261,23 +261,23 @@ def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
     """
     size = path.stat().st_size
     bits = spec.get_int_attribute("oiio:BitsPerSample", 0) or 8 * spec.format.size()
-    claimed = spec.width * spec.height * spec.nchannels * bits // 8
+    claimed_bytes = spec.width * spec.height * spec.nchannels * bits // 8
     if kind in ("dpx", "cineon"):
         with open_regular(path) as stream:
             is_packed = kind == "dpx" and stream.read(_DPX_ENCODING[1])[_DPX_ENCODING[0]:] not in (b"", b"\0\0")
-        most = _MAX_RUN_LENGTH * size if is_packed else size
+        max_bytes = _MAX_RUN_LENGTH * size if is_packed else size
     else:
-        most = _MAX_RUN_LENGTH * size if kind in ("tga", "bmp", "hdr") else claimed
-    if claimed > most:
-        raise _damaged(path, f"it claims {spec.width} x {spec.height} pixels in {size} bytes")
+        max_bytes = _MAX_RUN_LENGTH * size if kind in ("tga", "bmp", "hdr") else claimed_bytes
+    if claimed_bytes > max_bytes:
+        raise _damaged_file(path, f"it claims {spec.width} x {spec.height} pixels in {size} bytes")
 
 
 def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
     """Decode a file with OpenImageIO; see `decode_foreign`. Of more than four channels, the colours are kept, and alpha
     where it is the fourth. Raises FrameError."""
-    opened = open_oiio(path)
+    image_input = open_oiio(path)
     try:
-        spec = opened.spec()
+        spec = image_input.spec()
         channels = spec.nchannels
         if kind == "psd" and spec.get_string_attribute("psd:ColorMode") in ("CMYK", "Lab", "Multichannel"):
             raise FrameError(f"{path} is in {spec.get_string_attribute('psd:ColorMode')} colours; convert it to RGB.")
@@ -290,30 +290,30 @@ def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
             raise FrameError(f"{path} claims {spec.width} x {spec.height} pixels, more than this program opens.")
         _check_claimed_pixels(path, kind, spec)
         name = {"uint8": "uint8", "uint16": "uint16", "half": "half"}.get(str(spec.format), "float")
-        pixels = opened.read_image(0, 0, 0, channels, name)
-        problem = opened.geterror()
+        pixels = image_input.read_image(0, 0, 0, channels, name)
+        problem = image_input.geterror()
         if "not configured" in problem:
             number = spec.get_int_attribute("tiff:Compression")
             name = tiff.UNSUPPORTED_COMPRESSIONS.get(number, f"the method {number}")
             raise FrameError(f"{path} is compressed with {name}, which the TIFF library here is built without; save "
                              "it with LZW or ZIP compression.")
         if pixels is None or problem:
-            raise _damaged(path, problem)
+            raise _damaged_file(path, problem)
         pixels = np.asarray(pixels).reshape(spec.height, spec.width, channels)
         if kind == "tiff" and pixels.dtype == np.uint16 and spec.get_int_attribute("tiff:PhotometricInterpretation",
                                                                                    1) == 0:
             pixels = 65535 - pixels  # 0 is white, which OpenImageIO converts in 8 bits only
-        return _bgr(pixels)
+        return _to_bgr(pixels)
     finally:
-        opened.close()
+        image_input.close()
 
 
-def _guarded(decode: Callable[..., NDArray[Any]], path: Path) -> NDArray[Any]:
+def _decode_in_child(decode: Callable[..., NDArray[Any]], path: Path) -> NDArray[Any]:
     """Decode in a child process, since a damaged file ends the process of this library. Raises FrameError."""
     try:
         return np.asarray(run_in_child(decode, path, progress=Progress()))
     except ChildDied as problem:
-        raise _damaged(path, problem) from problem
+        raise _damaged_file(path, problem) from problem
 
 
 def _decode_by_opencv(path: Path, _progress: Progress | None = None) -> NDArray[Any]:
@@ -324,58 +324,58 @@ def _decode_by_opencv(path: Path, _progress: Progress | None = None) -> NDArray[
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     except cv2.error as problem:
-        raise _damaged(path, problem.err) from problem
+        raise _damaged_file(path, problem.err) from problem
     if pixels is None:
-        raise _damaged(path, "")
+        raise _damaged_file(path, "")
     return np.asarray(pixels)
 
 
 def _open_by_pillow(path: Path, kind: Kind) -> Any:
     """Open HEIC, AVIF, JPEG XL, JPEG 2000 or GIF with Pillow and its plug-ins. Raises FrameError."""
-    image = _library("PIL.Image", path)
+    image = _import_library("PIL.Image", path)
     if kind == "jxl":
-        _library("pillow_jxl", path)
+        _import_library("pillow_jxl", path)
     if kind == "heif":
-        _library("pillow_heif", path).register_heif_opener()
+        _import_library("pillow_heif", path).register_heif_opener()
     check_regular(path)
     image.MAX_IMAGE_PIXELS = MAX_PIXELS  # type: ignore[attr-defined]  # Pillow refuses photographs of 200 megapixels
     try:
         return image.open(path)
     except Exception as problem:  # the plug-ins raise what their libraries do; that of JPEG XL gives no reason
         is_vague = kind == "jxl" or isinstance(problem, image.UnidentifiedImageError)
-        raise _damaged(path, "" if is_vague else problem) from problem
+        raise _damaged_file(path, "" if is_vague else problem) from problem
 
 
 def _decode_heif(path: Path) -> NDArray[Any]:
     """Decode HEIC upright, with the bits of the file spread over 16 where it has more than 8."""
-    library = _library("pillow_heif", path)
+    library = _import_library("pillow_heif", path)
     check_regular(path)
     try:
         picture = library.open_heif(path, convert_hdr_to_8bit=False)
         pixels = np.asarray(picture)
     except Exception as problem:
-        raise _damaged(path, problem) from problem
-    return _bgr(pixels)
+        raise _damaged_file(path, problem) from problem
+    return _to_bgr(pixels)
 
 
 def _open_raw(path: Path) -> Any:
-    library = _library("rawpy", path)
+    library = _import_library("rawpy", path)
     check_regular(path)
     try:
         return library.imread(str(path))
     except Exception as problem:
-        raise _damaged(path, problem) from problem
+        raise _damaged_file(path, problem) from problem
 
 
 def _decode_raw(path: Path) -> NDArray[Any]:
     """Develop a raw file upright to 16 bit scene-linear Rec. 709, B G R, with the camera's white balance and without
     automatic brightening; highlights are clipped at white."""
-    library = _library("rawpy", path)
+    library = _import_library("rawpy", path)
     with _open_raw(path) as raw:
         try:
             pixels = raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True,
                                      output_color=library.ColorSpace.sRGB)
         except Exception as problem:
-            raise _damaged(path, problem) from problem
-    return _bgr(pixels)
+            raise _damaged_file(path, problem) from problem
+    return _to_bgr(pixels)
 

@@ -82,16 +82,16 @@ def read_exr_header(path: Path | str) -> dict[str, Any]:
     return read_exr_headers(path)[0]
 
 
-def foreign_strings(path: Path | str) -> dict[str, bytes]:
+def non_utf8_strings(path: Path | str) -> dict[str, bytes]:
     """Return the text attributes of an EXR that are not UTF-8, by name; none where it is no EXR. Raises OSError."""
     with open_regular(path) as stream:
         if stream.read(4) != exr_header.MAGIC:
             return {}
-        places = exr_header.string_places(stream)
-    return {name: text for name, (_, text) in places.items() if not is_utf8(text)}
+        texts = exr_header.locate_strings(stream)
+    return {name: text for name, (_, text) in texts.items() if not is_utf8(text)}
 
 
-def foreign_names(path: Path | str) -> dict[bytes, bytes]:
+def non_utf8_names(path: Path | str) -> dict[bytes, bytes]:
     """Return the names of attributes and channels of an EXR that are not UTF-8, by the ASCII names under which this
     program has them: each byte above 127 is replaced by DEL, the last character of ASCII.
 
@@ -101,11 +101,11 @@ def foreign_names(path: Path | str) -> dict[bytes, bytes]:
     with open_regular(path) as stream:
         if stream.read(4) != exr_header.MAGIC:
             return {}
-        places = exr_header.name_places(stream)
-    names = {_in_ascii(name): name for _, _, name in places if not is_utf8(name)}
+        locations = exr_header.locate_names(stream)
+    names = {_in_ascii(name): name for _, _, name in locations if not is_utf8(name)}
     if names:
-        for part in {part for part, _, _ in places}:
-            stored = [name for number, _, name in places if number == part]
+        for part in {part for part, _, _ in locations}:
+            stored = [name for number, _, name in locations if number == part]
             readable = [name if is_utf8(name) else _in_ascii(name) for name in stored]
             # Two names have become one, or the ranks of the names differ.
             if len(set(readable)) < len(set(stored)) or [sorted(stored).index(name) for name in stored] != [
@@ -135,27 +135,27 @@ def _readable_copy(path: Path | str) -> Iterator[str]:
     """Yield the path of an EXR that the library can read: the file itself, or a copy without what is not UTF-8, since
     the library would refuse the whole file.
 
-    In the copy, text attributes have "?" for each byte above 127, and names are those of `foreign_names`.
+    In the copy, text attributes have "?" for each byte above 127, and names are those of `non_utf8_names`.
     """
     check_regular(path)
-    names = foreign_names(path)
-    if not names and not foreign_strings(path):
+    names = non_utf8_names(path)
+    if not names and not non_utf8_strings(path):
         yield str(path)
         return
     with open_regular(path) as stream:
-        places = exr_header.string_places(stream)
-        name_places = exr_header.name_places(stream)
+        texts = exr_header.locate_strings(stream)
+        name_locations = exr_header.locate_names(stream)
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy.exr"
         shutil.copyfile(path, copy)
         with open(copy, "r+b") as stream:
-            for at, text in places.values():
+            for offset, text in texts.values():
                 if not is_utf8(text):
-                    stream.seek(at)
+                    stream.seek(offset)
                     stream.write(bytes(byte if byte < 128 else ord("?") for byte in text))
-            for _, at, name in name_places:
+            for _, offset, name in name_locations:
                 if not is_utf8(name):
-                    stream.seek(at)
+                    stream.seek(offset)
                     stream.write(_in_ascii(name))
         yield str(copy)
 
@@ -224,8 +224,8 @@ def main_part(parts: Sequence[tuple[_Part, Container[str]]]) -> _Part:
     depth or a render pass, with windows of their own.
     """
     for channels in ("RGB", "Y"):
-        for part, names in parts:
-            if all(name in names for name in channels):
+        for part, part_channels in parts:
+            if all(name in part_channels for name in channels):
                 return part
     return parts[0][0]
 
@@ -233,8 +233,8 @@ def main_part(parts: Sequence[tuple[_Part, Container[str]]]) -> _Part:
 def window_from_header(path: Path, header: Mapping[str, Any]) -> DataWindow:
     """Read the data window from an EXR's header, with its origin relative to the frame's. Raises FrameError for a size
     that is empty or too large."""
-    stored, frame = (checked_size(path, (int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1))
-                     for low, high in (header["dataWindow"], header["displayWindow"]))
+    stored, frame = (checked_size(path, (int(last[0]) - int(first[0]) + 1, int(last[1]) - int(first[1]) + 1))
+                     for first, last in (header["dataWindow"], header["displayWindow"]))
     (x, y), (left, top) = header["dataWindow"][0], header["displayWindow"][0]
     aspect = exr_header.sensible_aspect(float(header.get("pixelAspectRatio", 1.0)))
     return DataWindow(stored, (int(x) - int(left), int(y) - int(top)), frame, aspect)
@@ -295,13 +295,13 @@ def has_chroma(channels: Container[str]) -> bool:
 def read_luminance_chroma(path: Path) -> Pixels:
     """Read an EXR of luminance and chroma as R, G, B (height, width, 3) in its primaries, by OpenImageIO, which filters
     the chroma as the library of the format does. Raises FrameError."""
-    opened = open_oiio(path)
+    image_input = open_oiio(path)
     try:
-        spec = opened.spec()
-        pixels = opened.read_image(0, 0, 0, 3, "float")
-        problem = opened.geterror()
+        spec = image_input.spec()
+        pixels = image_input.read_image(0, 0, 0, 3, "float")
+        problem = image_input.geterror()
     finally:
-        opened.close()
+        image_input.close()
     if pixels is None or problem or spec.channelnames[:3] != ("R", "G", "B"):
         raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.")
     return _check_finite(path, "Y, RY, BY", np.asarray(pixels))

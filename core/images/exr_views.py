@@ -48,12 +48,12 @@ def views_of_parts(parts: _Parts) -> list[StereoView]:
     They are the views inside the main part, else the parts that name their view.
     """
     main = main_part([(number, names) for number, (_, names) in enumerate(parts)])
-    if inside := stereo_views(*parts[main]):
-        return [view._replace(part=main) for view in inside]
+    if main_views := stereo_views(*parts[main]):
+        return [view._replace(part=main) for view in main_views]
     views: dict[str, StereoView] = {}
     for number in (main, *(number for number in range(len(parts)) if number != main)):
         header, names = parts[number]
-        if (view := _view_of_part(header)) and (colours := _colours(names, "")):
+        if (view := _view_of_part(header)) and (colours := _colour_channels(names, "")):
             views.setdefault(view, StereoView(view, colours, number))
     return list(views.values()) if len(views) > 1 else []
 
@@ -72,21 +72,22 @@ def stereo_views(header: Mapping[str, Any], names: Collection[str]) -> list[Ster
     names: of the channels. Without the attribute multiView, views are the channel prefixes "left" and "right"; the
     picture at the root is then the eye that is not among them, or "root" if both are.
     """
-    listed = [str(name) for name in header.get("multiView", ())]
+    listed_views = [str(name) for name in header.get("multiView", ())]
     prefixed = dict.fromkeys(name.rpartition(".")[0] for name in names if name.count(".") == 1)
-    eyes = listed[1:] or [name for name in prefixed if name.lower() in _EYES]
-    root = listed[0] if listed else next(name for name in (*_EYES, "root") if name not in [eye.lower() for eye in eyes])
-    views = [StereoView(root, colours)] if (colours := _colours(names, "")) else []
-    if not views and listed:
-        eyes = listed  # the first one is behind its name too
-    views += [StereoView(eye, colours) for eye in eyes if (colours := _colours(names, f"{eye}."))]
+    eyes = listed_views[1:] or [name for name in prefixed if name.lower() in _EYES]
+    root = listed_views[0] if listed_views else next(
+        name for name in (*_EYES, "root") if name not in [eye.lower() for eye in eyes])
+    views = [StereoView(root, colours)] if (colours := _colour_channels(names, "")) else []
+    if not views and listed_views:
+        eyes = listed_views  # the first one is behind its name too
+    views += [StereoView(eye, colours) for eye in eyes if (colours := _colour_channels(names, f"{eye}."))]
     return views if len(views) > 1 else []
 
 
-def _colours(names: Collection[str], prefix: str) -> tuple[str, str, str] | None:
+def _colour_channels(names: Collection[str], prefix: str) -> tuple[str, str, str] | None:
     """Return the names of R, G, B, or three times that of Y, behind a prefix; None where neither is among `names`."""
-    for each in ("RGB", "YYY"):
-        channels = tuple(f"{prefix}{name}" for name in each)
+    for channel_names in ("RGB", "YYY"):
+        channels = tuple(f"{prefix}{name}" for name in channel_names)
         if all(name in names for name in channels):
             return channels[0], channels[1], channels[2]
     return None
@@ -95,7 +96,7 @@ def _colours(names: Collection[str], prefix: str) -> tuple[str, str, str] | None
 def check_parts(path: Path, parts: _Parts) -> None:
     """Raise FrameError for an EXR with several pictures of which only one would be changed: parts that are not of its
     views, or views of other windows."""
-    pictures = [number for number, (_, names) in enumerate(parts) if _colours(names, "")]
+    pictures = [number for number, (_, names) in enumerate(parts) if _colour_channels(names, "")]
     views = views_of_parts(parts)
     if len(pictures) > 1 and sorted(view.part for view in views) != pictures:
         raise FrameError(f"{path} has {len(parts)} parts, {len(pictures)} of them with a picture, and does not say "

@@ -38,7 +38,7 @@ def unlisted_entries(folder: Path, *, subfolders: bool = True) -> list[tuple[str
     Hidden files and the systems' own (Thumbs.db, desktop.ini) are not mentioned. subfolders: mention those that hold
     pictures or videos, with their number.
     """
-    left_out: dict[str, list[str]] = {}
+    names_by_reason: dict[str, list[str]] = {}
     for path in sorted(folder.iterdir(), key=natural_key):
         if path.name.startswith(".") or path.name.lower() in _SYSTEM_FILES:
             continue
@@ -53,5 +53,5 @@ def unlisted_entries(folder: Path, *, subfolders: bool = True) -> list[tuple[str
         else:
             reason = f"{suffix[1:].upper()} is not read here" if suffix else "not a picture"
         if reason:
-            left_out.setdefault(reason, []).append(path.name)
-    return list(left_out.items())
+            names_by_reason.setdefault(reason, []).append(path.name)
+    return list(names_by_reason.items())

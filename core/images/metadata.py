@@ -63,21 +63,22 @@ _EXTENDED_CLAIMS = ("http://ns.google.com/photos/1.0/depthmap/", "http://ns.adob
 
 
 def copy_metadata(encoded: bytes, source: Path, *, has_alpha: bool) -> bytes:
-    """Return an encoded PNG, JPEG or TIFF with the metadata of `source`, if that has the same format; else unchanged.
+    """Return an encoded PNG, JPEG or TIFF with the metadata of the file `source`; unchanged for another format.
 
     has_alpha: whether the encoded picture has alpha.
     """
-    data = read_bytes(source)
-    if encoded[:2] == b"\xff\xd8" == data[:2]:
-        return _copy_to_jpeg(encoded, data)
-    if encoded[:8] == png.SIGNATURE == data[:8]:
-        was_grey, is_grey = (not header[_COLOUR_TYPE_OFFSET] & 2 for header in (data, encoded))
-        left_out = (b"iCCP",) if was_grey != is_grey else ()  # a profile is for grey or for R G B
+    source_data = read_bytes(source)
+    if encoded[:2] == b"\xff\xd8" == source_data[:2]:
+        return _copy_to_jpeg(encoded, source_data)
+    if encoded[:8] == png.SIGNATURE == source_data[:8]:
+        was_grey, is_grey = (not header[_COLOUR_TYPE_OFFSET] & 2 for header in (source_data, encoded))
+        skipped_chunks = (b"iCCP",) if was_grey != is_grey else ()  # a profile is for grey or for R G B
         chunks = b"".join(png.make_chunk(name, without_thumbnail(content) if name == png.EXIF else content)
-                          for name, content in png.chunks(io.BytesIO(data), KEPT_CHUNKS) if name not in left_out)
+                          for name, content in png.chunks(io.BytesIO(source_data), KEPT_CHUNKS)
+                          if name not in skipped_chunks)
         return encoded[:_HEADER_END] + chunks + encoded[_HEADER_END:]
-    if encoded[:4] in (b"II*\0", b"MM\0*") and data[:4] in (b"II*\0", b"MM\0*", *tiff.BIG_TIFF):
-        return _copy_to_tiff(encoded, data, has_alpha)
+    if encoded[:4] in (b"II*\0", b"MM\0*") and source_data[:4] in (b"II*\0", b"MM\0*", *tiff.BIG_TIFF):
+        return _copy_to_tiff(encoded, source_data, has_alpha)
     return encoded
 
 
@@ -131,10 +132,10 @@ def dropped_parts(path: Path) -> str:
 def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
     """Return the encoded JPEG with the segments of the source `data`, in their order, behind a JFIF header: the
     source's if it has one, else that of the encoded JPEG."""
-    header, at = b"", 2
+    header, header_end = b"", 2
     if encoded[2:4] == b"\xff\xe0":
-        at = 4 + int.from_bytes(encoded[4:6], "big")
-        header = encoded[2:at]
+        header_end = 4 + int.from_bytes(encoded[4:6], "big")
+        header = encoded[2:header_end]
     segments = list(jpeg.segments(io.BytesIO(data)))
     has_refocus_original = any(content.startswith(jpeg.XMP) and _ORIGINAL.encode() in content
                                for _, content in segments)
@@ -151,7 +152,7 @@ def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
                 content = jpeg.EXIF + without_thumbnail(content.removeprefix(jpeg.EXIF))
             if content:
                 copied.append(jpeg.make_segment(marker, content))
-    return encoded[:2] + header + b"".join(copied) + encoded[at:]
+    return encoded[:2] + header + b"".join(copied) + encoded[header_end:]
 
 
 def _without_resource_thumbnails(segments: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
@@ -159,15 +160,15 @@ def _without_resource_thumbnails(segments: list[tuple[int, bytes]]) -> list[tupl
 
     The resources may span several segments, so they are joined, and split anew where the first of them was.
     """
-    numbers = [number for number, (marker, content) in enumerate(segments)
+    indices = [index for index, (marker, content) in enumerate(segments)
                if marker == jpeg.APP13 and content.startswith(jpeg.PHOTOSHOP)]
-    resources = b"".join(segments[number][1][len(jpeg.PHOTOSHOP):] for number in numbers)
-    if (kept := without_thumbnails(resources)) == resources:
+    resources = b"".join(segments[index][1][len(jpeg.PHOTOSHOP):] for index in indices)
+    if (cleaned := without_thumbnails(resources)) == resources:
         return segments
-    parts = [(jpeg.APP13, jpeg.PHOTOSHOP + kept[at:at + _MAX_RESOURCE_BYTES])
-             for at in range(0, len(kept), _MAX_RESOURCE_BYTES)]
-    return [*segments[:numbers[0]], *parts, *(segments[number] for number in range(numbers[0], len(segments))
-                                              if number not in numbers)]
+    parts = [(jpeg.APP13, jpeg.PHOTOSHOP + cleaned[offset:offset + _MAX_RESOURCE_BYTES])
+             for offset in range(0, len(cleaned), _MAX_RESOURCE_BYTES)]
+    return [*segments[:indices[0]], *parts, *(segments[index] for index in range(indices[0], len(segments))
+                                              if index not in indices)]
 
 
 def _has_claims(segment: bytes) -> bool:
@@ -206,21 +207,21 @@ def _without_claims(segment: bytes) -> bytes:
 def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
     """Return the TIFF `encoded` with all tags of the source `data` but those of its structure, and with its Exif and
     GPS directories."""
-    every = _AllBut(_STRUCTURE_TAGS)
-    tags = tiff.read_tags(io.BytesIO(data), every)
+    content_tags = _AllBut(_STRUCTURE_TAGS)
+    tags = tiff.read_tags(io.BytesIO(data), content_tags)
     directories = {number: tags.pop(number) for number in (EXIF_DIRECTORY, GPS_DIRECTORY) if number in tags}
     if not has_alpha:  # these tags describe the source's alpha
         tags.pop(tiff.EXTRA_SAMPLES, None)
     if (resources := tags.get(_RESOURCES_TAG)) is not None and resources.values.dtype.itemsize == 1:
         tags.pop(_RESOURCES_TAG)
-        if kept := without_thumbnails(resources.values.tobytes()):
-            tags[_RESOURCES_TAG] = resources._replace(values=np.frombuffer(kept, np.uint8))
+        if cleaned := without_thumbnails(resources.values.tobytes()):
+            tags[_RESOURCES_TAG] = resources._replace(values=np.frombuffer(cleaned, np.uint8))
     encoded = tiff.with_tags(encoded, tags)
-    for number, place in directories.items():
-        if len(place.values) == 1:
+    for number, offset_tag in directories.items():
+        if len(offset_tag.values) == 1:
             # 0xA005 is the offset of another directory (interoperability), which is not copied.
-            inner = tiff.read_tags(io.BytesIO(data), _AllBut({0xA005}), int(np.uint32(place.values[0])))
-            encoded = tiff.with_directory(encoded, number, inner)
+            directory = tiff.read_tags(io.BytesIO(data), _AllBut({0xA005}), int(np.uint32(offset_tag.values[0])))
+            encoded = tiff.with_directory(encoded, number, directory)
     return encoded
 
 

@@ -40,12 +40,12 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
     import OpenImageIO as oiio  # noqa: N813 - as its own documents do
 
     pixels = codes if alpha is None else np.concatenate([codes, alpha[..., None]], -1)
-    name = OIIO_FORMATS[suffix]
-    opened = open_oiio(source)
+    format_name = OIIO_FORMATS[suffix]
+    image_input = open_oiio(source)
     try:
-        spec = opened.spec().copy()
+        spec = image_input.spec().copy()
     finally:
-        opened.close()
+        image_input.close()
     names = ("R", "G", "B") if codes.shape[2] == 3 else ("Y",)
     spec.nchannels, spec.channelnames = pixels.shape[2], (*names, "A")[:pixels.shape[2]]
     spec.alpha_channel = pixels.shape[2] - 1 if alpha is not None else -1
@@ -53,22 +53,22 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
     spec.set_format(types.get(codes.dtype.name, oiio.FLOAT))
     spec.channelformats = ()
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    if name == "dpx" and file_kind(source) == "cineon":  # whose codes are film density in 10 bits
+    if format_name == "dpx" and file_kind(source) == "cineon":  # whose codes are film density in 10 bits
         spec.attribute("dpx:Transfer", "Printing density")
         spec.attribute("oiio:BitsPerSample", 10)
-    if name == "tiff":
+    if format_name == "tiff":
         spec.attribute("planarconfig", "contig")
         compression = spec.get_string_attribute("compression")
         if compression in ("jpeg", "webp", "lerc"):  # which may lose
             spec.attribute("compression", "zip")
     with atomic_path(path) as temporary:
-        output = oiio.ImageOutput.create(name)
-        done = (output is not None and output.open(str(temporary), spec)
+        output = oiio.ImageOutput.create(format_name)
+        is_written = (output is not None and output.open(str(temporary), spec)
                 and output.write_image(np.ascontiguousarray(pixels)) and output.close())
-        if not done:
+        if not is_written:
             raise FrameError(f"{path} could not be encoded as {suffix[1:].upper()} "
                              f"({output.geterror() if output is not None else oiio.geterror()}).")
-        if name == "tiff":
+        if format_name == "tiff":
             temporary.write_bytes(copy_metadata(temporary.read_bytes(), source, has_alpha=alpha is not None))
 
 
@@ -79,13 +79,13 @@ def _write_webp(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[An
     check_regular(source)
     try:
         with Image.open(source) as stored:
-            kept = {name: stored.info[name] for name in ("icc_profile", "exif", "xmp") if stored.info.get(name)}
-        if "exif" in kept:
-            kept["exif"] = without_thumbnail(kept["exif"].removeprefix(b"Exif\0\0"))
+            metadata = {name: stored.info[name] for name in ("icc_profile", "exif", "xmp") if stored.info.get(name)}
+        if "exif" in metadata:
+            metadata["exif"] = without_thumbnail(metadata["exif"].removeprefix(b"Exif\0\0"))
         colours = np.repeat(codes, 3, -1) if codes.shape[2] == 1 else codes
         pixels = colours if alpha is None else np.concatenate([colours, alpha[..., None]], -1)
         encoded = io.BytesIO()
-        Image.fromarray(np.ascontiguousarray(pixels)).save(encoded, "WEBP", lossless=True, exact=True, **kept)
+        Image.fromarray(np.ascontiguousarray(pixels)).save(encoded, "WEBP", lossless=True, exact=True, **metadata)
     except (OSError, ValueError) as problem:
         raise FrameError(f"{path} could not be encoded as WebP ({problem}).") from problem
     with atomic_path(path) as temporary:

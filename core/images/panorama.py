@@ -41,7 +41,7 @@ def wraps_around(path: Path, header: Mapping[str, Any] | None = None) -> bool:
         with open_regular(path) as stream:
             data = stream.read()
             stream.seek(0)
-            packets = [data, *(_decompressed(content) for _, content in png.chunks(stream, (b"iTXt",)))]
+            packets = [data, *(_decompress_xmp(content) for _, content in png.chunks(stream, (b"iTXt",)))]
     except OSError:
         return False
     return any(_is_full_panorama(packet) for packet in packets)
@@ -63,17 +63,18 @@ def _is_full_panorama(packet: bytes) -> bool:
     match = _PROJECTION.search(packet)
     if match is None or match[1].decode().lower() not in _PROJECTIONS:
         return False
-    full, cropped = _number(packet, b"FullPanoWidthPixels"), _number(packet, b"CroppedAreaImageWidthPixels")
-    return full is None or cropped is None or cropped >= full
+    full_width = _parse_xmp_number(packet, b"FullPanoWidthPixels")
+    cropped_width = _parse_xmp_number(packet, b"CroppedAreaImageWidthPixels")
+    return full_width is None or cropped_width is None or cropped_width >= full_width
 
 
-def _number(packet: bytes, name: bytes) -> int | None:
+def _parse_xmp_number(packet: bytes, name: bytes) -> int | None:
     """Return the whole number of an XMP property, as attribute or element; None where it is missing."""
     match = re.search(name + rb"\s*(?:=\s*[\"']|>)\s*(\d{1,9})", packet)
     return int(match[1]) if match else None
 
 
-def _decompressed(content: bytes) -> bytes:
+def _decompress_xmp(content: bytes) -> bytes:
     """Return the XMP of a PNG's iTXt chunk that is compressed (PNG specification, 11.3.3.4); empty for others."""
     if not content.startswith(_XMP_KEYWORD) or content[len(_XMP_KEYWORD):len(_XMP_KEYWORD) + 1] != b"\1":
         return b""

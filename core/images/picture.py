@@ -51,12 +51,12 @@ class Picture:
         return Picture(srgb_from_linear(light) if self.encoding == "srgb" else light, self.encoding)
 
 
-def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+def same_aspect(size: tuple[int, int], other_size: tuple[int, int]) -> bool:
     """True if one size (width, height) is the other, scaled and rounded to whole pixels.
 
     The sides of the scaled smaller one may differ from the larger one's by one pixel of the smaller (`scale`).
     """
-    small, large = sorted((size, other))
+    small, large = sorted((size, other_size))
     scale = max(large[0] / small[0], large[1] / small[1])
     return (abs(large[0] - small[0] * scale) <= max(scale, 1.0) + 1e-9
             and abs(large[1] - small[1] * scale) <= max(scale, 1.0) + 1e-9)

@@ -46,6 +46,8 @@ _UNWRITTEN = ("heif", "avif", "jxl", "jp2", "gif", "psd")
 """Formats whose clean plates are PNG."""
 _JPEG_QUALITY = 97
 """OpenCV's quality of JPEG, up to 100."""
+_MAX_HALF = 65504.0
+"""Greatest finite value of a half float."""
 _JPEGS, _TIFFS = JPEG_SUFFIXES, (".tif", ".tiff")
 _DEPTHS: dict[str, tuple[type, ...]] = {".png": (np.uint8, np.uint16), **dict.fromkeys(_JPEGS, (np.uint8,))}
 """Pixel types by suffix, for formats that cannot hold every plate; OpenCV would convert others to 8 bit silently."""
@@ -153,7 +155,7 @@ class Plate:
         if codes.dtype.kind == "u":
             codes[changed] = (np.clip(values, 0, 1) * np.float32(self.max_code) + np.float32(0.5)).astype(codes.dtype)
         else:
-            limit = np.float32(65504) if codes.dtype == np.float16 else np.finfo(np.float32).max
+            limit = np.float32(_MAX_HALF) if codes.dtype == np.float16 else np.finfo(np.float32).max
             codes[changed] = np.clip(values, -limit, limit).astype(codes.dtype)
         return codes
 
@@ -195,8 +197,9 @@ def _describe_jpeg(path: Path) -> Description:
     """Read the profile, the Exif block and the XMP of a JPEG. Raises FrameError."""
     with open_regular(path) as stream:
         profile, segments = jpeg_profile(stream), list(jpeg.segments(stream))
-    exif, xmp = (next((content[len(start):] for marker, content in segments
-                       if marker == jpeg.APP1 and content.startswith(start)), b"") for start in (jpeg.EXIF, jpeg.XMP))
+    exif, xmp = (next((content[len(signature):] for marker, content in segments
+                       if marker == jpeg.APP1 and content.startswith(signature)), b"")
+                 for signature in (jpeg.EXIF, jpeg.XMP))
     return Description(*picture_size(path), profile_space(path, profile), profile=profile, exif=exif, xmp=xmp)
 
 
@@ -223,7 +226,7 @@ def is_plate_error(problem: Exception) -> bool:
 
 def finite_light(codes: NDArray[Any]) -> NDArray[np.float32]:
     """Return float codes as finite linear light: NaN and negative infinity are black, infinity the greatest half."""
-    return np.nan_to_num(codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
+    return np.nan_to_num(codes.astype(np.float32), nan=0.0, posinf=_MAX_HALF, neginf=0.0)
 
 
 def read_plate(path: Path | str, space: ColourSpace | None = None) -> Plate:
@@ -253,7 +256,7 @@ def _read_codes(path: Path, space: ColourSpace | None) -> Plate:
     if _is_animated(path):
         raise FrameError(f"{path} is an animated PNG; export its frames as files of their own.")
     grey, codes = stored.ndim == 2 or _is_grey_with_alpha(path), rgb_codes(stored)
-    alpha = _transparency(path, stored) if stored.ndim == 2 else None
+    alpha = _read_transparency(path, stored) if stored.ndim == 2 else None
     if stored.ndim == 3 and stored.shape[2] == 4:
         alpha = stored[..., 3].copy()
     encoding: Encoding = "linear" if stored.dtype.kind == "f" else "srgb"
@@ -275,7 +278,7 @@ def _is_animated(path: Path) -> bool:
                    for _, content in png.chunks(stream, (b"acTL",), before_pixels=True))
 
 
-def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
+def _read_transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
     """Return alpha (height, width) of a grey PNG with one transparent code (PNG specification, 11.3.2.1), or None.
 
     OpenCV reads such files without it.
@@ -286,9 +289,9 @@ def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
                     if len(content) == 2), None)
     if key is None:
         return None
-    top = np.iinfo(stored.dtype).max
-    code = int.from_bytes(key, "big") * top // (2 ** depth[0] - 1)  # depths below 8 bits are spread over all codes
-    return np.where(stored == code, 0, top).astype(stored.dtype)
+    max_code = np.iinfo(stored.dtype).max
+    code = int.from_bytes(key, "big") * max_code // (2 ** depth[0] - 1)  # depths below 8 bits are spread over all codes
+    return np.where(stored == code, 0, max_code).astype(stored.dtype)
 
 
 def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
@@ -356,23 +359,30 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
         raise FrameError(f"{plate.path} holds what no {suffix[1:].upper()} can hold ({codes.dtype} pixels"
                          f"{', alpha' if plate.alpha is not None else ''}): it has the suffix of another kind of file; "
                          "rename it to what it is.")
+    encoded = _encode_by_opencv(path, plate, codes, suffix)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded)
+
+
+def _encode_by_opencv(path: Path, plate: Plate, codes: NDArray[Any], suffix: str) -> bytes:
+    """Return a PNG, JPEG or TIFF of codes, with the plate's alpha and metadata. suffix: of the format. path: for the
+    message of a FrameError."""
     import cv2
 
     stored: NDArray[Any] = codes[..., 0] if plate.grey and plate.alpha is None else codes[..., ::-1]
     if plate.alpha is not None:
         stored = np.concatenate([stored, plate.alpha[..., None]], -1)
-    done, data = cv2.imencode(".jpg" if suffix in _JPEGS else suffix, np.ascontiguousarray(stored),
-                              _encoder_options(suffix, codes.dtype))
-    if not done:
+    is_encoded, data = cv2.imencode(".jpg" if suffix in _JPEGS else suffix, np.ascontiguousarray(stored),
+                                    _encoder_options(suffix, codes.dtype))
+    if not is_encoded:
         raise FrameError(f"{path} could not be encoded as {suffix[1:].upper()}.")
     encoded = copy_metadata(data.tobytes(), plate.path, has_alpha=plate.alpha is not None)
-    if suffix == ".png" and (described := plate.description) is not None:
-        encoded = with_colour_chunks(encoded, described.profile, described.code_points)
+    if suffix == ".png" and (description := plate.description) is not None:
+        encoded = with_colour_chunks(encoded, description.profile, description.code_points)
         is_upright = file_kind(plate.path) != "jpeg"  # others are decoded so
-        exif = upright_block(described.exif) if is_upright else described.exif
-        encoded = with_description(encoded, exif, described.xmp)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(encoded)
+        exif = upright_block(description.exif) if is_upright else description.exif
+        encoded = with_description(encoded, exif, description.xmp)
+    return encoded
 
 
 def _format_suffix(path: Path, plate: Plate) -> str:
@@ -384,7 +394,7 @@ def _format_suffix(path: Path, plate: Plate) -> str:
     return clean_name(Path(f"plate{SUFFIX_OF_KIND[kind]}")).suffix
 
 
-def _encoder_options(suffix: str, kind: np.dtype[Any]) -> list[int]:
+def _encoder_options(suffix: str, dtype: np.dtype[Any]) -> list[int]:
     """Return OpenCV's options for a format and a type of pixels: JPEG with chroma at full resolution, floats as they
     are."""
     import cv2
@@ -392,7 +402,7 @@ def _encoder_options(suffix: str, kind: np.dtype[Any]) -> list[int]:
     if suffix in _JPEGS:
         return [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
                 cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    if suffix in _TIFFS and kind.kind == "f":  # OpenCV would write LogLuv, with loss
+    if suffix in _TIFFS and dtype.kind == "f":  # OpenCV would write LogLuv, with loss
         return [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE]
     return []
 

@@ -117,8 +117,8 @@ def has_float_pixels(path: Path, space: ColourSpace | None = None) -> bool:
         signed = formats is not None and formats.values[0] != tiff.UNSIGNED
         if (is_big or signed) and read_stored_pixels(path).dtype.kind == "f":
             return True
-    known = space or declared_space(path)
-    return known is not None and known.has_headroom
+    declared = space or declared_space(path)
+    return declared is not None and declared.has_headroom
 
 
 def has_half_pixels(path: Path) -> bool:
@@ -149,7 +149,7 @@ def read_stored_pixels(path: Path) -> NDArray[Any]:
     elif kind == "tiff" and _is_corrupt_tiff(path):
         stored = None
     elif kind == "png" or (kind == "tiff" and not needs_openimageio(path)):
-        stored = decode(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        stored = decode_by_opencv(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     else:
         stored = decode_foreign(path, kind)
     if stored is None or stored.shape[:2] != (height, width):
@@ -178,7 +178,7 @@ def _decode_jpeg(path: Path) -> NDArray[Any]:
     return pixels[..., 0] if is_grey else pixels
 
 
-def decode(path: Path, flags: int) -> NDArray[Any] | None:
+def decode_by_opencv(path: Path, flags: int) -> NDArray[Any] | None:
     """Decode a file with OpenCV's `flags`, a TIFF as stored; None where it cannot be.
 
     From memory, since OpenCV's reader cannot open every path that Windows allows.

@@ -69,5 +69,5 @@ def _exr_size(stream: BinaryIO) -> tuple[int, int] | None:
     so that `checked_size` refuses the file."""
     sizes = exr_header.windows(stream)
     stored = sizes.get("dataWindow")
-    whole = stored is not None and min(stored) > 0 and stored[0] * stored[1] <= MAX_PIXELS
-    return sizes.get("displayWindow", stored) if whole else stored
+    is_usable = stored is not None and min(stored) > 0 and stored[0] * stored[1] <= MAX_PIXELS
+    return sizes.get("displayWindow", stored) if is_usable else stored

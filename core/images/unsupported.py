@@ -54,7 +54,7 @@ def unsupported_reason(path: Path) -> str:
             return _CMYK if header is not None and header.components == 4 else ""
         if webp.is_animated(stream):
             return "is an animation; export its frames as files of their own"
-        tags = _tags(stream)
+        tags = _storage_tags(stream)
     if not tags:
         return ""
     if tags.get(tiff.PHOTOMETRIC) == tiff.SEPARATED:
@@ -75,7 +75,7 @@ def needs_openimageio(path: Path) -> bool:
     with open_regular(path) as stream:
         if stream.read(4) in tiff.BIG_TIFF:
             return True
-        tags = _tags(stream)
+        tags = _storage_tags(stream)
     bits, samples = tags.get(tiff.BITS, 1), tags.get(tiff.SAMPLES, 1)
     return (bits not in (1, 8, 16, 32, 64) or samples == 2
             or tags.get(tiff.COMPRESSION) in tiff.UNSUPPORTED_COMPRESSIONS
@@ -84,7 +84,7 @@ def needs_openimageio(path: Path) -> bool:
                               or (tags.get(tiff.PLANES) == tiff.PLANAR and samples > 1))))
 
 
-def _tags(stream: BinaryIO) -> dict[int, int]:
+def _storage_tags(stream: BinaryIO) -> dict[int, int]:
     """Return the first value of the tags that say how a TIFF is stored; none of other files."""
     numbers = (tiff.BITS, tiff.PHOTOMETRIC, tiff.SAMPLES, tiff.PLANES, tiff.SAMPLE_FORMAT, tiff.COMPRESSION)
     return {name: int(tag.values[0]) for name, tag in tiff.read_tags(stream, numbers).items()

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..colour.cicp import HLG, PQ
 from ..errors import EngineError, FrameError
 from ..system.files import atomic_path
 from ..system.reading import check_regular
@@ -30,6 +31,9 @@ from .formats.kinds import VIDEOS as VIDEOS
 from .formats.kinds import is_video as is_video
 from .picture import Encoding, Picture
 from .video_colour import (
+    BT_709,
+    BT_2020,
+    BY_PRIMARIES,
     LUMA_WEIGHTS,
     RGB,
     TRANSFERS,
@@ -130,11 +134,12 @@ class VideoFrame:
         arrays, planar = self._planes
         if not planar.has_alpha:
             return None
-        alpha, top = arrays[-1].astype(np.float32), float((1 << planar.bits) - 1)
+        alpha, max_code = arrays[-1].astype(np.float32), float((1 << planar.bits) - 1)
         if self.colour.is_light:
-            return self.orientation.upright(alpha / np.float32(top))
-        kind = np.uint8 if planar.bits == 8 and not self.colour.is_wide else np.uint16
-        return self.orientation.upright((alpha * np.float32(np.iinfo(kind).max / top) + np.float32(0.5)).astype(kind))
+            return self.orientation.upright(alpha / np.float32(max_code))
+        dtype = np.uint8 if planar.bits == 8 and not self.colour.is_wide else np.uint16
+        codes = alpha * np.float32(np.iinfo(dtype).max / max_code) + np.float32(0.5)
+        return self.orientation.upright(codes.astype(dtype))
 
     def straight_alpha(self) -> NDArray[np.float32] | None:
         """(height, width) alpha at 0..1, with which the pixels are not multiplied; None where the video has none."""
@@ -167,6 +172,7 @@ class Video:
     """Pixel aspect ratio (width / height) of upright frames; 1 where unknown."""
 
     def __init__(self, path: Path) -> None:
+        """Open the file and decode its first frame. Raises EngineError where PyAV is missing."""
         check_regular(path)
         self.path = Path(path)
         self._start = 0
@@ -186,7 +192,7 @@ class Video:
             self.close()
             raise self._unreadable()
         self._first_pass = itertools.chain((first,), decoded)
-        self.colour = _colour_of(self.path, first, self.stream)
+        self.colour = _read_colour(self.path, first, self.stream)
         """What the codes of the first frame mean."""
         self.matrix = display_matrix(first)
         self.orientation = orientation_from_matrix(self.matrix)
@@ -228,7 +234,7 @@ class Video:
                 break
             tags = (raw.colorspace, raw.color_range, raw.color_trc, raw.color_primaries)
             if tags not in colours:
-                colours[tags] = _colour_of(self.path, raw, self.stream)
+                colours[tags] = _read_colour(self.path, raw, self.stream)
             frame = VideoFrame(number, raw, colours[tags], self.orientation)
             if frame.is_damaged:
                 damaged.append(number + 1)
@@ -394,23 +400,23 @@ def write_frame(stem: Path, frame: VideoFrame) -> Path:
     import cv2
 
     if frame.colour.is_light:
-        light, coverage, target = frame.pixels(), frame.straight_alpha(), stem.with_name(stem.name + ".exr")
-        if coverage is not None:
-            light = light * coverage[..., None]
+        light, alpha, target = frame.pixels(), frame.straight_alpha(), stem.with_name(stem.name + ".exr")
+        if alpha is not None:
+            light = light * alpha[..., None]
         channels = {name: light[..., index] for index, name in enumerate("RGB")}
-        write_exr(target, channels if coverage is None else {**channels, "A": coverage})
+        write_exr(target, channels if alpha is None else {**channels, "A": alpha})
         return target
     target, alpha = stem.with_name(stem.name + ".png"), frame.alpha()
     planes = [*cv2.split(frame.pixels())[::-1], *([] if alpha is None else [alpha])]
-    done, data = cv2.imencode(".png", cv2.merge(planes), [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    if not done:
+    is_encoded, data = cv2.imencode(".png", cv2.merge(planes), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not is_encoded:
         raise FrameError(f"{target} could not be encoded as PNG.")
     with atomic_path(target) as temporary:
         temporary.write_bytes(data.tobytes())
     return target
 
 
-def _colour_of(path: Path, raw: Any, stream: Any) -> VideoColour:
+def _read_colour(path: Path, raw: Any, stream: Any) -> VideoColour:
     """Return what a frame's codes mean by its tags, which are code points of ITU-T H.273.
 
     Without tags, as players assume: limited range of Y Cb Cr, full range of grey and RGB; the matrix of BT.2020 with
@@ -419,8 +425,8 @@ def _colour_of(path: Path, raw: Any, stream: Any) -> VideoColour:
     """
     context = stream.codec_context
 
-    def tag(of_frame: int, of_container: int) -> int:  # the frame's, unless only the container has one
-        return int(of_container if of_frame in (UNSPECIFIED, 0) and of_container else of_frame)
+    def tag(frame_tag: int, container_tag: int) -> int:  # the frame's, unless only the container has one
+        return int(container_tag if frame_tag in (UNSPECIFIED, 0) and container_tag else frame_tag)
 
     matrix, transfer, primaries = (tag(*pair) for pair in (
         (raw.colorspace, context.colorspace), (raw.color_trc, context.color_trc),
@@ -431,21 +437,21 @@ def _colour_of(path: Path, raw: Any, stream: Any) -> VideoColour:
     if planar.is_rgb:
         matrix, limited = RGB, False
     elif planar.is_grey:
-        matrix, limited = 1, colour_range == _LIMITED  # any matrix: only the luma is decoded
+        matrix, limited = BT_709, colour_range == _LIMITED  # any matrix: only the luma is decoded
     else:
         limited = colour_range != _FULL and not planar.is_full_range and not raw.format.name.startswith("yuvj")
-        if matrix == 12:  # derived from the primaries
-            matrix = {1: 1, 9: 9}.get(primaries, UNSPECIFIED)
+        if matrix == BY_PRIMARIES:
+            matrix = primaries if primaries in (BT_709, BT_2020) else UNSPECIFIED
         if matrix in UNSUPPORTED_MATRICES:
             raise FrameError(f"{path} has the colour matrix {UNSUPPORTED_MATRICES[matrix]}, which this program does "
                              "not read; convert the video to BT.709, BT.2020 or RGB.")
         if matrix not in LUMA_WEIGHTS and matrix != YCGCO:
-            matrix = 9 if primaries == 9 else usual_matrix(raw.width, raw.height)
+            matrix = BT_2020 if primaries == BT_2020 else usual_matrix(raw.width, raw.height)
     if transfer in UNSUPPORTED_TRANSFERS:
         raise FrameError(f"{path} has a {UNSUPPORTED_TRANSFERS[transfer]} transfer curve, which this program does not "
                          "read; convert the video to BT.709.")
-    if primaries in (UNSPECIFIED, 0) and (matrix == 9 or transfer in (16, 18)):
-        primaries = 9
+    if primaries in (UNSPECIFIED, 0) and (matrix == BT_2020 or transfer in (PQ, HLG)):
+        primaries = BT_2020
     return VideoColour(matrix, limited, planar.bits, TRANSFERS.get(transfer, "display"), WIDE_PRIMARIES.get(primaries))
 
 

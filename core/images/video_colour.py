@@ -35,13 +35,15 @@ UNSUPPORTED_TRANSFERS = {9: "logarithmic (100:1)", 10: "logarithmic (316:1)"}
 LUMA_WEIGHTS = {1: (0.2126, 0.0722), 4: (0.30, 0.11), 5: (0.299, 0.114), 6: (0.299, 0.114), 7: (0.212, 0.087),
                 9: (0.2627, 0.0593)}
 """Weights of red and blue in the luma, by matrix coefficients."""
+BT_709, BT_601, BT_2020, BY_PRIMARIES = 1, 6, 9, 12
+"""Matrix coefficients: of three standards; those derived from the primaries. 1 and 9 are the primaries of the same."""
 RGB, YCGCO, UNSPECIFIED = 0, 8, 2
 """Matrix coefficients: the planes hold G, B, R; luma with green and orange differences; "unspecified", in all three
 tags."""
 UNSUPPORTED_MATRICES = {10: "BT.2020 of constant luminance", 11: "SMPTE ST 2085", 14: "ICtCp", 15: "IPT-C2",
                         13: "one by primaries, of constant luminance"}
 P3_DCI: Chromaticities = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.314, 0.351)
-WIDE_PRIMARIES = {9: REC_2020, 11: P3_DCI, 12: P3_D65}
+WIDE_PRIMARIES = {BT_2020: REC_2020, 11: P3_DCI, 12: P3_D65}
 """Colour primaries that are converted to Rec. 709. Those of BT.601 are shown as Rec. 709, as players do."""
 MIN_709_WIDTH, MAX_601_HEIGHT = 1280, 576
 """A video without a matrix is BT.709 from this long side, or above this short side, px."""
@@ -78,17 +80,17 @@ class VideoColour:
         """
         import cv2
 
-        kind = np.uint8 if self.bits == 8 and not self.is_light and not self.is_wide else np.uint16
-        top = np.iinfo(kind).max
-        matrix, offset = self._decoding
+        dtype = np.uint8 if self.bits == 8 and not self.is_light and not self.is_wide else np.uint16
+        max_code = np.iinfo(dtype).max
+        matrix, offset = self._decoding_affine
         if planes.shape[-1] == 1:
             levels = (np.arange(1 << self.bits) - self._black) * matrix[0, 0]  # without the offset of the differences
-            table = (np.clip(levels / self.signal_top, 0, 1) * top + 0.5).astype(kind)
+            table = (np.clip(levels / self.signal_top, 0, 1) * max_code + 0.5).astype(dtype)
             return np.asarray(cv2.merge([np.take(table, np.minimum(planes[..., 0], (1 << self.bits) - 1))] * 3))
-        if kind == np.uint8 and self.matrix == RGB:
+        if dtype == np.uint8 and self.matrix == RGB:
             return planes.copy()  # `stack_planes` reuses their memory
-        affine = np.concatenate([matrix, offset[:, None]], 1) * (top / self.signal_top)
-        if kind == np.uint16 and planes.dtype == np.uint8:  # cv2.transform returns the type that it is given
+        affine = np.concatenate([matrix, offset[:, None]], 1) * (max_code / self.signal_top)
+        if dtype == np.uint16 and planes.dtype == np.uint8:  # cv2.transform returns the type that it is given
             planes = planes.astype(np.uint16)
         return np.asarray(cv2.transform(planes, affine.astype(np.float32)))
 
@@ -138,7 +140,7 @@ class VideoColour:
         (height, width, 3)."""
         import cv2
 
-        return np.asarray(cv2.transform(differences, np.linalg.inv(self._decoding[0]).astype(np.float32)))
+        return np.asarray(cv2.transform(differences, np.linalg.inv(self._decoding_affine[0]).astype(np.float32)))
 
     @property
     def signal_top(self) -> float:
@@ -152,12 +154,12 @@ class VideoColour:
         return 16 << (self.bits - 8) if self.limited else 0
 
     @property
-    def _decoding(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _decoding_affine(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return matrix (3, 3) and offset (3,): signal R G B = matrix @ codes + offset; codes of RGB planes are R G B.
         """
         # Codes that luma and colour differences span (ITU-T H.273, 8.3).
-        step, top = float(1 << (self.bits - 8)), float((1 << self.bits) - 1)
-        luma, difference = (219 * step, 224 * step) if self.limited else (top, top)
+        step, max_code = float(1 << (self.bits - 8)), float((1 << self.bits) - 1)
+        luma, difference = (219 * step, 224 * step) if self.limited else (max_code, max_code)
         if self.matrix == RGB:
             return np.eye(3) / luma, np.full(3, -self._black / luma)
         if self.matrix == YCGCO:
@@ -177,7 +179,7 @@ class VideoColour:
 def usual_matrix(width: int, height: int) -> int:
     """Return the matrix coefficients that players assume for a size."""
     is_high = max(width, height) >= MIN_709_WIDTH or min(width, height) > MAX_601_HEIGHT
-    return 1 if is_high else 6
+    return BT_709 if is_high else BT_601
 
 
 @lru_cache(maxsize=4)

@@ -35,7 +35,7 @@ def _display_option(data: bytes) -> str:
     values = [numerator / denominator for numerator, denominator in zip(numbers[0::2], numbers[1::2], strict=True)]
     points = [round(value * _CHROMATICITY_STEPS) for value in values[:8]]
     low, high = (round(value * _LUMINANCE_STEPS) for value in values[8:])
-    red, green, blue, white = (f"({points[at]},{points[at + 1]})" for at in (0, 2, 4, 6))
+    red, green, blue, white = (f"({points[index]},{points[index + 1]})" for index in (0, 2, 4, 6))
     return f":master-display=G{green}B{blue}R{red}WP{white}L({high},{low})"
 
 

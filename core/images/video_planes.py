@@ -110,33 +110,33 @@ def stack_planes(arrays: list[NDArray[Any]], planar: PlaneFormat) -> NDArray[Any
         return arrays[0][..., None]
     height, width = arrays[0].shape
     across, down = planar.sampling
-    full = [arrays[0]]
+    full_planes = [arrays[0]]
     for index, codes in enumerate(arrays[1:3]):
         if (across, down) != (1, 1):
             size = codes.shape[1] * across, codes.shape[0] * down
-            room = _scratch(index, (size[1], size[0]), codes.dtype)
-            codes = np.asarray(cv2.resize(codes, size, room, interpolation=cv2.INTER_LINEAR))[:height, :width]
-        full.append(codes)
-    return np.asarray(cv2.merge(full, _scratch(2, (height, width, 3), arrays[0].dtype)))
+            scratch = _scratch_array(index, (size[1], size[0]), codes.dtype)
+            codes = np.asarray(cv2.resize(codes, size, scratch, interpolation=cv2.INTER_LINEAR))[:height, :width]
+        full_planes.append(codes)
+    return np.asarray(cv2.merge(full_planes, _scratch_array(2, (height, width, 3), arrays[0].dtype)))
 
 
 _BUFFERS = threading.local()
 
 
-def _scratch(number: int, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+def _scratch_array(slot: int, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
     """Return an array of this thread that the next frame overwrites: fresh memory costs more than the conversion.
 
-    number: of the array; arrays of different numbers do not overwrite each other.
+    slot: number of the array; those of different slots do not overwrite each other.
     """
     buffers: dict[str, NDArray[Any]] = _BUFFERS.__dict__
-    known = buffers.get(str(number))
-    if known is None or known.shape != shape or known.dtype != dtype:
-        known = buffers[str(number)] = np.empty(shape, dtype)
-    return known
+    buffer = buffers.get(str(slot))
+    if buffer is None or buffer.shape != shape or buffer.dtype != dtype:
+        buffer = buffers[str(slot)] = np.empty(shape, dtype)
+    return buffer
 
 
 def shrink_plane(plane: NDArray[np.float32], planar: PlaneFormat) -> NDArray[np.float32]:
-    """Average a plane (height, width) of the full size to the size of the chroma planes, rounded up."""
+    """Average a plane (height, width) of the full size to the size of the chroma planes, which is rounded up."""
     import cv2
 
     across, down = planar.sampling

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError, SettingsError
 from ..system.files import atomic_path
 from .video import Video, VideoFrame, import_av
+from .video_colour import BT_601, BT_709, MAX_601_HEIGHT
 from .video_mastering import x265_options
 from .video_planes import PlaneFormat, plane_arrays, plane_format, shrink_plane, to_planar
 
@@ -105,22 +106,22 @@ def rewrite_video(source: Path, target: Path, codec: str, change: Change, *,
     """
     av = import_av()
     encoder = CODECS[codec]
-    # `video` decodes the frames; `other` is the same file, read beside it for its sound, subtitles and tags.
+    # `video` decodes the frames; `container` is the same file, read beside it for its sound, subtitles and tags.
     with Video(source) as video, atomic_path(target) as temporary, av.open(str(source), metadata_errors="replace") as \
-            other:
+            container:
         # Without this, FFmpeg drops tags of other names than its own, such as "com.apple.quicktime.make".
-        options = {"movflags": "use_metadata_tags"} if any("." in name for name in other.metadata) else {}
+        options = {"movflags": "use_metadata_tags"} if any("." in name for name in container.metadata) else {}
         container_format = CONTAINERS[target.suffix.lower()]
         if container_format == "matroska":
             options = {}
         left_out = list[str]()
         try:
-            with av.open(str(temporary), "w", format=container_format, container_options=options) as out:
-                _copy_tags(other.metadata, out.metadata, _BRANDS)
-                stream = _add_picture(out, video, other, encoder, left_out)
-                sound = _OtherStreams(other, out, video, left_out)
-                _copy_chapters(other, out)
-                _encode(out, stream, encoder, video, change, sound, on_frame)
+            with av.open(str(temporary), "w", format=container_format, container_options=options) as output:
+                _copy_tags(container.metadata, output.metadata, _BRANDS)
+                stream = _add_video_stream(output, video, container, encoder, left_out)
+                other_streams = _OtherStreams(container, output, video, left_out)
+                _copy_chapters(container, output)
+                _encode(output, stream, encoder, video, change, other_streams, on_frame)
         except (av.error.FFmpegError, ValueError) as problem:
             if isinstance(problem, OSError) and problem.errno:
                 raise OSError(problem.errno, os.strerror(problem.errno), str(target)) from problem
@@ -156,7 +157,7 @@ def _timecode(container: Any, stream: Any) -> str | None:
 
 
 def _output_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFormat:
-    """Return the planar format to encode, the first of these that applies.
+    """Return the planar format to encode, the first of these that applies. first: the first frame of the video.
 
     The source's, if the encoder keeps it; the source's, without alpha where the encoder has none, if the encoder
     accepts that and is not one of limited range; the encoder's formats for alpha, for more than 8 bits, or for any.
@@ -167,21 +168,21 @@ def _output_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFo
     if encoder.keeps(planar) and planar.name in accepted and not (encoder.limited and not video.colour.limited):
         return planar
     # yuvj is FFmpeg's older name of yuv in full range.
-    name, plain = encoder.fallback, planar.name.replace("yuvj", "yuv")
+    output_name, plain_name = encoder.fallback, planar.name.replace("yuvj", "yuv")
     if encoder.alpha is None:
-        plain = plain.replace("yuva", "yuv")
-    if plain in accepted and not encoder.limited:
-        name = plain
+        plain_name = plain_name.replace("yuva", "yuv")
+    if plain_name in accepted and not encoder.limited:
+        output_name = plain_name
     elif planar.has_alpha and encoder.alpha is not None:
-        name = encoder.alpha
+        output_name = encoder.alpha
     elif encoder.deep is not None and planar.bits > 8:
-        name = encoder.deep
-    chosen = plane_format(name)
-    assert chosen is not None
-    return chosen
+        output_name = encoder.deep
+    output_format = plane_format(output_name)
+    assert output_format is not None
+    return output_format
 
 
-def _add_picture(out: Any, video: Video, source: Any, encoder: Encoder, left_out: list[str]) -> Any:
+def _add_video_stream(out: Any, video: Video, source: Any, encoder: Encoder, left_out: list[str]) -> Any:
     """Add the stream of the frames to `out`, with the tags, timing and shape of that of `video`, and return it.
 
     source: the container of the video, opened anew. left_out: sentences about what is not written, to which others are
@@ -213,7 +214,7 @@ def _add_picture(out: Any, video: Video, source: Any, encoder: Encoder, left_out
     for name, value in tags.items():  # 0 and 2: the frame names none, but its container may
         setattr(context, name, value if value not in (0, 2) else getattr(original.codec_context, name))
     if not planar.is_rgb and video.colour.matrix == 0:
-        context.colorspace = 1 if min(video.stored_size) > 576 else 6  # from RGB: BT.709, or BT.601 for small frames
+        context.colorspace = BT_709 if min(video.stored_size) > MAX_601_HEIGHT else BT_601  # converted from RGB
     context.color_range = 1 if _is_limited(planar, video, encoder) else 2
     if video.matrix is not None:
         stream.set_display_matrix(video.matrix)
@@ -239,23 +240,24 @@ class _OtherStreams:
     """
 
     def __init__(self, source: Any, out: Any, video: Video, left_out: list[str]) -> None:
+        """Add the streams to `out`. source: the container of the video, opened anew."""
         self._out, self._targets, self._encoded = out, dict[int, Any](), dict[int, Any]()
-        chosen = list[Any]()
+        copied_streams = list[Any]()
         for stream in source.streams:
             if stream.index == video.stream.index or stream.type == "video":
                 continue
             codec = stream.codec_context.name if stream.codec_context is not None else ""
             if stream.type == "audio" and codec:
                 is_mov = out.format.name == "mov"
-                anew = "pcm_s24le" if is_mov else out.default_audio_codec
+                replacement_codec = "pcm_s24le" if is_mov else out.default_audio_codec
                 if codec.startswith(MOV_SOUND) if is_mov else codec in out.supported_codecs:
                     target = out.add_stream_from_template(stream)
                 else:
-                    target = out.add_stream(anew, rate=stream.codec_context.sample_rate)
+                    target = out.add_stream(replacement_codec, rate=stream.codec_context.sample_rate)
                     target.codec_context.layout = stream.codec_context.layout
                     self._encoded[stream.index] = target
                     left_out.append(f"The sound of {video.path} ({codec}) does not fit into the new file and is "
-                                    f"encoded as {anew}.")
+                                    f"encoded as {replacement_codec}.")
             elif stream.type == "subtitle" and codec in out.supported_codecs:
                 target = out.add_stream_from_template(stream)
             else:
@@ -264,8 +266,8 @@ class _OtherStreams:
                 continue
             _copy_tags(stream.metadata, target.metadata, _STREAM_FACTS)
             self._targets[stream.index] = target
-            chosen.append(stream)
-        self._packets: Iterator[Any] = iter(source.demux(chosen)) if chosen else iter(())
+            copied_streams.append(stream)
+        self._packets: Iterator[Any] = iter(source.demux(copied_streams)) if copied_streams else iter(())
         self._waiting: Any = None
 
     def write_until(self, time: Fraction | None) -> None:
@@ -298,33 +300,33 @@ class _OtherStreams:
             self._out.mux(packet)
 
 
-def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Change, sound: _OtherStreams,
+def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Change, other_streams: _OtherStreams,
             on_frame: Callable[[], None]) -> None:
     """Encode every frame with its change, and write the other streams up to LEAD_S ahead of it.
 
-    stream: of the frames, by `_add_picture`. sound: the other streams. on_frame: called after each frame.
+    stream: of the frames, by `_add_video_stream`. on_frame: called after each frame.
     """
     planar = plane_format(stream.pix_fmt)
     assert planar is not None
     context, time_base = stream.codec_context, stream.codec_context.time_base
     limited = _is_limited(planar, video, encoder)
-    last: int | None = None
+    last_ticks: int | None = None
     for frame in video:
-        both = change(frame)  # codes before and after, None where no pixel changes
-        raw = apply_change(frame, *both) if both is not None else frame.raw
+        before_and_after = change(frame)  # None where no pixel changes
+        raw = apply_change(frame, *before_and_after) if before_and_after is not None else frame.raw
         if raw.format.name != planar.name or (not planar.is_rgb and frame.colour.limited != limited):
             raw = _reformat(raw, frame, planar, context, limited=limited)
-        ticks = frame.number if frame.time is None else frame.time[0]  # see the time base of `_add_picture`
-        if last is not None and ticks <= last:  # a damaged file may repeat a time
-            ticks = last + 1
+        ticks = frame.number if frame.time is None else frame.time[0]  # see the time base of `_add_video_stream`
+        if last_ticks is not None and ticks <= last_ticks:  # a damaged file may repeat a time
+            ticks = last_ticks + 1
         # Type 0 of a picture lets the encoder choose its key frames.
-        raw.pts, raw.time_base, raw.pict_type, last = ticks, time_base, 0, ticks
+        raw.pts, raw.time_base, raw.pict_type, last_ticks = ticks, time_base, 0, ticks
         raw.color_range, raw.colorspace = context.color_range, context.colorspace
-        sound.write_until(ticks * time_base + LEAD_S)
+        other_streams.write_until(ticks * time_base + LEAD_S)
         out.mux(stream.encode(raw))
         on_frame()
     out.mux(stream.encode())
-    sound.write_until(None)
+    other_streams.write_until(None)
 
 
 def _reformat(raw: Any, frame: VideoFrame, planar: PlaneFormat, context: Any, *, limited: bool) -> Any:
@@ -359,12 +361,12 @@ def apply_change(frame: VideoFrame, before: NDArray[np.float32], after: NDArray[
     difference[(after == before).all(-1)] = 0
     raw, planar = to_planar(frame.raw, colour.limited)
     raw.make_writable()
-    arrays, top = plane_arrays(raw, planar), (1 << planar.bits) - 1
+    arrays, max_code = plane_arrays(raw, planar), (1 << planar.bits) - 1
     codes = colour.to_plane_differences(frame.orientation.stored(difference))
     for index in range(1 if planar.is_grey else 3):
         plane = codes[..., index]
         if index and not planar.is_rgb and planar.sampling != (1, 1):
             plane = shrink_plane(np.ascontiguousarray(plane), planar)
-        changed = np.clip(np.rint(arrays[index].astype(np.float32) + plane), 0, top)
+        changed = np.clip(np.rint(arrays[index].astype(np.float32) + plane), 0, max_code)
         arrays[index][...] = changed.astype(planar.dtype)
     return raw

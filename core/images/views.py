@@ -53,12 +53,12 @@ def join_views(plate: Plate, codes: Sequence[NDArray[Any]]) -> tuple[Plate, NDAr
     if not views:
         return plate, codes[0]
     parts, is_changed = [(header, dict(channels)) for header, channels in _parts_of_plate(plate)], False
-    for view, each in zip(views[1:], codes[1:], strict=True):
+    for view, view_codes in zip(views[1:], codes[1:], strict=True):
         channels = parts[view.part][1]
         for index, name in enumerate(view.channels):
-            new = np.ascontiguousarray(each[..., index], channels[name].dtype)
-            is_changed = is_changed or not np.array_equal(new, channels[name], equal_nan=True)
-            channels[name] = new
+            new_channel = np.ascontiguousarray(view_codes[..., index], channels[name].dtype)
+            is_changed = is_changed or not np.array_equal(new_channel, channels[name], equal_nan=True)
+            channels[name] = new_channel
     extras = {**plate.extras, "channels": parts[views[0].part][1]}
     if "parts" in extras:
         extras["parts"] = parts

@@ -41,8 +41,8 @@ class DataWindow:
     def oriented(self, orientation: int) -> DataWindow:
         """Return the window of a picture as viewers show it, by its Exif orientation.
 
-    Formats with an orientation store the whole frame, so that swapped sides are all that changes.
-    """
+        Formats with an orientation store the whole frame, so that swapped sides are all that changes.
+        """
         if orientation < TRANSPOSED:
             return self
         return replace(self, size=self.size[::-1], origin=self.origin[::-1], frame=self.frame[::-1],
@@ -58,17 +58,17 @@ class DataWindow:
 
 def union_window(windows: Iterable[DataWindow]) -> DataWindow:
     """Return the window that holds the frame and all `windows`, which are of one frame."""
-    known = list(windows)
-    width, height = known[0].frame
-    left, top = (min(0, *(window.origin[axis] for window in known)) for axis in (0, 1))
-    right, bottom = (max((width, height)[axis], *(window.origin[axis] + window.size[axis] for window in known))
+    all_windows = list(windows)
+    width, height = all_windows[0].frame
+    left, top = (min(0, *(window.origin[axis] for window in all_windows)) for axis in (0, 1))
+    right, bottom = (max((width, height)[axis], *(window.origin[axis] + window.size[axis] for window in all_windows))
                      for axis in (0, 1))
-    return DataWindow((right - left, bottom - top), (left, top), (width, height), known[0].aspect)
+    return DataWindow((right - left, bottom - top), (left, top), (width, height), all_windows[0].aspect)
 
 
 def move_to_window(pixels: Pixels, source: DataWindow, target: DataWindow) -> Pixels:
-    """Return pixels (height, width, ...) of one data window as those of another on the same frame, 0 where there are
-    none."""
+    """Return pixels (height, width, ...) of the data window `source` as those of `target`, on the same frame; 0 where
+    there are none."""
     if (source.size, source.origin) == (target.size, target.origin):
         return pixels
     left, top = (source.origin[axis] - target.origin[axis] for axis in (0, 1))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError
 from ..system.files import atomic_path
 from ..typed import is_utf8
-from .exr import foreign_names, foreign_strings, is_exr_truncated
+from .exr import is_exr_truncated, non_utf8_names, non_utf8_strings
 from .formats import exr_header, exr_writer
 
 
@@ -61,16 +61,16 @@ def save_exr_parts(path: Path | str, parts: Sequence[tuple[Mapping[str, Any], Ma
 
     if not is_utf8(str(path)):
         raise FrameError(f"The path {str(path)!r} is not UTF-8, and no EXR can be written there; rename its folder.")
-    strings, names = (foreign_strings(source), foreign_names(source)) if source is not None else ({}, {})
-    first_header, first_channels = (dict(each) for each in parts[0])
-    opened = (OpenEXR.File(first_header, first_channels) if len(parts) == 1 else
+    strings, names = (non_utf8_strings(source), non_utf8_names(source)) if source is not None else ({}, {})
+    first_header, first_channels = (dict(items) for items in parts[0])
+    exr_file = (OpenEXR.File(first_header, first_channels) if len(parts) == 1 else
               OpenEXR.File([OpenEXR.Part(dict(header), dict(channels)) for header, channels in parts]))
-    with atomic_path(path, commit_lock) as temporary, opened as file:
+    with atomic_path(path, commit_lock) as temporary, exr_file as file:
         try:
             file.write(str(temporary))
         except RuntimeError as problem:  # the library reports a refusal of the system as text
-            full = os.strerror(errno.ENOSPC) in str(problem)
-            raise OSError(errno.ENOSPC if full else errno.EIO, str(problem), str(path)) from problem
+            is_disk_full = os.strerror(errno.ENOSPC) in str(problem)
+            raise OSError(errno.ENOSPC if is_disk_full else errno.EIO, str(problem), str(path)) from problem
         if strings or names:
             _restore_bytes(temporary, strings, names)
         # OpenEXR reports no error on closing a file, so a full disk shows as a file that is empty or cut short.
@@ -81,15 +81,15 @@ def save_exr_parts(path: Path | str, parts: Sequence[tuple[Mapping[str, Any], Ma
 def _restore_bytes(path: Path, strings: Mapping[str, bytes], names: Mapping[bytes, bytes]) -> None:
     """Overwrite parts of an EXR's headers with others of the same lengths.
 
-    strings: by the names of `exr_header.string_places`; a text that was changed to another length stays. names: of
+    strings: by the names of `exr_header.locate_strings`; a text that was changed to another length stays. names: of
     attributes and channels, by the names in the file.
     """
     with open(path, "r+b") as stream:
-        places = [(at, strings[name]) for name, (at, text) in exr_header.string_places(stream).items()
+        replacements = [(offset, strings[name]) for name, (offset, text) in exr_header.locate_strings(stream).items()
                   if len(strings.get(name, b"")) == len(text)]
-        places += [(at, names[name]) for _, at, name in exr_header.name_places(stream) if name in names]
-        for at, content in places:
-            stream.seek(at)
+        replacements += [(offset, names[name]) for _, offset, name in exr_header.locate_names(stream) if name in names]
+        for offset, content in replacements:
+            stream.seek(offset)
             stream.write(content)
 
 
@@ -97,11 +97,11 @@ def write_png(path: Path | str, display: NDArray[Any], bits: Literal[8, 16] = 8)
     """Write display values 0..1, (height, width, 3) or (height, width), as PNG."""
     import cv2
 
-    top = (1 << bits) - 1
-    pixels = np.clip(np.nan_to_num(display), 0.0, 1.0) * top + 0.5
+    max_code = (1 << bits) - 1
+    pixels = np.clip(np.nan_to_num(display), 0.0, 1.0) * max_code + 0.5
     stored: NDArray[Any] = pixels.astype(np.uint8 if bits == 8 else np.uint16)
-    done, data = cv2.imencode(".png", stored[..., ::-1] if stored.ndim == 3 else stored)
-    if not done:
+    is_encoded, data = cv2.imencode(".png", stored[..., ::-1] if stored.ndim == 3 else stored)
+    if not is_encoded:
         raise FrameError(f"{path} could not be encoded as PNG.")
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.tobytes())

@@ -104,6 +104,7 @@ def _index_by_key(folder: Path) -> dict[str, Path]:
 def _case_reader(path: Path, truth: Path, mask: Path | None) -> Callable[[], tuple[Pixels, Pixels, Pixels | None]]:
     """Return a function that reads frame, truth and mask of a case; it raises FrameError where their sizes differ."""
     def read() -> tuple[Pixels, Pixels, Pixels | None]:
+        """Read (frame, truth, mask) as display values."""
         frame, clean = read_picture(path), read_picture(truth)
         if frame.size != clean.size:
             raise FrameError(f"{path} is {frame.size[0]} x {frame.size[1]} pixels and {truth} {clean.size[0]} x "

@@ -39,8 +39,8 @@ class Tally:
     def skip(self, reason: str, *names: str) -> None:
         """Record items that are left out; a name is recorded once per reason."""
         if names:
-            known = self.skipped.setdefault(reason, [])
-            known += [name for name in dict.fromkeys(names) if name not in set(known)]
+            recorded = self.skipped.setdefault(reason, [])
+            recorded += [name for name in dict.fromkeys(names) if name not in set(recorded)]
 
     def merge(self, skipped: Iterable[tuple[str, Iterable[str]]]) -> None:
         """Record items that another part left out, by reason."""

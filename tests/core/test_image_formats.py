@@ -17,7 +17,7 @@ from PIL import Image, TiffImagePlugin, features
 from core.capture.plate_space import read_plate_space, record_plate_space
 from core.colour import colour_space
 from core.errors import FrameError, SettingsError
-from core.images.exr import foreign_names, foreign_strings, read_exr_header
+from core.images.exr import non_utf8_names, non_utf8_strings, read_exr_header
 from core.images.formats import jpeg, png, tiff
 from core.images.plates import Plate, clean_name, read_plate, write_plate
 from core.images.read import has_float_pixels, read_picture
@@ -163,7 +163,7 @@ def test_text_of_an_exr_that_is_not_utf8_stays_byte_for_byte(tmp_path: Path) -> 
     (tmp_path / "a.exr").write_bytes(data)
     plate = read_plate(tmp_path / "a.exr")
     write_plate(tmp_path / "b.exr", plate, plate.codes / np.float16(2))
-    assert foreign_strings(tmp_path / "b.exr") == {"owner": b"Studio Bross\xe9", "tags[1]": b"Nacht Stra\xdfe"}
+    assert non_utf8_strings(tmp_path / "b.exr") == {"owner": b"Studio Bross\xe9", "tags[1]": b"Nacht Stra\xdfe"}
     assert read_exr_header(tmp_path / "b.exr")["comments"] == "plain"
     np.testing.assert_array_equal(read_plate(tmp_path / "b.exr").codes, 0.25)
 
@@ -178,7 +178,7 @@ def test_names_in_an_exr_that_are_not_utf8_stay_byte_for_byte(tmp_path: Path) ->
     plate = read_plate(tmp_path / "a.exr")
     np.testing.assert_array_equal(read_picture(tmp_path / "a.exr").pixels, 0.5)
     write_plate(tmp_path / "b.exr", plate, plate.codes / np.float16(2))
-    assert foreign_names(tmp_path / "b.exr") == {b"H\x7fhe": b"H\xf6he", b"H\x7fhf": b"H\xf6hf",
+    assert non_utf8_names(tmp_path / "b.exr") == {b"H\x7fhe": b"H\xf6he", b"H\x7fhf": b"H\xf6hf",
                                                 b"gr\x7fsse": b"gr\xf6sse"}
     again = read_plate(tmp_path / "b.exr")
     np.testing.assert_array_equal(again.codes, 0.25)

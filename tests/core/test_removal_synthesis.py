@@ -136,9 +136,9 @@ def test_a_flare_is_non_negative_and_a_function_of_its_seed(kind: str) -> None:
         assert layer.dtype == np.float32
         assert np.isfinite(layer).all()
         assert layer.min() >= 0
-    assert one.whole.max() > 1e-3
-    assert np.array_equal(one.whole, again.whole)
-    assert not np.array_equal(one.whole, synthesise_flare((3, 6), SIZE, lenses.built_in_lenses(), kind).whole)
+    assert one.total.max() > 1e-3
+    assert np.array_equal(one.total, again.total)
+    assert not np.array_equal(one.total, synthesise_flare((3, 6), SIZE, lenses.built_in_lenses(), kind).total)
 
 
 def test_a_smear_consists_of_beams_from_the_light() -> None:
@@ -154,7 +154,7 @@ def test_a_smear_consists_of_beams_from_the_light() -> None:
 
 
 def test_flares_span_small_to_full_frame() -> None:
-    covered = [image_formation.coverage(synthesise_flare((11, k), SIZE, lenses.built_in_lenses()).whole)
+    covered = [image_formation.coverage(synthesise_flare((11, k), SIZE, lenses.built_in_lenses()).total)
                for k in range(60)]
     assert min(covered) < 0.02
     assert max(covered) > 0.7

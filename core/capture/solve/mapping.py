@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CaptureError, EngineError, is_out_of_memory
-from ...images.read import decode
+from ...images.read import decode_by_opencv
 from ...images.size import picture_size
 from ...system.files import read_json, write_json, write_text
 from ...system.progress import Progress
@@ -246,7 +246,7 @@ def _read_grey(path: Path) -> NDArray[np.uint8]:
     """Read (height, width) of a small picture. Raises CaptureError where it has been damaged."""
     import cv2
 
-    picture = decode(path, cv2.IMREAD_GRAYSCALE)
+    picture = decode_by_opencv(path, cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise CaptureError(f"{path} is damaged; remove the folder {path.parents[1]} and solve again.")
     return np.asarray(picture, np.uint8)

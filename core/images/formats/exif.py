@@ -34,9 +34,10 @@ def read_exif(path: Path) -> tuple[int, float | None]:
     """
     with open_regular(path) as stream:
         block = _exif_block(stream)
-        first = tiff.integer_values(tiff.read_tags(block, (tiff.ORIENTATION, EXIF)))
-        second = tiff.integer_values(tiff.read_tags(block, (FOCAL_35MM,), first[EXIF])) if EXIF in first else {}
-    orientation, focal = first.get(tiff.ORIENTATION, 1), second.get(FOCAL_35MM, 0)
+        main_tags = tiff.integer_values(tiff.read_tags(block, (tiff.ORIENTATION, EXIF)))
+        exif_tags = (tiff.integer_values(tiff.read_tags(block, (FOCAL_35MM,), main_tags[EXIF])) if EXIF in main_tags
+                     else {})
+    orientation, focal = main_tags.get(tiff.ORIENTATION, 1), exif_tags.get(FOCAL_35MM, 0)
     # A focal length beyond 5 to 2000 mm is damaged; 0 stands for an unknown one.
     return orientation if 1 <= orientation <= 8 else 1, focal / WIDTH_35MM if 5 <= focal <= 2000 else None
 
@@ -50,8 +51,8 @@ def _exif_block(stream: BinaryIO) -> BinaryIO:
         blocks = (content[6:] for marker, content in jpeg.segments(stream)
                   if marker == jpeg.APP1 and content.startswith(b"Exif\0\0"))
     elif magic[4:8] == b"ftyp":  # HEIC and AVIF, whose pixels are read upright
-        found = _BLOCK.search(magic + stream.read(_MAX_SEARCH_BYTES))
-        return io.BytesIO(upright_block(found[1]) if found else b"")
+        match = _BLOCK.search(magic + stream.read(_MAX_SEARCH_BYTES))
+        return io.BytesIO(upright_block(match[1]) if match else b"")
     elif magic[:4] == b"RIFF":
         blocks = (content.removeprefix(b"Exif\0\0") for name, content in webp.chunks(stream) if name == b"EXIF")
     else:
@@ -62,14 +63,14 @@ def _exif_block(stream: BinaryIO) -> BinaryIO:
 def upright_block(block: bytes) -> bytes:
     """Return an Exif block whose orientation is 1, for pixels that stand upright; empty for a damaged one."""
     order: Literal["little", "big"] = "little" if block[:2] == b"II" else "big"
-    first = int.from_bytes(block[4:8], order)
-    if block[:4] not in (b"II*\0", b"MM\0*") or first + 2 > len(block):
+    directory_offset = int.from_bytes(block[4:8], order)
+    if block[:4] not in (b"II*\0", b"MM\0*") or directory_offset + 2 > len(block):
         return b""
     changed = bytearray(block)
-    for number in range(int.from_bytes(block[first:first + 2], order)):  # entries of 12 bytes: tag, type, count, value
-        at = first + 2 + 12 * number
-        if at + 12 <= len(block) and int.from_bytes(block[at:at + 2], order) == tiff.ORIENTATION:
-            changed[at + 8:at + 10] = (1).to_bytes(2, order)
+    for number in range(int.from_bytes(block[directory_offset:directory_offset + 2], order)):
+        entry = directory_offset + 2 + 12 * number  # offset of 12 bytes: tag, type, count, value
+        if entry + 12 <= len(block) and int.from_bytes(block[entry:entry + 2], order) == tiff.ORIENTATION:
+            changed[entry + 8:entry + 10] = (1).to_bytes(2, order)
     return bytes(changed)
 
 

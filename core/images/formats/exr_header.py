@@ -41,11 +41,11 @@ HALF = 1
 def channel_kinds(stream: BinaryIO) -> dict[str, int]:
     """Return the pixel type of each channel, such as "flare_sun.R", in the file's order; empty for a damaged header."""
     value = _read_attributes(stream, {b"channels": b"chlist"}).get(b"channels", b"")
-    kinds, at = {}, 0
-    while (end := value.find(b"\0", at)) > at:
-        kinds[value[at:end].decode(errors="replace")] = int.from_bytes(value[end + 1:end + 5], "little")
-        at = end + 17  # past the zero, the kind, whether it is linear, and the sampling
-    return kinds if value[at:] == b"\0" else {}
+    kinds, offset = {}, 0
+    while (end := value.find(b"\0", offset)) > offset:
+        kinds[value[offset:end].decode(errors="replace")] = int.from_bytes(value[end + 1:end + 5], "little")
+        offset = end + 17  # past the zero, the kind, whether it is linear, and the sampling
+    return kinds if value[offset:] == b"\0" else {}
 
 
 def chromaticities(stream: BinaryIO) -> tuple[float, ...] | None:
@@ -88,50 +88,50 @@ def is_truncated(stream: BinaryIO) -> bool:
     offsets = np.frombuffer(stream.read(8 * chunks), "<u8")
     if not offsets.all():  # not written yet
         return True
-    last = int(offsets.max())
-    stream.seek(min(last + 4, end))
-    return last + 8 + int.from_bytes(stream.read(4), "little") > end
+    last_offset = int(offsets.max())
+    stream.seek(min(last_offset + 4, end))
+    return last_offset + 8 + int.from_bytes(stream.read(4), "little") > end
 
 
-def string_places(stream: BinaryIO) -> dict[str, tuple[int, bytes]]:
+def locate_strings(stream: BinaryIO) -> dict[str, tuple[int, bytes]]:
     """Return the offset and the bytes of each text of all headers, by the name of its attribute.
 
     Texts of a list have their number in the name, such as "tags[1]"; those of parts behind the first the part's number,
     such as "owner, part 1".
     """
-    places = {}
+    texts = {}
     for part, _, name, kind, length in _iterate_attributes(stream):
-        at = stream.tell()
-        key, behind = name.decode("latin-1"), f", part {part}" if part else ""
+        value_offset = stream.tell()
+        key, part_suffix = name.decode("latin-1"), f", part {part}" if part else ""
         if kind == b"string" and length <= _MAX_ATTRIBUTE_BYTES:
-            places[key + behind] = at, stream.read(length)
+            texts[key + part_suffix] = value_offset, stream.read(length)
         elif kind == b"stringvector" and length <= _MAX_ATTRIBUTE_BYTES:
             value, start, number = stream.read(length), 0, 0
             while start + 4 <= len(value):
                 end = start + 4 + int.from_bytes(value[start:start + 4], "little")
-                places[f"{key}[{number}]{behind}"] = at + start + 4, value[start + 4:end]
+                texts[f"{key}[{number}]{part_suffix}"] = value_offset + start + 4, value[start + 4:end]
                 start, number = end, number + 1
-    return places
+    return texts
 
 
-def name_places(stream: BinaryIO) -> list[tuple[int, int, bytes]]:
+def locate_names(stream: BinaryIO) -> list[tuple[int, int, bytes]]:
     """Return the part, the offset and the bytes of the name of each attribute and of each channel, in the file's order.
     """
-    places = []
-    for part, at, name, kind, length in _iterate_attributes(stream):
-        places.append((part, at, name))
+    names = []
+    for part, name_offset, name, kind, length in _iterate_attributes(stream):
+        names.append((part, name_offset, name))
         if kind == b"chlist" and length <= _MAX_ATTRIBUTE_BYTES:
-            start, value = stream.tell(), stream.read(length)
-            places += [(part, start + offset, channel) for offset, channel in _channels(value)]
-    return places
+            value_offset, value = stream.tell(), stream.read(length)
+            names += [(part, value_offset + offset, channel) for offset, channel in _channels(value)]
+    return names
 
 
 def _channels(value: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield the offset and the name of each channel in the value of a "chlist"."""
-    at = 0
-    while (end := value.find(b"\0", at)) > at:
-        yield at, value[at:end]
-        at = end + 17  # past the zero, the kind, whether it is linear, and the sampling
+    offset = 0
+    while (end := value.find(b"\0", offset)) > offset:
+        yield offset, value[offset:end]
+        offset = end + 17  # past the zero, the kind, whether it is linear, and the sampling
 
 
 def _iterate_attributes(stream: BinaryIO) -> Iterator[tuple[int, int, bytes, bytes, int]]:
@@ -139,20 +139,20 @@ def _iterate_attributes(stream: BinaryIO) -> Iterator[tuple[int, int, bytes, byt
     the first damaged one. The stream is then at the value."""
     stream.seek(len(MAGIC))
     has_parts = int.from_bytes(stream.read(4), "little") & _PARTS
-    part, is_empty, at = 0, True, stream.tell()
+    part, is_empty, name_offset = 0, True, stream.tell()
     while True:
         if not (name := _read_name(stream)):
             if is_empty or not has_parts:  # after the last of several headers comes an empty one
                 return
-            part, is_empty, at = part + 1, True, stream.tell()
+            part, is_empty, name_offset = part + 1, True, stream.tell()
             continue
         kind, length = _read_name(stream), int.from_bytes(stream.read(4), "little", signed=True)
         if length < 0:
             return
-        start = stream.tell()
-        yield part, at, name, kind, length
-        stream.seek(start + length)
-        is_empty, at = False, stream.tell()
+        value_offset = stream.tell()
+        yield part, name_offset, name, kind, length
+        stream.seek(value_offset + length)
+        is_empty, name_offset = False, stream.tell()
 
 
 def _read_attributes(stream: BinaryIO, kinds: dict[bytes, bytes], *, to_the_end: bool = False) -> dict[bytes, bytes]:

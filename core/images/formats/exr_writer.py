@@ -54,13 +54,14 @@ def write_scanlines(path: Path | str, channels: Mapping[str, NDArray[Any]], head
 
 
 def _header(names: list[str], pixels: list[NDArray[Any]], attributes: Mapping[str, Any]) -> bytes:
-    """Return magic number, version and attributes."""
+    """Return magic number, version and attributes. names, pixels: of the channels, in the file's order. attributes: as
+    `header` of `write_scanlines`, with both windows."""
     # Of each channel: name, type, whether it is perceptually linear, and sampling of columns and lines.
-    listed = b"".join(name.encode() + b"\0" + struct.pack("<iB3xii", _PIXEL_TYPES[one.dtype.name], 0, 1, 1)
-                      for name, one in zip(names, pixels, strict=True)) + b"\0"
+    channel_list = b"".join(name.encode() + b"\0" + struct.pack("<iB3xii", _PIXEL_TYPES[channel.dtype.name], 0, 1, 1)
+                            for name, channel in zip(names, pixels, strict=True)) + b"\0"
     flags = _LONG_NAMES if max(len(name.encode()) for name in (*names, *attributes)) > 31 else 0
     parts = [MAGIC, struct.pack("<i", 2 | flags),  # version 2 of the format
-             _attribute("channels", "chlist", listed),
+             _attribute("channels", "chlist", channel_list),
              _attribute("compression", "compression", bytes([_ZIP])), _attribute("lineOrder", "lineOrder", b"\0"),
              _attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0, 0)),
              _attribute("screenWindowWidth", "float", struct.pack("<f", 1))]
@@ -69,7 +70,7 @@ def _header(names: list[str], pixels: list[NDArray[Any]], attributes: Mapping[st
             (left, top), (right, bottom) = value
             parts.append(_attribute(name, "box2i", struct.pack("<4i", int(left), int(top), int(right), int(bottom))))
         elif name == "chromaticities":
-            parts.append(_attribute(name, name, struct.pack("<8f", *(float(one) for one in value))))
+            parts.append(_attribute(name, name, struct.pack("<8f", *(float(coordinate) for coordinate in value))))
         elif isinstance(value, str):
             parts.append(_attribute(name, "string", value.encode()))
         elif isinstance(value, int | float):
@@ -87,7 +88,7 @@ def _chunks(pixels: list[NDArray[Any]], height: int) -> Iterator[tuple[int, byte
     """Yield the first line and the stored bytes of each chunk; uncompressed where ZIP does not make it smaller."""
     for start in range(0, height, _LINES):
         lines = range(start, min(start + _LINES, height))
-        raw = b"".join(one[line].tobytes() for line in lines for one in pixels)
+        raw = b"".join(channel[line].tobytes() for line in lines for channel in pixels)
         packed = _compress(raw)
         yield start, packed if len(packed) < len(raw) else raw
 

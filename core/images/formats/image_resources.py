@@ -11,15 +11,15 @@ _THUMBNAILS = (1033, 1036)
 
 def without_thumbnails(resources: bytes) -> bytes:
     """Return image resources without thumbnails; what cannot be parsed stays byte for byte."""
-    kept, at = [], 0
-    while resources[at:at + 4] in _SIGNATURES and len(resources) >= at + 12:
-        size_at = at + 7 + resources[at + 6]  # the name has a byte of length, and an even size in all
-        size_at += (size_at - at) % 2
-        length = int.from_bytes(resources[size_at:size_at + 4], "big")
-        end = size_at + 4 + length + length % 2
-        if size_at + 4 + length > len(resources):
+    others, offset = [], 0
+    while resources[offset:offset + 4] in _SIGNATURES and len(resources) >= offset + 12:
+        length_offset = offset + 7 + resources[offset + 6]  # the name has a byte of length, and an even size in all
+        length_offset += (length_offset - offset) % 2
+        length = int.from_bytes(resources[length_offset:length_offset + 4], "big")
+        end = length_offset + 4 + length + length % 2
+        if length_offset + 4 + length > len(resources):
             break
-        if int.from_bytes(resources[at + 4:at + 6], "big") not in _THUMBNAILS:
-            kept.append(resources[at:end])
-        at = end
-    return b"".join(kept) + resources[at:]
+        if int.from_bytes(resources[offset + 4:offset + 6], "big") not in _THUMBNAILS:
+            others.append(resources[offset:end])
+        offset = end
+    return b"".join(others) + resources[offset:]

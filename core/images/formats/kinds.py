@@ -38,20 +38,20 @@ _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b
 
 def kind_of(head: bytes, suffix: str) -> Kind:
     """Return the format of a file by its first HEAD_BYTES, and by its suffix where a format has no signature."""
-    named = SUFFIXES.get(suffix.lower(), "")
-    if head[:4] in _TIFFS or named == "raw":  # most raw files are TIFFs by their first bytes
-        return "raw" if named == "raw" else "tiff"
+    suffix_kind = SUFFIXES.get(suffix.lower(), "")
+    if head[:4] in _TIFFS or suffix_kind == "raw":  # most raw files are TIFFs by their first bytes
+        return "raw" if suffix_kind == "raw" else "tiff"
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
         return "webp"
     if head[4:8] == b"ftyp":
-        brands = {head[8:12], *(head[at:at + 4] for at in range(16, len(head) - 3, 4))}
+        brands = {head[8:12], *(head[offset:offset + 4] for offset in range(16, len(head) - 3, 4))}
         if brands & {b"avif", b"avis"}:
             return "avif"
         return "heif" if brands.intersection(_HEIF_BRANDS) else ""
     for magic, kind in _MAGIC:
         if head.startswith(magic):
             return kind
-    return "tga" if named == "tga" else ""
+    return "tga" if suffix_kind == "tga" else ""
 
 
 def is_video(path: Path) -> bool:

@@ -32,14 +32,14 @@ def is_truncated(data: bytes) -> bool:
 
     OpenCV allocates as much as a chunk claims, gigabytes for a damaged length in a small file.
     """
-    at, end = len(SIGNATURE), len(data) if data.startswith(SIGNATURE) else 0
-    while at + 8 <= end:
-        after = at + 12 + int.from_bytes(data[at:at + 4], "big")
-        if after > end:
+    offset, end = len(SIGNATURE), len(data) if data.startswith(SIGNATURE) else 0
+    while offset + 8 <= end:
+        next_offset = offset + 12 + int.from_bytes(data[offset:offset + 4], "big")
+        if next_offset > end:
             return True
-        if data[at + 4:at + 8] == b"IEND":  # what follows is no part of it
+        if data[offset + 4:offset + 8] == b"IEND":  # what follows is no part of it
             return False
-        at = after
+        offset = next_offset
     return False
 
 
@@ -50,9 +50,9 @@ def _chunk_headers(stream: BinaryIO) -> Iterator[tuple[bytes, int]]:
         return
     while len(head := stream.read(8)) == 8:
         length = int.from_bytes(head[:4], "big")
-        after = stream.tell() + length + 4
+        next_offset = stream.tell() + length + 4
         yield head[4:], length
-        stream.seek(after)
+        stream.seek(next_offset)
 
 
 def make_chunk(name: bytes, content: bytes) -> bytes:

@@ -63,14 +63,14 @@ class _Layout(NamedTuple):
         return int(struct.unpack_from(self.order + (kind or self.offset), raw)[0])
 
     @property
-    def place(self) -> int:
+    def value_position(self) -> int:
         """Where in an entry its last field begins: the values, or their offset if they are longer than the field."""
         return 4 + struct.calcsize(self.offset)
 
     @property
-    def entry(self) -> int:
+    def entry_size(self) -> int:
         """Bytes of an entry."""
-        return self.place + struct.calcsize(self.offset)
+        return self.value_position + struct.calcsize(self.offset)
 
 
 _NO_DIRECTORY: tuple[_Layout, list[bytes]] = (_Layout("<", "H", "I"), [])
@@ -88,13 +88,13 @@ def short(value: int) -> Tag:
     return Tag(3, np.array([value], np.uint16))
 
 
-def read_tags(stream: BinaryIO, numbers: Container[int], at: int | None = None) -> dict[int, Tag]:
-    """Read the tags `numbers` of the first page, or of the directory at offset `at`. Damaged tags are left out; a file
+def read_tags(stream: BinaryIO, numbers: Container[int], directory_offset: int | None = None) -> dict[int, Tag]:
+    """Read the tags `numbers` of the first page, or of the directory at an offset. Damaged tags are left out; a file
     that is no TIFF gives {}.
 
     Whole numbers of 64 bits, of a BigTIFF, are returned as those of 32 bits, and left out where they do not fit.
     """
-    layout, entries = next(_directories(stream, at), _NO_DIRECTORY)
+    layout, entries = next(_directories(stream, directory_offset), _NO_DIRECTORY)
     tags: dict[int, Tag] = {}
     for entry in entries:
         number, kind = struct.unpack_from(layout.order + "HH", entry)
@@ -102,22 +102,22 @@ def read_tags(stream: BinaryIO, numbers: Container[int], at: int | None = None) 
         if number not in numbers or kind not in types:
             continue
         count = layout.number(entry[4:])
-        values = np.dtype(types[kind]).newbyteorder(layout.order)
-        length = count * values.itemsize * (2 if kind in _RATIONALS else 1)
-        raw = entry[layout.place:][:length]
-        if length > layout.entry - layout.place:  # then the field holds the offset of the values
-            start = layout.number(entry[layout.place:])
+        value_type = np.dtype(types[kind]).newbyteorder(layout.order)
+        length = count * value_type.itemsize * (2 if kind in _RATIONALS else 1)
+        raw = entry[layout.value_position:][:length]
+        if length > layout.entry_size - layout.value_position:  # then the field holds the offset of the values
+            start = layout.number(entry[layout.value_position:])
             if start + length > stream.seek(0, io.SEEK_END):  # reading asks for all the memory that is claimed
                 continue
             stream.seek(start)
             raw = stream.read(length)
         if not count or len(raw) != length:
             continue
-        found = np.frombuffer(raw, values).astype(values.newbyteorder("="))
+        decoded = np.frombuffer(raw, value_type).astype(value_type.newbyteorder("="))
         if kind not in _BIG_TYPES:
-            tags[number] = Tag(kind, found)
-        elif kind != 17 and found.max() < 1 << 32:  # 17 is signed
-            tags[number] = Tag(4, found.astype(np.uint32))
+            tags[number] = Tag(kind, decoded)
+        elif kind != 17 and decoded.max() < 1 << 32:  # 17 is signed
+            tags[number] = Tag(4, decoded.astype(np.uint32))
     return tags
 
 
@@ -131,7 +131,8 @@ def page_count(stream: BinaryIO) -> int:
     count = 0
     for layout, entries in _directories(stream):
         # The numbers of 32 bits of the tag SUBFILE, of which a page has one at most.
-        kinds = [layout.number(entry[layout.place:], "I") for entry in entries if layout.number(entry, "H") == SUBFILE]
+        kinds = [layout.number(entry[layout.value_position:], "I") for entry in entries
+                 if layout.number(entry, "H") == SUBFILE]
         count += not any(kind & 1 for kind in kinds)  # bit 0: a reduced copy of another page
     return count
 
@@ -148,10 +149,11 @@ def has_corrupt_data(stream: BinaryIO) -> bool:
     if numbers.get(COMPRESSION) not in _ZIP:
         return False
     limit = _BYTES_BEYOND + numbers.get(WIDTH, 0) * numbers.get(HEIGHT, 0) * numbers.get(SAMPLES, 1) * 8
-    for places, lengths in (_STRIPS, _TILES):
-        if places in tags and lengths in tags:
-            for at, length in zip(tags[places].values.tolist(), tags[lengths].values.tolist(), strict=False):
-                stream.seek(at)
+    for offsets_tag, lengths_tag in (_STRIPS, _TILES):
+        if offsets_tag in tags and lengths_tag in tags:
+            offsets, lengths = tags[offsets_tag].values.tolist(), tags[lengths_tag].values.tolist()
+            for offset, length in zip(offsets, lengths, strict=False):
+                stream.seek(offset)
                 limit -= (inflated := _inflated_size(stream.read(length), limit))
                 if inflated < 0:
                     return True
@@ -185,15 +187,15 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
         raw = values.astype(values.dtype.newbyteorder(order)).tobytes()
         count = len(values) // (2 if kind in _RATIONALS else 1)
         if len(raw) <= 4:
-            place = raw.ljust(4, b"\0")
+            value_field = raw.ljust(4, b"\0")
         else:
             result += b"\0" * (len(result) % 2)
-            place = struct.pack(order + "I", len(result))
+            value_field = struct.pack(order + "I", len(result))
             result += raw
-        new_entries.append(struct.pack(order + "HHI", number, kind, count) + place)
+        new_entries.append(struct.pack(order + "HHI", number, kind, count) + value_field)
     result += b"\0" * (len(result) % 2)
-    at = struct.unpack(order + "I", data[4:8])[0]
-    following = data[at + 2 + 12 * len(entries):][:4].ljust(4, b"\0")  # offset of the next page
+    directory_offset = struct.unpack(order + "I", data[4:8])[0]
+    following = data[directory_offset + 2 + 12 * len(entries):][:4].ljust(4, b"\0")  # offset of the next page
     new_entries.sort(key=lambda entry: struct.unpack(order + "H", entry[:2])[0])
     result[4:8] = struct.pack(order + "I", len(result))
     result += struct.pack(order + "H", len(new_entries)) + b"".join(new_entries) + following
@@ -207,16 +209,17 @@ def with_directory(data: bytes, number: int, tags: Mapping[int, Tag]) -> bytes:
     if not entries or not tags or data[:4] in BIG_TIFF:
         return data
     result = bytearray(data + b"\0" * (len(data) % 2))
-    listed = []
+    entry_list = []
     for name, (kind, values) in sorted(tags.items()):
         raw = values.astype(values.dtype.newbyteorder(order)).tobytes()
-        place = raw.ljust(4, b"\0") if len(raw) <= 4 else struct.pack(order + "I", len(result))
+        value_field = raw.ljust(4, b"\0") if len(raw) <= 4 else struct.pack(order + "I", len(result))
         if len(raw) > 4:
             result += raw + b"\0" * (len(raw) % 2)
-        listed.append(struct.pack(order + "HHI", name, kind, len(values) // (2 if kind in _RATIONALS else 1)) + place)
-    at = len(result)
-    result += struct.pack(order + "H", len(listed)) + b"".join(listed) + bytes(4)
-    return with_tags(bytes(result), {number: Tag(4, np.array([at], np.uint32))})
+        count = len(values) // (2 if kind in _RATIONALS else 1)
+        entry_list.append(struct.pack(order + "HHI", name, kind, count) + value_field)
+    directory_offset = len(result)
+    result += struct.pack(order + "H", len(entry_list)) + b"".join(entry_list) + bytes(4)
+    return with_tags(bytes(result), {number: Tag(4, np.array([directory_offset], np.uint32))})
 
 
 def is_premultiplied(path: Path) -> bool:
@@ -236,8 +239,8 @@ def without_reader_changes(data: bytes) -> bytes:
     return with_tags(data, changed)
 
 
-def _directories(stream: BinaryIO, at: int | None = None) -> Iterator[tuple[_Layout, list[bytes]]]:
-    """Yield (layout, entries) page by page, or from the directory at offset `at`, while the file is intact."""
+def _directories(stream: BinaryIO, offset: int | None = None) -> Iterator[tuple[_Layout, list[bytes]]]:
+    """Yield (layout, entries) page by page, or from the directory at `offset`, while the file is intact."""
     stream.seek(0)
     head = stream.read(16)
     order: _Order = "<" if head[:2] == b"II" else ">"
@@ -247,17 +250,17 @@ def _directories(stream: BinaryIO, at: int | None = None) -> Iterator[tuple[_Lay
         layout, first = _Layout(order, "Q", "Q"), head[8:]
     else:
         return
-    at = layout.number(first) if at is None else at
+    offset = layout.number(first) if offset is None else offset
     for _ in range(_MAX_PAGES):
-        stream.seek(min(at, stream.seek(0, io.SEEK_END)))
+        stream.seek(min(offset, stream.seek(0, io.SEEK_END)))
         raw = stream.read(struct.calcsize(layout.length))
         count = layout.number(raw, layout.length) if len(raw) == struct.calcsize(layout.length) else 0
-        entries = stream.read(count * layout.entry) if count < _MAX_ENTRIES else b""
-        if not count or len(entries) < count * layout.entry:
+        entries = stream.read(count * layout.entry_size) if count < _MAX_ENTRIES else b""
+        if not count or len(entries) < count * layout.entry_size:
             return
-        yield layout, [entries[k:k + layout.entry] for k in range(0, len(entries), layout.entry)]
-        stream.seek(at + len(raw) + len(entries))
+        yield layout, [entries[k:k + layout.entry_size] for k in range(0, len(entries), layout.entry_size)]
+        stream.seek(offset + len(raw) + len(entries))
         following = stream.read(struct.calcsize(layout.offset))
-        at = layout.number(following) if len(following) == struct.calcsize(layout.offset) else 0
-        if not at:
+        offset = layout.number(following) if len(following) == struct.calcsize(layout.offset) else 0
+        if not offset:
             return

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import BinaryIO
 
-_KEPT = (b"EXIF", b"ANIM")
+_READ_CHUNKS = (b"EXIF", b"ANIM")
 _MAX_CHUNK_BYTES = 1 << 20
 """Bound of a chunk that is read."""
 
@@ -18,10 +18,10 @@ def chunks(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
         return
     while len(head := stream.read(8)) == 8:
         length = int.from_bytes(head[4:], "little")
-        after = stream.tell() + length + length % 2
-        if head[:4] in _KEPT and length <= _MAX_CHUNK_BYTES:
+        next_offset = stream.tell() + length + length % 2
+        if head[:4] in _READ_CHUNKS and length <= _MAX_CHUNK_BYTES:
             yield head[:4], stream.read(length)
-        stream.seek(after)
+        stream.seek(next_offset)
 
 
 def is_animated(stream: BinaryIO) -> bool:

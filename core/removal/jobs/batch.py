@@ -115,11 +115,11 @@ def left_out_files(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) 
     return {reason: names for reason, names in names_by_reason.items() if names}
 
 
-def _blocking_path(folder: Path) -> Path | None:
-    """Return what prevents a folder from being created: a file or a dangling link in its place or in that of a parent;
-    None if nothing does."""
+def _check_creatable(folder: Path) -> None:
+    """Raise SettingsError where a file or a dangling link lies in the place of a folder or of one of its parents."""
     nearest = next((path for path in (folder, *folder.parents) if os.path.lexists(path)), None)
-    return None if nearest is None or nearest.is_dir() else nearest
+    if nearest is not None and not nearest.is_dir():
+        raise SettingsError(f"{nearest} is not a folder, so {folder} cannot be written to; choose another folder.")
 
 
 def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
@@ -140,10 +140,8 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     Raises SettingsError before anything is written, FrameError at once where the folder cannot be written to, and
     FrameError at the end with a list of the plates that failed.
     """
-    for output_folder in (folder, flare_folder):
-        if output_folder is not None and (blocking := _blocking_path(output_folder)):
-            raise SettingsError(f"{blocking} is not a folder, so {output_folder} cannot be written to; choose another "
-                                "folder.")
+    for output_folder in filter(None, (folder, flare_folder)):
+        _check_creatable(output_folder)
     excluded = [folder, flare_folder, mattes.source if mattes else None]
     plates = collect_plates(inputs, excluded)
     results = {name: [folder / clean_name(name), *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
@@ -190,10 +188,10 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
 
     frames = (CleanFrame(name, path, results[name])
               for path, name in sorted(plates, key=lambda plate: shot_sort_key(plate[0])))
-    written, kept = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
+    written, kept_counts = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
                                        keep_finished=not overwrite, overwrite=overwrite, on_error=leave_out)
-    manifest.report_kept(kept, progress)
-    tally = Tally("plate", "cleaned", written + kept.total(), left_out_files(inputs, excluded))
+    manifest.report_kept(kept_counts, progress)
+    tally = Tally("plate", "cleaned", written + kept_counts.total(), left_out_files(inputs, excluded))
     tally.skip("could not be cleaned", *failed_names)
     if failed:
         progress.say(tally.sentence())
@@ -201,9 +199,9 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
                          f"{join_failures(failed)}")
     confidence = manifest.confidence(name for _, name in plates)
     _report_low_confidence(confidence, progress)
-    progress.say(f"{written + kept.total()} clean frames are in {folder}.")
+    progress.say(f"{written + kept_counts.total()} clean frames are in {folder}.")
     progress.say(tally.sentence())
-    return {"plates": str(folder), "made": written, "kept": kept.total(), "confidence": confidence,
+    return {"plates": str(folder), "made": written, "kept": kept_counts.total(), "confidence": confidence,
             **tally.as_result()}
 
 

@@ -6,7 +6,7 @@
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -63,14 +63,9 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
         codec_name = choose_codec(target, video, codec)
     digest = digest_inputs(codec_name, [source, *clean.values()])
     record = _read_record(folder / RECORD)
-    if target.exists() and not overwrite:
-        existing_hash = content_hash(target)
-        if existing_hash not in (record.get("written"), record.get("replaced")):
-            raise SettingsError(f"{target} exists and was not made from these frames, so it may be someone's work; "
-                                "choose another name, or replace it with --overwrite.")
-        if record.get("from") == digest and record.get("written") == existing_hash:
-            progress.say(f"{target} is up to date; --overwrite makes it again.")
-            return True
+    if target.exists() and not overwrite and _is_up_to_date(target, record, digest):
+        progress.say(f"{target} is up to date; --overwrite makes it again.")
+        return True
 
     def changed_pixels(frame: VideoFrame) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Return a frame's pixels as extracted and as cleaned; None where they are the same."""
@@ -96,6 +91,16 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
         progress.say(sentence)
     progress.say(f"The clean video is {target}.")
     return True
+
+
+def _is_up_to_date(target: Path, record: Mapping[str, object], digest: str) -> bool:
+    """True if the existing video was written from what `digest` stands for. Raises SettingsError where it is another
+    file than the record names."""
+    existing_hash = content_hash(target)
+    if existing_hash not in (record.get("written"), record.get("replaced")):
+        raise SettingsError(f"{target} exists and was not made from these frames, so it may be someone's work; "
+                            "choose another name, or replace it with --overwrite.")
+    return record.get("from") == digest and record.get("written") == existing_hash
 
 
 def _read_record(path: Path) -> dict[str, object]:

@@ -86,14 +86,14 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
 
         return PreparedResults(write)
 
-    written, kept = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
+    written, kept_counts = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
                                        keep_finished=not overwrite, overwrite=overwrite)
     for light, count in dim_counts.items():
         progress.say(f"{count} of {written} frames show less than half of the flare that {light!r} has in the fit; no "
                      "more than they show was removed.")
-    manifest.report_kept(kept, progress)
+    manifest.report_kept(kept_counts, progress)
     progress.say(f"{len(views)} clean frames are in {folder}.")
-    return {"plates": str(folder), "made": written, "kept": kept.total()}
+    return {"plates": str(folder), "made": written, "kept": kept_counts.total()}
 
 
 def _result_paths(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:

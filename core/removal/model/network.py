@@ -112,6 +112,7 @@ class Attention(nn.Module):
     """
 
     def __init__(self, width: int, heads: int, octaves: int = 0) -> None:
+        """width: channels, a multiple of `heads`. octaves: see the class."""
         super().__init__()
         self.heads, self.octaves = heads, octaves
         self.norm = ChannelNorm(width)

@@ -34,7 +34,7 @@ class SynthesisedFlare:
     light: Array
 
     @property
-    def whole(self) -> Array:
+    def total(self) -> Array:
         """All light of the flare: rest and glow."""
         return self.rest + self.glow
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...colour.srgb import Pixels
 from ...errors import RunError, SettingsError
-from ...images.read import decode
+from ...images.read import decode_by_opencv
 from ..synthesis.canvas import log_uniform
 from . import background_augmentation
 from .shared_arrays import SharedArrays
@@ -105,7 +105,7 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", max_side
         searched.append(str(folder))
         for path in list_pictures(Path(folder), PHOTO_SUFFIXES | MAP_SUFFIXES, part):
             if path.suffix.lower() in PHOTO_SUFFIXES:
-                picture = decode(path, cv2.IMREAD_COLOR)
+                picture = decode_by_opencv(path, cv2.IMREAD_COLOR)
                 if picture is None or min(picture.shape[:2]) < MIN_SIDE:
                     unusable.append(path)
                     continue
@@ -173,7 +173,7 @@ def _read_environment_map(path: Path) -> NDArray[np.float16] | None:
             return None
         light: NDArray[Any] = np.stack([channels[name] for name in "RGB"], -1)
     else:
-        pixels = decode(path, cv2.IMREAD_UNCHANGED)
+        pixels = decode_by_opencv(path, cv2.IMREAD_UNCHANGED)
         if pixels is None:
             return None
         light = pixels[..., ::-1]

@@ -25,7 +25,7 @@ from ..conventions.run_files import SCENE
 from ..errors import CaptureError, RunError
 from ..flare.compositing import composite
 from ..flare.visibility import clear_visibilities, occlusion_loss
-from ..gaussians import Splats
+from ..gaussians import Rendering, Splats
 from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.ordering import morton_order
@@ -131,8 +131,8 @@ class Trainer(FlareTrainer):
         view = self._view()
         targets, mask = self.frames.targets(view), self.frames.mask(view)
         self.optimisers.set_rates(self.iteration)
-        scene = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)
-        scene_picture = self._clip_as_filmed(scene.colour)
+        rendering = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)
+        scene_picture = self._clip_as_filmed(rendering.colour)
         self._update_clear_visibility()
         self._measure_excess_ratio()
         scene_only = self._is_scene_only(targets)
@@ -169,23 +169,27 @@ class Trainer(FlareTrainer):
         occlusion_loss = self._occlusion_loss(targets)
         if occlusion_loss is not None:
             loss = loss + occlusion_loss
-        # Gradients and steps. The step moves far Gaussians, too; `_turn_far_layer` puts them back on their sphere.
+        self._optimise(loss, rendering)
+        if not scene_only:  # before, flare Gaussians are untrained, and their opacities say nothing
+            self._change_flare_density()
+        return metrics
+
+    def _optimise(self, loss: Tensor, rendering: Rendering) -> None:
+        """Backpropagate a loss, step scene and flare, and densify the scene. rendering: of the scene, in the loss."""
+        # The step moves far Gaussians, too; `_turn_far_layer` puts them back on their sphere.
         far_rows = self.scene.far_rows()
         far_means = self.scene.means.detach()[far_rows]
         if loss.requires_grad:  # it does not with a frozen scene and no light in front of the camera
             with self.optimisers.scene.step_in_backward() if self._steps_in_backward else nullcontext():
                 loss.backward()
         if self.fits_scene:
-            self.strategy.observe(scene)
+            self.strategy.observe(rendering)
         self.optimisers.step(scene=self.fits_scene)
         self._turn_far_layer(far_rows, far_means)
         if self.fits_scene:
-            if self.iteration < settings.iterations:  # Gaussians added by the last iteration would stay untrained
+            if self.iteration < self.settings.iterations:  # the last iteration's Gaussians would stay untrained
                 self.strategy.update(self.iteration)
             self._reorder_scene()
-        if not scene_only:  # before, flare Gaussians are untrained, and their opacities say nothing
-            self._change_flare_density()
-        return metrics
 
     @torch.no_grad()
     def _turn_far_layer(self, rows: Tensor, old_means: Tensor) -> None:

@@ -104,15 +104,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
         raise FlareFileError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
 
     n = len(table)
-    present = set(header.row.names or ())
-    rest_names = _rest_names(sum(name.startswith("f_rest_") for name in present))
-    if len(rest_names) not in (0, 9, 24, 45):
-        raise FlareFileError(
-            f"{path} has {len(rest_names)} f_rest properties, where Gaussians have 0, 9, 24 or 45; export it again."
-        )
-    for name in (*POSITION, *DC, *rest_names, "opacity", *SCALE, *ROTATION):
-        if name not in present:
-            raise FlareFileError(f"{path} is not a PLY file of Gaussians: the property {name} is missing.")
+    rest_names = _check_properties(path, set(header.row.names or ()))
 
     def columns(names: tuple[str, ...]) -> torch.Tensor:
         """Return (n, names) of these properties, with legal infinities replaced."""
@@ -148,6 +140,20 @@ def _read_table(path: Path) -> tuple[_Header, NDArray[Any]]:
             raise FlareFileError(f"{path} is cut short: it announces {header.vertices} Gaussians; copy it again.")
         file.seek(header.start)
         return header, np.frombuffer(file.read(size), header.row)
+
+
+def _check_properties(path: Path, present: set[str]) -> tuple[str, ...]:
+    """Return the names of the f_rest properties among those present. Raises FlareFileError if one of a Gaussian is
+    missing."""
+    rest_names = _rest_names(sum(name.startswith("f_rest_") for name in present))
+    if len(rest_names) not in (0, 9, 24, 45):
+        raise FlareFileError(
+            f"{path} has {len(rest_names)} f_rest properties, where Gaussians have 0, 9, 24 or 45; export it again."
+        )
+    for name in (*POSITION, *DC, *rest_names, "opacity", *SCALE, *ROTATION):
+        if name not in present:
+            raise FlareFileError(f"{path} is not a PLY file of Gaussians: the property {name} is missing.")
+    return rest_names
 
 
 class _Header(NamedTuple):

@@ -57,14 +57,7 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
     if settings.min_views < 1:
         raise SettingsError(f"A light needs at least 1 view, not {settings.min_views}.")
     views = [(view.name, view.camera) for view in capture.views]
-    detections: list[list[Detection]] = []
-    progress.stage("look for lights", len(views))
-    brightness_maps: dict[str, NDArray[np.bool_]] = {}
-    for view in capture.views:
-        frame = capture.frame(view)
-        detections.append(detector.detect(frame))
-        brightness_maps[view.name] = brightness_map(frame)
-        progress.advance(1, found=sum(map(len, detections)))
+    detections, brightness_maps = _detect(capture, detector, progress)
     views_with_lights = sum(bool(in_view) for in_view in detections)
     messages = [f"{sum(map(len, detections))} detections in {views_with_lights} of {len(views)} views."]
     min_views = min(settings.min_views, len(views))
@@ -91,6 +84,20 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
     if not lights and not doubtful:
         messages.append("No light was found: none is in frame in enough views, or none is over-exposed.")
     return Findings(lights, doubtful, detections, messages)
+
+
+def _detect(capture: Capture, detector: Detector, progress: Progress
+            ) -> tuple[list[list[Detection]], dict[str, NDArray[np.bool_]]]:
+    """Return the detections of each view, and the `brightness_map` of each view by name."""
+    detections: list[list[Detection]] = []
+    brightness_maps: dict[str, NDArray[np.bool_]] = {}
+    progress.stage("look for lights", len(capture.views))
+    for view in capture.views:
+        frame = capture.frame(view)
+        detections.append(detector.detect(frame))
+        brightness_maps[view.name] = brightness_map(frame)
+        progress.advance(1, found=sum(map(len, detections)))
+    return detections, brightness_maps
 
 
 def _triangulate_any(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[Detection]], extent: float,

@@ -60,18 +60,28 @@ def _draw_tile(capture: Capture, number: int, detections: Sequence[Detection],
     for i, (name, light) in enumerate(lights):
         colour = PALETTE[i % len(PALETTE)]
         pixels, depth = view.camera.project(light.xyz[None])
-        x, y = pixels[0] * scale
-        if depth[0] <= 0:
-            continue
-        if 0 <= x < size[0] and 0 <= y < size[1]:
-            thick = 2 if view.name in light.support else 1
-            cv2.drawMarker(tile, (int(x), int(y)), colour, cv2.MARKER_CROSS, 14, thick, cv2.LINE_AA)
-            cv2.putText(tile, name, (int(x) + 9, int(y) - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
-        else:
-            middle = np.array(size) / 2
-            offset = np.array([x, y]) - middle
-            tip = middle + offset * min((middle - 6) / np.maximum(np.abs(offset), 1e-9))
-            tail = tip - 16 * offset / np.linalg.norm(offset)
-            cv2.arrowedLine(tile, tuple(map(int, tail)), tuple(map(int, tip)), colour, 1, cv2.LINE_AA, tipLength=0.4)
+        if depth[0] > 0:
+            _draw_light(tile, pixels[0] * scale, name, colour, thickness=2 if view.name in light.support else 1)
     cv2.putText(tile, view.name, (4, size[1] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (1.0, 1.0, 1.0), 1, cv2.LINE_AA)
     return np.asarray(tile, np.float32)
+
+
+def _draw_light(tile: NDArray[np.float32], place: NDArray[np.float64], name: str, colour: tuple[float, float, float],
+                thickness: int) -> None:
+    """Draw a light at `place` (2,), pixels of the tile, in place: a cross with its name, or at the edge an arrow to it.
+
+    thickness: of the cross, pixels.
+    """
+    import cv2
+
+    height, width = tile.shape[:2]
+    x, y = place
+    if 0 <= x < width and 0 <= y < height:
+        cv2.drawMarker(tile, (int(x), int(y)), colour, cv2.MARKER_CROSS, 14, thickness, cv2.LINE_AA)
+        cv2.putText(tile, name, (int(x) + 9, int(y) - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+        return
+    middle = np.array([width, height]) / 2
+    offset = np.array([x, y]) - middle
+    tip = middle + offset * min((middle - 6) / np.maximum(np.abs(offset), 1e-9))
+    tail = tip - 16 * offset / np.linalg.norm(offset)
+    cv2.arrowedLine(tile, tuple(map(int, tail)), tuple(map(int, tip)), colour, 1, cv2.LINE_AA, tipLength=0.4)

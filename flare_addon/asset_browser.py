@@ -38,7 +38,7 @@ def why_not() -> str:
     return "" if library.files() else "The library is empty: save a flare to it first"
 
 
-def listed() -> Any:
+def library_entry() -> Any:
     """Return the entry of the asset library in Blender's preferences; None without one."""
     return next((entry for entry in bpy.context.preferences.filepaths.asset_libraries
                  if Path(entry.path).resolve() == folder().resolve()), None)
@@ -49,46 +49,46 @@ def list_looks() -> int:
 
     Raises FlareFileError where no look can be read.
     """
-    count = write()
-    if listed() is None:
+    count = write_assets()
+    if library_entry() is None:
         libraries = bpy.context.preferences.filepaths.asset_libraries
         entry = libraries.new(name=NAME, directory=str(folder()))
         entry.import_method = "APPEND"  # a light object of its own for each drop
     return count
 
 
-def unlist() -> None:
+def unlist_looks() -> None:
     """Remove the asset library from Blender's preferences."""
-    entry = listed()
+    entry = library_entry()
     if entry is not None:
         bpy.context.preferences.filepaths.asset_libraries.remove(entry)
 
 
-def update() -> None:
+def update_assets() -> None:
     """Write the asset library again where it is listed, because the library of looks has changed."""
-    if not why_not() and listed() is not None:
-        write()
+    if not why_not() and library_entry() is not None:
+        write_assets()
 
 
-def write() -> int:
+def write_assets() -> int:
     """Write the .blend with an asset for each look of the library; return their number.
 
     Raises FlareFileError where no look can be read.
     """
-    library.items()  # writes the missing thumbnails
+    library.menu_items()  # writes the missing thumbnails
     # In reverse, so that of two looks with one name the user's replaces the extension's.
     paths = {path.stem: path for path in reversed(library.files()) if _is_usable(path)}
     if not paths:
         raise FlareFileError("The library has no look that can be read; save one to it first.")
     write_text(folder() / CATALOGS, f"VERSION 1\n\n{CATALOG}:Lens Flares:Lens Flares\n")
-    made = [_make_asset(path) for path in paths.values()]
+    assets = [_make_asset(path) for path in paths.values()]
     try:
         with atomic_path(folder() / ASSETS) as temporary:
-            bpy.data.libraries.write(str(temporary), set(made), fake_user=True)
+            bpy.data.libraries.write(str(temporary), set(assets), fake_user=True)
     finally:
-        for item in made:
+        for item in assets:
             bpy.data.objects.remove(item)
-    return len(made)
+    return len(assets)
 
 
 def _is_usable(path: Path) -> bool:

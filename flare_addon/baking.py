@@ -84,11 +84,11 @@ def is_baking(scene: Any) -> bool:
     """Return whether this scene is read for a bake, or its layers are being baked."""
     if _preparation is not None and _preparation.reading.scene_name == scene.name:
         return True
-    job = jobs.find(shots.layers_folder(scene)) if scene.fit_flare.layers else None
+    job = jobs.find_job(shots.layers_folder(scene)) if scene.fit_flare.layers else None
     return job is not None and job.running
 
 
-def why_not(scene: Any) -> str:
+def why_not_bake(scene: Any) -> str:
     """Return why the scene cannot be baked now, for the tooltip; "" where it can."""
     if is_baking(scene) or _preparation is not None:
         return "A bake is running"
@@ -98,7 +98,7 @@ def why_not(scene: Any) -> str:
     return engine.missing_reason() if engine.configured_engine()[1] else ""
 
 
-def start(scene: Any, camera_objects: Sequence[Any], *, replace_others: bool = False) -> None:
+def start_bake(scene: Any, camera_objects: Sequence[Any], *, replace_others: bool = False) -> None:
     """Start a bake of these camera objects, or of the scene's camera for []. Without a window it has ended on return.
 
     replace_others: delete layers that `shots.frames_to_replace` returns; without it they are an error. Raises
@@ -112,62 +112,62 @@ def start(scene: Any, camera_objects: Sequence[Any], *, replace_others: bool = F
     reading = ShotReading(scene, camera_objects, shots.frames_to_bake(scene))
     folder = shots.choose_layers_folder(scene)
     shots.live_record(scene.fit_flare, ())  # gives each flare its id inside the operator's undo step
-    prepared = Preparation(reading, bool(camera_objects), folder)
+    new_preparation = Preparation(reading, bool(camera_objects), folder)
     _last_error, _last_scene = "", scene.name
     if bpy.app.background:
         try:
-            while prepared.step():
+            while new_preparation.step():
                 pass
         finally:
             reading.restore()
         return
-    _preparation = prepared
-    bpy.app.timers.register(_tick, first_interval=INTERVAL_S)
+    _preparation = new_preparation
+    bpy.app.timers.register(_read_scene, first_interval=INTERVAL_S)
 
 
 def cancel() -> None:
     """Stop reading the scene."""
     if _preparation is not None:
-        _end("Stopped before it began.")
+        _end_reading("Stopped before it began.")
 
 
-def _tick() -> float | None:
+def _read_scene() -> float | None:
     """Read frames for `STEP_S`; return the seconds to the next call, None to stop the timer."""
     if _preparation is None:
         return None
-    began = time.perf_counter()
+    start = time.perf_counter()
     try:
         while _preparation.step():
-            if time.perf_counter() - began > STEP_S:
+            if time.perf_counter() - start > STEP_S:
                 jobs.redraw_bars()
                 return INTERVAL_S
-        _end("")
+        _end_reading("")
     except FitFlareError as problem:
-        _end(str(problem))
+        _end_reading(str(problem))
     except OSError as problem:
-        _end(os_error_message(problem))
+        _end_reading(os_error_message(problem))
     return None
 
 
-def _end(error: str) -> None:
+def _end_reading(error: str) -> None:
     """End the reading of a scene, with the reason where it ended early."""
     global _preparation, _last_error
     assert _preparation is not None
-    ended, _preparation, _last_error = _preparation, None, error
-    ended.reading.restore()
+    finished, _preparation, _last_error = _preparation, None, error
+    finished.reading.restore()
     jobs.redraw_bars()
     redraw_viewports()
 
 
-def _start_process(folder: Path, frames: int) -> None:
-    """Start the process that bakes the shot in a folder. frames: their number."""
+def _start_process(folder: Path, frame_count: int) -> None:
+    """Start the process that bakes the shot in a folder: the engine, else Blender's own Python."""
     args = ["bake", folder / shots.SHOT_FILE, "--out", folder, "--overwrite"]
     if engine.find_engine() is not None or engine.configured_engine()[1]:
         engine.run("bake", folder, args)
         return
-    processes = min(max(available_cores() - 1, 1), MAX_PROCESSES, frames)
-    several = ["--jobs", str(processes)] if processes > 1 else []
-    engine.run_without("bake", folder, [*args, "--without-engine", *several])
+    processes = min(max(available_cores() - 1, 1), MAX_PROCESSES, frame_count)
+    jobs_option = ["--jobs", str(processes)] if processes > 1 else []
+    engine.run_without_engine("bake", folder, [*args, "--without-engine", *jobs_option])
 
 
 ON_BAKED: list[Callable[[jobs.Job, Any], None]] = []
@@ -201,5 +201,5 @@ def abandon() -> None:
 def unregister() -> None:
     """Stop reading a scene."""
     abandon()
-    if bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.unregister(_tick)
+    if bpy.app.timers.is_registered(_read_scene):
+        bpy.app.timers.unregister(_read_scene)

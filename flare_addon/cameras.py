@@ -54,17 +54,20 @@ def intrinsics_of(data: Any, render: Any) -> tuple[float, float, float, float]:
     if data.type != "PERSP":
         raise CaptureError(f"The camera {data.name!r} is not a perspective camera; a flare needs one.")
     width, height = render_size(render)
-    tall = render.pixel_aspect_y / render.pixel_aspect_x  # height of a pixel over its width
-    fit = data.sensor_fit
-    if fit == "AUTO":
-        fit = "HORIZONTAL" if width * render.pixel_aspect_x >= height * render.pixel_aspect_y else "VERTICAL"
-        sensor = data.sensor_width  # along the longer side, whichever it is
+    pixel_height = render.pixel_aspect_y / render.pixel_aspect_x  # in widths of a pixel
+    sensor_fit = data.sensor_fit
+    if sensor_fit == "AUTO":
+        is_wide = width * render.pixel_aspect_x >= height * render.pixel_aspect_y
+        sensor_fit = "HORIZONTAL" if is_wide else "VERTICAL"
+        sensor_size = data.sensor_width  # along the longer side, whichever it is
     else:
-        sensor = data.sensor_width if fit == "HORIZONTAL" else data.sensor_height
+        sensor_size = data.sensor_width if sensor_fit == "HORIZONTAL" else data.sensor_height
     # Length of the side that the sensor fits, in widths of a pixel; Blender's shifts are parts of it.
-    reach = width if fit == "HORIZONTAL" else height * tall
-    fx = data.lens * reach / sensor
-    return fx, fx / tall, width / 2 - data.shift_x * reach, height / 2 + data.shift_y * reach / tall
+    fitted_length = width if sensor_fit == "HORIZONTAL" else height * pixel_height
+    fx = data.lens * fitted_length / sensor_size
+    cx = width / 2 - data.shift_x * fitted_length
+    cy = height / 2 + data.shift_y * fitted_length / pixel_height
+    return fx, fx / pixel_height, cx, cy
 
 
 def camera_to_world(matrix: Any) -> Floats:

@@ -83,20 +83,20 @@ def command(*args: object) -> list[str]:
 
 
 def run(kind: str, folder: Path, args: Sequence[object]) -> Job:
-    """Start a command of run.py whose events go to `folder`; see `jobs.start`."""
-    return jobs.start(kind, folder, command(*args), {**child_environment(), **weights.environment()}, args=args)
+    """Start a command of run.py whose events go to `folder`; see `jobs.start_job`."""
+    return jobs.start_job(kind, folder, command(*args), {**child_environment(), **weights.environment()}, args=args)
 
 
-def run_without(kind: str, folder: Path, args: Sequence[object]) -> Job:
-    """Start a command of run.py that needs numpy alone in Blender's own Python; see `jobs.start`."""
+def run_without_engine(kind: str, folder: Path, args: Sequence[object]) -> Job:
+    """Start a command of run.py that needs numpy alone in Blender's own Python; see `jobs.start_job`."""
     command_line = [sys.executable, *bpy.app.python_args, str(RUN_SCRIPT), *map(str, args), "--progress", "json"]
-    return jobs.start(kind, folder, command_line, child_environment(), args=args)
+    return jobs.start_job(kind, folder, command_line, child_environment(), args=args)
 
 
 # ---- test, set-up and removal ------------------------------------------------------------------------------------
 
 
-def test() -> Job:
+def test_engine() -> Job:
     """Start the command `engine`; the job's result has version, python, torch and device."""
     folder = user_folder("test", create=True)
     write_text(folder / TESTED_FILE, str(find_engine()))
@@ -107,13 +107,13 @@ def last_test() -> Job | None:
     """Return the last test, if it tested the engine that is used now."""
     folder, python = user_folder("test"), find_engine()
     try:
-        same = python is not None and (folder / TESTED_FILE).read_text(encoding="utf-8") == str(python)
+        is_current = python is not None and (folder / TESTED_FILE).read_text(encoding="utf-8") == str(python)
     except (OSError, ValueError):
         return None
-    return jobs.find(folder) if same else None
+    return jobs.find_job(folder) if is_current else None
 
 
-def set_up() -> Job:
+def set_up_engine() -> Job:
     """Install the engine into a virtual environment in `set_up_folder`, and the weights where they are offered.
 
     Raises EngineError where Blender's online access is off, or where a damaged earlier engine cannot be removed.
@@ -122,7 +122,7 @@ def set_up() -> Job:
     if is_set_up() and not (virtual_environment() / "pyvenv.cfg").is_file():  # damaged
         _remove_environment(virtual_environment())
     command_line = [*weights.SET_UP, str(virtual_environment()), *weights.download_args()]
-    return jobs.start("set up", set_up_folder(), command_line, child_environment())
+    return jobs.start_job("set up", set_up_folder(), command_line, child_environment())
 
 
 def is_set_up() -> bool:
@@ -132,10 +132,10 @@ def is_set_up() -> bool:
 
 def set_up_job() -> Job | None:
     """Return the job of the current or last set-up; None without one."""
-    return jobs.find(set_up_folder())
+    return jobs.find_job(set_up_folder())
 
 
-def remove() -> None:
+def remove_engine() -> None:
     """Remove the installed engine. Raises FitFlareError while a job runs, EngineError where a file is in use."""
     if any(job.running for job in jobs.running()):
         raise FitFlareError("The engine is running; wait for it, or cancel it before you remove it.")

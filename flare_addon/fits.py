@@ -50,14 +50,14 @@ def has_clean_frames(scene: Any) -> bool:
 
 def fit_job(scene: Any) -> Job | None:
     """Return the job of the scene's current or last fit; None without one."""
-    return jobs.find(run_folder(scene))
+    return jobs.find_job(run_folder(scene))
 
 
 def engine_jobs(scene: Any) -> list[Job | None]:
     """Return the jobs of the scene's fit, light search and clean frames; None for each without one."""
     capture = capture_folder(scene)
-    of_capture = [] if capture is None else [jobs.find(capture / "lights"), cleaning_job(capture)]
-    return [fit_job(scene), *of_capture]
+    capture_jobs = [] if capture is None else [jobs.find_job(capture / "lights"), cleaning_job(capture)]
+    return [fit_job(scene), *capture_jobs]
 
 
 def fit_state(scene: Any) -> FitState:
@@ -65,7 +65,7 @@ def fit_state(scene: Any) -> FitState:
     folder = run_folder(scene)
     if folder is None:
         return "none"
-    job = jobs.find(folder)
+    job = jobs.find_job(folder)
     if job is not None and job.running:
         return "running"
     if is_file(folder / FLARE):
@@ -75,7 +75,7 @@ def fit_state(scene: Any) -> FitState:
     return "none" if not scene.fit_flare.run or is_folder(folder) else "lost"
 
 
-def why_not(scene: Any) -> str:
+def why_not_fit(scene: Any) -> str:
     """Return why a fit cannot start and what to do, without a full stop; "" where it can."""
     capture = capture_folder(scene)
     if capture is None:
@@ -99,14 +99,14 @@ def new_run_folder(scene: Any) -> Path:
     capture = capture_folder(scene)
     if capture is None:
         raise CaptureError("There is no capture yet; import one first.")
-    base = Path(bpy.data.filepath).parent / "fits" if bpy.data.filepath else capture / "fits"
+    parent = Path(bpy.data.filepath).parent / "fits" if bpy.data.filepath else capture / "fits"
     number = 1
-    while (folder := base / f"{capture.name}_{scene.fit_flare.preset}_{number}").exists():
+    while (folder := parent / f"{capture.name}_{scene.fit_flare.preset}_{number}").exists():
         number += 1
     return folder
 
 
-def start(scene: Any) -> Job:
+def start_fit(scene: Any) -> Job:
     """Start a fit in a new folder, with the present lights of the scene; the folder becomes the scene's run.
 
     Raises EngineError without an engine, CaptureError without a capture or lights, RunError for an unusable folder.
@@ -117,14 +117,14 @@ def start(scene: Any) -> Job:
                            if capture else "There is no capture yet; import one first.")
     engine.command()  # raises before anything is written
     lights.write_to_capture(scene, capture)
-    folder, before = new_run_folder(scene), scene.fit_flare.run
+    folder, earlier_run = new_run_folder(scene), scene.fit_flare.run
     scene.fit_flare.run = blend_relative(folder)
     folder = run_folder(scene) or folder  # as the stored path resolves
     try:
         return _run_fit(scene, capture, folder)
     except FitFlareError:
         if not is_file(folder / CONFIG):  # refused before it started: keep the earlier fit
-            scene.fit_flare.run = before
+            scene.fit_flare.run = earlier_run
         raise
 
 
@@ -137,10 +137,10 @@ def start_from_footage(scene: Any, source: Path) -> Job:
     if not source.name or not footage.exists():
         raise CaptureError(f"{source} is missing; choose a video, or a frame of a folder of frames.")
     engine.command()  # raises before anything is written
-    base, number = (Path(bpy.data.filepath).parent / "fits" if bpy.data.filepath else footage.parent), 1
-    while (out := base / f"{footage.stem}_flare_{number}").exists():
+    parent, number = (Path(bpy.data.filepath).parent / "fits" if bpy.data.filepath else footage.parent), 1
+    while (out := parent / f"{footage.stem}_flare_{number}").exists():
         number += 1
-    state, before = scene.fit_flare, scene.fit_flare.run
+    state, earlier_run = scene.fit_flare, scene.fit_flare.run
     state.run = blend_relative(out / SHOT_RUN)
     folder = run_folder(scene) or out / SHOT_RUN  # as the stored path resolves
     args: list[object] = ["shot", footage.resolve(), "--out", folder.parent,
@@ -150,24 +150,24 @@ def start_from_footage(scene: Any, source: Path) -> Job:
     try:
         return engine.run("fit", folder, args)
     except FitFlareError:
-        state.run = before
+        state.run = earlier_run
         raise
 
 
-def resume(scene: Any) -> Job:
-    """Resume the run of the scene, from the capture that it was started with. Raises as `start` does."""
+def resume_fit(scene: Any) -> Job:
+    """Resume the run of the scene, from the capture that it was started with. Raises as `start_fit` does."""
     capture, folder = capture_folder(scene), run_folder(scene)
-    stopped = fit_job(scene)
-    if folder is not None and stopped is not None and stopped.args[:1] == ["shot"]:
-        return engine.run("fit", folder, stopped.args)  # goes on with the steps after the fit too
+    stopped_job = fit_job(scene)
+    if folder is not None and stopped_job is not None and stopped_job.args[:1] == ["shot"]:
+        return engine.run("fit", folder, stopped_job.args)  # goes on with the steps after the fit too
     if folder is None or not is_file(folder / CONFIG):
         raise RunError(f"There is no fit to resume in {folder}; start a new one.")
-    fitted = _capture_of_run(folder)
-    if fitted is None or _capture_has_moved(folder, capture):
-        fitted = capture
-    if fitted is None or not is_folder(fitted):
-        raise CaptureError(f"The capture {fitted} of this fit does not exist; put it back, or start a new fit.")
-    return _run_fit(scene, fitted, folder)
+    recorded = _capture_of_run(folder)
+    if recorded is None or _capture_has_moved(folder, capture):
+        recorded = capture
+    if recorded is None or not is_folder(recorded):
+        raise CaptureError(f"The capture {recorded} of this fit does not exist; put it back, or start a new fit.")
+    return _run_fit(scene, recorded, folder)
 
 
 def _run_fit(scene: Any, capture: Path, folder: Path) -> Job:
@@ -219,16 +219,16 @@ def _may_belong_to(folder: Path, capture: Path) -> bool:
     Where the run's capture is missing, one of the same name counts, since it may have been moved. A run that does not
     store its capture may belong to any.
     """
-    fitted = _capture_of_run(folder)
-    if fitted is None:
+    recorded = _capture_of_run(folder)
+    if recorded is None:
         return True
-    return fitted.samefile(capture) if is_folder(fitted) and is_folder(capture) else fitted.name == capture.name
+    return recorded.samefile(capture) if is_folder(recorded) and is_folder(capture) else recorded.name == capture.name
 
 
 def _capture_has_moved(folder: Path, capture: Path | None) -> bool:
     """Return whether the capture of a run is missing from its folder and `capture` may be it."""
-    fitted = _capture_of_run(folder)
-    return (fitted is not None and not is_folder(fitted) and capture is not None and is_folder(capture)
+    recorded = _capture_of_run(folder)
+    return (recorded is not None and not is_folder(recorded) and capture is not None and is_folder(capture)
             and _may_belong_to(folder, capture))
 
 
@@ -267,7 +267,7 @@ def _push_undo(label: str, scenes: Sequence[Any]) -> None:
         bpy.ops.ed.undo_push(message=f"Fit Flare: {label}")
 
 
-def find_lights(scene: Any) -> Job:
+def start_light_search(scene: Any) -> Job:
     """Start a search for lights in the frames; lights of the scene stay. Raises EngineError and CaptureError."""
     capture = capture_folder(scene)
     if capture is None or not is_folder(capture):
@@ -279,15 +279,15 @@ def find_lights(scene: Any) -> Job:
                                                         *plate_space.command_args(scene)])
 
 
-def clean_frames(scene: Any) -> Job:
+def start_cleaning(scene: Any) -> Job:
     """Start the removal of flares from the frames into the capture's removed/. Raises EngineError and CaptureError."""
     capture = capture_folder(scene)
     if capture is None or not is_folder(capture / "images"):
         raise CaptureError("There is no capture with a folder images/ yet; import one first.")
     args = cleaning_args(scene, capture)
-    earlier = cleaning_job(capture)
+    earlier_job = cleaning_job(capture)
     # A finished job is replaced; one that was stopped is resumed if its arguments are the same.
-    if earlier is not None and (earlier.state == "done" or earlier.args != list(map(str, args))):
+    if earlier_job is not None and (earlier_job.state == "done" or earlier_job.args != list(map(str, args))):
         args = [*args, "--overwrite"]
     return engine.run("clean", _cleaning_folder(capture), args)
 
@@ -304,7 +304,7 @@ def why_not_clean(scene: Any) -> str:
 
 def cleaning_job(capture: Path) -> Job | None:
     """Return the current or last job that makes the clean frames of a capture; None without one."""
-    return jobs.find(_cleaning_folder(capture))
+    return jobs.find_job(_cleaning_folder(capture))
 
 
 def _cleaning_folder(capture: Path) -> Path:

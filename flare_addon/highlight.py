@@ -2,7 +2,7 @@
 """Shows which element a row of the panel Look is: for a second, the camera view dims the rest of the flare and outlines
 the element.
 
-The properties call `touch` when a row is chosen; `overlay` draws with `highlighted`.
+The properties call `start_highlight` when a row is chosen; `overlay` draws with `emphasise`.
 """
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..core.look import Edit, LookEdits, PlaneGaussians
 
 DURATION_S = 1.2
 DIMMED = 0.15
-"""Factor on the light of everything but the touched element."""
+"""Factor on the light of everything but the highlighted element."""
 OUTLINED = 0.1
 """Light of a Gaussian relative to the brightest of its element, from which on the outline goes around it."""
 REACH = 1.5
@@ -26,7 +26,7 @@ REACH = 1.5
 
 
 @dataclass(frozen=True)
-class Touched:
+class Highlight:
     """The element whose row was chosen: names of scene, flare and element, and the time when its highlight ends."""
 
     scene: str
@@ -35,76 +35,77 @@ class Touched:
     until: float
 
 
-_touched: Touched | None = None
+_current: Highlight | None = None
 
 
-def touch(item: Any) -> None:
+def start_highlight(item: Any) -> None:
     """Highlight the chosen element of a flare for `DURATION_S`."""
-    global _touched
+    global _current
     if not 0 <= item.element < len(item.elements):
         return
-    _touched = Touched(item.id_data.name, item.name, item.elements[item.element].name, time.monotonic() + DURATION_S)
+    _current = Highlight(item.id_data.name, item.name, item.elements[item.element].name, time.monotonic() + DURATION_S)
     if not bpy.app.background:
-        if bpy.app.timers.is_registered(_end):
-            bpy.app.timers.unregister(_end)
-        bpy.app.timers.register(_end, first_interval=DURATION_S)
+        if bpy.app.timers.is_registered(_end_highlight):
+            bpy.app.timers.unregister(_end_highlight)
+        bpy.app.timers.register(_end_highlight, first_interval=DURATION_S)
     _redraw()
 
 
-def touched(scene: Any) -> Touched | None:
+def current_highlight(scene: Any) -> Highlight | None:
     """Return the element of a scene that is highlighted now; None without one."""
-    if _touched is None or _touched.scene != scene.name or time.monotonic() > _touched.until:
+    if _current is None or _current.scene != scene.name or time.monotonic() > _current.until:
         return None
-    return _touched
+    return _current
 
 
-def highlighted(edits: LookEdits, chosen: Touched, elements: Mapping[str, list[str]]) -> LookEdits:
-    """Return edits that dim all but the touched element, and show it where it is muted.
+def emphasise(edits: LookEdits, highlight: Highlight, elements: Mapping[str, list[str]]) -> LookEdits:
+    """Return edits that dim all but the highlighted element, and show it where it is muted.
 
     elements: names of the elements by name of the flare.
     """
     def dimmed(edit: Edit) -> Edit:
         return replace(edit, intensity=DIMMED * edit.intensity)
 
-    lights = {name: edits.lights.get(name, Edit()) if name == chosen.flare else dimmed(edits.lights.get(name, Edit()))
-              for name in elements}
-    parts = {(name, part): edits.elements.get((name, part), Edit()) for name, parts in elements.items()
-             for part in parts}
-    for name in elements.get(chosen.flare, []):
-        key = chosen.flare, name
-        parts[key] = replace(parts[key], mute=False) if name == chosen.element else dimmed(parts[key])
-    return LookEdits(edits.master, lights, parts)
+    lights = {name: edits.lights.get(name, Edit()) for name in elements}
+    lights = {name: edit if name == highlight.flare else dimmed(edit) for name, edit in lights.items()}
+    element_edits = {(flare, name): edits.elements.get((flare, name), Edit()) for flare, names in elements.items()
+                     for name in names}
+    for name in elements.get(highlight.flare, []):
+        key = highlight.flare, name
+        edit = element_edits[key]
+        element_edits[key] = replace(edit, mute=False) if name == highlight.element else dimmed(edit)
+    return LookEdits(edits.master, lights, element_edits)
 
 
-def alone(chosen: Touched, edits: LookEdits) -> LookEdits:
-    """Return edits that show the touched element alone, at its size and place, at full intensity."""
-    key = chosen.flare, chosen.element
-    part = replace(edits.elements.get(key, Edit()), mute=False, solo=True, intensity=1.0)
-    whole = replace(edits.lights.get(chosen.flare, Edit()), mute=False, solo=True, intensity=1.0)
-    return LookEdits(replace(edits.master, mute=False, intensity=1.0), {**edits.lights, chosen.flare: whole},
-                     {**edits.elements, key: part})
+def isolate(highlight: Highlight, edits: LookEdits) -> LookEdits:
+    """Return edits that show the highlighted element alone, at its size and place, at full intensity."""
+    key = highlight.flare, highlight.element
+    element_edit = replace(edits.elements.get(key, Edit()), mute=False, solo=True, intensity=1.0)
+    flare_edit = replace(edits.lights.get(highlight.flare, Edit()), mute=False, solo=True, intensity=1.0)
+    return LookEdits(replace(edits.master, mute=False, intensity=1.0), {**edits.lights, highlight.flare: flare_edit},
+                     {**edits.elements, key: element_edit})
 
 
-def outline(gaussians: PlaneGaussians, centres: Any, covariances: Any) -> tuple[float, float, float, float] | None:
+def outline_box(gaussians: PlaneGaussians, centres: Any, covariances: Any) -> tuple[float, float, float, float] | None:
     """Return the box (left, top, right, bottom) around the brighter Gaussians, pixels; None where there are none.
 
     centres: (n, 2) px. covariances: (n, 3) xx, xy, yy, px².
     """
     light = gaussians.opacities * np.abs(gaussians.colours).max(-1)
-    chosen = np.isfinite(centres).all(-1) & (light >= OUTLINED * light.max(initial=0.0)) & (light > 0)
-    if not chosen.any():
+    is_bright = np.isfinite(centres).all(-1) & (light >= OUTLINED * light.max(initial=0.0)) & (light > 0)
+    if not is_bright.any():
         return None
     # Outer radius of a ring: r0 + w, Mahalanobis; 1 for a plain Gaussian.
     radii = np.ones(len(light)) if gaussians.rings is None else gaussians.rings.sum(-1)
-    reach = REACH * radii[:, None] * np.sqrt(np.maximum(covariances[:, [0, 2]], 0))
-    low, high = (centres - reach)[chosen].min(0), (centres + reach)[chosen].max(0)
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+    half_sizes = REACH * radii[:, None] * np.sqrt(np.maximum(covariances[:, [0, 2]], 0))
+    lower, upper = (centres - half_sizes)[is_bright].min(0), (centres + half_sizes)[is_bright].max(0)
+    return float(lower[0]), float(lower[1]), float(upper[0]), float(upper[1])
 
 
-def _end() -> None:
+def _end_highlight() -> None:
     """End the highlight."""
-    global _touched
-    _touched = None
+    global _current
+    _current = None
     _redraw()
 
 
@@ -115,11 +116,11 @@ def _redraw() -> None:
 
 
 def unregister() -> None:
-    global _touched
-    _touched = None
-    if bpy.app.timers.is_registered(_end):
-        bpy.app.timers.unregister(_end)
+    global _current
+    _current = None
+    if bpy.app.timers.is_registered(_end_highlight):
+        bpy.app.timers.unregister(_end_highlight)
 
 
 def register() -> None:
-    """Do nothing: a highlight begins by `touch`."""
+    """Do nothing: a highlight begins by `start_highlight`."""

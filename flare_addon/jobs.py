@@ -110,12 +110,12 @@ class Job:
         """Read new events; return whether there were any, or the job has ended."""
         if not self.running:
             return False
-        before = self._offset
+        previous_offset = self._offset
         alive = self._is_alive()  # before reading, so that the last events are read below
         self._read()
         if alive:
             self._was_seen_running = True
-            return self._offset > before
+            return self._offset > previous_offset
         while self._read():
             pass
         self._finish()
@@ -244,19 +244,19 @@ def _is_full(folder: Path) -> bool:
 # ---- starting and finding jobs ------------------------------------------------------------------------
 
 
-def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[str, str] | None = None, *,
+def start_job(kind: str, folder: Path, command: Sequence[str], environment: Mapping[str, str] | None = None, *,
           args: Sequence[object] = ()) -> Job:
     """Start a command whose events go to `folder`, and follow it.
 
     args: the arguments that identify the job. Without a window this returns when the job has ended. Raises EngineError
     where the command cannot be started, RunError where the folder cannot be written or a job runs in it.
     """
-    before = find(folder)
-    if before is not None and before.running:
+    earlier_job = find_job(folder)
+    if earlier_job is not None and earlier_job.running:
         raise RunError(f"The engine already works in {folder}; wait for it, or cancel it first.")
-    group = new_process_group()
+    process_options = new_process_group()
     if WINDOWS:
-        group["creationflags"] |= getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
+        process_options["creationflags"] |= getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         remove_file(folder / STOP)
@@ -264,7 +264,7 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
             log_offset = log.tell()
             process = _launch(command, stdin=subprocess.DEVNULL, stdout=events, stderr=log,
                               env={**(os.environ if environment is None else environment),
-                                     STOP_FILE: str((folder / STOP).absolute())}, **group)
+                                     STOP_FILE: str((folder / STOP).absolute())}, **process_options)
         _lower_priority(process.pid)
         try:
             write_json(folder / RECORD, {"kind": kind, "host": HOST, "host_name": platform.node(), "pid": process.pid,
@@ -302,14 +302,14 @@ def _lower_priority(pid: int) -> None:
             os.setpriority(os.PRIO_PROCESS, pid, NICENESS)
 
 
-def find(folder: Path | str | None) -> Job | None:
+def find_job(folder: Path | str | None) -> Job | None:
     """Return the job in a folder, also one that an earlier Blender started; None where there is none."""
     if not folder:
         return None
     folder = Path(folder)
-    known = _jobs.get(_key(folder))
-    if known is not None:
-        return known
+    job_in_memory = _jobs.get(_key(folder))
+    if job_in_memory is not None:
+        return job_in_memory
     try:
         record = parse_json(read_text(folder / RECORD))
         # The first version stored no host, and a later one the host name, which on a Mac is not the machine's id.
@@ -356,11 +356,11 @@ def _wait(job: Job) -> None:
 
 def _watch() -> None:
     """Start the timer that polls the jobs."""
-    if not bpy.app.background and not bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.register(_tick, first_interval=POLL_INTERVAL_S, persistent=True)
+    if not bpy.app.background and not bpy.app.timers.is_registered(_poll_jobs):
+        bpy.app.timers.register(_poll_jobs, first_interval=POLL_INTERVAL_S, persistent=True)
 
 
-def _tick() -> float | None:
+def _poll_jobs() -> float | None:
     """Poll the running jobs; return the seconds to the next call, None to stop the timer."""
     changes = [_poll_safely(job) for job in running()]
     if any(changes):
@@ -398,6 +398,6 @@ def redraw_bars() -> None:
 
 
 def unregister() -> None:
-    if bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.unregister(_tick)
+    if bpy.app.timers.is_registered(_poll_jobs):
+        bpy.app.timers.unregister(_poll_jobs)
     _jobs.clear()

@@ -54,54 +54,55 @@ def user_files() -> list[Path]:
     return _flares_of(folder())
 
 
-def _flares_of(place: Path) -> list[Path]:
+def _flares_of(directory: Path) -> list[Path]:
     try:
-        return sorted(path for path in place.glob("*.flare") if not path.name.startswith("."))
+        return sorted(path for path in directory.glob("*.flare") if not path.name.startswith("."))
     except OSError:
         return []
 
 
-def save(look: Look, edits: LookEdits, name: str, notes: str, licence: str) -> Path:
+def save_look(look: Look, edits: LookEdits, name: str, notes: str, licence: str) -> Path:
     """Save a look with edits of its lights to the library; return its file.
 
     Raises FlareFileError where the name is taken or not valid.
     """
     path = free_path(name)
     write_annotated(look.path, path, notes=notes, licence=licence, edits=edits)
-    write_png(path.with_suffix(".png"), thumbnail(read_look(path)))
+    write_png(path.with_suffix(".png"), draw_thumbnail(read_look(path)))
     return path
 
 
 def free_path(name: str) -> Path:
     """Return the file of a new entry, whose folder exists. Raises FlareFileError where the name is taken or not valid.
     """
-    safe = "".join(letter for letter in name if letter.isalnum() or letter in " -_()").strip()
-    if not safe:
+    stem = "".join(letter for letter in name if letter.isalnum() or letter in " -_()").strip()
+    if not stem:
         raise FlareFileError(f"{name!r} is not a valid file name; use letters and digits.")
-    path = folder(create=True) / f"{avoid_device_name(safe)}.flare"
+    path = folder(create=True) / f"{avoid_device_name(stem)}.flare"
     if path.exists():
-        raise FlareFileError(f"The library has {safe!r} already; choose another name.")
+        raise FlareFileError(f"The library has {stem!r} already; choose another name.")
     return path
 
 
-def thumbnail(look: Look) -> NDArray[np.float32]:
+def draw_thumbnail(look: Look) -> NDArray[np.float32]:
     """Return display values (THUMBNAIL_SIZE, THUMBNAIL_SIZE, 3): all flares for the middle of their training cameras,
     with the edits of the file and the light at the upper left.
 
     The focal length is 1.1 times the width. The light is at (-0.24, -0.2) on the normalised plane, or nearer to the
     centre where no training view has it as far out.
     """
-    k = np.array([[1.1 * THUMBNAIL_SIZE, 0, THUMBNAIL_SIZE / 2], [0, 1.1 * THUMBNAIL_SIZE, THUMBNAIL_SIZE / 2], [0, 0,
-                                                                                                                 1]])
+    focal, centre = 1.1 * THUMBNAIL_SIZE, THUMBNAIL_SIZE / 2
+    intrinsics = np.array([[focal, 0, centre], [0, focal, centre], [0, 0, 1]])
     total = np.zeros((THUMBNAIL_SIZE, THUMBNAIL_SIZE, 3), np.float32)
     for light in look.lights:
         if not look.edits.is_visible(light.name, look.names):
             continue
         middle = (light.query_range.camera_low + light.query_range.camera_high) / 2
-        _, place = light.query_range.clip(middle, np.array([-0.24, -0.2], np.float32))
-        gaussians = light.evaluate(ViewOfLight(middle, np.eye(3, dtype=np.float32), place, 1.0), edits=look.edits)
+        _, light_position = light.query_range.clip(middle, np.array([-0.24, -0.2], np.float32))
+        view = ViewOfLight(middle, np.eye(3, dtype=np.float32), light_position, 1.0)
+        gaussians = light.evaluate(view, edits=look.edits)
         if gaussians is not None:
-            picture = draw([gaussians], k, THUMBNAIL_SIZE, THUMBNAIL_SIZE, look.blend, look.pixel_grid)
+            picture = draw([gaussians], intrinsics, THUMBNAIL_SIZE, THUMBNAIL_SIZE, look.blend, look.pixel_grid)
             total += picture if look.blend == "add" else linear_from_srgb(picture)
     return np.clip(srgb_from_linear(np.maximum(total, 0)), 0, 1)
 
@@ -111,7 +112,7 @@ def write_png(path: Path, display: NDArray[np.float32]) -> None:
     height, width = display.shape[:2]
     rows = (np.clip(display, 0, 1) * 255 + 0.5).astype(np.uint8).reshape(height, -1)
     # Each row begins with the number of its filter, 0 for none.
-    raw = np.concatenate([np.zeros((height, 1), np.uint8), rows], 1).tobytes()
+    filtered_rows = np.concatenate([np.zeros((height, 1), np.uint8), rows], 1).tobytes()
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -119,11 +120,11 @@ def write_png(path: Path, display: NDArray[np.float32]) -> None:
     # 8 bits a channel, colour type 2 (RGB), the standard compression and filters, no interlacing
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(raw))
+        temporary.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(filtered_rows))
                               + chunk(b"IEND", b""))
 
 
-def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, int, int]]:
+def menu_items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, int, int]]:
     """Return the items of the preview menu: file, name, notes, icon, number. They are cached until a file changes."""
     global _previews, _items, _stamps
     stamps = []
@@ -146,7 +147,7 @@ def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, 
         try:
             look = read_look(path)
             if not path.with_suffix(".png").is_file() and path.parent != BOX:
-                write_png(path.with_suffix(".png"), thumbnail(look))
+                write_png(path.with_suffix(".png"), draw_thumbnail(look))
             icon = _previews.load(name, str(path.with_suffix(".png")), "IMAGE").icon_id
             _notes[name] = look.notes.partition(". ")[0]
             tip = f"{len(look.lights)} lights, {look.count} Gaussians. {look.notes}".strip()
@@ -164,7 +165,7 @@ def notes(path: str) -> str:
 
 def chosen(_self: Any = None) -> int:
     """Return the number of the chosen item; that of the first where none is chosen or the chosen one was deleted."""
-    numbers = [item[-1] for item in items()]
+    numbers = [item[-1] for item in menu_items()]
     return _chosen if _chosen in numbers else numbers[0]
 
 
@@ -176,7 +177,7 @@ def choose(_self: Any, number: int) -> None:
 
 def register() -> None:
     bpy.types.WindowManager.fit_flare_library = bpy.props.EnumProperty(
-        name="Library", description="A flare from the library", items=items, get=chosen, set=choose)
+        name="Library", description="A flare from the library", items=menu_items, get=chosen, set=choose)
 
 
 def unregister() -> None:

@@ -178,10 +178,11 @@ def remove_flare(scene: Any, number: int) -> None:
     The flares after it keep their animation and their drivers in the compositor. The layer of the removed flare stays
     in the compositor as it was baked.
     """
-    gains = drivers.connected_flares(scene)
+    flare_by_layer = drivers.connected_flares(scene)
     fcurves.remove_item(scene.fit_flare.lights, "fit_flare.lights", number)
-    if gains:
-        drivers.connect(scene, {layer: index - (index > number) for layer, index in gains.items() if index != number})
+    if flare_by_layer:
+        remaining = {layer: index - (index > number) for layer, index in flare_by_layer.items() if index != number}
+        drivers.connect_node(scene, remaining)
 
 
 def _was_learned_here(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> bool:

@@ -47,9 +47,9 @@ def visibility(scene: Any, depsgraph: Any, eye: Any, item: Any) -> float:
 
 def _lamp_parts(item: Any, depsgraph: Any) -> tuple[set[str], set[tuple[str, Any]]]:
     """Return the names of the light object of a flare and its children, and the instances of these."""
-    lamp = (item.target, *item.target.children_recursive)
-    names = {obj.name for obj in lamp}
-    return names, _instances_of(depsgraph, names) if any(obj.is_instancer for obj in lamp) else set()
+    objects = (item.target, *item.target.children_recursive)
+    names = {obj.name for obj in objects}
+    return names, _instances_of(depsgraph, names) if any(obj.is_instancer for obj in objects) else set()
 
 
 def _instances_of(depsgraph: Any, parents: set[str]) -> set[tuple[str, Any]]:
@@ -90,12 +90,12 @@ def visible_points(scene: Any, depsgraph: Any, eye: Any, item: Any, points: NDAr
     from mathutils import Vector
 
     ignored, instances = _lamp_parts(item, depsgraph)
-    clear = []
+    is_clear = []
     for point in points.tolist():
         offset = Vector(point) - eye
-        clear.append(offset.length < 1e-6 or _is_clear(scene, depsgraph, eye, offset.normalized(), offset.length,
+        is_clear.append(offset.length < 1e-6 or _is_clear(scene, depsgraph, eye, offset.normalized(), offset.length,
                                                        ignored, instances))
-    return np.array(clear, bool)
+    return np.array(is_clear, bool)
 
 
 def _is_clear(scene: Any, depsgraph: Any, eye: Any, direction: Any, distance: float, ignored: set[str],
@@ -109,7 +109,8 @@ def _is_clear(scene: Any, depsgraph: Any, eye: Any, direction: Any, distance: fl
         if not hit:
             return True
         if obj is None or not (obj.original.name in ignored or _is_invisible_to_camera(obj)
-                               or any(obj.original.name == name and matrix == place for name, place in instances)):
+                               or any(obj.original.name == name and matrix == instance_matrix
+                                      for name, instance_matrix in instances)):
             return False
         # Go on just behind the surface.
         step = (hit_point - start).length + 1e-4 * distance

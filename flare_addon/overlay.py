@@ -322,7 +322,7 @@ def _draw() -> None:
 
 def _draw_outlines() -> None:
     """Draw the outline of the highlighted element in the current 3D view."""
-    if highlight.touched(bpy.context.scene) is not None:
+    if highlight.current_highlight(bpy.context.scene) is not None:
         _draw_with(draw_outline)
 
 
@@ -369,10 +369,10 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
         return
     region = context.region.width, context.region.height
     look = looks.look_of(scene)
-    chosen, edits = highlight.touched(scene), looks.edits_of(scene.fit_flare)
+    chosen, edits = highlight.current_highlight(scene), looks.edits_of(scene.fit_flare)
     if chosen is not None:
         names = {item.name: [part.name for part in item.elements] for item in scene.fit_flare.lights}
-        edits = highlight.highlighted(edits, chosen, names)
+        edits = highlight.emphasise(edits, chosen, names)
     gaussians = concatenate(list(looks.evaluate_flares(scene, depsgraph, camera, edits).values()))
     if gaussians is None:
         return
@@ -402,14 +402,14 @@ def draw_outline(context: Any, scene: Any, camera: Any) -> None:
     import gpu
     from gpu_extras.batch import batch_for_shader
 
-    window, chosen = _window_of(context, scene, camera), highlight.touched(scene)
+    window, chosen = _window_of(context, scene, camera), highlight.current_highlight(scene)
     if window is None or chosen is None:
         return
-    edits = highlight.alone(chosen, looks.edits_of(scene.fit_flare))
+    edits = highlight.isolate(chosen, looks.edits_of(scene.fit_flare))
     gaussians = concatenate(list(looks.evaluate_flares(scene, context.view_layer.depsgraph, camera, edits).values()))
     if gaussians is None:
         return
-    box = highlight.outline(gaussians, *to_pixels(gaussians, window.intrinsics, looks.look_of(scene).pixel_grid))
+    box = highlight.outline_box(gaussians, *to_pixels(gaussians, window.intrinsics, looks.look_of(scene).pixel_grid))
     if box is None:
         return
     (left, right), (top, bottom) = (np.clip(box[axis::2], 1, size - 1) for axis, size in (

@@ -100,7 +100,7 @@ class FITFLARE_PT_lights(_FitPanel, bpy.types.Panel):
             row.operator("fit_flare.remove_light", text="", icon="X").object = light.name
         panel_parts.draw_motion(layout, scene, objects)
         folder = fits.capture_folder(scene)
-        job = jobs.find(folder / "lights") if folder is not None else None
+        job = jobs.find_job(folder / "lights") if folder is not None else None
         if job is not None and job.running:
             draw_progress(layout, job, "Searching for lights")
         elif job is not None and job.error:
@@ -124,7 +124,7 @@ class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
         """Draw a running fit alone; else settings, clean frames, state of the last fit, and the button of a fit."""
         layout, scene = self.layout, context.scene
         state, stage, folder = scene.fit_flare, fits.fit_state(scene), fits.run_folder(scene)
-        job = jobs.find(folder)
+        job = jobs.find_job(folder)
         for other in shots.orphaned_jobs():
             draw_progress(layout, other, f"{other.folder.name} (used by no scene)")
         if engine.find_engine() is None:
@@ -154,7 +154,7 @@ class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
             _draw_finished_fit(layout, scene, job)
         elif job is not None and job.state in ("failed", "stopped"):
             label_lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
-        why = fits.why_not(scene)
+        why = fits.why_not_fit(scene)
         if why and engine.find_engine() is not None:
             label_lines(layout, f"{why}.", "INFO")
         row = layout.row()
@@ -368,7 +368,7 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
         state = scene.fit_flare
         if not state.flare:
             label_lines(layout, "Nothing to bake yet: fit or open a flare first.", "INFO")
-        job = jobs.find(shots.layers_folder(scene)) if state.layers else None
+        job = jobs.find_job(shots.layers_folder(scene)) if state.layers else None
         reading = baking.preparation()
         if reading is not None:
             row = layout.row(align=True)

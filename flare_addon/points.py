@@ -14,22 +14,22 @@ _batches: dict[tuple[str, int], Any] = {}
 _handle: Any = None
 
 
-def _batch(mesh: Any) -> Any:
+def _point_batch(mesh: Any) -> Any:
     """Return the shader and the GPU batch of a point cloud, cached by mesh and size."""
     from gpu_extras.batch import batch_for_shader
 
     key = (mesh.name, len(mesh.vertices))
     if key not in _batches:
-        for old in [other for other in _batches if other[0] == mesh.name]:
-            del _batches[old]
+        for outdated in [other for other in _batches if other[0] == mesh.name]:
+            del _batches[outdated]
         count = len(mesh.vertices)
-        places, colours = np.empty(3 * count, np.float32), np.empty(4 * count, np.float32)
-        mesh.vertices.foreach_get("co", places)
+        coordinates, colours = np.empty(3 * count, np.float32), np.empty(4 * count, np.float32)
+        mesh.vertices.foreach_get("co", coordinates)
         mesh.color_attributes[ATTRIBUTE].data.foreach_get("color", colours)
         step = max(-(-count // MAX_VERTICES), 1)
         shader = _shader()
         _batches[key] = shader, batch_for_shader(shader, "POINTS", {
-            "pos": np.ascontiguousarray(places.reshape(-1, 3)[::step]),
+            "pos": np.ascontiguousarray(coordinates.reshape(-1, 3)[::step]),
             "color": np.ascontiguousarray(colours.reshape(-1, 4)[::step])})
     return _batches[key]
 
@@ -41,7 +41,7 @@ def _shader() -> Any:
     return gpu.shader.from_builtin("POINT_FLAT_COLOR" if bpy.app.version >= (4, 5, 0) else "FLAT_COLOR")
 
 
-def _draw() -> None:
+def _draw_points() -> None:
     """Draw the point clouds in the current 3D view."""
     import gpu
 
@@ -56,7 +56,7 @@ def _draw() -> None:
             continue
         if not item.fit_flare.is_points or not len(item.data.vertices):
             continue
-        shader, batch = _batch(item.data)
+        shader, batch = _point_batch(item.data)
         gpu.state.depth_test_set("LESS_EQUAL")
         gpu.state.point_size_set(3.0)
         with gpu.matrix.push_pop():
@@ -73,7 +73,7 @@ def clear_cache() -> None:
 def register() -> None:
     global _handle
     if not bpy.app.background:
-        _handle = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
+        _handle = bpy.types.SpaceView3D.draw_handler_add(_draw_points, (), "WINDOW", "POST_VIEW")
 
 
 def unregister() -> None:

@@ -96,15 +96,15 @@ def _draw_engine(layout: Any) -> None:
 
 def _draw_weights(layout: Any) -> None:
     """Draw whether the weights of the removal network are there, their download, and its button."""
-    box, job, found = layout.box().column(), weights.job(), weights.find()
+    box, job, weights_path = layout.box().column(), weights.download_job(), weights.find_weights()
     if job is not None and job.running:
         draw_progress(box, job, "Downloading the weights")
         return
-    if found is not None:
-        box.label(text=f"Removal weights: {found}", icon="CHECKMARK")
+    if weights_path is not None:
+        box.label(text=f"Removal weights: {weights_path}", icon="CHECKMARK")
         return
     box.label(text="No weights of the removal network", icon="INFO")
-    _, configured = weights.configured()
+    _, configured = weights.configured_weights()
     if configured:
         label_lines(box, f"{weights.missing_reason()}.")
         return
@@ -142,7 +142,7 @@ class FITFLARE_OT_test_engine(GuardedOperator, bpy.types.Operator):
         return ""
 
     def act(self, _context: bpy.types.Context) -> None:
-        engine.test()
+        engine.test_engine()
 
 
 class FITFLARE_OT_set_up_engine(GuardedOperator, bpy.types.Operator):
@@ -169,7 +169,7 @@ class FITFLARE_OT_set_up_engine(GuardedOperator, bpy.types.Operator):
             confirm_text="Set Up Again")
 
     def act(self, _context: bpy.types.Context) -> None:
-        engine.set_up()
+        engine.set_up_engine()
 
 
 class FITFLARE_OT_download_weights(GuardedOperator, bpy.types.Operator):
@@ -183,12 +183,12 @@ class FITFLARE_OT_download_weights(GuardedOperator, bpy.types.Operator):
     def why_not(cls, _context: bpy.types.Context) -> str:
         if not bpy.app.online_access:
             return NO_ONLINE_ACCESS
-        if weights.find() is not None:
+        if weights.find_weights() is not None:
             return "The weights are installed already"
         return "" if weights.source_url() else "This extension was not installed from a repository that offers them"
 
     def act(self, _context: bpy.types.Context) -> None:
-        weights.download()
+        weights.download_weights()
 
 
 class FITFLARE_OT_remove_engine(GuardedOperator, bpy.types.Operator):
@@ -209,7 +209,7 @@ class FITFLARE_OT_remove_engine(GuardedOperator, bpy.types.Operator):
             self, event, title="Remove the engine?", message="Set Up Engine installs it again", confirm_text="Remove")
 
     def act(self, _context: bpy.types.Context) -> None:
-        engine.remove()
+        engine.remove_engine()
 
 
 _CLASSES = (FITFLARE_AP_preferences, FITFLARE_OT_test_engine, FITFLARE_OT_set_up_engine, FITFLARE_OT_remove_engine,

@@ -65,11 +65,11 @@ def _update_target(self: Any, context: Any) -> None:
     redraw_viewports()
 
 
-def _touch_element(self: Any, _context: Any) -> None:
+def _highlight_element(self: Any, _context: Any) -> None:
     """Highlight the chosen element in the camera view."""
-    from .highlight import touch
+    from .highlight import start_highlight
 
-    touch(self)
+    start_highlight(self)
 
 
 USUAL_WIDTH = 960
@@ -195,7 +195,7 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
     identity: StringProperty()  # type: ignore[valid-type]  # stays when the flare is renamed; the baked layers store it
     elements: CollectionProperty(type=FITFLARE_PG_element)  # type: ignore[valid-type]
     element: IntProperty(  # type: ignore[valid-type]
-        name="Element", description="The element whose sliders are shown", default=0, update=_touch_element)
+        name="Element", description="The element whose sliders are shown", default=0, update=_highlight_element)
     show_elements: BoolProperty(  # type: ignore[valid-type]
         name="Elements", description="Show the sliders of single ghosts, streaks and rings", default=False)
     radius: FloatProperty(  # type: ignore[valid-type]

@@ -54,8 +54,8 @@ class ShotReading:
             raise SettingsError(f"Frame {min(frames)} cannot be baked, since layers have no negative numbers; start at "
                                 "frame 0 or later.")
         self.scene_name, self._cameras = scene.name, [camera.name for camera in camera_objects]
-        self._frames, self._before = list(frames), (scene.frame_current, scene.frame_subframe)
-        self._read: list[ShotFrame] = []
+        self._frames, self._frame_before = list(frames), (scene.frame_current, scene.frame_subframe)
+        self._shot_frames: list[ShotFrame] = []
         self.total, self.done = len(self._frames), 0
 
     @property
@@ -80,21 +80,22 @@ class ShotReading:
         scene.frame_set(frame)
         depsgraph = view_layer_of(scene).depsgraph
         if self._cameras:
-            self._read += [shot_frame(scene, depsgraph, scene.objects[name], frame) for name in self._cameras]
+            self._shot_frames += [shot_frame(scene, depsgraph, scene.objects[name], frame) for name in self._cameras]
         else:
             current = shot_frame(scene, depsgraph, scene.camera, frame)
-            self._read.append(replace(current, name=self._read[0].name if self._read else current.name))
+            name = self._shot_frames[0].name if self._shot_frames else current.name
+            self._shot_frames.append(replace(current, name=name))
         self.done += 1
 
     def restore(self) -> None:
         """Move the timeline back to where it was."""
         if self.scene_name in bpy.data.scenes:
-            self.scene.frame_set(self._before[0], subframe=self._before[1])
+            self.scene.frame_set(self._frame_before[0], subframe=self._frame_before[1])
 
     def shot(self, flare: Path, run: Path | None) -> Shot:
         """Return the shot of the frames that were read."""
         state = self.scene.fit_flare
-        return Shot(flare, tuple(self._read), looks.query_of(state), run, state.bake_live)
+        return Shot(flare, tuple(self._shot_frames), looks.query_of(state), run, state.bake_live)
 
 
 def scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int], flare: Path, run: Path | None) -> Shot:
@@ -116,13 +117,13 @@ def shot_frame(scene: Any, depsgraph: Any, camera: Any, frame: int) -> ShotFrame
     """Return the frame of a shot for one camera at the current frame of the scene. frame: its number."""
     evaluated = camera.evaluated_get(depsgraph)
     pose, lights = looks.place_lights(scene, depsgraph, camera)
-    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    core_camera = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
     edits = looks.edits_of(scene.fit_flare)
     if scene.fit_flare.bake_live:
         edits = without_live_edits(edits)
-    edit_texts = _for_lights(edits, {light.name for light in lights}).texts()
-    seen_by = replace(core, world_to_camera=pose, exposure=evaluated.fit_flare.exposure)
-    return ShotFrame(frame, camera.name, seen_by, tuple(lights), tuple(edit_texts))
+    edit_texts = _edits_of_lights(edits, {light.name for light in lights}).texts()
+    capture_camera = replace(core_camera, world_to_camera=pose, exposure=evaluated.fit_flare.exposure)
+    return ShotFrame(frame, camera.name, capture_camera, tuple(lights), tuple(edit_texts))
 
 
 def without_live_edits(edits: LookEdits) -> LookEdits:
@@ -134,7 +135,7 @@ def without_live_edits(edits: LookEdits) -> LookEdits:
                      edits.elements)
 
 
-def _for_lights(edits: LookEdits, names: set[str]) -> LookEdits:
+def _edits_of_lights(edits: LookEdits, names: set[str]) -> LookEdits:
     """Return the edits of these lights only, since a shot accepts no edits of other lights."""
     return LookEdits(edits.master, {name: edit for name, edit in edits.lights.items() if name in names},
                      {pair: edit for pair, edit in edits.elements.items() if pair[0] in names})
@@ -158,7 +159,7 @@ def live_layers(state: Any, folder: Path) -> dict[str, int] | None:
     state: the scene's properties. folder: of the layers, or of those of one camera, whose parent has the LIVE_FILE.
     Layers of removed flares are left out. None where neither the folder nor its parent has a readable LIVE_FILE.
     """
-    folder = next((place for place in (folder, folder.parent) if (place / LIVE_FILE).is_file()), folder)
+    folder = next((candidate for candidate in (folder, folder.parent) if (candidate / LIVE_FILE).is_file()), folder)
     try:
         live = parse_json(read_text(folder / LIVE_FILE))
         baked = layer_names(live["lights"])
@@ -190,15 +191,15 @@ def choose_layers_folder(scene: Any) -> Path:
         if path is None:
             raise RunError("There is no flare to bake; fit one, or open a .flare.")
         if bpy.data.filepath:
-            base = Path(bpy.data.filepath).parent
+            parent = Path(bpy.data.filepath).parent
         elif path.parent.resolve() in (library.folder().resolve(), library.BOX.resolve()):
-            base = Path(bpy.utils.user_resource("DATAFILES", path="fit_flare/layers"))
+            parent = Path(bpy.utils.user_resource("DATAFILES", path="fit_flare/layers"))
         else:
-            base = path.parent
-        folder, number = base / "layers", 1
+            parent = path.parent
+        folder, number = parent / "layers", 1
         while folder.exists():
             number += 1
-            folder = base / f"layers_{number}"
+            folder = parent / f"layers_{number}"
         state.layers = blend_relative(folder)
     return layers_folder(scene)
 
@@ -209,13 +210,13 @@ def camera_folder(layers: Path, camera: Any) -> Path:
     camera: a camera object, or None. Raises FrameError where there are layers of other cameras only.
     """
     try:
-        last = Shot.read(layers / SHOT_FILE).folders
+        last_folders = Shot.read(layers / SHOT_FILE).folders
     except SettingsError:
         return layers
-    folders = {**_baked_folders(layers), **last}
+    folders = {**_baked_folders(layers), **last_folders}
     name = camera.name if camera is not None else ""
     # Where the last bake wrote into the folder itself (""), or EXRs are there, they serve any camera.
-    if name not in folders and "" not in last.values() and not any(layers.glob("*.exr")):
+    if name not in folders and "" not in last_folders.values() and not any(layers.glob("*.exr")):
         raise FrameError(f"{layers} has no layers of the camera {name!r}, only of {', '.join(map(repr, folders))}; "
                          "bake it too, or make one of those the scene's camera. A renamed camera needs its old name.")
     return layers / folders.get(name, "")
@@ -241,7 +242,7 @@ def frames_to_replace(scene: Any, camera_objects: Sequence[Any]) -> list[int]:
     if not scene.fit_flare.layers or not (folder / bakes.MANIFEST).exists():
         return []
     shot = _panel_shot(scene, camera_objects, frames[:1])  # one frame has all lights and cameras
-    files = {layers_file(inner, frame) for inner in shot.folders.values() for frame in frames}
+    files = {layers_file(camera_subfolder, frame) for camera_subfolder in shot.folders.values() for frame in frames}
 
     def fingerprint() -> str:
         run = shot.run
@@ -286,7 +287,7 @@ def check_bake(scene: Any, camera_objects: Sequence[Any]) -> None:
 
 def running_jobs(scene: Any) -> list[Job]:
     """Return the running jobs of a scene: fit, light search, clean frames and bake."""
-    layers = jobs.find(layers_folder(scene)) if scene.fit_flare.layers else None
+    layers = jobs.find_job(layers_folder(scene)) if scene.fit_flare.layers else None
     return [job for job in (*fits.engine_jobs(scene), layers) if job is not None and job.running]
 
 

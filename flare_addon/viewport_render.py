@@ -26,7 +26,7 @@ HIDDEN = ("show_floor", "show_axis_x", "show_axis_y", "show_axis_z", "show_ortho
 """Overlays that a viewport render leaves out. Footage behind the camera is an overlay too, and stays."""
 
 
-def check(scene: Any) -> None:
+def check_output(scene: Any) -> None:
     """Raise SettingsError where the scene's output cannot be that of a viewport render."""
     if scene.render.is_movie_format:
         raise SettingsError("Viewport renders with the flare are pictures: choose an image format such as PNG in "
@@ -40,7 +40,7 @@ def output_path(scene: Any, frame: int) -> Path:
     return Path(bpy.path.abspath(scene.render.frame_path(frame=frame)))
 
 
-def size_of(scene: Any) -> tuple[int, int]:
+def picture_size(scene: Any) -> tuple[int, int]:
     """Return width and height of the pictures."""
     render = scene.render
     width, height = (max(int(length * render.resolution_percentage / 100), 1)
@@ -48,7 +48,7 @@ def size_of(scene: Any) -> tuple[int, int]:
     return width, height
 
 
-def draw(context: Any, space: Any, region: Any) -> NDArray[np.float32]:
+def draw_frame(context: Any, space: Any, region: Any) -> NDArray[np.float32]:
     """Draw the present frame of the scene's camera with the shading of a 3D view; return pixels (height, width, 4),
     scene-linear, row 0 at the bottom.
 
@@ -57,7 +57,7 @@ def draw(context: Any, space: Any, region: Any) -> NDArray[np.float32]:
     import gpu
 
     scene, depsgraph = context.scene, context.evaluated_depsgraph_get()
-    width, height = size_of(scene)
+    width, height = picture_size(scene)
     camera = scene.camera.evaluated_get(depsgraph)
     render = scene.render
     projection = camera.calc_matrix_camera(depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x,
@@ -81,20 +81,20 @@ def draw(context: Any, space: Any, region: Any) -> NDArray[np.float32]:
 def _without_overlays(space: Any) -> Iterator[None]:
     """Switch off the overlays of a 3D view that are no part of the picture."""
     settings = space.overlay
-    before = {name: getattr(settings, name) for name in HIDDEN if hasattr(settings, name)}
-    gizmo = space.show_gizmo
+    previous = {name: getattr(settings, name) for name in HIDDEN if hasattr(settings, name)}
+    previous_gizmo = space.show_gizmo
     try:
         space.show_gizmo = False
-        for name in before:
+        for name in previous:
             setattr(settings, name, False)
         yield
     finally:
-        space.show_gizmo = gizmo
-        for name, value in before.items():
+        space.show_gizmo = previous_gizmo
+        for name, value in previous.items():
             setattr(settings, name, value)
 
 
-def save(scene: Any, pixels: NDArray[np.float32], path: Path) -> None:
+def save_picture(scene: Any, pixels: NDArray[np.float32], path: Path) -> None:
     """Save pixels (height, width, 4), scene-linear, row 0 at the bottom, as the scene's output settings and view
     transform say. Raises FrameError."""
     height, width = pixels.shape[:2]

@@ -33,23 +33,23 @@ def downloaded_file() -> Path:
     return user_folder(FOLDER) / published_name()
 
 
-def configured() -> tuple[str, str]:
+def configured_weights() -> tuple[str, str]:
     """Return the source and the path of configured weights: FIT_FLARE_WEIGHTS, else the preferences, else ("", "")."""
     return configured_path(WEIGHTS_VARIABLE, "weights")
 
 
-def find() -> Path | None:
+def find_weights() -> Path | None:
     """Return the weights: the configured ones, else those of the source, else the downloaded ones; None without any."""
-    _, path = configured()
+    _, path = configured_weights()
     candidates = [Path(path).expanduser()] if path else [IN_THE_BOX, downloaded_file()]
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def missing_reason() -> str:
     """Return why there are no weights and what to do, without a full stop; "" where there are."""
-    if find() is not None:
+    if find_weights() is not None:
         return ""
-    source, path = configured()
+    source, path = configured_weights()
     if path:
         return f"The weights named by {source} are missing: {path}. Name a file that exists, or name none"
     return ("The removal network needs its weights. Open the preferences of Fit Flare and "
@@ -59,8 +59,8 @@ def missing_reason() -> str:
 def environment() -> dict[str, str]:
     """Return the variable that names the weights to a command; {} where it finds them itself, or where there are
     none."""
-    found = find()
-    return {} if found is None or found == IN_THE_BOX else {WEIGHTS_VARIABLE: str(found)}
+    path = find_weights()
+    return {} if path is None or path == IN_THE_BOX else {WEIGHTS_VARIABLE: str(path)}
 
 
 def source_url() -> str:
@@ -77,20 +77,20 @@ def source_url() -> str:
 
 def download_args() -> list[str]:
     """Return the arguments of SET_UP that download the weights; [] where they are not missing or offered nowhere."""
-    url = source_url() if find() is None and not configured()[1] else ""
+    url = source_url() if find_weights() is None and not configured_weights()[1] else ""
     return ["--weights", url, str(downloaded_file()), published_digest()] if url else []
 
 
-def download() -> Job:
+def download_weights() -> Job:
     """Download the weights. Raises EngineError where Blender's online access is off or no repository offers them."""
     check_online_access("download")
     args = download_args()
     if not args:
         raise EngineError("No repository offers the weights of the removal network; name their file under Removal "
                           "Weights.")
-    return jobs.start("weights", user_folder(FOLDER, create=True), [*SET_UP, *args], child_environment())
+    return jobs.start_job("weights", user_folder(FOLDER, create=True), [*SET_UP, *args], child_environment())
 
 
-def job() -> Job | None:
+def download_job() -> Job | None:
     """Return the job of the current or last download; None without one."""
-    return jobs.find(user_folder(FOLDER))
+    return jobs.find_job(user_folder(FOLDER))

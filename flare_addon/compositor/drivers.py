@@ -24,21 +24,21 @@ _LIVE_PATH = re.compile(r"fit_flare\.(master|lights\[\d+\])\.(intensity|tint|mut
 _LIGHT_PATH = re.compile(r'fit_flare\.lights\[(?:(\d+)|"(.*)")\]\.intensity')
 
 
-def connect(scene: Any, gains: dict[str, int]) -> None:
-    """Drive the node's inputs by the panel's sliders. gains: the index of the flare for each layer.
+def connect_node(scene: Any, flare_by_layer: dict[str, int]) -> None:
+    """Drive the node's inputs by the panel's sliders. flare_by_layer: the index of the flare for each layer.
 
     In the expressions, i is an intensity, t a channel of a tint, m a mute, s a solo, and n the number of solo flares.
     The layers must be baked without Intensity, Tint, Mute and Solo. A layer without a flare is shown as baked.
     """
     node = find_node(scene)
-    disconnect(scene)
+    disconnect_node(scene)
     _drive(node, "Intensity", -1, "i*(1-m)", {"i": _slider(scene, "master.intensity"),
                                               "m": _slider(scene, "master.mute")})
     for channel in range(3):
         _drive(node, "Tint", channel, "t", {"t": _slider(scene, f"master.tint[{channel}]")})
-    solos = _count_solos(scene, node, sorted(set(gains.values())))
-    for layer, number in gains.items():
-        path = f"lights[{number}]"
+    solos = _count_solos(scene, node, sorted(set(flare_by_layer.values())))
+    for layer, index in flare_by_layer.items():
+        path = f"lights[{index}]"
         for channel in range(3):
             _drive(node, gain_input(layer), channel, "i*t*(1-m)*(s if n else 1)", {
                 "i": _slider(scene, f"{path}.intensity"), "t": _slider(scene, f"{path}.tint[{channel}]"),
@@ -75,7 +75,7 @@ def migrate_to_indices(scene: Any) -> None:
            for variable in curve.driver.variables for target in variable.targets):
         for item in scene.fit_flare.lights:
             item.identity = item.identity or item.name  # that version identified layers by names
-        connect(scene, connected_flares(scene))
+        connect_node(scene, connected_flares(scene))
 
 
 def is_animated(scene: Any) -> bool:
@@ -126,7 +126,7 @@ def node_drivers(scene: Any) -> list[Any]:
     return [curve for curve in tree.animation_data.drivers if curve.data_path.startswith(f'nodes["{GROUP}"]')]
 
 
-def disconnect(scene: Any) -> None:
+def disconnect_node(scene: Any) -> None:
     """Remove the drivers of the node's inputs, and reset the inputs to 1.
 
     Otherwise an input would keep its last driven value, and a muted flare would stay invisible.
@@ -154,17 +154,17 @@ def _slider(scene: Any, path: str) -> tuple[Any, str]:
     return scene, f"fit_flare.{path}"
 
 
-def _count_solos(scene: Any, node: Any, numbers: Sequence[int]) -> tuple[Any, str]:
+def _count_solos(scene: Any, node: Any, flare_indices: Sequence[int]) -> tuple[Any, str]:
     """Drive a property of the node by the number of solo flares; return its data block and path.
 
-    numbers: indices of the flares that have layers. The expression of each Gain could not hold all flares, since it is
+    flare_indices: of the flares that have layers. The expression of each Gain could not hold all flares, since it is
     limited to 255 characters.
     """
     node[SOLOS] = 0.0
     driver = node.driver_add(f'["{SOLOS}"]').driver
     driver.type = "SUM"
-    for number in numbers:
-        _add_variable(driver, f"s{number}", *_slider(scene, f"lights[{number}].solo"))
+    for index in flare_indices:
+        _add_variable(driver, f"s{index}", *_slider(scene, f"lights[{index}].solo"))
     path = f'nodes["{GROUP}"]["{SOLOS}"]'
     return (node.id_data, path) if GROUPS_ARE_TREES else (scene, f"node_tree.{path}")  # which owns the tree
 
@@ -178,8 +178,8 @@ def _drive(node: Any, name: str, index: int, expression: str, variables: dict[st
         return
     driver = node.inputs[name].driver_add("default_value", index).driver
     driver.type = "SCRIPTED"
-    for short, (block, path) in variables.items():
-        _add_variable(driver, short, block, path)
+    for variable, (block, path) in variables.items():
+        _add_variable(driver, variable, block, path)
     driver.expression = expression  # a simple expression, which needs no permission to run
 
 

@@ -74,20 +74,21 @@ def _add_sockets(group: Any, inputs: Iterable[str]) -> None:
 
 def _add_nodes(group: Any, layers: Sequence[str]) -> None:
     """Add the nodes that compute Flare and Image: one row for each layer, the sums in row -1 to the right of them."""
-    entry = new_node(group, "NodeGroupInput", 0, 0)
-    sized = [scale_to_render_size(group, entry.outputs[name], 1, -row) for row, name in enumerate(layers, 1)]
-    gained = [_mix(group, "MULTIPLY", scaled_layer.outputs[0], entry.outputs[gain_input(name)], 2, -row)
-              for row, (name, scaled_layer) in enumerate(zip(layers, sized, strict=True), 1)]
-    total = gained[0]
-    for column, layer in enumerate(gained[1:], 3):
-        total = _mix(group, "ADD", total, layer, column, -1)
+    group_input = new_node(group, "NodeGroupInput", 0, 0)
+    scaled_layers = [scale_to_render_size(group, group_input.outputs[name], 1, -row)
+                     for row, name in enumerate(layers, 1)]
+    gained_layers = [_mix(group, "MULTIPLY", scaled_layer.outputs[0], group_input.outputs[gain_input(name)], 2, -row)
+              for row, (name, scaled_layer) in enumerate(zip(layers, scaled_layers, strict=True), 1)]
+    sum_of_layers = gained_layers[0]
+    for column, layer in enumerate(gained_layers[1:], 3):
+        sum_of_layers = _mix(group, "ADD", sum_of_layers, layer, column, -1)
     column = len(layers) + 2
-    tinted = _mix(group, "MULTIPLY", total, entry.outputs["Tint"], column, -1)
-    scaled = _mix(group, "MULTIPLY", tinted, entry.outputs["Intensity"], column + 1, -1)
-    image = _mix(group, "ADD", entry.outputs["Scene"], scaled, column + 2, 0)
+    tinted = _mix(group, "MULTIPLY", sum_of_layers, group_input.outputs["Tint"], column, -1)
+    flare = _mix(group, "MULTIPLY", tinted, group_input.outputs["Intensity"], column + 1, -1)
+    image = _mix(group, "ADD", group_input.outputs["Scene"], flare, column + 2, 0)
     output = new_node(group, "NodeGroupOutput", column + 6, 0)
     group.links.new(image, output.inputs["Image"])
-    group.links.new(_add_matte(group, scaled, column + 2), output.inputs["Flare"])
+    group.links.new(_add_matte(group, flare, column + 2), output.inputs["Flare"])
 
 
 def _add_matte(group: Any, colour: Any, column: int) -> Any:
@@ -95,14 +96,14 @@ def _add_matte(group: Any, colour: Any, column: int) -> Any:
 
     colour: output socket. Returns the output socket of the result.
     """
-    split = new_node(group, "CompositorNodeSeparateColor", column, -2)
-    group.links.new(colour, split.inputs[0])
-    red, green, blue = split.outputs[:3]
+    separate = new_node(group, "CompositorNodeSeparateColor", column, -2)
+    group.links.new(colour, separate.inputs[0])
+    red, green, blue = separate.outputs[:3]
     alpha = _math(group, "MAXIMUM", _math(group, "MAXIMUM", red, green, column + 1), blue, column + 2, clamp=True)
-    join = new_node(group, "CompositorNodeCombineColor", column + 3, -2)
-    for source, target in zip((red, green, blue, alpha), join.inputs, strict=True):
+    combine = new_node(group, "CompositorNodeCombineColor", column + 3, -2)
+    for source, target in zip((red, green, blue, alpha), combine.inputs, strict=True):
         group.links.new(source, target)
-    return join.outputs[0]
+    return combine.outputs[0]
 
 
 def new_node(tree: Any, kind: str, column: float, row: float) -> Any:
@@ -132,8 +133,8 @@ def crop_to_frame(tree: Any, socket: Any, window: DataWindow, column: float, row
     socket: output socket of the picture. window: its data window.
     """
     node = new_node(tree, "CompositorNodeCrop", column, row)
-    (left, top), (width, height), (_, stored) = window.origin, window.frame, window.size
-    bottom = stored + top - height  # rows of overscan below the frame; Blender counts from there
+    (left, top), (width, height), (_, stored_height) = window.origin, window.frame, window.size
+    bottom = stored_height + top - height  # rows of overscan below the frame; Blender counts from there
     if "Width" in node.inputs:
         for name, value in (("X", -left), ("Y", bottom), ("Width", width), ("Height", height), ("Alpha Crop", False)):
             node.inputs[name].default_value = value

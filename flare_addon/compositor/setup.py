@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Sets the compositor of a scene up to combine baked layers with the node "Fit Flare" (flare_node.py).
 
-The previous state is stored on the scene, so that `remove` restores it. It works with the compositors of 4.2 to 5.3
-(`trees`): up to 4.5 the tree ends in a Composite node, from 5.0 in a Group Output.
+The previous state is stored on the scene, so that `remove_nodes` restores it. It works with the compositors of 4.2
+to 5.3 (`trees`): up to 4.5 the tree ends in a Composite node, from 5.0 in a Group Output.
 """
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _IMAGE_NODE_SETTINGS = ("image", "frame_start", "frame_offset", "frame_duration"
 _OUTPUT_TYPE = trees.OUTPUT_TYPE
 
 
-def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: Any = None) -> Any:
+def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: Any = None) -> Any:
     """Build the nodes that combine `layers`, or make existing ones show them; return the "Fit Flare" node.
 
     The flare goes over the baked scene by default. keep_image: it goes over the present input of the output (a render
@@ -82,11 +82,44 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     node = tree.nodes.get(GROUP)
     if node is None:
         node = _set_name(new_node(tree, "CompositorNodeGroup", -2, 0), GROUP)
-    drivers.disconnect(scene)
+    drivers.disconnect_node(scene)
+    _change_inputs(tree, node, names)
+    _remove_crops(tree)
+    if not layers.window().is_frame:  # the layers have overscan
+        shown = names if plate is not None or keep_image else ["scene", *names]
+        sockets.update(_crop_overscan(tree, layers, {name: sockets[name] for name in shown}))
+    for name in names:
+        tree.links.new(sockets[name], node.inputs[name])
+    # artists_picture: the output socket under the flare, to which `remove_nodes` connects the output again.
+    end = _output_input(tree)
+    artists_picture = _feeding_socket(end)
+    # Set up earlier, perhaps with nodes of the artist after it.
+    is_set_up = artists_picture is not None and _depends_on(artists_picture.node, node)
+    if is_set_up or artists_picture is None or _is_ours(artists_picture.node):
+        artists_picture = _image_under_flare(tree, node, scene[STATE_PROPERTY])
+    if artists_picture is not None:
+        scene[STATE_PROPERTY].update({"from": artists_picture.node.name, "socket": artists_picture.identifier})
+    if plate is not None:
+        scene_picture = _footage_node(tree, plate).outputs["Image"]
+    elif keep_image:
+        scene_picture = artists_picture or _render_picture(tree)
+    else:
+        scene_picture = sockets["scene"]
+    _connect_scene_picture(tree, node, scene_picture)
+    if not is_set_up or end.links[0].from_node == node:  # else the artist has nodes between ours and the output
+        tree.links.new(node.outputs["Image"], end)
+    if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
+        viewer = _set_name(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
+        tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
+    return node
+
+
+def _change_inputs(tree: Any, node: Any, layer_names: Sequence[str]) -> None:
+    """Give our node the inputs of these layers. Inputs that stay keep values, links and animation."""
     old_names = [socket.name for socket in node.inputs]
     sliders = {name: (_input_value(node, name), _feeding_socket(node.inputs[name])) for name in old_names
                if name in ("Intensity", "Tint") or layer_of_gain(name)}
-    node.node_tree = node_group(names)
+    node.node_tree = node_group(layer_names)
     new_indices = {socket.name: index for index, socket in enumerate(node.inputs)}
     # Animated inputs keep their keys, whatever their index is now; keys on inputs that are gone are removed.
     fcurves.renumber(tree, f'nodes["{GROUP}"].inputs',
@@ -98,39 +131,24 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
             node.inputs[name].default_value = value
             if feeder is not None:
                 tree.links.new(feeder, node.inputs[name])
-    _remove_crops(tree)
-    window = layers.window()
-    if not window.is_frame:  # the layers have overscan
-        for row, name in enumerate(names if plate is not None or keep_image else ("scene", *names)):
-            cropped = _set_name(crop_to_frame(tree, sockets[name], window, -3.2, -0.7 * row), f"{CROP} {name}")
-            sockets[name] = cropped.outputs[0]
-    for name in names:
-        tree.links.new(sockets[name], node.inputs[name])
-    # before: the output socket of the artist's picture under the flare, to which `remove` connects the output again.
-    end = _output_input(tree)
-    before = _feeding_socket(end)
-    is_set_up = before is not None and _depends_on(before.node, node)  # set up earlier, perhaps with nodes after it
-    if is_set_up or before is None or _is_ours(before.node):
-        before = _image_under_flare(tree, node, scene[STATE_PROPERTY])
-    if before is not None:
-        scene[STATE_PROPERTY].update({"from": before.node.name, "socket": before.identifier})
-    scene_socket = sockets["scene"]
-    if plate is not None:
-        scene_socket = _footage_node(tree, plate).outputs["Image"]
-    elif keep_image:
-        scene_socket = before or _render_picture(tree)
+
+
+def _crop_overscan(tree: Any, layers: LayerFolder, sockets: dict[str, Any]) -> dict[str, Any]:
+    """Add nodes that cut the overscan of layers off; return their output sockets. sockets: of the layers, by name."""
+    return {name: _set_name(crop_to_frame(tree, socket, layers.window(), -3.2, -0.7 * row), f"{CROP} {name}").outputs[0]
+            for row, (name, socket) in enumerate(sockets.items())}
+
+
+def _connect_scene_picture(tree: Any, node: Any, socket: Any) -> None:
+    """Connect the picture under the flare, an output socket, to our node.
+
+    Pictures of files are scaled to the size of the render, which the render itself has.
+    """
     if (size := tree.nodes.get(SIZE)) is not None:
         tree.nodes.remove(size)
-    # Pictures of files are scaled to the size of the render, which the render itself has.
-    if scene_socket is not None and (scene_socket.node.name in (LAYERS, PLATE) or _is_crop(scene_socket.node)):
-        scene_socket = _set_name(scale_to_render_size(tree, scene_socket, -3, 1), SIZE).outputs[0]
-    tree.links.new(scene_socket, node.inputs["Scene"])
-    if not is_set_up or end.links[0].from_node == node:  # else the artist has nodes between ours and the output
-        tree.links.new(node.outputs["Image"], end)
-    if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
-        viewer = _set_name(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
-        tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
-    return node
+    if socket is not None and (socket.node.name in (LAYERS, PLATE) or _is_crop(socket.node)):
+        socket = _set_name(scale_to_render_size(tree, socket, -3, 1), SIZE).outputs[0]
+    tree.links.new(socket, node.inputs["Scene"])
 
 
 def _is_crop(node: Any) -> bool:
@@ -139,7 +157,7 @@ def _is_crop(node: Any) -> bool:
 
 
 def _is_ours(node: Any) -> bool:
-    """Return whether a node was added by `set_up`."""
+    """Return whether a node was added by `set_up_nodes`."""
     return node.name in _OUR_NODES or _is_crop(node)
 
 
@@ -229,7 +247,7 @@ def _depends_on(candidate: Any, node: Any) -> bool:
 def _image_under_flare(tree: Any, node: Any, state: Any) -> Any:
     """Return the output socket of the artist's image under the flare; None where there is none.
 
-    It feeds our node (`node`), or fed the output before the set-up (`state`, as `set_up` stored it). A node that
+    It feeds our node (`node`), or fed the output before the set-up (`state`, as `set_up_nodes` stored it). A node that
     depends on the flare would make a cycle and does not count.
     """
     feeder = tree.nodes.get(state["from"])
@@ -297,7 +315,7 @@ def _scene_state(scene: Any) -> dict[str, Any]:
 
 
 def _tree_state(tree: Any) -> dict[str, Any]:
-    """Return what `remove` needs to know of a tree before the set-up.
+    """Return what `remove_nodes` needs to know of a tree before the set-up.
 
     nodes: names of the nodes, one a line. drivers: whether it has animation data. inputs: number of its inputs. from,
     socket: node and socket that feed its output; "" for none.
@@ -309,8 +327,11 @@ def _tree_state(tree: Any) -> dict[str, Any]:
             "from": feeder.node.name if feeder else "", "socket": feeder.identifier if feeder else ""}
 
 
-def remove(scene: Any) -> None:
-    """Remove our nodes and restore the state before `set_up` or `show_plate`. Raises FrameError where none is there."""
+def remove_nodes(scene: Any) -> None:
+    """Remove our nodes and restore the state before `set_up_nodes` or `show_plate`.
+
+    Raises FrameError where the compositor has none.
+    """
     if shows_plate_alone(scene):
         tree = tree_of(scene)
         image = tree.nodes[PLATE].image
@@ -334,7 +355,7 @@ def remove(scene: Any) -> None:
                 and (link.from_socket.name == "Image" or link.to_node.bl_idname == _OUTPUT_TYPE)]:
         if below is not None:
             tree.links.new(below, fed)
-    drivers.disconnect(scene)
+    drivers.disconnect_node(scene)
     if not state.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
         tree.animation_data_clear()
     _remove_crops(tree)
@@ -342,9 +363,20 @@ def remove(scene: Any) -> None:
         ours = tree.nodes.get(name)
         if ours is not None and not (name == RENDER and any(socket.is_linked for socket in ours.outputs)):
             tree.nodes.remove(ours)
-    # A tree that we made is discarded unless the artist added nodes; one of the artist loses the output that we added.
-    if not state["tree"] and all(node.bl_idname in _ENDS or node.name == RENDER
-                                 for node in tree.nodes):
+    _restore_tree(scene, tree, state)
+    if STATE_PROPERTY in scene:
+        del scene[STATE_PROPERTY]
+    if group is not None and not group.users:
+        bpy.data.node_groups.remove(group)
+    _remove_unused(images, state)
+
+
+def _restore_tree(scene: Any, tree: Any, state: dict[str, Any]) -> None:
+    """Restore the compositor tree of the scene, from which our nodes were removed. state: from before the set-up.
+
+    A tree that we made is discarded unless the artist added nodes; one of the artist loses the output that we added.
+    """
+    if not state["tree"] and all(node.bl_idname in _ENDS or node.name == RENDER for node in tree.nodes):
         trees.discard_tree(scene, tree, bool(state["use_nodes"]))
     elif state["tree"]:
         if state.get("nodes") is not None:
@@ -356,11 +388,6 @@ def remove(scene: Any) -> None:
             scene.use_nodes = bool(state["use_nodes"])
     if state["tree"]:
         trees.remove_incoming(tree, state.get("inputs", len(trees.input_sockets(tree))))
-    if STATE_PROPERTY in scene:
-        del scene[STATE_PROPERTY]
-    if group is not None and not group.users:
-        bpy.data.node_groups.remove(group)
-    _remove_unused(images, state)
 
 
 def _remove_unused(images: Sequence[Any], state: dict[str, Any]) -> None:

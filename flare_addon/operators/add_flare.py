@@ -24,7 +24,7 @@ NEW_LIGHT_DISTANCE = 10.0
 
 def _look_items(_self: Any, _context: Any) -> list[tuple[str, str, str, int, int]]:
     """Return the entries of the library as menu items."""
-    return library.items()
+    return library.menu_items()
 
 
 class FITFLARE_OT_add_library_flare(GuardedOperator, bpy.types.Operator):
@@ -53,8 +53,8 @@ class FITFLARE_OT_add_library_flare(GuardedOperator, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> None:
         """Add flares at the selected lights, else at one in view, else at a new one; add a camera if there is none."""
         scene = context.scene
-        camera = _camera_of(scene) or _add_camera(context)
-        targets = [] if self.light == "new" else _chosen_lights(context)
+        camera = _choose_camera(scene) or _add_camera(context)
+        targets = [] if self.light == "new" else _selected_lights(context)
         if not targets and self.light != "new":
             targets = _lights_in_view(scene, camera)[:1]
         if not targets:
@@ -76,8 +76,8 @@ class FITFLARE_OT_add_library_flare(GuardedOperator, bpy.types.Operator):
         look_through_camera(context)
 
 
-def _camera_of(scene: Any) -> Any:
-    """Return the scene's camera; where none is set, the first camera object, which becomes it; None without any."""
+def _choose_camera(scene: Any) -> Any:
+    """Return the scene's camera; without one, make the first camera object the scene's. None without any."""
     if scene.camera is None or scene.camera.type != "CAMERA":
         first = next((item for item in scene.objects if item.type == "CAMERA"), None)
         if first is not None:
@@ -101,7 +101,7 @@ def _add_camera(context: Any) -> Any:
     return camera
 
 
-def _chosen_lights(context: Any) -> list[Any]:
+def _selected_lights(context: Any) -> list[Any]:
     """Return the selected light objects: lamps and empties, or, where the scene has no lamp at all, any object but a
     camera."""
     selected = [item for item in context.selected_objects if item.type != "CAMERA"]
@@ -118,26 +118,26 @@ def _lights_in_view(scene: Any, camera: Any) -> list[Any]:
     """
     depsgraph = depsgraph_of(scene)
     evaluated = camera.evaluated_get(depsgraph)
-    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
-    found = []
+    core_camera = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    candidates = []
     for item in scene.objects:
         if item.type != "LIGHT" or item.hide_render or not item.visible_get(view_layer=depsgraph.view_layer):
             continue
         position = lights.light_position(item, world_matrix(item, depsgraph), evaluated.matrix_world.translation)
-        (pixel,), (depth,) = core.project([list(position)])
-        x, y = pixel[0] / core.width - 0.5, pixel[1] / core.height - 0.5
+        (pixel,), (depth,) = core_camera.project([list(position)])
+        x, y = pixel[0] / core_camera.width - 0.5, pixel[1] / core_camera.height - 0.5
         if depth > 0 and max(abs(x), abs(y)) <= 0.5 + FRAME_MARGIN:
-            found.append((float(x * x + y * y), item.name, item))
-    return [item for _, _, item in sorted(found, key=lambda entry: entry[:2])]
+            candidates.append((float(x * x + y * y), item.name, item))
+    return [item for _, _, item in sorted(candidates, key=lambda entry: entry[:2])]
 
 
 def _add_light(scene: Any, camera: Any) -> Any:
     """Add an empty in the camera's view as a light object; return it."""
     depsgraph = depsgraph_of(scene)
     evaluated = camera.evaluated_get(depsgraph)
-    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    core_camera = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
     x, y = NEW_LIGHT_PLACE
-    ray = Vector(core.rays([[x * core.width, y * core.height]])[0].tolist())
+    ray = Vector(core_camera.rays([[x * core_camera.width, y * core_camera.height]])[0].tolist())
     distance = NEW_LIGHT_DISTANCE * max(evaluated.matrix_world.to_scale())
     light = bpy.data.objects.new("Flare", None)
     light.empty_display_type, light.empty_display_size = "SPHERE", 0.02 * distance

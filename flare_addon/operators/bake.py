@@ -15,7 +15,7 @@ from ..compositor import drivers, flare_node, setup, warnings
 from ..paths import absolute, is_folder
 from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator, report_errors
 
-_composite_anew: set[str] = set()
+_scenes_to_set_up: set[str] = set()
 """The scenes whose bake sets the compositor up, also if it is set up already."""
 
 
@@ -43,13 +43,13 @@ class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
             return NO_FLARE
         if scene.camera is None:
             return NO_CAMERA
-        return baking.why_not(scene)
+        return baking.why_not_bake(scene)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask before layers are replaced, then bake."""
         replaced: list[int] = []
         with report_errors(self) as outcome:
-            replaced = shots.frames_to_replace(context.scene, self._chosen(context))
+            replaced = shots.frames_to_replace(context.scene, self._chosen_cameras(context))
         if outcome.status == {"CANCELLED"}:
             return outcome.status
         self.replace = True  # nothing is replaced, or the dialog below asks first
@@ -61,13 +61,13 @@ class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         scene = context.scene
-        _composite_anew.discard(scene.name)
+        _scenes_to_set_up.discard(scene.name)
         if self.composite:
             scene.fit_flare.bake_composite = True
-            _composite_anew.add(scene.name)
-        baking.start(scene, self._chosen(context), replace_others=self.replace)
+            _scenes_to_set_up.add(scene.name)
+        baking.start_bake(scene, self._chosen_cameras(context), replace_others=self.replace)
 
-    def _chosen(self, context: bpy.types.Context) -> list[Any]:
+    def _chosen_cameras(self, context: bpy.types.Context) -> list[Any]:
         """Return the selected cameras; [] for the scene's camera. Raises CaptureError where none is selected."""
         if not self.selected:
             return []
@@ -88,7 +88,8 @@ class FITFLARE_OT_cancel_bake(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: bool, match: bool = False) -> None:
+def set_up_compositor(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: bool,
+                      match: bool = False) -> None:
     """Set the compositor up for the layers in a folder, and report warnings to the operator.
 
     folder: that of a bake or of one camera's layers, as the .blend stores it. The flare goes over the baked scene, the
@@ -96,7 +97,8 @@ def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: b
     the size of the scene to the layers'. Raises FrameError.
     """
     layers = LayerFolder.open(shots.camera_folder(absolute(folder), scene.camera))
-    setup.set_up(scene, layers, keep_image=keep_image, plate=setup.footage_behind_camera(scene) if plate else None)
+    footage = setup.footage_behind_camera(scene) if plate else None
+    setup.set_up_nodes(scene, layers, keep_image=keep_image, plate=footage)
     if match:
         render_settings.match_scene(scene, layers, layers.size())
     live = "; Intensity and Tint of the panel act on it" if connect_sliders(scene, layers) else ""
@@ -141,17 +143,17 @@ class FITFLARE_OT_set_up_compositor(GuardedOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def act(self, context: bpy.types.Context) -> None:
-        set_up(self, context.scene, self.directory, keep_image=self.keep_image, plate=self.plate,
+        set_up_compositor(self, context.scene, self.directory, keep_image=self.keep_image, plate=self.plate,
                match=self.match_scene)
 
 
 def connect_sliders(scene: Any, layers: LayerFolder) -> bool:
     """Drive the compositor by the sliders of the panel Look, for layers baked without them; return whether it was
     done."""
-    gains = shots.live_layers(scene.fit_flare, layers.folder)
-    if gains is None:
+    flare_by_layer = shots.live_layers(scene.fit_flare, layers.folder)
+    if flare_by_layer is None:
         return False
-    drivers.connect(scene, gains)
+    drivers.connect_node(scene, flare_by_layer)
     return True
 
 
@@ -169,7 +171,7 @@ class FITFLARE_OT_remove_compositor(GuardedOperator, bpy.types.Operator):
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
-        setup.remove(context.scene)
+        setup.remove_nodes(context.scene)
 
 
 class FITFLARE_OT_set_up_baked(GuardedOperator, bpy.types.Operator):
@@ -188,11 +190,12 @@ class FITFLARE_OT_set_up_baked(GuardedOperator, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         state = context.scene.fit_flare
-        set_up(self, context.scene, state.layers, keep_image=state.over == "present", plate=state.over == "plate")
+        set_up_compositor(self, context.scene, state.layers, keep_image=state.over == "present",
+                          plate=state.over == "plate")
 
 
-class _Notes:
-    """Takes the reports of `set_up` for a bake that has ended, whose operator is gone: warnings go to the panel."""
+class _JobReports:
+    """Takes the reports of `set_up_compositor` after a bake, whose operator is gone: warnings go to the panel."""
 
     def __init__(self, job: jobs.Job) -> None:
         self._job = job
@@ -208,16 +211,16 @@ def _set_up_after_bake(job: jobs.Job, scene: Any) -> None:
 
     One that is set up already stays as it is, unless the bake was to set it up anew.
     """
-    state, is_anew = scene.fit_flare, scene.name in _composite_anew
-    _composite_anew.discard(scene.name)
+    state, set_up_again = scene.fit_flare, scene.name in _scenes_to_set_up
+    _scenes_to_set_up.discard(scene.name)
     if not state.bake_composite or scene.library is not None or (
-            flare_node.find_node(scene) is not None and not is_anew):
+            flare_node.find_node(scene) is not None and not set_up_again):
         return
-    notes = _Notes(job)
+    reports = _JobReports(job)
     try:
-        set_up(notes, scene, state.layers, keep_image=state.over == "present", plate=state.over == "plate")
+        set_up_compositor(reports, scene, state.layers, keep_image=state.over == "present", plate=state.over == "plate")
     except FitFlareError as problem:
-        notes.report({"ERROR"}, f"The compositor was not set up: {problem}")
+        reports.report({"ERROR"}, f"The compositor was not set up: {problem}")
         return
     with contextlib.suppress(RuntimeError):  # without a window there are no undo steps
         bpy.ops.ed.undo_push(message="Set Up Compositor")

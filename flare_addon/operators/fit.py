@@ -28,10 +28,10 @@ class FITFLARE_OT_fit(GuardedOperator, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        return fits.why_not(context.scene)
+        return fits.why_not_fit(context.scene)
 
     def act(self, context: bpy.types.Context) -> None:
-        fits.start(context.scene)
+        fits.start_fit(context.scene)
 
 
 class FITFLARE_OT_resume(GuardedOperator, bpy.types.Operator):
@@ -49,7 +49,7 @@ class FITFLARE_OT_resume(GuardedOperator, bpy.types.Operator):
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
-        fits.resume(context.scene)
+        fits.resume_fit(context.scene)
 
 
 class FITFLARE_OT_flare_from_footage(GuardedOperator, bpy.types.Operator):
@@ -88,7 +88,7 @@ class FITFLARE_OT_clean_frames(GuardedOperator, bpy.types.Operator):
         return fits.why_not_clean(context.scene)
 
     def act(self, context: bpy.types.Context) -> None:
-        fits.clean_frames(context.scene)
+        fits.start_cleaning(context.scene)
 
 
 class FITFLARE_OT_cancel(bpy.types.Operator):

@@ -43,8 +43,8 @@ class FITFLARE_OT_save_flare(GuardedOperator, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> None:
         look = looks.look_of(context.scene)
         edits = looks.edits_to_store(context.scene.fit_flare, look)
-        path = library.save(look, edits, self.name, self.notes or look.notes, self.licence or look.licence)
-        asset_browser.update()
+        path = library.save_look(look, edits, self.name, self.notes or look.notes, self.licence or look.licence)
+        asset_browser.update_assets()
         sliders = "" if edits.is_neutral else ", with the sliders of the panel Look as they are now"
         self.report({"INFO"}, f"{path.stem} is in the library{sliders}")
 
@@ -75,10 +75,10 @@ class FITFLARE_OT_unlist_assets(GuardedOperator, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:
-        return "" if asset_browser.listed() is not None else "The looks are not in the Asset Browser"
+        return "" if asset_browser.library_entry() is not None else "The looks are not in the Asset Browser"
 
     def act(self, _context: bpy.types.Context) -> None:
-        asset_browser.unlist()
+        asset_browser.unlist_looks()
 
 
 class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
@@ -104,8 +104,8 @@ class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
         path = self.filepath or context.window_manager.fit_flare_library
         if not path:
             raise FlareFileError("Choose a flare of the library first.")
-        chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
-        looks.show_look(context.scene, Path(path), chosen, add=self.add)
+        selected = [item for item in context.selected_objects if item.type != "CAMERA"]
+        looks.show_look(context.scene, Path(path), selected, add=self.add)
         missing = [item.name for item in context.scene.fit_flare.lights if item.target is None]
         if missing:
             self.report({"WARNING"}, f"{', '.join(missing)}: choose the light object in the panel Look")
@@ -156,22 +156,23 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         if event.type in {"ESC", "RIGHTMOUSE"} or area is None or self.why_not(context):
             self.cancel(context)
             return {"CANCELLED"}
-        if event.type != "LEFTMOUSE" or event.value != "PRESS" or not self._pick(context, area, event):
+        if event.type != "LEFTMOUSE" or event.value != "PRESS" or not self._store_position(context, area, event):
             return {"PASS_THROUGH"}
         self.cancel(context)
         return self.execute(context)
 
-    def _pick(self, context: bpy.types.Context, area: Any, event: Any) -> bool:
+    def _store_position(self, context: bpy.types.Context, area: Any, event: Any) -> bool:
         """Store the position of the mouse in the picture; return whether it is over the picture.
 
         area: the 3D view, as `invoke` turned it to the camera.
         """
-        under = [region for region in area.regions if 0 <= event.mouse_x - region.x < region.width
+        regions_under_mouse = [region for region in area.regions if 0 <= event.mouse_x - region.x < region.width
                  and 0 <= event.mouse_y - region.y < region.height]
         space = area.spaces.active
-        if space.type != "VIEW_3D" or [region.type for region in under] != ["WINDOW"]:  # the sidebar may lie over it
+        # The sidebar may lie over the view.
+        if space.type != "VIEW_3D" or [region.type for region in regions_under_mouse] != ["WINDOW"]:
             return False
-        region = under[0]
+        region = regions_under_mouse[0]
         x, y = event.mouse_x - region.x, event.mouse_y - region.y
         with context.temp_override(area=area, region=region, space_data=space, region_data=space.region_3d):
             frame = overlay.camera_frame(bpy.context, context.scene, context.scene.camera)
@@ -195,8 +196,8 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         scene = context.scene
         depsgraph = context.evaluated_depsgraph_get()
         camera = scene.camera.evaluated_get(depsgraph)
-        core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
-        ray = Vector(core.rays([[self.x * core.width, self.y * core.height]])[0].tolist())
+        core_camera = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
+        ray = Vector(core_camera.rays([[self.x * core_camera.width, self.y * core_camera.height]])[0].tolist())
         eye = camera.matrix_world.translation
         hit, position, *_ = scene.ray_cast(depsgraph, eye, ray)
         if not hit:
@@ -246,8 +247,8 @@ class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):
             raise FlareFileError(f"{self.filepath} is not a picture that Blender can open.")
         lens = None
         if scene.fit_flare.flare:  # the lens of the flare, to which its shapes belong
-            filmed = looks.look_of(scene).camera
-            lens = SENSOR * filmed.fx * filmed.pixel_ratio(*image.size) / image.size[0]
+            flare_camera = looks.look_of(scene).camera
+            lens = SENSOR * flare_camera.fx * flare_camera.pixel_ratio(*image.size) / image.size[0]
         scene.camera = _add_camera(scene, Path(self.filepath).stem, image, lens)
         scene.render.resolution_x, scene.render.resolution_y = image.size
         scene.render.resolution_percentage = 100

@@ -86,7 +86,7 @@ class FITFLARE_OT_find_lights(GuardedOperator, bpy.types.Operator):
         return engine.missing_reason()
 
     def act(self, context: bpy.types.Context) -> None:
-        fits.find_lights(context.scene)
+        fits.start_light_search(context.scene)
 
 
 class FITFLARE_OT_use_lights(GuardedOperator, bpy.types.Operator):

@@ -46,8 +46,8 @@ class FITFLARE_OT_open_flare(GuardedOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def act(self, context: bpy.types.Context) -> None:
-        chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
-        look = looks.show_look(context.scene, Path(bpy.path.abspath(self.filepath)), chosen)
+        selected = [item for item in context.selected_objects if item.type != "CAMERA"]
+        look = looks.show_look(context.scene, Path(bpy.path.abspath(self.filepath)), selected)
         self.report({"INFO"}, f"{Path(self.filepath).name}: {len(look.lights)} lights, {look.count} Gaussians")
         lamp_drive.report_dark(self, context.scene)
 

@@ -20,7 +20,7 @@ _items: list[tuple[str, str, str]] = []
 
 def making_job() -> jobs.Job | None:
     """Return the job of the flare that is being made, or that was made last; None without one."""
-    return jobs.find(user_folder("make_flare"))
+    return jobs.find_job(user_folder("make_flare"))
 
 
 def _lens_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
@@ -34,17 +34,17 @@ def _lens_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
     return _items
 
 
-def _on_made(job: jobs.Job) -> None:
+def _on_finished(job: jobs.Job) -> None:
     """Choose the new look in the panel Library, and offer it as an asset."""
     target = job.args[job.args.index("--out") + 1] if "--out" in job.args else ""
-    number = next((item[-1] for item in library.items() if item[0] == target), None)
+    number = next((item[-1] for item in library.menu_items() if item[0] == target), None)
     if job.state == "done" and number is not None:
         library.choose(None, number)
-        asset_browser.update()
+        asset_browser.update_assets()
     jobs.redraw_bars()
 
 
-jobs.ON_FINISHED["make flare"] = _on_made
+jobs.ON_FINISHED["make flare"] = _on_finished
 
 
 class FITFLARE_OT_make_flare(GuardedOperator, bpy.types.Operator):
@@ -98,10 +98,10 @@ class FITFLARE_OT_make_flare(GuardedOperator, bpy.types.Operator):
         target = library.free_path(self.name)
         options = {"--f-number": self.f_number, "--squeeze": self.squeeze if self.squeeze != 1 else 0.0,
                    "--streak": self.streak, "--ring": self.ring}
-        args = [word for name, value in options.items() if value for word in (name, f"{value:.6g}")]
+        option_args = [arg for name, value in options.items() if value for arg in (name, f"{value:.6g}")]
         engine.run("make flare", user_folder("make_flare", create=True), [
             "make-flare", lens, "--out", target, "--blades", self.blades, "--dust", self.dust, "--scratches",
-            self.scratches, *args])
+            self.scratches, *option_args])
 
 
 def register() -> None:

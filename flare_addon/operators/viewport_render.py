@@ -39,11 +39,11 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         """Render one frame at once, an animation frame by frame in `modal`."""
         with report_errors(self) as outcome:
-            self._begin(context)
+            self._prepare_frames(context)
             if not self.animation:
                 for _ in self._frames:
                     pass
-                self._end(context)
+                self._report_result(context)
                 return outcome.status
             manager = context.window_manager
             self._timer = manager.event_timer_add(INTERVAL_S, window=context.window)
@@ -55,48 +55,48 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Render all frames at once, for a script."""
         with report_errors(self) as outcome:
-            self._begin(context)
+            self._prepare_frames(context)
             try:
                 for _ in self._frames:
                     pass
-                self._end(context)
+                self._report_result(context)
             finally:
-                self._restore(context.scene)
+                self._restore_frame(context.scene)
         return outcome.status
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Render the next frame; other events wait, so that nothing changes the scene meanwhile."""
         if event.type == "ESC":
             self.cancel(context)
-            self.report({"INFO"}, f"The viewport render was cancelled after {self._done} frames")
+            self.report({"INFO"}, f"The viewport render was cancelled after {self._frame_count} frames")
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"RUNNING_MODAL"}
         with report_errors(self) as outcome:
             if next(self._frames, None) is not None:
                 return {"RUNNING_MODAL"}
-            self._end(context)
+            self._report_result(context)
         self.cancel(context)
         return outcome.status
 
     def cancel(self, context: bpy.types.Context) -> None:
         """End the timer, and move the timeline back."""
-        self._restore(context.scene)
+        self._restore_frame(context.scene)
         if getattr(self, "_timer", None) is not None:
             context.window_manager.event_timer_remove(self._timer)
             context.workspace.status_text_set(None)
 
-    def _begin(self, context: bpy.types.Context) -> None:
+    def _prepare_frames(self, context: bpy.types.Context) -> None:
         """Prepare the frames. Raises SettingsError."""
         scene = context.scene
-        viewport_render.check(scene)
-        self._before = scene.frame_current, scene.frame_subframe
-        self._done, self._timer = 0, None
+        viewport_render.check_output(scene)
+        self._frame_before = scene.frame_current, scene.frame_subframe
+        self._frame_count, self._timer = 0, None
         numbers = (list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)) if self.animation
                    else [scene.frame_current])
-        self._frames = self._render(context, numbers)
+        self._frames = self._render_frames(context, numbers)
 
-    def _render(self, context: Any, numbers: list[int]) -> Iterator[int]:
+    def _render_frames(self, context: Any, numbers: list[int]) -> Iterator[int]:
         """Render and save each frame; yield its number."""
         scene = context.scene
         for number in numbers:
@@ -107,23 +107,23 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
                 raise SettingsError("The 3D viewport was closed while it was rendered; open one, and render again.")
             area, region, space = view
             with context.temp_override(area=area, region=region, space_data=space, region_data=space.region_3d):
-                pixels = viewport_render.draw(bpy.context, space, region)
-            viewport_render.save(scene, pixels, viewport_render.output_path(scene, number))
-            self._done += 1
+                pixels = viewport_render.draw_frame(bpy.context, space, region)
+            viewport_render.save_picture(scene, pixels, viewport_render.output_path(scene, number))
+            self._frame_count += 1
             yield number
 
-    def _restore(self, scene: Any) -> None:
+    def _restore_frame(self, scene: Any) -> None:
         """Move the timeline back to where it was."""
-        frame, subframe = self._before
+        frame, subframe = self._frame_before
         if (scene.frame_current, scene.frame_subframe) != (frame, subframe):
             scene.frame_set(frame, subframe=subframe)
 
-    def _end(self, context: bpy.types.Context) -> None:
+    def _report_result(self, context: bpy.types.Context) -> None:
         """Report what was rendered, and move the timeline back."""
         path = viewport_render.output_path(context.scene, context.scene.frame_current)
-        self._restore(context.scene)
-        what = f"{self._done} frames are" if self.animation else f"{path.name} is"
-        self.report({"INFO"}, f"{what} in {path.parent}")
+        self._restore_frame(context.scene)
+        subject = f"{self._frame_count} frames are" if self.animation else f"{path.name} is"
+        self.report({"INFO"}, f"{subject} in {path.parent}")
 
 
 def _draw_menu(self: Any, _context: Any) -> None:

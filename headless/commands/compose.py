@@ -72,7 +72,7 @@ def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, number
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
-    node = setup.set_up(scene, layers)
+    node = setup.set_up_nodes(scene, layers)
     render_settings.match_scene(scene, layers, layers.size())
     render = scene.render
     render.pixel_aspect_x, render.pixel_aspect_y = cameras.pixel_aspect(1, layers.pixel_aspect())

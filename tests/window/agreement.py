@@ -72,7 +72,7 @@ def prepare(over: str):
     scene.render.resolution_x, scene.render.resolution_y = WIDTH, HEIGHT
     scene.render.dither_intensity = 0
     scene.frame_end = 1
-    library = {item[1]: item[0] for item in module("library").items()}
+    library = {item[1]: item[0] for item in module("library").menu_items()}
     if over == "fence":
         add_fenced_lamp(scene)
         bpy.ops.fit_flare.add_library_flare(look=library["Vintage Ring"])
@@ -83,7 +83,7 @@ def prepare(over: str):
         bpy.ops.fit_flare.bake("EXEC_DEFAULT")
     jobs, shots, flare_node = module("jobs"), module("shots"), module("compositor.flare_node")
     yield from wait(lambda: flare_node.find_node(scene) is not None, 120)
-    assert jobs.find(shots.layers_folder(scene)).state == "done"
+    assert jobs.find_job(shots.layers_folder(scene)).state == "done"
     return scene
 
 

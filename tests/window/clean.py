@@ -38,7 +38,7 @@ def clean(capture: Path, where: str):
     x, y = yield from ui.find("fit_flare.matte", flow.panel(), path=True, across=0.65)
     yield from ui.fill(x, y, where)
     yield from ui.press_button("fit_flare.clean_frames", flow.panel(), below=y)
-    job = module("jobs").find(capture / "removal")
+    job = module("jobs").find_job(capture / "removal")
     assert job is not None and job.running, "the engine did not start"
     yield from flow.wait(lambda: not job.running, 600)
     assert job.state == "done", job.error

@@ -42,7 +42,7 @@ def steps():
     if REPOSITORY:
         yield from ui.press_button("fit_flare.download_weights", place)
         weights = sys.modules[f"{package_name()}.flare_addon.weights"]
-        yield from wait(lambda: weights.find() is not None and not weights.job().running, 60)
+        yield from wait(lambda: weights.find_weights() is not None and not weights.download_job().running, 60)
         yield 0.5
         shot("21_weights")
     yield from ui.show_editor(area, "VIEW_3D")

@@ -30,7 +30,7 @@ def steps():
     flow.shot("01_no_clean_frames")
     yield from ui.press_button("fit_flare.fit", flow.panel())
     job = fits.fit_job(scene)
-    assert job is not None and job.running, f"the fit did not start: {fits.why_not(scene)}"
+    assert job is not None and job.running, f"the fit did not start: {fits.why_not_fit(scene)}"
     yield from flow.wait(lambda: (job.stage == "remove" and job.done > 2) or not job.running, 300)
     flow.shot("02_cleaning")
     yield from flow.wait(lambda: (job.stage == "fit" and job.done > 2) or not job.running, 900)

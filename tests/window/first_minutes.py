@@ -66,7 +66,7 @@ def change():
     shot("04_looks")
     ui.press("ESC")
     yield 0.5
-    names = {item[1]: item[0] for item in module("library").items()}
+    names = {item[1]: item[0] for item in module("library").menu_items()}
     bpy.context.window_manager.fit_flare_library = names["Vintage Ring"]
     yield from ui.press_button("fit_flare.apply_flare", panel(), across=0.3)
     yield 1
@@ -90,8 +90,8 @@ def bake():
     yield from ui.choose_item(x, y, lambda: state.bake_range == "current")
     yield from ui.press_button("fit_flare.bake", panel(), below=y)
     jobs, shots = module("jobs"), module("shots")
-    yield from wait(lambda: state.layers and jobs.find(shots.layers_folder(scene)) is not None, 20)
-    job = jobs.find(shots.layers_folder(scene))
+    yield from wait(lambda: state.layers and jobs.find_job(shots.layers_folder(scene)) is not None, 20)
+    job = jobs.find_job(shots.layers_folder(scene))
     yield 1
     shot("07_baking")
     took = yield from wait(lambda: not job.running, 300)

@@ -162,7 +162,7 @@ def fit():
     ours = Ours()
     yield from ui.press_button("fit_flare.fit", panel(), below=y)
     job = fits.fit_job(scene)
-    assert job is not None and job.running, f"the fit did not start: {fits.why_not(scene)}"
+    assert job is not None and job.running, f"the fit did not start: {fits.why_not_fit(scene)}"
     gaps = Gaps()
     seen: set[int] = set()
     before = ui.area().spaces.active.region_3d.view_rotation.copy()
@@ -227,7 +227,7 @@ def bake():
         yield from ui.fill(x, y, text)
     assert (state.bake_first, state.bake_last) == (now, now + 2)
     yield from ui.press_button("fit_flare.bake", panel(), below=y)
-    job = module("jobs").find(Path(state.layers))
+    job = module("jobs").find_job(Path(state.layers))
     assert job is not None, "the bake did not start"
     took = yield from wait(lambda: not job.running, 300)
     assert job.state == "done", job.error

@@ -31,7 +31,7 @@ def steps():
     scene = bpy.context.scene
     scene.frame_end = FRAMES
     scene.render.resolution_percentage = 10
-    library = {item[1]: item[0] for item in module("library").items()}
+    library = {item[1]: item[0] for item in module("library").menu_items()}
     with ui.override():
         bpy.ops.fit_flare.add_library_flare(look=library["Clean Prime"], light="new")
     scene.camera.keyframe_insert("location", frame=1)
@@ -56,7 +56,7 @@ def steps():
     took = time.perf_counter() - began
     measured = gaps.stop()
     assert not baking.last_error(scene), baking.last_error(scene)
-    job = jobs.find(shots.layers_folder(scene))
+    job = jobs.find_job(shots.layers_folder(scene))
     assert job is not None, "the bake did not start"
     job.stop()
     yield from wait(lambda: not job.running, 60)

@@ -82,7 +82,7 @@ def names(scene: bpy.types.Scene) -> list[str]:
 
 # ---- taken away from a composite that an artist has built round it ----------------------------------
 scene = empty()
-setup.set_up(scene, layers)
+setup.set_up_nodes(scene, layers)
 tree = flare_node.tree_of(scene)
 fed = tree.nodes.new("CompositorNodeRGB")
 fed.name = "Sky"
@@ -90,63 +90,63 @@ fed.outputs[0].default_value = (0.5, 0.5, 0.5, 1)
 tree.links.new(fed.outputs[0], flare_node.find_node(scene).inputs["Scene"])
 grade(tree)
 facts["with our own tree"] = shown(scene)
-setup.remove(scene)
+setup.remove_nodes(scene)
 facts["our own tree, removed"] = [shown(scene), names(scene)]
 
 # A render that the artist's nodes go on from stays.
 scene = empty()
-setup.set_up(scene, layers, keep_image=True)
+setup.set_up_nodes(scene, layers, keep_image=True)
 grade(flare_node.tree_of(scene))
-setup.remove(scene)
+setup.remove_nodes(scene)
 tree = flare_node.tree_of(scene)
 facts["render goes on"] = tree is not None and tree.nodes["Grade"].inputs[0].is_linked
 
 # Nodes of ours that were deleted by hand, and a composite made since.
 scene = empty()
-setup.set_up(scene, layers, keep_image=True)
+setup.set_up_nodes(scene, layers, keep_image=True)
 if GROUPS:
     bpy.data.node_groups.remove(flare_node.tree_of(scene))
 plate(scene)
-setup.set_up(scene, layers, keep_image=True)
-setup.remove(scene)
+setup.set_up_nodes(scene, layers, keep_image=True)
+setup.remove_nodes(scene)
 facts["made since"] = [shown(scene), names(scene)]
 
 # Our group alone deleted by hand: what was there before it is still known.
 scene = empty()
 tree, _ = plate(scene)
-setup.set_up(scene, layers)
+setup.set_up_nodes(scene, layers)
 tree.nodes.remove(flare_node.find_node(scene))
-setup.set_up(scene, layers)
-setup.remove(scene)
+setup.set_up_nodes(scene, layers)
+setup.remove_nodes(scene)
 facts["set up again"] = [shown(scene), names(scene)]
 
 # ---- nodes behind the flare -------------------------------------------------------------------------
 for over, keep in (("present", True), ("scene", False)):
     scene = empty()
     tree, _ = plate(scene)
-    setup.set_up(scene, layers, keep_image=keep)
+    setup.set_up_nodes(scene, layers, keep_image=keep)
     grade(tree)
     before = shown(scene)
-    setup.set_up(scene, layers, keep_image=keep)
+    setup.set_up_nodes(scene, layers, keep_image=keep)
     facts[f"graded, {over}"] = [before, shown(scene)]
-    setup.remove(scene)
+    setup.remove_nodes(scene)
     facts[f"graded, {over}, removed"] = [shown(scene), names(scene)]
 
 # A file in which that has made a cycle is put right.
 scene = empty()
 tree, colour = plate(scene)
-node = setup.set_up(scene, layers, keep_image=True)
+node = setup.set_up_nodes(scene, layers, keep_image=True)
 after = grade(tree)
 tree.links.new(node.outputs["Image"], setup._output_input(tree))
 tree.links.new(after.outputs[0], node.inputs["Scene"])
 facts["a cycle"] = shown(scene)
-setup.set_up(scene, layers, keep_image=True)
+setup.set_up_nodes(scene, layers, keep_image=True)
 facts["no cycle"] = shown(scene)
 
 # ---- over the baked scene, and back -----------------------------------------------------------------
 scene = empty()
 tree, _ = plate(scene)
-node = setup.set_up(scene, layers, keep_image=True)
+node = setup.set_up_nodes(scene, layers, keep_image=True)
 before = node.inputs["Scene"].links[0].from_socket
 stop = tree.nodes.new("CompositorNodeExposure")
 stop.name, stop.inputs["Exposure"].default_value = "Stop", 1
@@ -154,10 +154,10 @@ tree.links.new(before, stop.inputs[0])
 tree.links.new(stop.outputs[0], node.inputs["Scene"])
 facts["over"] = [shown(scene)]
 for keep in (False, True):
-    setup.set_up(scene, layers, keep_image=keep)
+    setup.set_up_nodes(scene, layers, keep_image=keep)
     facts["over"].append(shown(scene))
-setup.set_up(scene, layers)
-setup.remove(scene)
+setup.set_up_nodes(scene, layers)
+setup.remove_nodes(scene)
 facts["over"].append(shown(scene))
 
 # ---- two outputs, of which the second counts --------------------------------------------------------
@@ -171,17 +171,17 @@ else:
     tree.nodes.active = second  # as a click does, which makes it the one that counts, too
 facts["two outputs"] = []
 for _ in range(2):
-    setup.set_up(scene, layers, keep_image=True)
+    setup.set_up_nodes(scene, layers, keep_image=True)
     facts["two outputs"] += [shown(scene), [node.inputs[0].links[0].from_node.name for node in tree.nodes
                                             if node.bl_idname == END]]
     tree.nodes.active = colour  # 4.x goes by the second none the less, and tells nobody
-setup.remove(scene)
+setup.remove_nodes(scene)
 facts["two outputs"].append(shown(scene))
 
 # ---- a slider of the group that has another name ----------------------------------------------------
 scene = empty()
 plate(scene)
-node = setup.set_up(scene, layers, keep_image=True)
+node = setup.set_up_nodes(scene, layers, keep_image=True)
 for item in node.node_tree.interface.items_tree:
     if item.name in ("Intensity", "Scene"):
         item.name = f"My {item.name}"
@@ -192,7 +192,7 @@ FITFLARE_PT_bake._draw_compositor(None, layout, SimpleNamespace(
                        {"node_tree": scene.node_tree, "use_nodes": True})))
 facts["renamed in the panel"] = [call.kwargs["text"] for call in layout.mock_calls if call[0].endswith(".prop")
                                  and "text" in call.kwargs]
-setup.remove(scene)
+setup.remove_nodes(scene)
 facts["renamed sockets"] = [shown(scene), names(scene)]
 
 # ---- a compositor that is linked from another file (up to 4.5 it is its scene's) --------------------
@@ -204,12 +204,12 @@ if GROUPS:
     with bpy.data.libraries.load(str(out / "studio.blend"), link=True) as (there, linked):
         linked.node_groups = there.node_groups
     scene.compositing_node_group = linked.node_groups[0]
-setup.set_up(scene, layers, keep_image=True)
+setup.set_up_nodes(scene, layers, keep_image=True)
 bpy.ops.wm.save_as_mainfile(filepath=str(out / "shot.blend"))
 bpy.ops.wm.open_mainfile(filepath=str(out / "shot.blend"))
 scene = bpy.context.scene
 facts["linked"] = [shown(scene), "Plate" in names(scene)]
-setup.remove(scene)
+setup.remove_nodes(scene)
 facts["linked, removed"] = [shown(scene), names(scene)]
 
 leave(facts)

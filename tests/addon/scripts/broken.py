@@ -126,21 +126,21 @@ long_ago = folder / "long ago"
 long_ago.mkdir()
 (long_ago / jobs.LOG).write_text("a warning of the last time\n")
 with contextlib.suppress(part("core.errors").FitFlareError):
-    jobs.start("fit", long_ago, [sham])
-said["dies without a word"] = jobs.find(long_ago).error
+    jobs.start_job("fit", long_ago, [sham])
+said["dies without a word"] = jobs.find_job(long_ago).error
 jobs.stop_watching(long_ago)
-said["dies without a word, found again"] = jobs.find(long_ago).error
+said["dies without a word, found again"] = jobs.find_job(long_ago).error
 
 # As one that is stopped while it loads its modules: with a status, and without a word to us.
 (long_ago / jobs.STOP).touch()
 jobs.stop_watching(long_ago)
-found = jobs.find(long_ago)
+found = jobs.find_job(long_ago)
 said["stopped before it listened"] = [found.state, found.error]
 (long_ago / jobs.STOP).unlink()
 not_executable = folder / "python"
 not_executable.touch(mode=0o644)
 try:
-    jobs.start("fit", folder / "cannot", [str(not_executable)])
+    jobs.start_job("fit", folder / "cannot", [str(not_executable)])
 except part("core.errors").EngineError as problem:
     said["cannot be executed"] = str(problem)
 behave("finishes")
@@ -177,7 +177,7 @@ said["footage"] = [refusal(lambda path=path: ops.flare_from_footage(filepath=str
                    for path in (folder / "none.mp4", clip)]
 said["footage that failed changes no run"] = scene.fit_flare.run == before
 said["footage's command"] = [word.replace(str(folder.resolve()), "X").replace(str(folder), "X")
-                             for word in jobs.find(folder / "clip_flare_1" / "run").args]
+                             for word in jobs.find_job(folder / "clip_flare_1" / "run").args]
 said["footage in the panel"] = "Flare from Footage needs only a clip" in said["panels of an empty scene"][0]
 shutil.rmtree(folder / "clip_flare_1")
 
@@ -191,7 +191,7 @@ shutil.copy(folder / "events", run / jobs.EVENTS)
 (run / jobs.RECORD).write_text(f'{{"kind": "fit", "pid": {process.pid}, "started": {time.time()}}}')
 time.sleep(0.5)
 shutil.copy(folder / "events", run / jobs.EVENTS)
-found = jobs.find(run)
+found = jobs.find_job(run)
 found.poll()
 said["found again"] = [found.state, found.stage, found.done, found.total]
 scene.fit_flare.run = str(run)
@@ -204,13 +204,13 @@ found.poll()
 said["cancelled"] = [found.state, found.error]
 (run / jobs.RECORD).write_text(f'{{"kind": "fit", "pid": {os.getpid()}, "started": {time.time() - 86400}}}')
 jobs.stop_watching(run)
-again = jobs.find(run)
+again = jobs.find_job(run)
 again.poll()
 said["another program has the number"] = again.state
 shutil.rmtree(run)
 jobs.stop_watching(run)
 said["panel of a lost run"] = shown("fit")
-said["run folder deleted"] = [fits.fit_state(scene), jobs.find(run) is None, polls("resume")]
+said["run folder deleted"] = [fits.fit_state(scene), jobs.find_job(run) is None, polls("resume")]
 
 # ---- paths -------------------------------------------------------------------------------------------
 paths = part("flare_addon.paths")
@@ -270,7 +270,7 @@ for how in ("breaks", "fills", "bakes"):
     baked.append([refusal(lambda: ops.bake()), shown("bake"), sorted(
         path.name for path in (folder / "layers").glob("*.exr"))])
 said["bakes"] = baked
-job = jobs._jobs[jobs._key(fits._cleaning_folder(Path(capture)))] = jobs.find(folder / "layers")
+job = jobs._jobs[jobs._key(fits._cleaning_folder(Path(capture)))] = jobs.find_job(folder / "layers")
 job.error = "It cannot be shown."
 said["done, and not shown"] = [job.state, shown("fit"), shown("bake")]
 job.error = ""

@@ -48,7 +48,7 @@ facts: dict[str, object] = {"version": bpy.app.version_string}
 # ---- the graph as it comes, rendered and saved ----------------------------------------------------
 scene = empty()
 facts["stands at"] = scene.frame_current
-node = setup.set_up(scene, layers)
+node = setup.set_up_nodes(scene, layers)
 facts["inputs"] = [socket.name for socket in node.inputs]
 facts["outputs"] = [socket.name for socket in node.outputs]
 render(scene, "plain", sorted(layers.files))
@@ -61,7 +61,7 @@ render_settings.save_blend(out / "scene" / "compositor.blend")
 
 # ---- set up again: nothing doubles, the sliders stay ----------------------------------------------
 count = len(flare_node.tree_of(scene).nodes), len(bpy.data.node_groups)
-again = setup.set_up(scene, layers)
+again = setup.set_up_nodes(scene, layers)
 facts["doubled"] = [count, (len(flare_node.tree_of(scene).nodes), len(bpy.data.node_groups))]
 facts["sliders"] = [again.inputs["Intensity"].default_value, list(again.inputs["Tint"].default_value)]
 
@@ -76,7 +76,7 @@ plate = tree.nodes.new("CompositorNodeRGB")
 plate.outputs[0].default_value = (0.25, 0.5, 0.75, 1.0)
 tree.links.new(plate.outputs[0], setup._output_input(tree))
 for _ in range(2):
-    setup.set_up(scene, layers, keep_image=True)
+    setup.set_up_nodes(scene, layers, keep_image=True)
 facts["plate stays"] = plate.name in tree.nodes
 render(scene, "over", sorted(layers.files)[:1])
 
@@ -85,16 +85,16 @@ for percentage in (50, 200):
     scene.render.resolution_percentage = percentage
     render(scene, f"over at {percentage}", sorted(layers.files)[:1])
 scene = empty()
-setup.set_up(scene, layers)
+setup.set_up_nodes(scene, layers)
 scene.render.resolution_percentage = 50
 render(scene, "plain at 50", sorted(layers.files)[:1])
 
 # ---- pointed at layers of fewer lights ------------------------------------------------------------
 scene = empty()
-setup.set_up(scene, layers)
-node = setup.set_up(scene, LayerFolder.open(fewer))
+setup.set_up_nodes(scene, layers)
+node = setup.set_up_nodes(scene, LayerFolder.open(fewer))
 try:
-    setup.set_up(scene, LayerFolder.open(none))
+    setup.set_up_nodes(scene, LayerFolder.open(none))
 except FrameError as problem:
     facts["no layers"] = str(problem)
 facts["fewer"] = [socket.name for socket in node.inputs if socket.is_linked]
@@ -103,20 +103,20 @@ render(scene, "fewer", [layers.first])
 # ---- two scenes of one tree -----------------------------------------------------------------------
 if flare_node.GROUPS_ARE_TREES:
     scene = empty()
-    setup.set_up(scene, layers)
+    setup.set_up_nodes(scene, layers)
     second = bpy.data.scenes.new("Second")
     second.compositing_node_group = scene.compositing_node_group
-    setup.set_up(second, LayerFolder.open(fewer))
+    setup.set_up_nodes(second, LayerFolder.open(fewer))
     shown = flare_node.tree_of(scene).nodes[setup.LAYERS].image.filepath
-    setup.remove(second)
+    setup.remove_nodes(second)
     third = bpy.data.scenes.new("Third")
     third.compositing_node_group = scene.compositing_node_group
-    setup.remove(third)
+    setup.remove_nodes(third)
     fourth = bpy.data.scenes.new("Fourth")
     fourth.compositing_node_group = scene.compositing_node_group
     trees = len(bpy.data.node_groups)
     try:
-        setup.set_up(fourth, LayerFolder.open(none))
+        setup.set_up_nodes(fourth, LayerFolder.open(none))
     except FrameError:
         facts["refused of one tree"] = [fourth.compositing_node_group == scene.compositing_node_group,
                                         len(bpy.data.node_groups) - trees]
@@ -131,7 +131,7 @@ render_settings.match_scene(scene, layers, layers.size())
 facts["pixel aspect"] = scene.render.pixel_aspect_x
 scene.render.use_border = scene.render.use_crop_to_border = True
 try:
-    setup.set_up(scene, layers)
+    setup.set_up_nodes(scene, layers)
 except FrameError as problem:
     facts["cropped"] = [str(problem), flare_node.find_node(scene) is None]
 
@@ -143,12 +143,12 @@ facts["aces"] = [setup.colour_space_warning(scene), scene.render.pixel_aspect_x,
 # ---- overscan, in the command and beside an artist's nodes ------------------------------------------
 compose.compose_frames(LayerFolder.open(overscan), out / "overscan", Progress())
 scene = bpy.context.scene
-setup.set_up(scene, LayerFolder.open(overscan))
+setup.set_up_nodes(scene, LayerFolder.open(overscan))
 facts["crops"] = sorted(node.name for node in flare_node.tree_of(scene).nodes if node.name.startswith(setup.CROP))
-setup.set_up(scene, layers)
+setup.set_up_nodes(scene, layers)
 facts["crops after"] = [node.name for node in flare_node.tree_of(scene).nodes if node.name.startswith(setup.CROP)]
-setup.set_up(scene, LayerFolder.open(overscan))
-setup.remove(scene)
+setup.set_up_nodes(scene, LayerFolder.open(overscan))
+setup.remove_nodes(scene)
 tree = flare_node.tree_of(scene)
 facts["crops removed"] = [node.name for node in tree.nodes if node.name.startswith("Fit Flare")] if tree else []
 
@@ -159,7 +159,7 @@ if sys.platform == "linux":
 
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     scene = empty()
-    setup.set_up(scene, layers)
+    setup.set_up_nodes(scene, layers)
     full, before = out / "full", resource.getrlimit(resource.RLIMIT_FSIZE)
     refused = []
     for write in (lambda: render(scene, "full", sorted(layers.files)[:1]),

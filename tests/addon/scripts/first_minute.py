@@ -22,8 +22,8 @@ ops = bpy.ops.fit_flare
 looks, library, panels, core_look = (
     part(name) for name in ("flare_addon.looks", "flare_addon.library", "flare_addon.panels", "core.look"))
 facts: dict[str, object] = {}
-names = [item[1] for item in library.items()]
-path_of = {item[1]: item[0] for item in library.items()}
+names = [item[1] for item in library.menu_items()]
+path_of = {item[1]: item[0] for item in library.menu_items()}
 
 
 def rows(scene):
@@ -118,8 +118,8 @@ ops.apply_flare(filepath=str(saved))
 facts["chosen"] = [state.master.intensity, state.lights[1].mute, state.lights[0].spread]
 ops.apply_flare(filepath=two)
 facts["as fitted"] = [state.master.intensity, state.lights[0].spread, state.lights[0].elements[0].tint[1]]
-neutral = library.thumbnail(core_look.read_look(two))
-facts["thumbnail differs"] = float(np.abs(library.thumbnail(core_look.read_look(saved)) - neutral).max()) > 0.01
+neutral = library.draw_thumbnail(core_look.read_look(two))
+facts["thumbnail differs"] = float(np.abs(library.draw_thumbnail(core_look.read_look(saved)) - neutral).max()) > 0.01
 
 # ---- the asset browser ----------------------------------------------------------------------------------
 browser = part("flare_addon.asset_browser")
@@ -133,7 +133,7 @@ if facts["reports drops"]:
     assets = browser.folder() / browser.ASSETS
     with bpy.data.libraries.load(str(assets), assets_only=True) as (inside, _):
         offered = list(inside.objects)
-    facts["offered as assets"] = [sorted(offered) == sorted(item[1] for item in library.items()),
+    facts["offered as assets"] = [sorted(offered) == sorted(item[1] for item in library.menu_items()),
                                   sum(entry.name == "Fit Flare" for entry in entries),
                                   len(bpy.data.objects) - before, (browser.folder() / browser.CATALOGS).is_file()]
     scene, _ = scene_with()

@@ -66,7 +66,7 @@ def said(scene):
 def set_up_warnings(scene):
     """Return the warnings of Set Up Compositor."""
     operator = MagicMock()
-    bake.set_up(operator, scene, layers, keep_image=True, plate=False)
+    bake.set_up_compositor(operator, scene, layers, keep_image=True, plate=False)
     return [call.args[1] for call in operator.report.mock_calls if call.args[0] == {"WARNING"}]
 
 
@@ -244,10 +244,10 @@ for x, name in enumerate(("lamp", "second")):
     scene.objects[name].location = (x, 8, 0.5)
 bpy.context.view_layer.update()
 highlight, state = part("flare_addon.highlight"), scene.fit_flare
-facts["nothing touched"] = highlight.touched(scene)
+facts["nothing touched"] = highlight.current_highlight(scene)
 state.lights[1].elements[0].mute = True
 state.lights[1].element = 0
-chosen, edits = highlight.touched(scene), looks.edits_of(state)
+chosen, edits = highlight.current_highlight(scene), looks.edits_of(state)
 elements = {item.name: [entry.name for entry in item.elements] for item in state.lights}
 
 
@@ -258,14 +258,14 @@ def light_of(edits):
 
 
 plain, dimmed, by_itself = (light_of(each) for each in (
-    edits, highlight.highlighted(edits, chosen, elements), highlight.alone(chosen, edits)))
+    edits, highlight.emphasise(edits, chosen, elements), highlight.isolate(chosen, edits)))
 names = list(elements)
 facts["touched"] = [chosen.flare == names[1], dimmed[names[0]] / plain[names[0]],
                     dimmed[names[1]] / (by_itself[names[1]] + highlight.DIMMED * plain[names[1]]), list(by_itself)]
 facts["sliders stay"] = looks.edits_of(state) == edits
 parts = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera,
-                              highlight.alone(chosen, edits))[names[1]]
-left, top, right, bottom = highlight.outline(parts, parts.means, parts.covariances)
+                              highlight.isolate(chosen, edits))[names[1]]
+left, top, right, bottom = highlight.outline_box(parts, parts.means, parts.covariances)
 facts["outlined"] = [left < float(parts.means[:, 0].mean()) < right, top < float(parts.means[:, 1].mean()) < bottom]
 # ---- panels of other editors ------------------------------------------------------------------------
 editors = part("flare_addon.editor_panels")
@@ -301,9 +301,9 @@ pixels = np.zeros((4, 8, 4), np.float32)
 pixels[..., :3], pixels[0, 0, :3] = 0.2140411, 2.0
 scene.render.image_settings.file_format = "PNG"
 path = viewport_render.output_path(scene, 7)
-viewport_render.save(scene, pixels, path)
+viewport_render.save_picture(scene, pixels, path)
 image = bpy.data.images.load(str(path))
-facts["viewport render"] = [path.name, list(viewport_render.size_of(scene)), list(image.size),
+facts["viewport render"] = [path.name, list(viewport_render.picture_size(scene)), list(image.size),
                             [round(255 * image.pixels[index]) for index in (0, 4, 4 * 31)]]
 if hasattr(render.image_settings, "media_type"):
     render.image_settings.media_type = "VIDEO"
@@ -317,7 +317,7 @@ for gone in (False, True):
             render.image_settings.media_type = "IMAGE"
         render.image_settings.file_format = "PNG"
     try:
-        viewport_render.check(scene)
+        viewport_render.check_output(scene)
     except errors.SettingsError as problem:
         refusals.append(str(problem))
 facts["viewport render refused"] = [*refusals, refusal(ops.viewport_render)]
@@ -327,7 +327,7 @@ renders.largest_view = lambda _context: None  # as after the view was closed
 reports: list[str] = []
 scene.camera = bpy.data.objects["Camera"]
 operator = type("Operator", (), {name: getattr(kind, name) for name in (
-    "execute", "_begin", "_render", "_restore", "_end")})()
+    "execute", "_prepare_frames", "_render_frames", "_restore_frame", "_report_result")})()
 operator.animation, operator.report = True, lambda _kind, text: reports.append(text)
 scene.frame_start, scene.frame_end = 1, 3
 scene.frame_set(7, subframe=0.5)

@@ -41,8 +41,8 @@ def begun(name: str, events: str, **record: object) -> Path:
 # ---- another machine --------------------------------------------------------------------------------
 ended = []
 jobs.ON_FINISHED["fit"] = lambda job: ended.append(job.folder.name)
-facts["ended elsewhere"] = jobs.find(begun("ended elsewhere", RESULT, host="another")).state
-far = jobs.find(begun("goes on elsewhere", GOES_ON, host="another"))
+facts["ended elsewhere"] = jobs.find_job(begun("ended elsewhere", RESULT, host="another")).state
+far = jobs.find_job(begun("goes on elsewhere", GOES_ON, host="another"))
 facts["goes on elsewhere"] = [far.state, far.done]
 far.stop()
 facts["asked elsewhere"] = [(far.folder / jobs.STOP).exists(), far.stage]
@@ -54,14 +54,14 @@ silent = begun("silent", GOES_ON, host="another")
 os.utime(silent / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENCE_LIMIT_S))
 named = begun("named", GOES_ON, host="6f1c", host_name="studio-mac")
 os.utime(named / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENCE_LIMIT_S))
-facts["silent on a Mac"] = jobs.find(named).error
-facts["silent elsewhere"] = [jobs.find(silent).state, jobs.find(silent).error]
+facts["silent on a Mac"] = jobs.find_job(named).error
+facts["silent elsewhere"] = [jobs.find_job(silent).state, jobs.find_job(silent).error]
 
 # ---- events that no engine writes -----------------------------------------------------------------
 strange = ["[" * 5000, '"text"', "null", '{"type": []}', '{"type": "stage"}', '{"type": "result", "data": [1]}',
            '{"type": "progress", "done": 1e999, "total": 8, "figures": {}}',
            '{"type": "progress", "done": 5, "total": 8, "figures": {"loss": "x"}}', "x" * (5 << 20)]
-odd = jobs.find(begun("odd", "\n".join([*strange, GOES_ON]), host="another"))
+odd = jobs.find_job(begun("odd", "\n".join([*strange, GOES_ON]), host="another"))
 while odd.poll() and odd.done != 4:
     pass
 facts["strange events"] = [odd.state, odd.done, odd.total]
@@ -69,26 +69,27 @@ jobs.stop_watching(odd.folder)
 piped = begun("piped", "", host="another")
 (piped / jobs.EVENTS).unlink()
 os.mkfifo(piped / jobs.EVENTS)
-facts["events from a pipe"] = jobs.find(piped).done
+facts["events from a pipe"] = jobs.find_job(piped).done
 jobs.stop_watching(piped)
 
 # ---- what is done in the scenes with one goes wrong ---------------------------------------------------
-goes_on, ends = (jobs.find(begun(name, GOES_ON, host="another")) for name in ("goes on still", "ends badly"))
+goes_on, ends = (jobs.find_job(begun(name, GOES_ON, host="another")) for name in ("goes on still", "ends badly"))
 jobs.ON_FINISHED["fit"] = lambda _job: [].pop()
 with open(ends.folder / jobs.EVENTS, "a") as stream:
     stream.write(RESULT)
 with contextlib.redirect_stderr(io.StringIO()) as console:
-    again = jobs._tick()
+    again = jobs._poll_jobs()
 facts["ends badly"] = [again, ends.state, ends.error, "IndexError" in console.getvalue(), goes_on.state]
 jobs.stop_watching(goes_on.folder)
 
 # ---- this machine -----------------------------------------------------------------------------------
-facts["written by the version before"] = [jobs.find(begun("old", GOES_ON)).state,
-                                          jobs.find(begun("by name", GOES_ON,
+facts["written by the version before"] = [jobs.find_job(begun("old", GOES_ON)).state,
+                                          jobs.find_job(begun("by name", GOES_ON,
                                                           host=platform.node())).origin.host == jobs.HOST]
-later = jobs.find(begun("later", GOES_ON, started=time.time() + 3600))  # as when this machine was started anew since
+# As when this machine was started anew since.
+later = jobs.find_job(begun("later", GOES_ON, started=time.time() + 3600))
 facts["its number is an older process's"] = later.state
-found = jobs.find(begun("given out again", GOES_ON))
+found = jobs.find_job(begun("given out again", GOES_ON))
 found.origin.started -= 3600  # as when its engine ended unseen, and the number went to another process
 found.stop()
 time.sleep(0.5)
@@ -102,7 +103,7 @@ own, other, bake = (begun(name, GOES_ON, pid=process.pid, kind=kind) for name, p
 shots, scene = part("flare_addon.shots"), empty()
 scene.fit_flare.run = str(own)
 for folder in (own, other, bake):
-    jobs.find(folder)
+    jobs.find_job(folder)
 facts["of the scene"] = [job.folder.name for job in shots.running_jobs(scene)]
 facts["of none"] = [job.folder.name for job in shots.orphaned_jobs()
                     if job.folder.name not in ("old", "by name", "given out again")]

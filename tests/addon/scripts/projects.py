@@ -190,11 +190,11 @@ facts["moved unseen"] = max(abs(float(lights.capture_position(item, scene.fit_fl
 # ---- another flare is saved into the library while one is chosen ----------------------------------------
 library, look = part("flare_addon.library"), part("core.look").read(flare)
 for name in ("mid", "zed"):
-    library.save(look, look.edits, name, "", "")
+    library.save_look(look, look.edits, name, "", "")
 manager = bpy.context.window_manager
 facts["chosen at first"] = Path(manager.fit_flare_library).stem
-manager.fit_flare_library = next(item[0] for item in library.items() if item[1] == "zed")
-library.save(look, look.edits, "aaa", "", "")
+manager.fit_flare_library = next(item[0] for item in library.menu_items() if item[1] == "zed")
+library.save_look(look, look.edits, "aaa", "", "")
 facts["chosen"] = Path(manager.fit_flare_library).stem
 Path(manager.fit_flare_library).unlink()
 facts["chosen is gone"] = Path(manager.fit_flare_library).stem

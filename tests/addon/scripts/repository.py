@@ -54,32 +54,33 @@ scene = bpy.context.scene
 ops.import_capture(directory=str(capture))
 os.environ["FIT_FLARE_ENGINE"] = sys.executable
 scene.fit_flare.mode = "estimated"
-facts["fit without weights"] = fits.why_not(scene)
+facts["fit without weights"] = fits.why_not_fit(scene)
 facts["cleaning without weights"] = refusal(ops.clean_frames)
 scene.fit_flare.mode = "split"
-facts["fit by parallax"] = fits.why_not(scene)
+facts["fit by parallax"] = fits.why_not_fit(scene)
 del os.environ["FIT_FLARE_ENGINE"]
-with patch.object(part("flare_addon.jobs"), "start") as start:
-    engine.set_up()
+with patch.object(part("flare_addon.jobs"), "start_job") as start:
+    engine.set_up_engine()
     facts["set-up brings them"] = "--weights" in start.call_args.args[2]
 facts["the preferences offer them"] = "fit_flare.download_weights" in drawn(preferences.FITFLARE_AP_preferences)
 system.use_online_access = False
 facts["offline"] = [refusal(ops.download_weights), refusal(ops.set_up_engine)]
 system.use_online_access = True
 ops.download_weights()
-facts["downloaded"] = [weights.job().state, weights.job().error, weights.find() == weights.downloaded_file(),
+facts["downloaded"] = [weights.download_job().state, weights.download_job().error,
+                       weights.find_weights() == weights.downloaded_file(),
                        weights.environment() == {"FIT_FLARE_WEIGHTS": str(weights.downloaded_file())}]
 facts["the preferences name them"] = str(weights.downloaded_file()) in drawn(preferences.FITFLARE_AP_preferences)
 scene.fit_flare.mode = "estimated"
 os.environ["FIT_FLARE_ENGINE"] = sys.executable
-facts["fit with weights"] = fits.why_not(scene)
-with patch.object(part("flare_addon.jobs"), "start") as start:
+facts["fit with weights"] = fits.why_not_fit(scene)
+with patch.object(part("flare_addon.jobs"), "start_job") as start:
     engine.run("clean", out, ["remove"])
     facts["passed to the engine"] = start.call_args.args[3]["FIT_FLARE_WEIGHTS"] == str(weights.downloaded_file())
 own = out / "own.safetensors"
 own.touch()
 bpy.context.preferences.addons["bl_ext.ours.fit_flare"].preferences.weights = str(own)
-facts["those of the preferences"] = weights.find() == own
+facts["those of the preferences"] = weights.find_weights() == own
 own.unlink()
 facts["those of the preferences are missing"] = weights.missing_reason()
 leave(facts)

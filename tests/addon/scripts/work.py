@@ -113,7 +113,7 @@ spaces, run_command = [], fits.engine.run
 fits.engine.run = lambda _kind, _folder, words: spaces.append(list(map(str, words)))
 for space in ("LogC4", "AgX Log", ""):
     scene.fit_flare.plate_space = space
-    fits.find_lights(scene)
+    fits.start_light_search(scene)
     spaces.append(list(map(str, fits.cleaning_args(scene, Path("capture")))))
 facts["spaces passed"] = spaces
 fits.engine.run = run_command
@@ -122,13 +122,13 @@ chosen_space.show_recorded(scene, record.parent)
 facts["space shown"] = scene.fit_flare.plate_space
 scene.fit_flare.plate_space = ""
 facts["space kept"] = record.exists()
-find, start = fits.jobs.find, fits.engine.run
+find, start = fits.jobs.find_job, fits.engine.run
 fits.engine.run = lambda _kind, _folder, words: again.append(words[-1] == "--overwrite")
 for state, words in (("none", None), ("done", given), ("stopped", given), ("stopped", given[:-1])):
     made = None if words is None else SimpleNamespace(state=state, args=words)
-    fits.jobs.find = lambda _, made=made: made
-    fits.clean_frames(scene)
-fits.jobs.find, fits.engine.run = find, start
+    fits.jobs.find_job = lambda _, made=made: made
+    fits.start_cleaning(scene)
+fits.jobs.find_job, fits.engine.run = find, start
 facts["cleaned again"] = again
 run = Path(out) / "a run"
 run.mkdir()
@@ -143,11 +143,11 @@ moved.mkdir(parents=True)
 scene.fit_flare.capture, chosen = str(moved), scene.fit_flare.capture
 fits.engine.run = lambda _kind, _folder, these: words.append(list(map(str, these)))
 (run / "capture.txt").write_text(f"{Path(out) / 'gone' / 'capture'}\n")
-fits.resume(scene)
+fits.resume_fit(scene)
 facts["moved"] = [words[-1][1], list(map(str, fits.cleaning_args(scene, moved))), str(moved)]
 (run / "capture.txt").write_text(f"{Path(out) / 'gone' / 'another'}\n")
 try:
-    fits.resume(scene)
+    fits.resume_fit(scene)
 except part("core.errors").CaptureError as problem:
     facts["another's"] = str(problem)
 for name in ("capture.txt", fits.CONFIG):
@@ -378,7 +378,7 @@ facts["saved"] = [list(ops.save_flare(name="Desk: lamp", notes="35 mm")),
 library = part("flare_addon.library")
 facts["library"] = [path.name for path in library.user_files()]
 facts["thumbnail"] = (Path(out) / "library" / "Desk lamp.png").stat().st_size
-facts["items"] = [entry[1:3] for entry in library.items()[:1]]
+facts["items"] = [entry[1:3] for entry in library.menu_items()[:1]]
 other = empty()
 camera = bpy.data.objects.new("Second", bpy.data.cameras.new("Second"))
 camera.rotation_euler = (math.pi / 2, 0, 0)

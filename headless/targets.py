@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ..core.choices import Follows
 from ..core.errors import CaptureError, RunError, SettingsError
 from ..core.images.listing import SUFFIXES, pictures_in
-from ..core.images.unsupported import unsupported_file
+from ..core.images.unsupported import unsupported_file_error
 
 if TYPE_CHECKING:
     from ..core.capture.camera import Floats
@@ -97,7 +97,7 @@ def _target_kind(target: Path) -> str:
     if suffix in SUFFIXES:
         return "picture"
     if target.is_file() and suffix not in TARGET_OPTIONS:
-        raise unsupported_file(target)
+        raise unsupported_file_error(target)
     return suffix if suffix in TARGET_OPTIONS else "run" if (target / CONFIG).is_file() else "capture"
 
 

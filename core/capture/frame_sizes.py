@@ -8,7 +8,7 @@ from ..errors import FrameError
 from ..images.listing import SUFFIXES
 from ..images.picture import same_aspect
 from ..images.size import picture_size
-from ..images.unsupported import unsupported_file
+from ..images.unsupported import unsupported_file_error
 from .lens import Lens
 from .orientation import TurnedFrame
 
@@ -24,7 +24,7 @@ def checked_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> t
         raise FrameError(f"{path} is {size[0]} x {size[1]} pixels and its camera {lens.width} x {lens.height}, "
                          "which is another shape; use the frames that were solved.")
     if path.suffix.lower() not in SUFFIXES:
-        raise unsupported_file(path)
+        raise unsupported_file_error(path)
     return size
 
 

@@ -38,7 +38,8 @@ def layers_file(folder: PurePosixPath | str, number: int) -> str:
 
 
 def number_views(views: Iterable[str]) -> list[NumberedFrame]:
-    """Return frames for views, by folder and number. A view in a folder keeps the folder: `left/layers.0001.exr`.
+    """Number views by the rules of this module's head, and return them by folder and number. A view in a folder keeps
+    the folder: `left/layers.0001.exr`.
 
     Raises SettingsError for a number below 0.
     """
@@ -136,7 +137,7 @@ def select_frames(frames: Sequence[NumberedFrame], text: str | None) -> list[Num
     ranges = _parse_ranges(text)
     selected = [frame for frame in frames if any(frame.number in numbers for numbers in ranges)]
     if not selected:
-        raise _no_frames(frames, text)
+        raise _no_frames_error(frames, text)
     return selected
 
 
@@ -156,7 +157,7 @@ def select_task_frames(frames: Sequence[NumberedFrame], text: str | None,
         return select_frames(frames, text)
     has_others = any(number in job_range for number in numbers for job_range in job_ranges)
     if not has_others and (job_text is not None or not _is_between(numbers, ranges)):
-        raise _no_frames(frames, job_text or text)
+        raise _no_frames_error(frames, job_text or text)
     return []
 
 
@@ -166,7 +167,7 @@ def _is_between(numbers: Sequence[int], ranges: Sequence[range]) -> bool:
                                  for number_range in ranges)
 
 
-def _no_frames(frames: Sequence[NumberedFrame], text: str) -> SettingsError:
+def _no_frames_error(frames: Sequence[NumberedFrame], text: str) -> SettingsError:
     """Return the error for a list `text` of which no frame exists."""
     numbers = [frame.number for frame in frames]
     existing = f"there are {min(numbers)} to {max(numbers)}" if frames else "there are none"

@@ -130,7 +130,7 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
         try:
             pixels = np.asarray(picture.convert(mode))
         except Exception as problem:  # the plug-ins raise what their libraries do
-            raise _damaged_file(path, "" if kind == "jxl" else problem) from problem
+            raise _damaged_error(path, "" if kind == "jxl" else problem) from problem
     return _to_bgr(apply_orientation(pixels, orientation))
 
 
@@ -189,7 +189,7 @@ def _import_library(name: str, path: Path) -> ModuleType:
                          f"{group} -c constraints.txt`, or save the picture as PNG, TIFF or EXR.") from problem
 
 
-def _damaged_file(path: Path, problem: object) -> FrameError:
+def _damaged_error(path: Path, problem: object) -> FrameError:
     reason = " ".join(str(problem).split())[:160]
     return FrameError(f"{path} is damaged or truncated{f' ({reason})' if reason else ''}; export it again.")
 
@@ -204,7 +204,7 @@ def open_oiio(path: Path) -> Any:
     settings.attribute("oiio:UnassociatedAlpha", 1)
     image_input = oiio.ImageInput.open(str(path), settings)
     if image_input is None:
-        raise _damaged_file(path, oiio.geterror())
+        raise _damaged_error(path, oiio.geterror())
     return image_input
 
 
@@ -251,7 +251,7 @@ def _check_stated_size(path: Path) -> None:
     order: Literal["big", "little"] = "big" if head[:4] in _STATED_SIZES else "little"
     stated_size, user_data = (int.from_bytes(head[offset:offset + 4], order) for offset in offsets)
     if size < stated_size < 0xFFFFFFFF or size < user_data < 0xFFFFFFFF:  # all bits set: not stated
-        raise _damaged_file(path, f"it has {size} of {max(stated_size, user_data)} bytes")
+        raise _damaged_error(path, f"it has {size} of {max(stated_size, user_data)} bytes")
 
 
 def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
@@ -269,7 +269,7 @@ def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
     else:
         max_bytes = _MAX_RUN_LENGTH * size if kind in ("tga", "bmp", "hdr") else claimed_bytes
     if claimed_bytes > max_bytes:
-        raise _damaged_file(path, f"it claims {spec.width} x {spec.height} pixels in {size} bytes")
+        raise _damaged_error(path, f"it claims {spec.width} x {spec.height} pixels in {size} bytes")
 
 
 def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
@@ -298,7 +298,7 @@ def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
             raise FrameError(f"{path} is compressed with {name}, which the TIFF library here is built without; save "
                              "it with LZW or ZIP compression.")
         if pixels is None or problem:
-            raise _damaged_file(path, problem)
+            raise _damaged_error(path, problem)
         pixels = np.asarray(pixels).reshape(spec.height, spec.width, channels)
         if kind == "tiff" and pixels.dtype == np.uint16 and spec.get_int_attribute("tiff:PhotometricInterpretation",
                                                                                    1) == 0:
@@ -313,7 +313,7 @@ def _decode_in_child(decode: Callable[..., NDArray[Any]], path: Path) -> NDArray
     try:
         return np.asarray(run_in_child(decode, path, progress=Progress()))
     except ChildDied as problem:
-        raise _damaged_file(path, problem) from problem
+        raise _damaged_error(path, problem) from problem
 
 
 def _decode_by_opencv(path: Path, _progress: Progress | None = None) -> NDArray[Any]:
@@ -324,9 +324,9 @@ def _decode_by_opencv(path: Path, _progress: Progress | None = None) -> NDArray[
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     except cv2.error as problem:
-        raise _damaged_file(path, problem.err) from problem
+        raise _damaged_error(path, problem.err) from problem
     if pixels is None:
-        raise _damaged_file(path, "")
+        raise _damaged_error(path, "")
     return np.asarray(pixels)
 
 
@@ -343,7 +343,7 @@ def _open_by_pillow(path: Path, kind: Kind) -> Any:
         return image.open(path)
     except Exception as problem:  # the plug-ins raise what their libraries do; that of JPEG XL gives no reason
         is_vague = kind == "jxl" or isinstance(problem, image.UnidentifiedImageError)
-        raise _damaged_file(path, "" if is_vague else problem) from problem
+        raise _damaged_error(path, "" if is_vague else problem) from problem
 
 
 def _decode_heif(path: Path) -> NDArray[Any]:
@@ -354,7 +354,7 @@ def _decode_heif(path: Path) -> NDArray[Any]:
         picture = library.open_heif(path, convert_hdr_to_8bit=False)
         pixels = np.asarray(picture)
     except Exception as problem:
-        raise _damaged_file(path, problem) from problem
+        raise _damaged_error(path, problem) from problem
     return _to_bgr(pixels)
 
 
@@ -364,7 +364,7 @@ def _open_raw(path: Path) -> Any:
     try:
         return library.imread(str(path))
     except Exception as problem:
-        raise _damaged_file(path, problem) from problem
+        raise _damaged_error(path, problem) from problem
 
 
 def _decode_raw(path: Path) -> NDArray[Any]:
@@ -376,6 +376,6 @@ def _decode_raw(path: Path) -> NDArray[Any]:
             pixels = raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True,
                                      output_color=library.ColorSpace.sRGB)
         except Exception as problem:
-            raise _damaged_file(path, problem) from problem
+            raise _damaged_error(path, problem) from problem
     return _to_bgr(pixels)
 

@@ -33,7 +33,8 @@ def is_exr(path: Path) -> bool:
 
 
 def channel_names(path: Path | str) -> list[str]:
-    """The channels of an EXR's first part by its header alone. Raises FrameError where the header is no EXR's."""
+    """Return the names of the channels of an EXR's first part, by its header alone. Raises FrameError where the header
+    is no EXR's."""
     path = Path(path)
     try:
         with open_regular(path) as stream:
@@ -283,7 +284,7 @@ def rgb_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> Pixels:
         return read_luminance_chroma(path)
     names = "RGB" if all(name in channels for name in "RGB") else "YYY" if "Y" in channels else ""
     if not names:
-        raise missing_rgb(path, channels)
+        raise missing_rgb_error(path, channels)
     return np.stack([_check_finite(path, name, channels[name]) for name in names], axis=-1)
 
 
@@ -307,7 +308,7 @@ def read_luminance_chroma(path: Path) -> Pixels:
     return _check_finite(path, "Y, RY, BY", np.asarray(pixels))
 
 
-def missing_rgb(path: Path, channels: Iterable[str]) -> FrameError:
+def missing_rgb_error(path: Path, channels: Iterable[str]) -> FrameError:
     """Make the error for an EXR without R, G, B or Y."""
     return FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}); export the "
                       "picture under those names.")

@@ -25,7 +25,7 @@ from ..system.reading import open_regular
 from .borders import PictureArea, find_picture_area
 from .declared import declared_space, jpeg_profile
 from .decoders import Description, describe, file_kind, profile_space
-from .exr import has_chroma, is_exr, main_part, missing_rgb, read_exr_parts, read_luminance_chroma
+from .exr import has_chroma, is_exr, main_part, missing_rgb_error, read_exr_parts, read_luminance_chroma
 from .exr_views import check_parts, stereo_views
 from .formats import jpeg, png, tiff
 from .formats.exif import upright_block
@@ -37,7 +37,7 @@ from .oiio_writer import OIIO_FORMATS, needs_oiio_writer, write_by_oiio
 from .picture import Encoding
 from .read import read_stored_pixels, rgb_codes
 from .size import picture_size
-from .unsupported import unsupported_file
+from .unsupported import unsupported_file_error
 from .write import save_exr_parts, write_exr
 
 _PLACEMENT = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
@@ -239,7 +239,7 @@ def read_plate(path: Path | str, space: ColourSpace | None = None) -> Plate:
     if not path.exists():
         raise FrameError(f"{path} is missing{': it is a link that leads nowhere' if path.is_symlink() else ''}.")
     if path.suffix.lower() not in SUFFIXES:
-        raise unsupported_file(path)
+        raise unsupported_file_error(path)
     picture_size(path)
     return _read_exr(path, space) if is_exr(path) else _read_codes(path, space)
 
@@ -315,7 +315,7 @@ def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
     if not names and (views := stereo_views(header, channels)):  # every view's channels are behind its name
         names = list(dict.fromkeys(views[0].channels))
     if not names:
-        raise missing_rgb(path, channels)
+        raise missing_rgb_error(path, channels)
     if any(channels[name].dtype not in (np.float16, np.float32) for name in names):
         raise FrameError(f"{path} has colour channels that are no floats; export it as half or float.")
     if len({channel.shape for channel in channels.values()}) > 1:

@@ -22,7 +22,7 @@ from .formats import exr_header, png, tiff
 from .listing import SUFFIXES
 from .picture import Picture
 from .size import picture_size
-from .unsupported import needs_openimageio, unsupported_file, unsupported_reason
+from .unsupported import needs_openimageio, unsupported_file_error, unsupported_reason
 from .window import crop_to_display_window
 
 
@@ -40,7 +40,7 @@ def read_picture(path: Path | str, *, space: ColourSpace | None = None, over_bla
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
-        raise unsupported_file(path)
+        raise unsupported_file_error(path)
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     if is_exr(path):

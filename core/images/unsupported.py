@@ -16,7 +16,7 @@ from .formats import jpeg, tiff, webp
 from .formats.kinds import HEAD_BYTES, SUFFIX_OF_KIND, holds_video, is_video, kind_of
 
 
-def unsupported_file(path: Path) -> FrameError:
+def unsupported_file_error(path: Path) -> FrameError:
     """Make the error for a file of another kind, by its name."""
     if is_video(path):
         return FrameError(f"{path} is a video; take its frames out first, as by `ffmpeg -i {path.name} "

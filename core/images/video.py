@@ -190,7 +190,7 @@ class Video:
             raise
         if first is None:
             self.close()
-            raise self._unreadable()
+            raise self._unreadable_error()
         self._first_pass = itertools.chain((first,), decoded)
         self.colour = _read_colour(self.path, first, self.stream)
         """What the codes of the first frame mean."""
@@ -273,12 +273,12 @@ class Video:
             best = self._container.streams.best("video")
             self.stream: Any = best if best in streams else streams[0]
             if self.stream.codec_context is None:  # no decoder
-                raise self._unreadable()
+                raise self._unreadable_error()
             self._decoder = self._alpha_decoder() or self.stream.codec_context
             self._decoder.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
             self._decoder.thread_type = "AUTO"
         except (av.error.FFmpegError, OSError, ValueError, MemoryError) as problem:
-            raise self._unreadable() from problem
+            raise self._unreadable_error() from problem
 
     def _alpha_decoder(self) -> Any:
         """Return libvpx's decoder for VP8 and VP9 with alpha, which FFmpeg's own decoders leave out; None for others,
@@ -294,7 +294,7 @@ class Video:
             decoder.extradata = self.stream.codec_context.extradata
         return decoder
 
-    def _unreadable(self) -> FrameError:
+    def _unreadable_error(self) -> FrameError:
         if not self.path.exists():
             return FrameError(f"{self.path} is missing.")
         return FrameError(f"{self.path} cannot be decoded: it is cut off, or not a video that this program knows; copy "

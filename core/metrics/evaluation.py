@@ -167,7 +167,7 @@ def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]
     The PSNR of the flare, the PSNR of an empty flare and the relative error are means over the views whose reference
     holds a flare, because an empty flare has an infinite PSNR where the reference is black.
     """
-    means = {layer: _mean([scores[layer] for _, scores in views if layer in scores]) for layer in LAYERS}
+    means = {layer: _mean_scores([scores[layer] for _, scores in views if layer in scores]) for layer in LAYERS}
     return {
         "reference": reference,
         "size": list(size),
@@ -178,13 +178,13 @@ def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]
     }
 
 
-def _mean(parts: list[Scores]) -> Scores:
+def _mean_scores(view_scores: list[Scores]) -> Scores:
     """Return the mean of each score of one layer over its views, as `summarise` says; None where no view has one."""
     means: Scores = {}
-    flared = [part for part in parts if not _has_no_flare(part)]
-    for key in parts[0] if parts else ():
-        values = [value for part in (flared if key in _COMPARED_TO_EMPTY else parts)
-                  if (value := part[key]) is not None and math.isfinite(value)]
+    scores_with_flare = [scores for scores in view_scores if not _has_no_flare(scores)]
+    for key in view_scores[0] if view_scores else ():
+        values = [value for scores in (scores_with_flare if key in _COMPARED_TO_EMPTY else view_scores)
+                  if (value := scores[key]) is not None and math.isfinite(value)]
         means[key] = sum(values) / len(values) if values else None
     return means
 

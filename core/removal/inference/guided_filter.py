@@ -80,8 +80,6 @@ def upsample_flare(maps: GuidedFilterMaps, codes: NDArray[Any], encoding: Encodi
 
     max_code: the code of white, of "srgb" codes. The flare is 0 or more, and no more than the plate's light.
     """
-    import cv2
-
     height, width = codes.shape[:2]
     map_height, map_width = maps.gain.shape[:2]
     x = ((np.arange(width, dtype=np.float32) + 0.5) * (map_width / width) - 0.5)[None, :]
@@ -91,13 +89,19 @@ def upsample_flare(maps: GuidedFilterMaps, codes: NDArray[Any], encoding: Encodi
         map_top = max(int(y[0, 0]) - 2, 0)  # rows of the maps that the strip needs, with some to spare
         map_bottom = min(int(y[-1, 0]) + 4, map_height)
         map_x, map_y = np.broadcast_to(x, (len(y), width)), np.broadcast_to(y - map_top, (len(y), width))
-        gain, offset = (np.concatenate([
-            cv2.remap(np.ascontiguousarray(part[map_top:map_bottom]),
-                      np.ascontiguousarray(map_x[:, left:left + REMAP_COLUMNS]),
-                      np.ascontiguousarray(map_y[:, left:left + REMAP_COLUMNS]), cv2.INTER_LINEAR,
-                      borderMode=cv2.BORDER_REPLICATE) for left in range(0, width, REMAP_COLUMNS)], 1)
-                        for part in (maps.gain, maps.offset))
+        gain, offset = (_remap(part[map_top:map_bottom], map_x, map_y) for part in (maps.gain, maps.offset))
         light = to_linear(codes[rows], encoding, max_code)
         display = codes[rows].astype(np.float32) / np.float32(max_code) if encoding == "srgb" else to_display(light)
         flare = gain * display + offset
         yield rows, np.minimum(np.maximum(flare, 0), np.maximum(light, 0))
+
+
+def _remap(values: Pixels, map_x: Pixels, map_y: Pixels) -> Pixels:
+    """Interpolate values (h, w, 3) at map_x, map_y (n, width) bilinearly, REMAP_COLUMNS columns at a time."""
+    import cv2
+
+    source = np.ascontiguousarray(values)
+    return np.concatenate([
+        cv2.remap(source, np.ascontiguousarray(map_x[:, left:left + REMAP_COLUMNS]),
+                  np.ascontiguousarray(map_y[:, left:left + REMAP_COLUMNS]), cv2.INTER_LINEAR,
+                  borderMode=cv2.BORDER_REPLICATE) for left in range(0, map_x.shape[1], REMAP_COLUMNS)], 1)

@@ -35,7 +35,7 @@ from .framing import (
     wrap_margin,
     wrap_plate,
 )
-from .guided_filter import fit_guided_filter, upsample_flare
+from .guided_filter import GuidedFilterMaps, fit_guided_filter, upsample_flare
 from .light_discs import retained_fraction
 from .plate_light import (
     MAX_FLOAT16,
@@ -147,15 +147,7 @@ class Remover:
         codes = wrapped.codes.copy()
         flare = np.zeros(codes.shape, np.float16 if wrapped is plate else np.float32)
         if not maps.is_empty:
-            matte = None if matte is None else wrap_columns(matte, margin)
-            area, encoding, max_code = wrapped.picture_area.slices, wrapped.encoding, wrapped.max_code
-            observed, clean, removed = (part[area] for part in (wrapped.codes, codes, flare))
-            for rows, light in upsample_flare(maps, observed, encoding, max_code):
-                light = wrapped.to_plate_channels(light)
-                if matte is not None:
-                    light *= matte[area][rows, :, None]
-                clean[rows] = subtract_flare(observed[rows], light, encoding, max_code)
-                removed[rows] = removed_light(observed[rows], clean[rows], light, encoding, max_code)
+            _subtract_upsampled(wrapped, maps, None if matte is None else wrap_columns(matte, margin), codes, flare)
         if wrapped is plate:
             return codes, flare.astype(np.float16)
         light = merge_margins(flare.astype(np.float32), margin) / gain
@@ -230,6 +222,22 @@ class Remover:
         flare = flare * (1 - retained_fraction(prediction.display, flare, prediction.glow_fraction,
                                                keep_glow=keep_glow))
         return np.where(flare > 0, self.amount * flare_to_linear(prediction.display, flare), np.float32(0))
+
+
+def _subtract_upsampled(plate: Plate, maps: GuidedFilterMaps, matte: Pixels | None, codes: NDArray[Any],
+                        flare: NDArray[Any]) -> None:
+    """Write a plate's codes without flare to `codes`, and the removed light to `flare`, inside its black borders.
+
+    matte: (height, width), 0..1, the share to remove; None for all. codes, flare: (height, width, 3).
+    """
+    area, encoding, max_code = plate.picture_area.slices, plate.encoding, plate.max_code
+    observed, clean, removed = (pixels[area] for pixels in (plate.codes, codes, flare))
+    for rows, strip_flare in upsample_flare(maps, observed, encoding, max_code):
+        light = plate.to_plate_channels(strip_flare)
+        if matte is not None:
+            light *= matte[area][rows, :, None]
+        clean[rows] = subtract_flare(observed[rows], light, encoding, max_code)
+        removed[rows] = removed_light(observed[rows], clean[rows], light, encoding, max_code)
 
 
 def compute_cache_key(model: str, weights: Path | str, *settings: Any) -> str:

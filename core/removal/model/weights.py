@@ -69,7 +69,7 @@ def read_architecture(path: Path | str, metadata: Mapping[str, str]) -> Architec
         # Without the setting a network has no attention between blocks.
         return Architecture(tuple(recipe["widths"]), tuple(recipe["blocks"]), tuple(recipe.get("attention", (0, 0))))
     except (KeyError, ValueError, TypeError, AttributeError) as problem:
-        raise _not_weights(path) from problem
+        raise _not_weights_error(path) from problem
 
 
 def _is_size_list(sizes: object) -> bool:
@@ -78,7 +78,7 @@ def _is_size_list(sizes: object) -> bool:
             and all(type(size) is int and 0 <= size <= _MAX_SIZE for size in sizes))
 
 
-def _not_weights(path: Path | str) -> RunError:
+def _not_weights_error(path: Path | str) -> RunError:
     return RunError(f"{path} holds no weights of the removal network; train it with train-removal.")
 
 
@@ -95,9 +95,9 @@ def load_network(path: Path) -> RemovalNetwork:
             expected = RemovalNetwork(*architecture).state_dict()
         if {name: value.shape for name, value in expected.items()} != {
                 name: value.shape for name, value in tensors.items()}:
-            raise _not_weights(path)
+            raise _not_weights_error(path)
         network = RemovalNetwork(*architecture)
         network.load_state_dict({name: value.float() for name, value in tensors.items()})
     except (RuntimeError, TypeError, ValueError) as problem:
-        raise _not_weights(path) from problem
+        raise _not_weights_error(path) from problem
     return network.eval()

@@ -54,56 +54,58 @@ def log_uniform(random: Random, low: float, high: float) -> float:
 
 @njit(fastmath=True)  # not cached: numba caches by module name, and the commands import this one under another
 def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, clip_radius: Array,
-               second_centre: Array, second_radius: Array, weight: Array, blades: int, turn: float, roundness: float,
-               soft: float, rim: float, rim_width: float, hollow: float, slope: float) -> None:
+               second_centre: Array, second_radius: Array, weight: Array, blades: int, rotation: float,
+               roundness: float, softness: float, rim: float, rim_width: float, hollow: float, slope: float) -> None:
     """Add a ghost to `layer` (n, n, 3), channel by channel, in canvas coordinates: the part that three images share.
 
     centre, clip_centre, second_centre: (3, 2) by channel, of the images of the stop, of the entrance, and of the stop
     at the light's last passage. radius, clip_radius, second_radius: of the same, (3,). weight: brightness by channel,
-    (3,). blades: number of the stop's blades, turned by `turn` radians, from straight (roundness 0) to a circle (1).
-    soft: width of the edge. rim: brightness added within rim_width (relative to the radius) of the edge. hollow: share
-    removed from the middle. slope: by how much the side away from the canvas' middle is brighter.
+    (3,). blades: number of the stop's blades, turned by `rotation` radians, from straight (roundness 0) to a circle
+    (1). softness: width of the edge. rim: brightness added within rim_width (relative to the radius) of the edge.
+    hollow: share removed from the middle. slope: by how much the side away from the canvas' middle is brighter.
     """
-    n = layer.shape[0]
+    size = layer.shape[0]
     sector = 2 * math.pi / blades
-    flat = math.cos(sector / 2)  # distance of a straight blade from the centre, where the corners are at 1
+    apothem = math.cos(sector / 2)  # distance of a straight blade from the centre, where the corners are at 1
     for channel in range(3):
-        r = radius[channel]
+        ghost_radius = radius[channel]
         cx, cy = centre[channel, 0], centre[channel, 1]
-        reach = r * 1.02 + soft
-        x0 = max(int((cx - reach + 1) * n / 2), 0)
-        x1 = min(int((cx + reach + 1) * n / 2) + 2, n)
-        y0 = max(int((cy - reach + 1) * n / 2), 0)
-        y1 = min(int((cy + reach + 1) * n / 2) + 2, n)
-        edge = max(soft / r, 2.5 / (n * r))  # relative to the radius; 1.25 pixels or more, so that it is anti-aliased
-        distance = math.sqrt(cx * cx + cy * cy) + 1e-6
-        ux, uy = cx / distance, cy / distance  # direction away from the canvas' middle
+        drawn_radius = ghost_radius * 1.02 + softness
+        x0 = max(int((cx - drawn_radius + 1) * size / 2), 0)
+        x1 = min(int((cx + drawn_radius + 1) * size / 2) + 2, size)
+        y0 = max(int((cy - drawn_radius + 1) * size / 2), 0)
+        y1 = min(int((cy + drawn_radius + 1) * size / 2) + 2, size)
+        # Relative to the radius; 1.25 pixels or more, so that it is anti-aliased.
+        edge = max(softness / ghost_radius, 2.5 / (size * ghost_radius))
+        middle_distance = math.sqrt(cx * cx + cy * cy) + 1e-6
+        away_x, away_y = cx / middle_distance, cy / middle_distance  # direction away from the canvas' middle
         for row in range(y0, y1):
-            y = (row + 0.5) * 2 / n - 1
+            y = (row + 0.5) * 2 / size - 1
             for column in range(x0, x1):
-                x = (column + 0.5) * 2 / n - 1
-                dx, dy = (x - cx) / r, (y - cy) / r
-                d = math.sqrt(dx * dx + dy * dy)
-                if d > 1 + edge:
+                x = (column + 0.5) * 2 / size - 1
+                dx, dy = (x - cx) / ghost_radius, (y - cy) / ghost_radius
+                centre_distance = math.sqrt(dx * dx + dy * dy)
+                if centre_distance > 1 + edge:
                     continue
-                far = d  # distance from the centre, 1 at the edge
+                edge_distance = centre_distance  # distance from the centre, 1 at the edge
                 if roundness < 1:
-                    angle = math.atan2(dy, dx) - turn
+                    angle = math.atan2(dy, dx) - rotation
                     angle -= sector * math.floor(angle / sector + 0.5)  # from the middle of the nearest blade
-                    far = roundness * d + (1 - roundness) * d * math.cos(angle) / flat
-                qx, qy = (x - second_centre[channel, 0]) / second_radius[channel], \
+                    edge_distance = (roundness * centre_distance
+                                     + (1 - roundness) * centre_distance * math.cos(angle) / apothem)
+                second_x, second_y = (x - second_centre[channel, 0]) / second_radius[channel], \
                     (y - second_centre[channel, 1]) / second_radius[channel]
-                far = max(far, math.sqrt(qx * qx + qy * qy))
-                kx, ky = (x - clip_centre[channel, 0]) / clip_radius[channel], \
+                edge_distance = max(edge_distance, math.sqrt(second_x * second_x + second_y * second_y))
+                clip_x, clip_y = (x - clip_centre[channel, 0]) / clip_radius[channel], \
                     (y - clip_centre[channel, 1]) / clip_radius[channel]
-                outside = math.sqrt(kx * kx + ky * ky)
+                clip_distance = math.sqrt(clip_x * clip_x + clip_y * clip_y)
                 # 1 inside all three images, 0 outside, smooth over the width of the edge
-                cover = min(max((1 - far) / edge + 0.5, 0.0), 1.0)
-                cover *= min(max((1 - outside) * clip_radius[channel] / (edge * r) + 0.5, 0.0), 1.0)
-                if cover <= 0:
+                coverage = min(max((1 - edge_distance) / edge + 0.5, 0.0), 1.0)
+                coverage *= min(max((1 - clip_distance) * clip_radius[channel] / (edge * ghost_radius) + 0.5, 0.0), 1.0)
+                if coverage <= 0:
                     continue
-                cover = cover * cover * (3 - 2 * cover)
-                value = 1 - hollow * (1 - min(far * far, 1.0))
-                value += rim * math.exp(-((1 - far) / rim_width) ** 2)
-                value *= max(1 + slope * (dx * ux + dy * uy), 0.0)
-                layer[row, column, channel] += weight[channel] * cover * value
+                coverage = coverage * coverage * (3 - 2 * coverage)
+                value = 1 - hollow * (1 - min(edge_distance * edge_distance, 1.0))
+                value += rim * math.exp(-((1 - edge_distance) / rim_width) ** 2)
+                value *= max(1 + slope * (dx * away_x + dy * away_y), 0.0)
+                layer[row, column, channel] += weight[channel] * coverage * value

@@ -156,8 +156,8 @@ def _canvas_to_frame(matrix: NDArray[Any], layers: FlareLayers, position: tuple[
 
 def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearance, matrix: NDArray[Any], width: int,
                    height: int) -> tuple[Pixels, Pixels, Pixels]:
-    """Return rest, glow and light, warped from canvas to frame and coloured; what the glow saturates near a light is
-    added to the light."""
+    """Return rest, glow and light, (height, width, 3) each, warped from canvas to frame and coloured; what the glow
+    saturates near a light is added to the light. matrix: (2, 3), from canvas to frame, pixels."""
     import cv2
 
     half_diagonal = math.hypot(width, height) / 2
@@ -166,7 +166,8 @@ def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearan
                          for layer in (layers.rest, layers.glow, layers.light))
     if appearance.blur:
         rest = cv2.GaussianBlur(rest, (0, 0), appearance.blur)
-    mean = float(np.minimum((rest[::4, ::4] + glow[::4, ::4]) * appearance.gain, 1).mean())
+    sampled = rest[::4, ::4] + glow[::4, ::4]  # every fourth pixel is enough for a mean
+    mean = float(np.minimum(sampled * appearance.gain, 1).mean())
     gain = appearance.gain * np.float32(min(appearance.max_mean / max(mean, 1e-6), 1))
     rest, glow = rest * (appearance.colour * gain), glow * (appearance.colour * gain)
     light_proximity = np.zeros((height, width), np.float32)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..core.errors import CaptureError, FlareFileError
 from ..core.look import Edit, LightLook, Look, LookEdits, PlacedLight, PlaneGaussians, read_look
 from ..core.look.look import Query
+from ..core.look.network import OffsetsBudget
 from . import cameras, fcurves, lamp_drive, light_extents, occlusion
 from .compositor import drivers
 from .lights import capture_position, free_name, light_name, light_position, scene_lights
@@ -310,15 +311,17 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
     return PlacedLight(item.name, item.source, xyz, 1.0, extent, shares, gain, reference)
 
 
-def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | None = None
-                    ) -> dict[str, PlaneGaussians]:
+def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | None = None,
+                    budget: OffsetsBudget | None = None) -> dict[str, PlaneGaussians]:
     """Evaluate every flare of the scene for a camera object at the current frame; return the Gaussians by flare's name.
 
-    edits: in place of those of the scene's sliders. Raises FlareFileError and CaptureError.
+    edits: in place of those of the scene's sliders. budget: see `Look.evaluate_lights`.
+    Raises FlareFileError and CaptureError.
     """
     look = look_of(scene)
     pose, lights = place_lights(scene, depsgraph, camera)
-    gaussians = look.evaluate_lights(pose, lights, edits or edits_of(scene.fit_flare), query_of(scene.fit_flare))
+    gaussians = look.evaluate_lights(pose, lights, edits or edits_of(scene.fit_flare), query_of(scene.fit_flare),
+                                    budget)
     exposure = camera.evaluated_get(depsgraph).fit_flare.exposure
     return {name: light_gaussians.with_exposure(exposure, look.blend) for name, light_gaussians in gaussians.items()}
 

@@ -24,10 +24,12 @@ from numpy.typing import NDArray
 from ..core.errors import FitFlareError
 from ..core.look import Look, PlaneGaussians, to_pixels
 from ..core.look.drawing import OPACITY_MAX, extent
+from ..core.look.network import OffsetsBudget
 from ..core.look.plane import arc_log_peak, arcs_to_pixels, concatenate
 from . import baking, cameras, highlight, looks
 from .compositor.flare_node import find_node
 from .overlay_shaders import gaussian_shader, sum_shader
+from .properties import redraw_viewports
 
 LEVELS = (1, 2, 4, 8, 16)
 MIN_TEXELS = 4.0  # standard deviation of the narrow side of a Gaussian, in the level that it is drawn in
@@ -35,6 +37,11 @@ MIN_TEXELS = 4.0  # standard deviation of the narrow side of a Gaussian, in the 
 MAX_IN_HALF_FLOAT = 6_000
 """Gaussians up to which the buffers are half float. A sum of more, as for an area light, loses the light of faint ones
 to rounding."""
+
+NETWORK_S = 0.03
+"""Time for the look's network in one drawing; while a camera moves, more lights than fit into it take turns."""
+REFINE_S = 0.02
+"""Time after which a drawing in which lights wait for their turn is followed by another."""
 
 Floats = NDArray[np.float32]
 
@@ -45,6 +52,8 @@ _handles: list[Any] = []
 _scene_buffer: Any = None  # the framebuffer with the scene-linear picture of the region that is being drawn
 _shaders: dict[str, Any] = {}
 _offscreens: dict[tuple[int, int, int, str], Any] = {}
+_budgets: dict[str, OffsetsBudget] = {}
+"""By the camera's name."""
 
 
 @dataclass(frozen=True)
@@ -373,7 +382,11 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
     if chosen is not None:
         names = {item.name: [part.name for part in item.elements] for item in scene.fit_flare.lights}
         edits = highlight.emphasise(edits, chosen, names)
-    gaussians = concatenate(list(looks.evaluate_flares(scene, depsgraph, camera, edits).values()))
+    budget = _budgets.setdefault(camera.name, OffsetsBudget(NETWORK_S))
+    budget.begin()
+    gaussians = concatenate(list(looks.evaluate_flares(scene, depsgraph, camera, edits, budget).values()))
+    if not budget.is_complete and not bpy.app.timers.is_registered(redraw_viewports):
+        bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
     if gaussians is None:
         return
     drawn = render(gaussians, window, look)
@@ -480,4 +493,7 @@ def unregister() -> None:
         offscreen.free()
     _offscreens.clear()
     _shaders.clear()
+    _budgets.clear()
+    if bpy.app.timers.is_registered(redraw_viewports):
+        bpy.app.timers.unregister(redraw_viewports)
     last_error = ""

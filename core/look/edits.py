@@ -310,7 +310,7 @@ def apply_colour(gaussians: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGa
         return gaussians
     if blend == "add":
         # Not clipped, so that a sum of Gaussians changes as a finished layer would.
-        return replace(gaussians, colours=np.asarray(gaussians.colours @ edit.matrix.T, np.float32))
+        return replace(gaussians, colours=gaussians.colours @ edit.matrix.T.astype(np.float32))
     dimmed, brighter = min(edit.intensity, 1.0), max(edit.intensity, 1.0)
     linear = linear_from_srgb(gaussians.colours) @ replace(edit, intensity=brighter).matrix.T
     return replace(gaussians, opacities=np.asarray(gaussians.opacities * dimmed, np.float32),

@@ -27,7 +27,7 @@ from . import container, elements
 from .edits import LookEdits, apply_edits
 from .elements import Element
 from .form import FlareForm
-from .network import Floats, Network, QueryRange, frequency_encoding
+from .network import Floats, Network, OffsetsBudget, QueryRange, frequency_encoding
 from .placed_light import PlacedLight as PlacedLight
 from .placed_light import ViewOfLight as ViewOfLight
 from .placed_light import evaluate_placed
@@ -110,29 +110,31 @@ class LightLook:
         return elements.group_elements(gaussians, self._canonical["positions"][:, 0] if self.form.line else None)
 
     def evaluate(self, view: ViewOfLight, *, query: ViewOfLight | None = None, edits: LookEdits | None = None,
-                 visibility: float = 1.0, name: str | None = None) -> PlaneGaussians | None:
+                 visibility: float = 1.0, name: str | None = None, budget: OffsetsBudget | None = None
+                 ) -> PlaneGaussians | None:
         """Return the plane Gaussians of this light's flare in `view`; None for a light behind the camera.
 
         query: camera and light at which the network is evaluated, by default the view's: appearance follows it,
         placement follows the view. visibility: 0..1, scales the opacities. name: of the light whose edits are applied,
-        by default this light's.
+        by default this light's. budget: see `Look.evaluate_lights`.
         """
         if view.depth <= 0:
             return None
-        gaussians, light = self._evaluate_on_plane(view, query)
+        gaussians, light = self._evaluate_on_plane(view, query, budget, name or self.name)
         if edits is not None:
             gaussians = apply_edits(gaussians, name or self.name, light, self.elements, edits, self.blend)
         if visibility != 1.0:
             gaussians = replace(gaussians, opacities=np.asarray(gaussians.opacities * visibility, np.float32))
         return gaussians
 
-    def _evaluate_on_plane(self, view: ViewOfLight, query: ViewOfLight | None) -> tuple[PlaneGaussians, Floats]:
+    def _evaluate_on_plane(self, view: ViewOfLight, query: ViewOfLight | None, budget: OffsetsBudget | None = None,
+                           name: str = "") -> tuple[PlaneGaussians, Floats]:
         """Return Gaussians on the plane (paper, eq. 1 to 3), and the light's position (2,) with delta_l.
 
-        query: see `evaluate`."""
+        query, budget: see `evaluate`. name: of the placed light."""
         form, rows, queried = self.form, self._canonical, query or view  # the rows are canonical, before deformation
         features = self._network.view_features(queried.camera, queried.light)
-        offsets = self._network.offsets(features)
+        offsets = self._network.offsets(features, budget, name)
         light = view.light
         if form.light_correction:
             light = light + self._network.light_correction(features)
@@ -217,20 +219,22 @@ class Look:
         return self.evaluate_lights(world_to_camera, placed, edits, query)
 
     def evaluate_lights(self, world_to_camera: ArrayLike, lights: Sequence[PlacedLight],
-                        edits: LookEdits | None = None, query: Query = "target") -> dict[str, PlaneGaussians]:
+                        edits: LookEdits | None = None, query: Query = "target",
+                        budget: OffsetsBudget | None = None) -> dict[str, PlaneGaussians]:
         """Return the plane Gaussians of each placed light of `visible_lights` with a visibility above 0, by its name.
 
         edits: by the names of the placed lights; lights that mute and solo turn off are omitted.
         query: the view at which the network is evaluated: "target" the view itself; "trained" camera and light, clipped
         to the range of the training views; "source" the middle of the range of cameras, and the clipped light.
-        Placement always follows the view.
+        Placement always follows the view. budget: bounds the time for the network, for an interactive drawing; lights
+        with an extent do not count. None for exact flares.
         """
         flares: dict[str, PlaneGaussians] = {}
         for light, source in self.visible_lights(lights, edits):
-            def evaluate(view: ViewOfLight, visibility: float, source: LightLook = source, name: str = light.name
-                         ) -> PlaneGaussians | None:
+            def evaluate(view: ViewOfLight, visibility: float, source: LightLook = source, name: str = light.name,
+                         is_point: bool = light.extent is None) -> PlaneGaussians | None:
                 return source.evaluate(view, query=network_query(source, view, query), edits=edits,
-                                       visibility=visibility, name=name)
+                                       visibility=visibility, name=name, budget=budget if is_point else None)
 
             gaussians = evaluate_placed(light, world_to_camera, self.blend, evaluate, self.pixel_grid)
             if gaussians is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,8 @@ CORNERS = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in ra
 """Corners of a cell, (8, 3)."""
 
 
+ROWS_PER_BLOCK = 400
+"""Gaussians that the network is evaluated for in one go; their activations stay in a processor's cache."""
 MAX_CACHE_BYTES = 64 << 20
 """Most bytes of offsets that are kept: those of some hundred lights of a look."""
 
@@ -64,6 +67,52 @@ class _OffsetsCache:
 
 
 _cache = _OffsetsCache(MAX_CACHE_BYTES)
+
+
+class OffsetsBudget:
+    """Bounds the time that drawings of many lights spend in the network while the camera moves.
+
+    Lights whose features changed get new offsets in turn, those that have waited longest first, as many in a drawing as
+    fit into its time and one at least. The others are drawn with their last offsets, at their exact places. Further
+    drawings complete them. A light that is drawn for the first time is always computed. For one camera.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        """seconds: for the network in one drawing."""
+        self._seconds, self._seconds_per_light = seconds, 0.0
+        # Cache key and offsets of each light, by number of its network and its name; that which waited longest first.
+        self._offsets: OrderedDict[tuple[int, str], tuple[tuple[int, bytes], Floats]] = OrderedDict()
+        self._drawn: set[tuple[int, str]] = set()
+        self._due: set[tuple[int, str]] = set()
+        self.is_complete = True
+        """Whether the drawing since `begin` has exact offsets."""
+
+    def begin(self) -> None:
+        """Begin a drawing; forget the lights that the last one did not have."""
+        for light in [light for light in self._offsets if light not in self._drawn]:
+            del self._offsets[light]
+        count = max(int(self._seconds / self._seconds_per_light), 1) if self._seconds_per_light else len(self._offsets)
+        self._due, self._drawn, self.is_complete = set(itertools.islice(self._offsets, count)), set(), True
+
+    def get(self, light: tuple[int, str], key: tuple[int, bytes], compute: Callable[[], Floats]) -> Floats:
+        """Return the offsets of a light: those of the key if it is the light's turn, else its last ones."""
+        self._drawn.add(light)
+        known = self._offsets.get(light)
+        if known is None or (known[0] != key and light in self._due):
+            known = self._offsets[light] = key, _cache.get(key, lambda: self._measure(compute))
+        if known[0] == key:
+            self._offsets.move_to_end(light)
+        else:
+            self.is_complete = False
+        return known[1]
+
+    def _measure(self, compute: Callable[[], Floats]) -> Floats:
+        """Compute offsets, and update the mean time of it."""
+        began = time.perf_counter()
+        offsets = compute()
+        seconds = time.perf_counter() - began
+        self._seconds_per_light = 0.9 * self._seconds_per_light + 0.1 * seconds if self._seconds_per_light else seconds
+        return offsets
 
 
 class HashGrid:
@@ -169,6 +218,7 @@ class Network:
         self._hidden_layers = sorted(name[:-len(".weight")] for name in self._tensors
                                      if name.startswith("network.layers.") and name.endswith(".weight"))
         self._encoded, self._number = encoded, next(_numbers)
+        self._last_camera: tuple[bytes, Floats] = (b"", np.zeros(0, np.float32))
         if self._tensors["network.head.weight"].shape[0] != sum(self._heads.values()):
             raise ValueError("the network's heads do not fit the form")
 
@@ -184,7 +234,16 @@ class Network:
         extent = self._range.camera_high - self._range.camera_low
         folded = np.append(np.abs(light), np.linalg.norm(light)).astype(np.float32)
         position = (camera.astype(np.float32) - self._range.camera_low) / extent
-        return np.concatenate([self._light_grid(folded / self._range.light_high), self._camera_grid(position)])
+        return np.concatenate([self._light_grid(folded / self._range.light_high), self._camera_features(position)])
+
+    def _camera_features(self, position: Floats) -> Floats:
+        """Return the features of a camera position (3,) in its range; those of the last one are kept, since all lights
+        of a view have them."""
+        key = position.tobytes()
+        known = self._last_camera
+        if known[0] != key:
+            known = self._last_camera = key, self._camera_grid(position)
+        return known[1]
 
     def check_shapes(self, *, has_correction: bool) -> None:
         """Evaluate one Gaussian, and delta_l if `has_correction`. Raises ValueError or KeyError for tensors that do not
@@ -195,10 +254,15 @@ class Network:
         if has_correction and self.light_correction(features).shape != (2,):
             raise ValueError("the correction of the light is no place")
 
-    def offsets(self, features: Floats) -> dict[str, Floats]:
-        """Return the offsets by name, (n, width) each; they are shared and must not be changed."""
-        all_offsets = _cache.get((self._number, features.tobytes()), lambda: self._concatenated_offsets(
-            self._gaussian_features, features))
+    def offsets(self, features: Floats, budget: OffsetsBudget | None = None, light: str = "") -> dict[str, Floats]:
+        """Return the offsets by name, (n, width) each; they are shared and must not be changed.
+
+        budget: may return earlier offsets of the placed light of the name `light`."""
+        def compute() -> Floats:
+            return self._concatenated_offsets(self._gaussian_features, features)
+
+        key = self._number, features.tobytes()
+        all_offsets = _cache.get(key, compute) if budget is None else budget.get((self._number, light), key, compute)
         edges = np.cumsum([0, *self._heads.values()])
         return {name: all_offsets[:, start:end]
                 for name, start, end in zip(self._heads, edges[:-1], edges[1:], strict=True)}
@@ -209,20 +273,27 @@ class Network:
 
     def _concatenated_offsets(self, gaussian_features: Floats, features: Floats) -> Floats:
         """Return the offsets of all heads, (n, sum of their widths); see `_encode_gaussians` and `view_features`."""
-        x = gaussian_features + self._linear("network.view_layer", features[None])
-        np.maximum(x, 0, out=x)
-        for name in self._hidden_layers:
-            x = self._linear(name, x)
+        from_view = self._linear("network.view_layer", features[None])
+        result = np.empty((len(gaussian_features), len(self._tensors["network.head.weight"])), np.float32)
+        x, y = np.empty((2, min(ROWS_PER_BLOCK, len(result)), from_view.shape[1]), np.float32)
+        for start in range(0, len(result), ROWS_PER_BLOCK):
+            rows = slice(start, min(start + ROWS_PER_BLOCK, len(result)))
+            x, y = x[:rows.stop - start], y[:rows.stop - start]
+            np.add(gaussian_features[rows], from_view, out=x)
             np.maximum(x, 0, out=x)
-        return self._linear("network.head", x)
+            for name in self._hidden_layers:
+                x, y = self._linear(name, x, y), x
+                np.maximum(x, 0, out=x)
+            self._linear("network.head", x, result[rows])
+        return result
 
     def light_correction(self, features: Floats) -> Floats:
         """Return delta_l (2,), normalised coordinates."""
         hidden = np.maximum(self._linear("network.correction.0", features[None]), 0)
         return self._linear("network.correction.2", hidden)[0]
 
-    def _linear(self, name: str, inputs: Floats) -> Floats:
-        """Return the outputs (n, d) of the linear layer of this name for inputs (n, c)."""
-        outputs = inputs @ self._tensors[f"{name}.weight"].T
+    def _linear(self, name: str, inputs: Floats, out: Floats | None = None) -> Floats:
+        """Return the outputs (n, d) of the linear layer of this name for inputs (n, c); out: where to write them."""
+        outputs: Floats = np.matmul(inputs, self._tensors[f"{name}.weight"].T, out=out)
         outputs += self._tensors[f"{name}.bias"]
-        return np.asarray(outputs, np.float32)
+        return outputs

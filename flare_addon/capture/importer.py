@@ -22,7 +22,7 @@ from ...core.capture.camera import Camera, quaternion_from_rotation
 from ...core.conventions.frame_numbers import number_views
 from ...core.errors import CaptureError
 from ...core.removal.jobs.provenance import has_exact_clean_frames
-from ...core.system.steps import Steps, finish
+from ...core.system.steps import PAUSE, Steps, finish
 from .. import cameras, fcurves, light_paths
 from ..cameras import FLIP_YZ
 from ..compositor.setup import footage_nodes
@@ -43,6 +43,9 @@ PIXEL_ASPECT_TOLERANCE = 2e-3
 
 CAMERAS_PER_STEP = 10
 """Cameras with a picture each that one step adds."""
+
+CAMERAS_PER_LINK = 100
+"""Cameras that the scene gets in one step."""
 
 CameraLayout = Literal["animated", "each"]
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")
@@ -80,19 +83,20 @@ class _SceneState:
         self._render = {name: getattr(render, name) for name in (
             "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y")}
 
-    def restore(self, collection: Any) -> None:
-        """Restore size and frames of the scene, and remove the collection with its objects and their data."""
+    def restore(self, *collections: Any) -> None:
+        """Restore size and frames of the scene, and remove collections with their objects and the objects' data."""
         scene = self._scene
         scene.frame_start, scene.frame_end = self._range[:2]
         for name, value in self._render.items():
             setattr(scene.render, name, value)
         scene.frame_set(self._range[2])
-        for item in list(collection.objects):
-            data = item.data
-            bpy.data.objects.remove(item)
-            if data is not None and not data.users:
-                bpy.data.batch_remove([data])
-        bpy.data.collections.remove(collection)
+        for collection in collections:
+            for item in list(collection.objects):
+                data = item.data
+                bpy.data.objects.remove(item)
+                if data is not None and not data.users:
+                    bpy.data.batch_remove([data])
+            bpy.data.collections.remove(collection)
 
 
 def find_capture(path: Path | str) -> Path:
@@ -122,18 +126,25 @@ def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) ->
     folder = find_capture(folder)
     capture = yield from Capture.open_in_steps(folder, need_frames=settings.frames)
     collection = bpy.data.collections.new(folder.resolve().name)
+    unlinked = bpy.data.collections.new("Imported Cameras")
     before = _SceneState(scene)
     try:
-        imported = yield from _add_capture(scene, folder, settings, capture, collection)
+        imported = yield from _add_capture(scene, folder, settings, capture, collection, unlinked)
     except BaseException:  # GeneratorExit too
-        before.restore(collection)
+        before.restore(collection, unlinked)
         raise
+    bpy.data.collections.remove(unlinked)
     return imported
 
 
-def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Capture, collection: Any
+def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Capture, collection: Any, unlinked: Any
                  ) -> Steps[Imported]:
-    """Add the objects of a capture, in steps, to a new collection that is not linked to the scene yet."""
+    """Add the objects of a capture, in steps, to a new collection.
+
+    After each object that the scene gets, Blender builds its dependency graph and draws anew, which takes longer the
+    more objects there are. The points therefore come first, and the cameras are made in the collection `unlinked`,
+    which no scene has, and moved over a few times CAMERAS_PER_LINK.
+    """
     notes: list[str] = []
     extent = capture.extent
     scene.collection.children.link(collection)
@@ -141,10 +152,17 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
     root.empty_display_type, root.empty_display_size = "ARROWS", 0.2 * extent
     root.rotation_euler, root.scale = UP_ROTATIONS[settings.up], (settings.scale,) * 3
     yield
-    camera_objects = yield from _add_cameras(collection, root, capture, extent, settings, scene, notes)
     if settings.points and len(capture.points):
-        _add_points(collection, root, capture.points)
-    yield
+        mesh = _make_points_mesh(capture.points)
+        yield PAUSE
+        _add_points(collection, root, mesh)
+        yield PAUSE
+    camera_objects = yield from _add_cameras(unlinked, root, capture, extent, settings, scene, notes)
+    for number, camera in enumerate(camera_objects, 1):
+        collection.objects.link(camera)
+        unlinked.objects.unlink(camera)
+        if number % CAMERAS_PER_LINK == 0 or number == len(camera_objects):
+            yield PAUSE
     lights = tuple(add_light(collection, root, light.name, np.nan_to_num(light.xyz), 0.02 * extent)
                    for light in capture.lights)
     scene_frames = {frame.view: frame.number for frame in number_views(view.name for view in capture.views)}
@@ -402,8 +420,8 @@ def _add_background(camera: Any, image: Any) -> Any:
 # ---- points and objects -------------------------------------------------------------------------------------
 
 
-def _add_points(collection: Any, root: Any, cloud: PointCloud) -> Any:
-    """Add the point cloud as a mesh of vertices with the colour attribute "Col"; it is not rendered."""
+def _make_points_mesh(cloud: PointCloud) -> Any:
+    """Return the point cloud as a new mesh of vertices with the colour attribute "Col"."""
     mesh = bpy.data.meshes.new("Points")
     mesh.vertices.add(len(cloud))
     mesh.vertices.foreach_set("co", np.ascontiguousarray(cloud.xyz, np.float32).ravel())
@@ -412,6 +430,11 @@ def _add_points(collection: Any, root: Any, cloud: PointCloud) -> Any:
     rgba[:, :3] = cloud.rgb / np.float32(255)
     colours.data.foreach_set("color_srgb", rgba.ravel())
     mesh.update()
+    return mesh
+
+
+def _add_points(collection: Any, root: Any, mesh: Any) -> Any:
+    """Add the object of a point cloud, which is not rendered."""
     points = _add_object(collection, "Points", mesh, root)
     points.hide_render = points.hide_select = True
     points.display_type, points.fit_flare.is_points = "BOUNDS", True  # points.py draws them in their colours

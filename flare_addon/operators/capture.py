@@ -7,7 +7,7 @@ from pathlib import Path
 
 import bpy
 
-from ...core.system.steps import finish
+from ...core.system.steps import PAUSE, finish
 from .. import fits
 from ..capture import exporter
 from ..capture.importer import Imported, ImportSettings, import_in_steps
@@ -52,6 +52,8 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
 
     _in_steps = False
     """Whether a person called the operator, who sees the window; a script waits for the end."""
+    _is_shown = False
+    """Whether the import is complete."""
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         self._in_steps = True
@@ -87,6 +89,9 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Go on with the import; other events wait, so that nothing else changes the scene meanwhile."""
+        if self._is_shown:  # in a turn of its own, since Blender stores the undo step at the end
+            self.cancel(context)
+            return {"FINISHED"}
         if event.type == "ESC":
             self.cancel(context)
             self.report({"INFO"}, "The import was cancelled")
@@ -96,11 +101,12 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         began = time.perf_counter()
         with report_errors(self) as outcome:
             try:
-                while time.perf_counter() - began < STEP_S:
-                    next(self._steps)
-                return {"RUNNING_MODAL"}
+                while next(self._steps) != PAUSE and time.perf_counter() - began < STEP_S:
+                    pass
             except StopIteration as end:
                 self._show(context, end.value)
+                self._is_shown = True
+            return {"RUNNING_MODAL"}
         self.cancel(context)
         return outcome.status
 

@@ -101,10 +101,10 @@ def time_steps(target, record: Times) -> None:
         while True:
             with noted(record):
                 try:
-                    next(walk)
+                    pause = next(walk)
                 except StopIteration as end:
                     return end.value
-            yield
+            yield pause
 
     target.import_in_steps = import_in_steps
 

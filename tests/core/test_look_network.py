@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from core.look import Look, PlacedLight, PlaneGaussians, read
+from core.look import Look, PlacedLight, PlaneGaussians, read_look
 from core.look.network import ROWS_PER_BLOCK, OffsetsBudget, _OffsetsCache
 from tests.core.flared import LIGHT, cameras
 from tests.core.test_look import saved
@@ -52,7 +52,7 @@ def exact_lights(look: Look, view: int, flares: dict[str, PlaneGaussians]) -> li
 
 def test_lights_take_turns_until_all_are_exact(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
-    look, budget = read(tmp_path / "a.flare"), OffsetsBudget(1e-9)
+    look, budget = read_look(tmp_path / "a.flare"), OffsetsBudget(1e-9)
     assert len(exact_lights(look, 0, drawn(look, 0, budget))) == len(LIGHTS) and budget.is_complete
     counts = []
     for _ in LIGHTS:
@@ -67,7 +67,7 @@ def test_lights_take_turns_until_all_are_exact(tmp_path: Path) -> None:
 
 def test_a_moving_camera_lets_no_light_wait_for_ever(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
-    look, budget = read(tmp_path / "a.flare"), OffsetsBudget(1e-9)
+    look, budget = read_look(tmp_path / "a.flare"), OffsetsBudget(1e-9)
     drawn(look, 0, budget)
     turns = set()
     for number in range(2 * len(LIGHTS)):
@@ -77,14 +77,14 @@ def test_a_moving_camera_lets_no_light_wait_for_ever(tmp_path: Path) -> None:
 
 def test_time_for_all_lights_is_an_exact_drawing(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
-    look, budget = read(tmp_path / "a.flare"), OffsetsBudget(60.0)
+    look, budget = read_look(tmp_path / "a.flare"), OffsetsBudget(60.0)
     for view in (0, 1, 2):
         assert len(exact_lights(look, view, drawn(look, view, budget))) == len(LIGHTS) and budget.is_complete
 
 
 def test_the_network_does_not_depend_on_the_blocks_of_its_rows(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1, count=2 * ROWS_PER_BLOCK + 7)
-    network = read(tmp_path / "a.flare").lights[0]._network
+    network = read_look(tmp_path / "a.flare").lights[0]._network
     features = network.view_features(np.zeros(3, np.float32), np.array([0.1, 0.2], np.float32))
     rows = network._gaussian_features
     whole = network._concatenated_offsets(rows, features)

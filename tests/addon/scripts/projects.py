@@ -188,7 +188,7 @@ facts["moved unseen"] = max(abs(float(lights.capture_position(item, scene.fit_fl
                                 - float(place[lights.light_name(item)][0])) for item in lights.scene_lights(scene))
 
 # ---- another flare is saved into the library while one is chosen ----------------------------------------
-library, look = part("flare_addon.library"), part("core.look").read(flare)
+library, look = part("flare_addon.library"), part("core.look").read_look(flare)
 for name in ("mid", "zed"):
     library.save_look(look, look.edits, name, "", "")
 manager = bpy.context.window_manager

@@ -72,7 +72,7 @@ except errors.FitFlareError as problem:
     facts["moved by itself"] = str(problem)
 
 # ---- the whole capture switched off, and the file opened again --------------------------------------
-learned = part("core.look").read(flare).lights[0].xyz
+learned = part("core.look").read_look(flare).lights[0].xyz
 for how in ("excluded", "disabled"):
     scene = empty()
     ops.import_capture(directory=str(capture), up="-Y", scale=2.0)

@@ -164,19 +164,19 @@ def _power(gamma: float) -> Table:
     return lambda x: np.power(np.maximum(x, 0), np.float32(gamma)).astype(np.float32)
 
 
-def _parametric(kind: int, numbers: list[float]) -> Table:
+def _parametric(function_type: int, parameters: list[float]) -> Table:
     """Return a parametric curve (ICC.1:2022, table 68): (a x + b)**g + e from x = d on, c x + f below.
 
-    kind: the number of the function, 0..4. numbers: its parameters, in the order g, a, b, c, d, e, f.
+    function_type: the number of the function, 0..4. parameters: its parameters, in the order g, a, b, c, d, e, f.
     """
-    g, a, b, c, d, e, f = (numbers + [0.0] * 7)[:7]
+    g, a, b, c, d, e, f = (parameters + [0.0] * 7)[:7]
     power = _power(g)  # checks the exponent too
-    if kind == 0:
+    if function_type == 0:
         return power
     if a == 0:
         raise UnreadableProfile("has a curve that no picture has")
-    if kind in (1, 2):  # begin at x = -b / a; below it is 0 (kind 1), or c, which is also added above (kind 2)
-        c, d, e, f = 0.0, -b / a, c if kind == 2 else 0.0, c if kind == 2 else 0.0
+    if function_type in (1, 2):  # from x = -b / a on; below, function 1 is 0, and 2 is c, which it adds above too
+        c, d, e, f = 0.0, -b / a, c if function_type == 2 else 0.0, c if function_type == 2 else 0.0
 
     def decode(x: NDArray[Any]) -> Pixels:
         upper = np.power(np.maximum(a * x + b, 0), g) + e

@@ -165,9 +165,9 @@ def _without_resource_thumbnails(segments: list[tuple[int, bytes]]) -> list[tupl
     resources = b"".join(segments[index][1][len(jpeg.PHOTOSHOP):] for index in indices)
     if (cleaned := without_thumbnails(resources)) == resources:
         return segments
-    parts = [(jpeg.APP13, jpeg.PHOTOSHOP + cleaned[offset:offset + _MAX_RESOURCE_BYTES])
+    new_segments = [(jpeg.APP13, jpeg.PHOTOSHOP + cleaned[offset:offset + _MAX_RESOURCE_BYTES])
              for offset in range(0, len(cleaned), _MAX_RESOURCE_BYTES)]
-    return [*segments[:indices[0]], *parts, *(segments[index] for index in range(indices[0], len(segments))
+    return [*segments[:indices[0]], *new_segments, *(segments[index] for index in range(indices[0], len(segments))
                                               if index not in indices)]
 
 

@@ -38,7 +38,7 @@ from .picture import Encoding
 from .read import read_stored_pixels, rgb_codes
 from .size import picture_size
 from .unsupported import unsupported_file_error
-from .write import save_exr_parts, write_exr
+from .write import MAX_HALF, save_exr_parts, write_exr
 
 _PLACEMENT = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
 """Attributes that give another EXR a plate's windows and colours."""
@@ -46,8 +46,6 @@ _UNWRITTEN = ("heif", "avif", "jxl", "jp2", "gif", "psd")
 """Formats whose clean plates are PNG."""
 _JPEG_QUALITY = 97
 """OpenCV's quality of JPEG, up to 100."""
-_MAX_HALF = 65504.0
-"""Greatest finite value of a half float."""
 _JPEGS, _TIFFS = JPEG_SUFFIXES, (".tif", ".tiff")
 _DEPTHS: dict[str, tuple[type, ...]] = {".png": (np.uint8, np.uint16), **dict.fromkeys(_JPEGS, (np.uint8,))}
 """Pixel types by suffix, for formats that cannot hold every plate; OpenCV would convert others to 8 bit silently."""
@@ -155,7 +153,7 @@ class Plate:
         if codes.dtype.kind == "u":
             codes[changed] = (np.clip(values, 0, 1) * np.float32(self.max_code) + np.float32(0.5)).astype(codes.dtype)
         else:
-            limit = np.float32(_MAX_HALF) if codes.dtype == np.float16 else np.finfo(np.float32).max
+            limit = np.float32(MAX_HALF) if codes.dtype == np.float16 else np.finfo(np.float32).max
             codes[changed] = np.clip(values, -limit, limit).astype(codes.dtype)
         return codes
 
@@ -226,7 +224,7 @@ def is_plate_error(problem: Exception) -> bool:
 
 def finite_light(codes: NDArray[Any]) -> NDArray[np.float32]:
     """Return float codes as finite linear light: NaN and negative infinity are black, infinity the greatest half."""
-    return np.nan_to_num(codes.astype(np.float32), nan=0.0, posinf=_MAX_HALF, neginf=0.0)
+    return np.nan_to_num(codes.astype(np.float32), nan=0.0, posinf=MAX_HALF, neginf=0.0)
 
 
 def read_plate(path: Path | str, space: ColourSpace | None = None) -> Plate:

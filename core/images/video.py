@@ -34,6 +34,8 @@ from .video_colour import (
     BT_709,
     BT_2020,
     BY_PRIMARIES,
+    FULL_RANGE,
+    LIMITED_RANGE,
     LUMA_WEIGHTS,
     RGB,
     TRANSFERS,
@@ -62,8 +64,7 @@ MAX_VIDEO_PIXELS = 100_000_000
 """Largest frame that is decoded; a header that claims more is damaged or hostile."""
 MAX_NAMED_FRAMES = 8
 """Number of damaged frames that a sentence names."""
-_LIMITED, _FULL = 1, 2
-"""FFmpeg's numbers of the ranges; 0 is unspecified."""
+
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 """Decoders that keep alpha, by FFmpeg's names of the codecs."""
 
@@ -437,9 +438,9 @@ def _read_colour(path: Path, raw: Any, stream: Any) -> VideoColour:
     if planar.is_rgb:
         matrix, limited = RGB, False
     elif planar.is_grey:
-        matrix, limited = BT_709, colour_range == _LIMITED  # any matrix: only the luma is decoded
+        matrix, limited = BT_709, colour_range == LIMITED_RANGE  # any matrix: only the luma is decoded
     else:
-        limited = colour_range != _FULL and not planar.is_full_range and not raw.format.name.startswith("yuvj")
+        limited = colour_range != FULL_RANGE and not planar.is_full_range and not raw.format.name.startswith("yuvj")
         if matrix == BY_PRIMARIES:
             matrix = primaries if primaries in (BT_709, BT_2020) else UNSPECIFIED
         if matrix in UNSUPPORTED_MATRICES:

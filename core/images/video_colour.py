@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from ..colour.spaces import P3_D65, REC_709, REC_2020, Chromaticities, matrix_between
 from ..colour.srgb import linear_from_srgb, srgb_from_linear
 
+LIMITED_RANGE, FULL_RANGE = 1, 2
+"""FFmpeg's numbers of the ranges of codes; 0 is unspecified."""
 REFERENCE_WHITE_NITS = 203.0
 """Luminance of diffuse white in high dynamic range, cd/m² (ITU-R BT.2408)."""
 PQ_PEAK_NITS, HLG_PEAK_NITS, HLG_GAMMA = 10000.0, 1000.0, 1.2

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .video_colour import FULL_RANGE, LIMITED_RANGE
+
 _PLANAR = re.compile(r"(?P<kind>yuvj|yuva|yuv|gbra|gbr|gray)(?P<sampling>4[0-4]{2})?p?(?P<bits>9|1[0246])?(le)?")
 """Names of the formats with one component per plane, in the byte order of the machine."""
 _SAMPLING = {None: (1, 1), "444": (1, 1), "440": (1, 2), "422": (2, 1), "420": (2, 2), "411": (4, 1), "410": (4, 4)}
@@ -76,7 +78,7 @@ def to_planar(frame: Any, is_limited: bool) -> tuple[Any, PlaneFormat]:
         if planar.is_rgb:
             frame = frame.reformat(format=name)
         else:  # the same range on both sides, so that codes stay as they are
-            colour_range = 1 if is_limited else 2
+            colour_range = LIMITED_RANGE if is_limited else FULL_RANGE
             frame = frame.reformat(format=name, src_color_range=colour_range, dst_color_range=colour_range)
     return frame, planar
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError, SettingsError
 from ..system.files import atomic_path
 from .video import Video, VideoFrame, import_av
-from .video_colour import BT_601, BT_709, MAX_601_HEIGHT
+from .video_colour import BT_601, BT_709, FULL_RANGE, LIMITED_RANGE, MAX_601_HEIGHT, RGB, UNSPECIFIED
 from .video_mastering import x265_options
 from .video_planes import PlaneFormat, plane_arrays, plane_format, shrink_plane, to_planar
 
@@ -82,7 +82,7 @@ def choose_codec(target: Path, video: Video, codec: str | None) -> str:
     if suffix == ".mkv":
         return "ffv1"
     if suffix == ".mov":
-        return "prores4444" if video.has_alpha or video.colour.matrix == 0 else "prores"
+        return "prores4444" if video.has_alpha or video.colour.matrix == RGB else "prores"
     return "h265" if video.colour.bits > 8 or video.colour.is_light else "h264"
 
 
@@ -211,11 +211,11 @@ def _add_video_stream(out: Any, video: Video, source: Any, encoder: Encoder, lef
     if ratio:
         context.sample_aspect_ratio = ratio
     tags = {"colorspace": raw.colorspace, "color_trc": raw.color_trc, "color_primaries": raw.color_primaries}
-    for name, value in tags.items():  # 0 and 2: the frame names none, but its container may
-        setattr(context, name, value if value not in (0, 2) else getattr(original.codec_context, name))
-    if not planar.is_rgb and video.colour.matrix == 0:
+    for name, value in tags.items():  # where the frame names none, its container may
+        setattr(context, name, value if value not in (0, UNSPECIFIED) else getattr(original.codec_context, name))
+    if not planar.is_rgb and video.colour.matrix == RGB:
         context.colorspace = BT_709 if min(video.stored_size) > MAX_601_HEIGHT else BT_601  # converted from RGB
-    context.color_range = 1 if _is_limited(planar, video, encoder) else 2
+    context.color_range = LIMITED_RANGE if _is_limited(planar, video, encoder) else FULL_RANGE
     if video.matrix is not None:
         stream.set_display_matrix(video.matrix)
     _copy_tags(original.metadata, stream.metadata, _STREAM_FACTS)
@@ -229,7 +229,7 @@ def _is_limited(planar: PlaneFormat, video: Video, encoder: Encoder) -> bool:
     encoder demands or the source has it. planar: the format that is encoded."""
     if planar.is_rgb:
         return False
-    return encoder.limited or video.colour.limited or video.colour.matrix == 0
+    return encoder.limited or video.colour.limited or video.colour.matrix == RGB
 
 
 class _OtherStreams:
@@ -248,16 +248,7 @@ class _OtherStreams:
                 continue
             codec = stream.codec_context.name if stream.codec_context is not None else ""
             if stream.type == "audio" and codec:
-                is_mov = out.format.name == "mov"
-                replacement_codec = "pcm_s24le" if is_mov else out.default_audio_codec
-                if codec.startswith(MOV_SOUND) if is_mov else codec in out.supported_codecs:
-                    target = out.add_stream_from_template(stream)
-                else:
-                    target = out.add_stream(replacement_codec, rate=stream.codec_context.sample_rate)
-                    target.codec_context.layout = stream.codec_context.layout
-                    self._encoded[stream.index] = target
-                    left_out.append(f"The sound of {video.path} ({codec}) does not fit into the new file and is "
-                                    f"encoded as {replacement_codec}.")
+                target = self._add_sound(stream, codec, video, left_out)
             elif stream.type == "subtitle" and codec in out.supported_codecs:
                 target = out.add_stream_from_template(stream)
             else:
@@ -269,6 +260,19 @@ class _OtherStreams:
             copied_streams.append(stream)
         self._packets: Iterator[Any] = iter(source.demux(copied_streams)) if copied_streams else iter(())
         self._waiting: Any = None
+
+    def _add_sound(self, stream: Any, codec: str, video: Video, left_out: list[str]) -> Any:
+        """Add a stream of sound to the output and return it: as it is, or encoded anew where its codec does not fit."""
+        is_mov = self._out.format.name == "mov"
+        if codec.startswith(MOV_SOUND) if is_mov else codec in self._out.supported_codecs:
+            return self._out.add_stream_from_template(stream)
+        replacement_codec = "pcm_s24le" if is_mov else self._out.default_audio_codec
+        target = self._out.add_stream(replacement_codec, rate=stream.codec_context.sample_rate)
+        target.codec_context.layout = stream.codec_context.layout
+        self._encoded[stream.index] = target
+        left_out.append(f"The sound of {video.path} ({codec}) does not fit into the new file and is "
+                        f"encoded as {replacement_codec}.")
+        return target
 
     def write_until(self, time: Fraction | None) -> None:
         """Write the packets up to `time` seconds; all remaining ones for None."""
@@ -342,8 +346,8 @@ def _reformat(raw: Any, frame: VideoFrame, planar: PlaneFormat, context: Any, *,
     source = _SWSCALE_MATRICES.get(frame.colour.matrix, 5)  # 5 is BT.601; RGB has none
     target = _SWSCALE_MATRICES.get(int(context.colorspace), source)
     return raw.reformat(format=planar.name, interpolation=exact, src_colorspace=source, dst_colorspace=target,
-                        src_color_range=1 if frame.colour.limited else 2,
-                        dst_color_range=1 if limited and not planar.is_rgb else 2)
+                        src_color_range=LIMITED_RANGE if frame.colour.limited else FULL_RANGE,
+                        dst_color_range=LIMITED_RANGE if limited and not planar.is_rgb else FULL_RANGE)
 
 
 _SWSCALE_MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9}

@@ -19,6 +19,9 @@ from ..typed import is_utf8
 from .exr import is_exr_truncated, non_utf8_names, non_utf8_strings
 from .formats import exr_header, exr_writer
 
+MAX_HALF = 65504
+"""Greatest finite value of a 16 bit float."""
+
 
 def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: bool = True,
               header: Mapping[str, Any] | None = None, commit_lock: AbstractContextManager[None] | None = None) -> None:
@@ -27,12 +30,13 @@ def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: b
     half: store 16 bit floats, clipped to their range; depth ("Z" and "*.Z") stays 32 bit, since it needs more. header:
     more attributes. commit_lock: see `atomic_path`.
     """
-    def stored(name: str, pixels: NDArray[Any]) -> NDArray[Any]:
+    def convert(name: str, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return a channel in the type that is stored."""
         if half and not name.endswith(".Z") and name != "Z":
-            return np.ascontiguousarray(np.clip(pixels, -65504, 65504), np.float16)
+            return np.ascontiguousarray(np.clip(pixels, -MAX_HALF, MAX_HALF), np.float16)
         return np.ascontiguousarray(pixels, np.float32)
 
-    stored_channels = {name: stored(name, pixels) for name, pixels in channels.items()}
+    stored_channels = {name: convert(name, pixels) for name, pixels in channels.items()}
     if importlib.util.find_spec("OpenEXR") is None:  # Blender's own Python
         with atomic_path(path, commit_lock) as temporary:
             exr_writer.write_scanlines(temporary, stored_channels, header or {})

@@ -96,8 +96,8 @@ def _blur(picture: NDArray[np.float64], borders: Borders) -> NDArray[np.float64]
             pad = [(WINDOW // 2, WINDOW // 2) if a == axis else (0, 0) for a in range(picture.ndim)]
             picture = np.pad(picture, pad)
         length = picture.shape[axis] - WINDOW + 1
-        parts = (weight * np.take(picture, range(i, i + length), axis) for i, weight in enumerate(window))
-        picture = sum(parts, np.zeros(()))
+        weighted_shifts = (weight * np.take(picture, range(i, i + length), axis) for i, weight in enumerate(window))
+        picture = sum(weighted_shifts, np.zeros(()))
     return picture
 
 

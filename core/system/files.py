@@ -206,7 +206,7 @@ def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
     """
     lock = Path(lock)
     lock.parent.mkdir(parents=True, exist_ok=True)
-    refusals, last_mtime, since = 0, 0, time.monotonic()  # since: when the lock was first seen with that time
+    refusals, last_mtime, unchanged_since = 0, 0, time.monotonic()
     while True:
         try:
             os.close(os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
@@ -217,8 +217,8 @@ def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
             try:
                 status = lock.stat()
                 if status.st_mtime_ns != last_mtime:
-                    last_mtime, since = status.st_mtime_ns, time.monotonic()
-                if max(time.time() - status.st_mtime, time.monotonic() - since) > stale_s:
+                    last_mtime, unchanged_since = status.st_mtime_ns, time.monotonic()
+                if max(time.time() - status.st_mtime, time.monotonic() - unchanged_since) > stale_s:
                     with file_lock(lock.with_name(lock.name + ".taken_over"), stale_s):  # others may want to as well
                         _remove_lock(lock, status.st_mtime_ns)
             except FileNotFoundError:

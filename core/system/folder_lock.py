@@ -37,7 +37,7 @@ def folder_lock(folder: Path | str) -> Iterator[None]:
     try:
         yield
     finally:
-        _remove(lock, descriptor)
+        _remove_lock_file(lock, descriptor)
         if is_new:
             with contextlib.suppress(OSError):  # not empty
                 folder.rmdir()
@@ -75,7 +75,7 @@ def _lock(descriptor: int) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def _remove(lock: Path, descriptor: int) -> None:
+def _remove_lock_file(lock: Path, descriptor: int) -> None:
     """Remove the lock file while it is locked, or another process could lock it and a third one a new file.
 
     Windows removes no open file, so there it is closed first.

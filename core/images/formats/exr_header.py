@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -134,9 +134,18 @@ def _channels(value: bytes) -> Iterator[tuple[int, bytes]]:
         offset = end + 17  # past the zero, the kind, whether it is linear, and the sampling
 
 
-def _iterate_attributes(stream: BinaryIO) -> Iterator[tuple[int, int, bytes, bytes, int]]:
-    """Yield the part, the offset of the name, name, type and length of value of each attribute of all headers, up to
-    the first damaged one. The stream is then at the value."""
+class _Attribute(NamedTuple):
+    """An attribute: number of its part, offset of its name, the name, its type, and the bytes of its value."""
+
+    part: int
+    name_offset: int
+    name: bytes
+    kind: bytes
+    length: int
+
+
+def _iterate_attributes(stream: BinaryIO) -> Iterator[_Attribute]:
+    """Yield the attributes of all headers, up to the first damaged one, each with the stream at its value."""
     stream.seek(len(MAGIC))
     has_parts = int.from_bytes(stream.read(4), "little") & _PARTS
     part, is_empty, name_offset = 0, True, stream.tell()
@@ -150,7 +159,7 @@ def _iterate_attributes(stream: BinaryIO) -> Iterator[tuple[int, int, bytes, byt
         if length < 0:
             return
         value_offset = stream.tell()
-        yield part, name_offset, name, kind, length
+        yield _Attribute(part, name_offset, name, kind, length)
         stream.seek(value_offset + length)
         is_empty, name_offset = False, stream.tell()
 

@@ -47,7 +47,7 @@ def fill_hidden(plate: Plate) -> Plate:
     small_size = max(round(width * scale), 1), max(round(height * scale), 1)
     light = plate.space.to_linear(plate.values) * alpha[..., None]
     filling = _pull_push_fill(*(np.asarray(cv2.resize(part, small_size, interpolation=cv2.INTER_AREA), np.float32)
-                         for part in (light, alpha)))
+                                for part in (light, alpha)))
     # Where alpha is partial, the filling shows through.
     light += (1 - alpha)[..., None] * np.asarray(cv2.resize(filling, (width, height)), np.float32)
     values = plate.space.from_linear(light)

@@ -165,9 +165,11 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         matte = mattes.read(frame.name, read_data_window(frame.source), read_exif(frame.source)[0]) if mattes else None
 
         def write() -> None:
-            (_, first), *others = split_views(plate)  # the eyes of a stereo picture; the first one is predicted above
-            cleaned = [remover.remove(first, matte, prediction), *(remover.remove(view, matte) for _, view in others)]
-            write_view_results(frame.results, plate, cleaned)
+            # The eyes of a stereo picture; the first one is predicted above.
+            (_, first_view), *other_views = split_views(plate)
+            view_results = [remover.remove(first_view, matte, prediction),
+                            *(remover.remove(view, matte) for _, view in other_views)]
+            write_view_results(frame.results, plate, view_results)
             if plate.warning:
                 progress.say(plate.warning)
 

@@ -59,9 +59,9 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress,
         plate, prediction = predictor.predict(frame.source)
         if frame.name in flared_names:
             prediction = prediction._replace(confidence=np.float32(1))
-        (_, first), *others = split_views(plate)
+        (_, first_view), *other_views = split_views(plate)
         return PreparedResults(lambda: write_view_results(frame.results, plate, [
-            remover.remove(first, prediction=prediction), *(remover.remove(view) for _, view in others)]),
+            remover.remove(first_view, prediction=prediction), *(remover.remove(view) for _, view in other_views)]),
             float(prediction.confidence))
 
     try:

@@ -13,6 +13,9 @@ Array = NDArray[np.float32]
 Point = tuple[float, float]
 Random = np.random.Generator
 
+GREEN_WAVELENGTH = 0.55
+"""Micrometres; colours separate about it."""
+
 
 def canvas_grid(size: int) -> tuple[Array, Array]:
     """Return x and y of the pixel centres of a square canvas, each (size, size), -1..1, x to the right, y down."""

@@ -18,7 +18,7 @@ from ...optics.prescription import (
     reflectance,
     trace_ghost_pairs,
 )
-from .canvas import Array, Point, Random, draw_ghost, log_uniform, random_tint, spectral_colour
+from .canvas import GREEN_WAVELENGTH, Array, Point, Random, draw_ghost, log_uniform, random_tint, spectral_colour
 
 
 @lru_cache(maxsize=2048)
@@ -50,7 +50,7 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
     rim, rim_width = (log_uniform(random, 0.1, 2.0), random.uniform(0.02, 0.12)) if random.random() < 0.6 else (0, 0.1)
     candidates = []  # (greatest channel, light by channel, path)
     for ghost in _ghost_paths(lens):
-        weight, radius = _brightness(ghost, coating_wavelengths, stop, entrance)
+        weight, radius = _brightness_and_radius(ghost, coating_wavelengths, stop, entrance)
         # Smaller ghosts are points, and larger ones an even veil.
         if 0.004 < radius / (HALF_DIAGONAL * crop) < 6 and np.isfinite(weight).all():
             candidates.append((float(weight.max()), weight, ghost))
@@ -121,7 +121,7 @@ def _draw_coatings(random: Random, lens: Prescription) -> NDArray[np.float64]:
     return coating_wavelengths
 
 
-def _brightness(ghost: GhostPath, coating_wavelengths: NDArray[np.float64], stop: float,
+def _brightness_and_radius(ghost: GhostPath, coating_wavelengths: NDArray[np.float64], stop: float,
                 entrance: float) -> tuple[NDArray[np.float64], float]:
     """Return the light (3,) of a ghost by channel, before any exposure, and its radius on the sensor, mm.
 
@@ -209,14 +209,14 @@ def draw_arc(random: Random, light: Point, size: int, x: Array, y: Array) -> Arr
     angle = np.arctan2(y, x) - direction
     opening_angle = random.uniform(0.1, 0.9) * (1 + light_radius)
     window = np.exp(-(np.arctan2(np.sin(angle), np.cos(angle)) / opening_angle) ** 2 * 2)
-    radius_of_pixel = np.hypot(x, y)
+    pixel_radius = np.hypot(x, y)
     wavelengths = np.linspace(0.42, 0.68, 9)
     colours = spectral_colour(wavelengths)
     layer = np.zeros((size, size, 3), np.float32)
     spread = random.uniform(-0.6, 0.6)  # of the colours: change of the radius per micrometre from green
     for wavelength, colour in zip(wavelengths, colours / colours.sum(0), strict=True):
-        radius_of_wave = radius * (1 + spread * (wavelength - 0.55))
-        layer += np.exp(-((radius_of_pixel - radius_of_wave) / width) ** 2)[..., None] * colour.astype(np.float32)
+        wave_radius = radius * (1 + spread * (wavelength - GREEN_WAVELENGTH))
+        layer += np.exp(-((pixel_radius - wave_radius) / width) ** 2)[..., None] * colour.astype(np.float32)
     return layer * window[..., None] * log_uniform(random, 0.1, 1.0)
 
 

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from .canvas import Array, Point, Random, log_uniform, spectral_colour
+from .canvas import GREEN_WAVELENGTH, Array, Point, Random, log_uniform, spectral_colour
 
 STOP_SAMPLES = 256
 """Samples across the plane of the stop, which fills about half of it."""
@@ -38,7 +38,7 @@ def draw_starburst(random: Random, light: Point, size: int) -> Array:
     spread = random.uniform(0.3, 1.0)  # of the colours; sensors mix wavelengths
     for wavelength, colour in zip(wavelengths, colours.astype(np.float32), strict=True):
         # An image grows with its wavelength, and its light spreads over zoom^2 as many pixels.
-        zoom = relative_size * (1 + spread * (wavelength / 0.55 - 1)) * size / (2 * STOP_SAMPLES)
+        zoom = relative_size * (1 + spread * (wavelength / GREEN_WAVELENGTH - 1)) * size / (2 * STOP_SAMPLES)
         x, y = (light[0] + 1) * size / 2, (light[1] + 1) * size / 2
         matrix = np.array([[zoom, 0, x - zoom * STOP_SAMPLES], [0, zoom, y - zoom * STOP_SAMPLES]])
         layer += cv2.warpAffine(blurred, matrix, (size, size))[..., None] * (colour / zoom**2)

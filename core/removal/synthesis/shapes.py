@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .canvas import Array, Point, Random, log_uniform, random_tint, spectral_colour
+from .canvas import GREEN_WAVELENGTH, Array, Point, Random, log_uniform, random_tint, spectral_colour
 
 
 def draw_streak(random: Random, light: Point, x: Array, y: Array) -> Array:
@@ -108,17 +108,17 @@ def draw_halo(random: Random, light: Point, x: Array, y: Array) -> Array:
         spread = random.uniform(-1, 1) if random.random() < 0.7 else 0.0
         ring = np.zeros_like(layer)
         for wavelength, colour in zip(wavelengths, colours.astype(np.float32), strict=True):
-            radius_of_wave = radius * (1 + spread * (wavelength - 0.55))  # about green, micrometres
-            side = np.where(r < radius_of_wave, random.uniform(0.7, 1.3), 1.0)
-            ring += np.exp(-((r - radius_of_wave) / (width * side)) ** 2)[..., None] * colour
+            wave_radius = radius * (1 + spread * (wavelength - GREEN_WAVELENGTH))
+            side = np.where(r < wave_radius, random.uniform(0.7, 1.3), 1.0)
+            ring += np.exp(-((r - wave_radius) / (width * side)) ** 2)[..., None] * colour
         if random.random() < 0.4:  # partial
             direction, opening_angle = random.uniform(-math.pi, math.pi), random.uniform(0.3, 2)
             angle_offset = np.arctan2(np.sin(angle - direction), np.cos(angle - direction))
             ring *= np.exp(-((angle_offset / opening_angle) ** 2))[..., None]
         if random.random() < 0.3:  # of fine rays
-            fine = sum(random.normal(0, 0.3) * np.cos(k * angle + random.uniform(0, 7))
+            ray_pattern = sum(random.normal(0, 0.3) * np.cos(k * angle + random.uniform(0, 7))
                        for k in random.integers(8, 120, 6))
-            ring *= np.exp(np.asarray(fine, np.float32))[..., None]
+            ring *= np.exp(np.asarray(ray_pattern, np.float32))[..., None]
         layer += level * ring * (random_tint(random, 0.5) if spread == 0 else random_tint(random, 0.15))
     return layer / max(float(layer.max()), 1e-9)
 

@@ -101,7 +101,7 @@ class RemovalTrainer:
     def _backward_on_gpu(self, batch: Batch) -> dict[str, float]:
         """Set the gradients by the captured graph; the metrics are those of the iteration before, so that the CPU does
         not wait for the GPU."""
-        psnr_phase, schedule = self._schedule()
+        psnr_phase, schedule = self._loss_schedule()
         schedule = schedule.pin_memory().to(self.device, non_blocking=True)
         *gradients, metrics = self._graphed_gradients[psnr_phase](batch.frame, batch.scene, batch.scene_with_glow,
                                                                   schedule)
@@ -118,13 +118,13 @@ class RemovalTrainer:
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """Return the loss at this iteration (`_compute_loss`), and the metrics."""
-        psnr_phase, schedule = self._schedule()
+        psnr_phase, schedule = self._loss_schedule()
         frame, scene, scene_with_glow = (part.to(self.device)
                                          for part in (batch.frame, batch.scene, batch.scene_with_glow))
         loss, metrics = self._compute_loss(psnr_phase, frame, scene, scene_with_glow, schedule.to(self.device))
         return loss, dict(zip(METRICS, metrics.tolist(), strict=True))
 
-    def _schedule(self) -> tuple[bool, Tensor]:
+    def _loss_schedule(self) -> tuple[bool, Tensor]:
         """Return whether the training is in its PSNR phase; then (3,): the power that a flare's mean square is raised
         to, the mean square of a faint flare (FAINT_FLARE_MSE), and that of an error that does not matter
         (ERROR_FLOOR_MSE)."""
@@ -145,7 +145,8 @@ class RemovalTrainer:
         mixes it with the mean of the same over patches. The prediction without the glow has half the weight of the
         whole one.
 
-        psnr_phase, schedule: the results of `_schedule`, passed in so that one captured graph serves every iteration.
+        psnr_phase, schedule: the results of `_loss_schedule`, passed in so that one captured graph serves every
+        iteration.
         """
         with _autocast(self.device):
             prediction = self.network(frame)

@@ -57,11 +57,12 @@ class Child:
     def events(self) -> Iterator[Event]:
         """Yield the events until the process ends; only for a child with an event queue of its own."""
         while True:
-            item = next_event(self._event_queue)
-            if item is not None:
-                if item[1] is None:
+            arrival = next_event(self._event_queue)
+            if arrival is not None:
+                _, event = arrival
+                if event is None:
                     return
-                yield item[1]
+                yield event
 
     def interrupt(self) -> None:
         """Ask the process to stop; the second call ends it at once."""
@@ -133,11 +134,11 @@ def combined_error(failed: Sequence[Child], count: int, step: str) -> FitFlareEr
     if silent := [child for child in failed if not child.error_text]:
         log_tail = silent[0].log_tail
         sys.stderr.write(log_tail)
-        who = f"{len(silent)} of {count} processes of {step}" if count > 1 else f"{silent[0].name}, for {step},"
+        subject = f"{len(silent)} of {count} processes of {step}" if count > 1 else f"{silent[0].name}, for {step},"
         statuses = ", ".join(str(child.status) for child in silent)
-        where = "the end of one log is above" if count > 1 else "the end of its log is above"
-        messages.append(f"{who} ended without a message, status {statuses}; "
-                    f"{where if log_tail else 'memory may have been short'}.")
+        log_hint = "the end of one log is above" if count > 1 else "the end of its log is above"
+        messages.append(f"{subject} ended without a message, status {statuses}; "
+                        f"{log_hint if log_tail else 'memory may have been short'}.")
         return EngineError(" ".join(messages))
-    kinds = {type(problem) for problem in problems}
-    return (kinds.pop() if len(kinds) == 1 else FitFlareError)(" ".join(messages))
+    error_types = {type(problem) for problem in problems}
+    return (error_types.pop() if len(error_types) == 1 else FitFlareError)(" ".join(messages))

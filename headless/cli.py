@@ -80,15 +80,15 @@ def build_parser() -> argparse.ArgumentParser:
                          help="the Blender for steps that need one (default, in this order: FIT_FLARE_BLENDER, the bpy "
                               "package of this Python, `blender` on the PATH, the system's usual places)")
     options.add_argument("--step", help=argparse.SUPPRESS)
-    parser_ = _Parser(prog="run.py", description=_DESCRIPTION, epilog=f"{_resume_summary()}\n{_EPILOGUE}",
-                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser_.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    parser = _Parser(prog="run.py", description=_DESCRIPTION, epilog=f"{_resume_summary()}\n{_EPILOGUE}",
+                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command in COMMANDS.values():
         subparser = commands.add_parser(command.name, parents=[shared], help=command.summary,
                                         description=f"{command.summary}\n\n{command.description}",
                                         formatter_class=argparse.RawDescriptionHelpFormatter)
         command.arguments(subparser)
-    return parser_
+    return parser
 
 
 def _resume_summary() -> str:
@@ -113,7 +113,7 @@ def main(argv: Sequence[str]) -> int:
             with _open_progress(argv) as progress:
                 for old, new in renamed.items():
                     progress.say(f"{old} is now {new}; the old name still works in this version.")
-                status = _exit_status(argv, progress)
+                status = _run_command(argv, progress)
         else:
             build_parser().print_help(sys.stderr)
             status = USAGE_ERROR
@@ -136,8 +136,8 @@ def _current_options(argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     return current, renamed
 
 
-def _exit_status(argv: Sequence[str], progress: Progress) -> int:
-    """Run the command, report its result or error, and return the exit status."""
+def _run_command(argv: Sequence[str], progress: Progress) -> int:
+    """Run the command that `argv` names, report its result or error, and return the exit status."""
     arguments = argparse.Namespace(argv=list(argv))
     try:
         if "" in argv:
@@ -168,9 +168,9 @@ def _exit_status(argv: Sequence[str], progress: Progress) -> int:
         progress.error(os_error_message(problem))
         return FAILED
     except Exception as problem:
-        looped = problem.__context__
-        if isinstance(problem, RuntimeError) and isinstance(looped, OSError) and looped.errno == errno.ELOOP:
-            progress.error(os_error_message(looped))  # how pathlib reports it before Python 3.13
+        context = problem.__context__
+        if isinstance(problem, RuntimeError) and isinstance(context, OSError) and context.errno == errno.ELOOP:
+            progress.error(os_error_message(context))  # how pathlib reports it before Python 3.13
             return FAILED
         if is_out_of_memory(problem):
             progress.error(f"This machine has not enough memory for it; {_memory_advice(arguments)}.")
@@ -195,11 +195,11 @@ def _open_progress(argv: Sequence[str]) -> Iterator[Progress]:
     """
     # As in argparse, the last --progress counts.
     values = " ".join(argv).replace("--progress=", "--progress ").split("--progress ")[1:]
-    kind = values[-1].split(" ")[0] if values else ""
-    if kind != "json" or "--help" in argv:  # the help is text on standard output
-        if kind == "openjd" and isinstance(sys.stdout, io.TextIOWrapper):  # farms read UTF-8 on every system
+    output_format = values[-1].split(" ")[0] if values else ""
+    if output_format != "json" or "--help" in argv:  # the help is text on standard output
+        if output_format == "openjd" and isinstance(sys.stdout, io.TextIOWrapper):  # farms read UTF-8 on every system
             sys.stdout.reconfigure(encoding="utf-8", errors="replace")
-        progress: Progress = OpenJdProgress() if kind == "openjd" else TerminalProgress()
+        progress: Progress = OpenJdProgress() if output_format == "openjd" else TerminalProgress()
         try:
             yield progress
         finally:
@@ -214,16 +214,16 @@ def _open_progress(argv: Sequence[str]) -> Iterator[Progress]:
 def _redirect_stdout(target: int) -> Iterator[TextIO]:
     """Point standard output at another file descriptor within the block; yield a stream to the original one."""
     sys.stdout.flush()
-    before = os.dup(1)
+    original = os.dup(1)
     os.dup2(target, 1)
     try:
-        with os.fdopen(os.dup(before), "w", encoding="utf-8") as stream:
+        with os.fdopen(os.dup(original), "w", encoding="utf-8") as stream:
             yield stream
             flush_or_drop(stream)
     finally:
         flush_or_drop(sys.stdout)
-        os.dup2(before, 1)
-        os.close(before)
+        os.dup2(original, 1)
+        os.close(original)
 
 
 @contextlib.contextmanager
@@ -279,8 +279,8 @@ def _run_step(step: Step, arguments: argparse.Namespace, argv: Sequence[str], pr
                               "X11, on a server too: install the one that is missing (see README.md), or name a "
                               "Blender with --blender.") from problem
     # An engine that --engine names is used even where this Python has torch.
-    elsewhere = step.side == "engine" and arguments.engine is not None and not arguments.step
-    if step.side == "any" or (hand_off.current_side() == step.side and not elsewhere):
+    uses_named_engine = step.side == "engine" and arguments.engine is not None and not arguments.step
+    if step.side == "any" or (hand_off.current_side() == step.side and not uses_named_engine):
         with _silence_stdout() if step.side == "blender" else _report_torch_load_errors():
             return step.run(arguments, progress)
     if arguments.step:

@@ -122,7 +122,7 @@ def _split_command_line(text: str) -> list[str]:
     if Path(text.strip('"')).is_file():
         return [text.strip('"')]
     try:
-        return [part.strip('"') if WINDOWS else part for part in shlex.split(text, posix=not WINDOWS)]
+        return [argument.strip('"') if WINDOWS else argument for argument in shlex.split(text, posix=not WINDOWS)]
     except ValueError:  # an unclosed quotation mark
         return []
 
@@ -177,8 +177,8 @@ def _relay_events(child: Child, progress: Progress) -> dict[str, Any]:
                 done = event["done"]
                 progress.stage(event["name"], event["total"], done)
             elif kind == "progress":
-                done, before = event["done"], done
-                progress.advance(done - before, **event["figures"])
+                done, done_before = event["done"], done
+                progress.advance(done - done_before, **event["figures"])
             elif kind == "say":
                 progress.say(event["text"])
             elif kind == "result":
@@ -192,7 +192,7 @@ def _forward_signals(child: Child) -> Iterator[None]:
 
     The child has its own process group, so the terminal does not send it any.
     """
-    before = {number: signal.getsignal(number) for number in stop_signals()}
+    previous_handlers = {number: signal.getsignal(number) for number in stop_signals()}
     received: list[int] = []
 
     def forward(number: int, frame: FrameType | None) -> None:
@@ -200,12 +200,12 @@ def _forward_signals(child: Child) -> Iterator[None]:
         if not received or not is_hangup(number):
             child.interrupt()
         received.append(number)
-        handler = before[number]
+        handler = previous_handlers[number]
         if callable(handler):
             handler(number, frame)
 
     try:
-        for number in before:
+        for number in previous_handlers:
             signal.signal(number, forward)
     except ValueError:  # only the main thread may set handlers
         yield
@@ -213,5 +213,5 @@ def _forward_signals(child: Child) -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)

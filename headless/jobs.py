@@ -34,19 +34,19 @@ def split_frames(numbers: Sequence[int], jobs: int) -> list[str]:
     check_at_least_one("--jobs", jobs)
     ordered = sorted(set(numbers))
     count = min(jobs, len(ordered))
-    cuts = [round(len(ordered) * part / count) for part in range(count + 1)] if count else [0]
-    return [_format_ranges(ordered[low:high]) for low, high in itertools.pairwise(cuts)]
+    bounds = [round(len(ordered) * part / count) for part in range(count + 1)] if count else [0]
+    return [_format_ranges(ordered[start:end]) for start, end in itertools.pairwise(bounds)]
 
 
 def _format_ranges(numbers: Sequence[int]) -> str:
     """Format ascending numbers, such as [1, 2, 3, 7] as "1-3,7"."""
-    runs: list[list[int]] = []
+    ranges: list[list[int]] = []
     for number in numbers:
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1][1] = number
         else:
-            runs.append([number, number])
-    return ",".join(f"{low}-{high}" if high > low else f"{low}" for low, high in runs)
+            ranges.append([number, number])
+    return ",".join(f"{low}-{high}" if high > low else f"{low}" for low, high in ranges)
 
 
 def run_jobs(args: argparse.Namespace, step: str, numbers: Sequence[int], progress: Progress,
@@ -115,10 +115,10 @@ def _run_all(commands: Sequence[Sequence[str]], jobs: int, counter: _JointProgre
             while waiting and len(running) < jobs:
                 running.append(Child(waiting.popleft(), variables, event_queue))
             counter.progress.check()
-            item = next_event(event_queue)
-            if item is None:
+            arrival = next_event(event_queue)
+            if arrival is None:
                 continue
-            child, event = item
+            child, event = arrival
             if event is None:
                 child.wait_or_kill()
                 running.remove(child)

@@ -65,14 +65,14 @@ def report_layers(frames: Sequence[NumberedFrame], folder: Path, total: int, pro
 
     skipped: names of what was left out, by reason.
     """
-    besides = "" if total == len(frames) else f", which holds {total}"
-    progress.say(f"Layers of {len(frames)} frame{'s' * (len(frames) != 1)} are in {folder}{besides}.")
+    total_note = "" if total == len(frames) else f", which holds {total}"
+    progress.say(f"Layers of {len(frames)} frame{'s' * (len(frames) != 1)} are in {folder}{total_note}.")
     tally = Tally("frame", "rendered", len(frames))
     tally.merge(skipped)
     progress.say(tally.sentence())
     return {"layers": str(folder), "frames": len(frames), "frames_in_folder": total, **tally.as_result()}
 
 
-def report_nothing(folder: Path) -> dict[str, object]:
+def empty_result(folder: Path) -> dict[str, object]:
     """Return the result of a task of a farm whose frames do not exist; the folder is not touched."""
     return {"layers": str(folder), "frames": 0}

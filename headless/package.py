@@ -51,10 +51,10 @@ def build(packer: list[str], out: Path) -> int:
 def add_handbook(package: Path) -> None:
     """Add the handbook to the extension, as HTML pages."""
     sys.path.insert(0, str(ROOT))
-    from headless.handbook import write_pages
+    from headless.handbook import render_pages
 
     with zipfile.ZipFile(package, "a", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in write_pages(ROOT / "docs" / "handbook").items():
+        for name, content in render_pages(ROOT / "docs" / "handbook").items():
             archive.writestr(f"handbook/{name}", content)
 
 

@@ -50,9 +50,9 @@ def space_of_plates(args: argparse.Namespace, plates: Sequence[Path], progress: 
     folders = [_capture_with_space(path, FILE) for path in plates]
     spaces = {folder: None if folder is None else read_plate_space(folder) for folder in folders}
     if len({None if space is None else space.fingerprint for space in spaces.values()}) > 1:
-        named = next(folder for folder in folders if folder is not None)
-        raise SettingsError(f"{named / FILE} names the colour space of some of the plates only; clean them in separate "
-                            "runs, or name one space with --plate-space.")
+        recorded = next(folder for folder in folders if folder is not None)
+        raise SettingsError(f"{recorded / FILE} names the colour space of some of the plates only; clean them in "
+                            "separate runs, or name one space with --plate-space.")
     folder, space = next(iter(spaces.items()))
     if folder is not None and space is not None:
         progress.say(f"The plates are read in the colour space {space.name}, which {folder / FILE} names.")

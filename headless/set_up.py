@@ -73,31 +73,31 @@ def run_logged(command: list[str]) -> str:
     Its output goes to the log, and the lines that name a download also to the events. The reason is its first line that
     begins with "ERROR:", as pip and `--fetch` write one, else its last line.
     """
-    last, unreached = "", False
+    reason, is_unreachable = "", False
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                           text=True, errors="replace") as process:
         assert process.stdout is not None
         try:
-            with _killed_by_stop_file(process):
+            with _kill_on_stop_file(process):
                 for line in process.stdout:
                     print(line, end="", file=sys.stderr, flush=True)
                     if line.strip().startswith(("Downloading ", "Installing collected")):
                         emit(type="say", text=line.strip()[:120])  # torch takes minutes
-                    unreached |= "Retrying (" in line  # pip's last line then speaks of versions
-                    if not last.startswith("ERROR:"):
-                        last = line.strip() or last
+                    is_unreachable |= "Retrying (" in line  # pip's last line then speaks of versions
+                    if not reason.startswith("ERROR:"):
+                        reason = line.strip() or reason
         except BaseException:
             process.kill()
             raise
     if not process.returncode:
         return ""
-    if unreached:
+    if is_unreachable:
         return "the network could not be reached"
-    return last.removeprefix("ERROR:").strip(" .")[:200] or f"status {process.returncode}"
+    return reason.removeprefix("ERROR:").strip(" .")[:200] or f"status {process.returncode}"
 
 
 @contextlib.contextmanager
-def _killed_by_stop_file(process: subprocess.Popen[str]) -> Iterator[None]:
+def _kill_on_stop_file(process: subprocess.Popen[str]) -> Iterator[None]:
     """Kill the process when the file that FIT_FLARE_STOP names appears (core/system/progress.py); raise
     KeyboardInterrupt then. On Windows the panel cannot send a signal."""
     stop_file, ended = os.environ.get("FIT_FLARE_STOP"), threading.Event()
@@ -237,14 +237,14 @@ def download_weights(url: str, file: Path, digest: str) -> str:
     step = weights_step(url, file, digest)
     emit(type="say", text=step.message)
     try:
-        why = run_logged(step.command)
+        reason = run_logged(step.command)
     finally:
         for partial in file.parent.glob(f".{glob.escape(file.name)}.*"):  # of a download that was killed
             partial.unlink(missing_ok=True)
-    return step.failure.replace("{why}", why) if why else ""
+    return step.failure.replace("{why}", reason) if reason else ""
 
 
-def only_weights(url: str, file: Path, digest: str) -> int:
+def set_up_weights(url: str, file: Path, digest: str) -> int:
     """Download the weights alone; return the exit status."""
     emit(type="stage", name="weights", total=1, done=0)
     if problem := download_weights(url, file, digest):
@@ -265,7 +265,8 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     if args.fetch:
         try:
-            fetch(args.fetch[0], Path(args.fetch[1]), args.fetch[2])
+            url, file, digest = args.fetch
+            fetch(url, Path(file), digest)
         except (OSError, ValueError) as problem:
             # `run_logged` in the parent process takes the reason from this line.
             print(f"ERROR: {getattr(problem, 'reason', None) or problem}", flush=True)
@@ -275,7 +276,8 @@ def main(argv: list[str]) -> int:
         if args.weights is None:
             parser.print_usage(sys.stderr)
             return 2
-        return only_weights(args.weights[0], Path(args.weights[1]), args.weights[2])
+        url, file, digest = args.weights
+        return set_up_weights(url, Path(file), digest)
     return set_up_engine(args.folder, args.packages, args.weights)
 
 
@@ -306,26 +308,37 @@ def set_up_engine(folder: Path, packages: list[str], weights: list[str] | None =
         emit(type="error", text=f"The engine in {folder} is in use; close other Blenders and programs that use it, "
                                "and set up again.")
         return 1
-    for number, step in enumerate(steps):
-        emit(type="say", text=step.message)
-        try:
-            why = run_logged(step.command)
-        except KeyboardInterrupt:
-            discard_environment(folder)
-            raise
-        if why:
-            discard_environment(folder)
-            emit(type="error", text=step.failure.replace("{why}", why))
-            return 1
-        emit(type="progress", stage="set up", done=number + 1, total=total, eta_s=None, figures={})
+    if problem := _run_steps(steps, folder, total):
+        emit(type="error", text=problem)
+        return 1
     result = {"engine": str(environment_python(folder))}
     if weights is not None:
-        if problem := download_weights(weights[0], Path(weights[1]), weights[2]):
+        url, file, digest = weights
+        if problem := download_weights(url, Path(file), digest):
             emit(type="say", text=problem)
             result["weights_error"] = problem
         emit(type="progress", stage="set up", done=total, total=total, eta_s=None, figures={})
     emit(type="result", data=result)
     return 0
+
+
+def _run_steps(steps: list[Step], folder: Path, total: int) -> str:
+    """Run the steps of a set-up in `folder`, `total` with that of the weights; return "" on success.
+
+    After a failure, or a stop, the environment is discarded; a failure is returned as a sentence.
+    """
+    for number, step in enumerate(steps):
+        emit(type="say", text=step.message)
+        try:
+            reason = run_logged(step.command)
+        except KeyboardInterrupt:
+            discard_environment(folder)
+            raise
+        if reason:
+            discard_environment(folder)
+            return step.failure.replace("{why}", reason)
+        emit(type="progress", stage="set up", done=number + 1, total=total, eta_s=None, figures={})
+    return ""
 
 
 if __name__ == "__main__":

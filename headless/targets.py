@@ -9,7 +9,7 @@ import argparse
 import hashlib
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ from ..core.images.unsupported import unsupported_file_error
 
 if TYPE_CHECKING:
     from ..core.capture.camera import Floats
-    from ..core.look.look import LightLook
+    from ..core.look.look import LightLook, Look
     from ..core.transfer.query import TrainingViews
     from ..core.transfer.target import Target
 
@@ -82,11 +82,11 @@ def shot_path(options: TargetOptions) -> Path:
     """Return the file that the Blender step writes the shot to; each range of frames has its own."""
     if options.shot:
         return options.shot
-    part = options.frames or ""
-    if not re.fullmatch(r"[\d,-]{0,60}", part):  # not a valid file name on every system
-        part = hashlib.sha256(part.encode()).hexdigest()[:8]
-    part = f".{part.replace(',', '_')}" if part else ""
-    return options.out / f"shot{part}.json"
+    suffix = options.frames or ""
+    if not re.fullmatch(r"[\d,-]{0,60}", suffix):  # not a valid file name on every system
+        suffix = hashlib.sha256(suffix.encode()).hexdigest()[:8]
+    suffix = f".{suffix.replace(',', '_')}" if suffix else ""
+    return options.out / f"shot{suffix}.json"
 
 
 def _target_kind(target: Path) -> str:
@@ -142,64 +142,79 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
     Raises SettingsError, CaptureError, FrameError and RunError.
     """
     from ..core.capture import Capture
-    from ..core.colour import colour_space
-    from ..core.conventions.frame_numbers import NumberedFrame, select_task_frames
     from ..core.conventions.run_files import SCENE
     from ..core.fit.run import Run
-    from ..core.lights.detection import Detector
-    from ..core.lights.exposure import ExposureDetector
     from ..core.look import read_look
-    from ..core.look.shot import Shot
-    from ..core.transfer.highlights import NAME
-    from ..core.transfer.query import training_views
     from ..core.transfer.sources import parse_assignments
-    from ..core.transfer.target import capture_target, picture_target, shot_target
+    from ..core.transfer.target import capture_target
 
-    look, to, sources = read_look(flare), list(options.to), parse_assignments(options.use)
-    if len(to) > 1 and not all(path.suffix.lower() in SUFFIXES for path in to):
+    look, paths, sources = read_look(flare), list(options.to), parse_assignments(options.use)
+    if len(paths) > 1 and not all(path.suffix.lower() in SUFFIXES for path in paths):
         raise SettingsError("Several targets at once have to be pictures.")
-    if missing := next((path for path in to if not path.exists()), None):
+    if missing := next((path for path in paths if not path.exists()), None):
         raise CaptureError(f"{missing} is missing; name a target for the flare: pictures, a capture, a run, a .blend, "
                            "a PLY or a shot.")
-    if len(to) == 1 and _target_kind(to[0]) == "capture" and _is_plate_folder(to[0]):
-        to = pictures_in(to[0])
-    kind = _target_kind(to[0])
+    if len(paths) == 1 and _target_kind(paths[0]) == "capture" and _is_plate_folder(paths[0]):
+        paths = pictures_in(paths[0])
+    kind = _target_kind(paths[0])
     check_options(options, kind)
     if options.highlight_gain is not None and options.highlights is None:
         raise SettingsError("--highlight-gain is for --highlights; give both.")
     if kind == "picture":
-        views = training_views(flare, look.lights, training)
-        distances = {light.name: _median_distance(light, views.get(light.name)) for light in look.lights}
-        if options.highlights is not None and options.light:
-            raise SettingsError("--highlights takes the lights from the plates; leave --light out.")
-        # The transfer moves this one light to the highlights of each plate; its pixel here has no meaning.
-        named = {NAME: (0.5, 0.5)} if options.highlights is not None else _parse_lights(options.light)
-        detector: Detector | None = None if named else ExposureDetector()
-        centre = _parse_point(options.centre) if options.centre else None
-        space = None if options.plate_space == "auto" else colour_space(options.plate_space, options.ocio)
-        return picture_target(to, look, named, sources, distances, detector=detector,
-                              focal=options.focal, centre=centre, space=space, training=views)
+        return _open_pictures(options, paths, look, sources, training)
     if kind in (".blend", ".json"):
-        path = shot_path(options) if kind == ".blend" else to[0]  # the Blender step has written that of a .blend
-        shot = Shot.read(path)
-        numbers = [NumberedFrame("", number, "") for number in sorted({shot_frame.frame for shot_frame in shot.frames})]
-        return shot_target(shot, look, sources, plates=options.plates, scene=options.scene,
-                           required_frames={frame.number for frame in
-                                            select_task_frames(numbers, options.frames, options.job_frames)})
+        # The Blender step has written the shot file of a .blend.
+        return _open_shot(options, shot_path(options) if kind == ".blend" else paths[0], look, sources)
     lights = Path(options.lights) if options.lights else None
     if kind == ".ply":
         if options.cameras is None:
-            raise SettingsError(f"{to[0]} is a scene without cameras; name a capture that has them with --cameras.")
+            raise SettingsError(f"{paths[0]} is a scene without cameras; name a capture that has them with --cameras.")
         return capture_target(Capture.open(options.cameras, need_frames=False), look, sources, lights=lights,
-                              scene=to[0], scene_is_background=True)
+                              scene=paths[0], scene_is_background=True)
     if kind == "run":
         capture = (Capture.open(options.cameras, need_frames=False) if options.cameras else
-                   Run.open(to[0]).capture(need_frames=False))
-        return capture_target(capture, look, sources, lights=lights, scene=options.scene or to[0] / SCENE,
+                   Run.open(paths[0]).capture(need_frames=False))
+        return capture_target(capture, look, sources, lights=lights, scene=options.scene or paths[0] / SCENE,
                               scene_is_background=True)
-    if to[0].is_dir() and not any(to[0].iterdir()):
-        raise CaptureError(f"{to[0]} is empty: neither pictures nor a capture; name a target for the flare.")
-    return capture_target(Capture.open(to[0]), look, sources, lights=lights, scene=options.scene)
+    if paths[0].is_dir() and not any(paths[0].iterdir()):
+        raise CaptureError(f"{paths[0]} is empty: neither pictures nor a capture; name a target for the flare.")
+    return capture_target(Capture.open(paths[0]), look, sources, lights=lights, scene=options.scene)
+
+
+def _open_pictures(options: TargetOptions, paths: list[Path], look: Look, sources: Mapping[str, str],
+                   training: list[Floats] | None) -> Target:
+    """Return the target of pictures. sources: of --use. training: as of `open_target`. Raises SettingsError."""
+    from ..core.colour import colour_space
+    from ..core.lights.detection import Detector
+    from ..core.lights.exposure import ExposureDetector
+    from ..core.transfer.highlights import NAME
+    from ..core.transfer.query import training_views
+    from ..core.transfer.target import picture_target
+
+    views = training_views(look.path, look.lights, training)
+    distances = {light.name: _median_distance(light, views.get(light.name)) for light in look.lights}
+    if options.highlights is not None and options.light:
+        raise SettingsError("--highlights takes the lights from the plates; leave --light out.")
+    # The transfer moves this one light to the highlights of each plate; its pixel here has no meaning.
+    positions = {NAME: (0.5, 0.5)} if options.highlights is not None else _parse_lights(options.light)
+    detector: Detector | None = None if positions else ExposureDetector()
+    centre = _parse_point(options.centre) if options.centre else None
+    space = None if options.plate_space == "auto" else colour_space(options.plate_space, options.ocio)
+    return picture_target(paths, look, positions, sources, distances, detector=detector, focal=options.focal,
+                          centre=centre, space=space, training=views)
+
+
+def _open_shot(options: TargetOptions, path: Path, look: Look, sources: Mapping[str, str]) -> Target:
+    """Return the target of a shot file. sources: of --use. Raises SettingsError."""
+    from ..core.conventions.frame_numbers import NumberedFrame, select_task_frames
+    from ..core.look.shot import Shot
+    from ..core.transfer.target import shot_target
+
+    shot = Shot.read(path)
+    numbers = [NumberedFrame("", number, "") for number in sorted({shot_frame.frame for shot_frame in shot.frames})]
+    selected = select_task_frames(numbers, options.frames, options.job_frames)
+    return shot_target(shot, look, sources, plates=options.plates, scene=options.scene,
+                       required_frames={frame.number for frame in selected})
 
 
 def left_out(options: TargetOptions, target: Target) -> list[tuple[str, list[str]]]:
@@ -208,8 +223,8 @@ def left_out(options: TargetOptions, target: Target) -> list[tuple[str, list[str
 
     folder = options.to[0]
     is_folder = len(options.to) == 1 and folder.is_dir() and _is_plate_folder(folder)
-    dark = [frame.plate.name for frame in target.frames if frame.plate is not None and not frame.shot.lights]
-    return [*(unlisted_entries(folder) if is_folder else ()), ("shows no light, so it has no flare", dark)]
+    unlit = [frame.plate.name for frame in target.frames if frame.plate is not None and not frame.shot.lights]
+    return [*(unlisted_entries(folder) if is_folder else ()), ("shows no light, so it has no flare", unlit)]
 
 
 def _is_plate_folder(folder: Path) -> bool:
@@ -227,20 +242,20 @@ def _median_distance(light: LightLook, views: TrainingViews | None) -> float:
 
     if views is not None:
         return float(np.median(views.distances))
-    reach = light.query_range
-    return float(np.linalg.norm((reach.camera_low + reach.camera_high) / 2 - light.xyz)) or 1.0
+    query_range = light.query_range
+    return float(np.linalg.norm((query_range.camera_low + query_range.camera_high) / 2 - light.xyz)) or 1.0
 
 
 def _parse_lights(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     """Parse each "[name=]x,y"; return the pixels by name. Raises SettingsError."""
-    places: dict[str, tuple[float, float]] = {}
+    positions: dict[str, tuple[float, float]] = {}
     for number, text in enumerate(texts, 1):
-        prefix, equals, place = text.rpartition("=")
+        prefix, equals, position_text = text.rpartition("=")
         name = prefix.strip() if equals else f"light{number}"
-        if name in places:
+        if name in positions:
             raise SettingsError(f"--light names {name!r} twice; give each light a name of its own.")
-        places[name] = _parse_point(place)
-    return places
+        positions[name] = _parse_point(position_text)
+    return positions
 
 
 def _parse_point(text: str) -> tuple[float, float]:

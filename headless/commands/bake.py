@@ -74,7 +74,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     cameras = {view.name: view.camera for view in capture.views}
     selected = frames.select_task(number_views(cameras), args, progress)
     if not selected:
-        return layers.report_nothing(args.out)
+        return layers.empty_result(args.out)
     if args.jobs != 1:
         jobs.run_jobs(args, "bake", [frame.number for frame in selected], progress)
     # After jobs, this keeps their finished frames and returns the record of all.
@@ -141,7 +141,7 @@ def _bake_frames(args: argparse.Namespace, progress: Progress, step: str,
     numbered = [NumberedFrame("", shot_frame.frame, "") for shot_frame in shot.frames]
     selected = frames.select_task(numbered, args, progress)
     if not selected:
-        return layers.report_nothing(args.out)
+        return layers.empty_result(args.out)
     if args.jobs != 1:
         jobs.run_jobs(args, step, [frame.number for frame in selected], progress)
     # After jobs, this keeps their finished frames and returns the record of all.

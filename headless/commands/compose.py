@@ -41,16 +41,16 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.out.resolve() == args.layers.resolve():
         raise SettingsError(f"{args.out} holds the layers; choose another folder for the frames.")
     layers = LayerFolder.open(args.layers)
-    known = [NumberedFrame("", number, str(path)) for number, path in layers.files.items()]
-    selected = frames.select_task(known, args, progress)
+    available = [NumberedFrame("", number, str(path)) for number, path in layers.files.items()]
+    selected = frames.select_task(available, args, progress)
     if not selected:
         return {"frames": str(args.out)}
-    done = compose_frames(layers, args.out, progress, numbers=[frame.number for frame in selected],
-                          intensity=args.intensity, tint=args.tint)
-    progress.say(f"The frames are in {done['frames']}; {done['blend']} opens in Blender.")
+    result = compose_frames(layers, args.out, progress, numbers=[frame.number for frame in selected],
+                            intensity=args.intensity, tint=args.tint)
+    progress.say(f"The frames are in {result['frames']}; {result['blend']} opens in Blender.")
     tally = Tally("frame", "composed", len(selected))
     progress.say(tally.sentence())
-    return {**done, **tally.as_result()}
+    return {**result, **tally.as_result()}
 
 
 def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, numbers: Sequence[int] | None = None,
@@ -79,9 +79,9 @@ def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, number
     if not (window := layers.window()).is_frame:
         progress.say(f"The layers have overscan ({window.size[0]} x {window.size[1]} pixels for a frame of "
                      f"{window.frame[0]} x {window.frame[1]}), which Blender cannot show; its nodes cut it off.")
-    for note in (render_settings.set_plain_view(scene), setup.colour_space_warning(scene)):
-        if note:
-            progress.say(note)
+    for sentence in (render_settings.set_plain_view(scene), setup.colour_space_warning(scene)):
+        if sentence:
+            progress.say(sentence)
     node.inputs["Intensity"].default_value = intensity
     node.inputs["Tint"].default_value = (*colour, 1.0)
     for name in _VARYING_METADATA:

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if not source.is_dir():
         raise CaptureError(f"There is no capture in {source}; the sample comes with the repository, "
                            "or name another with --capture.")
-    began = time.monotonic()
+    start = time.monotonic()
     capture = with_lights(Capture.open(args.capture or _copy_sample(out, args.remove)), progress)
     if args.remove:
         capture = with_removed(capture, progress)
@@ -77,17 +77,18 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     bake(run_, number_views(cameras), cameras, out / "layers", progress=progress, overwrite=True)
     write_sheet(capture, run_.settings.holdout, out)
     progress.say(f"The run, the layers of {len(cameras)} frames (EXR) and {SHEET} are in {out}; "
-                 f"{time.monotonic() - began:.0f} s.")
+                 f"{time.monotonic() - start:.0f} s.")
     return {**result, "run": str(run_.folder), "layers": str(out / "layers"), "sheet": str(out / SHEET)}
 
 
-def _copy_sample(out: Path, remove: bool) -> Path:
+def _copy_sample(out: Path, without_clean_frames: bool) -> Path:
     """Copy the sample to DIR/capture, where results can be written; return the copy.
 
-    Its lights are left out, since the demo finds them, and with `remove` also its clean frames, since it makes them.
+    Its lights are left out, since the demo finds them; `without_clean_frames` also its clean frames, which the demo
+    makes with --remove.
     """
-    copy = out / ("capture-removal" if remove else "capture")
-    left_out = [LIGHTS, REMOVED] if remove else [LIGHTS]
+    copy = out / ("capture-removal" if without_clean_frames else "capture")
+    left_out = [LIGHTS, REMOVED] if without_clean_frames else [LIGHTS]
     if not copy.exists():
         with atomic_folder(copy) as temporary:
             shutil.copytree(SAMPLE, temporary, ignore=shutil.ignore_patterns(*left_out), dirs_exist_ok=True)
@@ -140,9 +141,10 @@ def composite_frames(args: argparse.Namespace, progress: Progress) -> dict[str, 
     """Blender step: composite the baked layers."""
     from ...core.bake.folder import LayerFolder
 
-    done = compose.compose_frames(LayerFolder.open(args.out / "layers"), args.out / "frames", progress)
-    progress.say(f"Blender {done['blender']} composited the frames in {done['frames']}; {done['blend']} opens there.")
-    return done
+    result = compose.compose_frames(LayerFolder.open(args.out / "layers"), args.out / "frames", progress)
+    progress.say(f"Blender {result['blender']} composited the frames in {result['frames']}; {result['blend']} opens "
+                 "there.")
+    return result
 
 
 COMMAND = Command(

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.errors import RunError, SettingsError
 from ...core.system.files import check_no_overwrite
 from ...core.system.progress import Progress
 from .. import frames
 from ..command import Command, Step
+
+if TYPE_CHECKING:
+    from ...core.capture import Camera
+    from ...core.conventions.frame_numbers import NumberedFrame
+    from ...core.look import Look, LookEdits
 
 KINDS = ("preset", "ply")
 
@@ -38,7 +44,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.conventions.run_files import FLARE
     from ...core.fit.run import Run
     from ...core.look import LookEdits, ViewOfLight, read_look
-    from ...core.transfer.export import write_flare_ply, write_preset
+    from ...core.transfer.export import write_preset
 
     folder = args.capture
     if args.flare.is_dir():
@@ -58,32 +64,43 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         capture = capture.with_exposures(Run.open(args.flare).exposures)
     cameras = {view.name: view.camera for view in capture.views}
     selected = frames.select(number_views(cameras), args.frames, progress)
-    if args.kind == "preset":
-        if args.frames is not None and len(selected) > 1:
-            raise SettingsError(f"A preset holds one frame, and --frames {args.frames} selects {len(selected)}; select "
-                                "one.")
-        number, camera = selected[0].number, cameras[selected[0].view]
-        views = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
-        behind = [name for name, view in views.items() if view.depth <= 0]
-        if len(behind) == len(views):
-            raise RunError(f"No light is in front of the camera in frame {number} of {folder}; name another with "
-                           "--frames.")
-        write_preset(args.out, look, views, edits, camera)
-        progress.say(f"The preset is {args.out}.")
-        if behind:
-            progress.say(f"Lights behind the camera in frame {number} are left out: {', '.join(behind)}.")
-        return {"preset": str(args.out)}
+    if args.kind == "ply":
+        return _write_plys(args.out, look, edits, selected, cameras, progress)
+    if args.frames is not None and len(selected) > 1:
+        raise SettingsError(f"A preset holds one frame, and --frames {args.frames} selects {len(selected)}; select "
+                            "one.")
+    number, camera = selected[0].number, cameras[selected[0].view]
+    views = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
+    behind = [name for name, view in views.items() if view.depth <= 0]
+    if len(behind) == len(views):
+        raise RunError(f"No light is in front of the camera in frame {number} of {folder}; name another with "
+                       "--frames.")
+    write_preset(args.out, look, views, edits, camera)
+    progress.say(f"The preset is {args.out}.")
+    if behind:
+        progress.say(f"Lights behind the camera in frame {number} are left out: {', '.join(behind)}.")
+    return {"preset": str(args.out)}
+
+
+def _write_plys(out: Path, look: Look, edits: LookEdits, selected: Sequence[NumberedFrame],
+                cameras: Mapping[str, Camera], progress: Progress) -> dict[str, Any]:
+    """Write the flare of each selected frame as a PLY into the folder `out`; return the command's result.
+
+    cameras: by the view's name.
+    """
+    from ...core.transfer.export import write_flare_ply
+
     progress.stage("export", len(selected))
     for frame in selected:
         camera = cameras[frame.view]
         flares = {light: gaussians.with_exposure(camera.exposure, look.blend)
                   for light, gaussians in look.evaluate(camera.world_to_camera, edits=edits).items()}
-        write_flare_ply(args.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"), flares, camera,
+        write_flare_ply(out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"), flares, camera,
                         look.blend, look.pixel_grid)
         progress.advance()
     summary = "1 frame of Gaussians is" if len(selected) == 1 else f"{len(selected)} frames of Gaussians are"
-    progress.say(f"{summary} in {args.out}.")
-    return {"ply": str(args.out), "frames": len(selected)}
+    progress.say(f"{summary} in {out}.")
+    return {"ply": str(out), "frames": len(selected)}
 
 
 COMMAND = Command(

@@ -87,8 +87,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     check_at_least_one("--jobs", args.jobs)
     if args.list_file is not None and args.entry is None:
         count = len(read_list(args.list_file))
-        parts = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]
-        jobs.run_parts(args, "fit", parts, args.jobs, count, progress, continue_on_failure=True)
+        part_options = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]
+        jobs.run_parts(args, "fit", part_options, args.jobs, count, progress, continue_on_failure=True)
         progress.say(f"{count} runs are in {args.out}.")
         return {"runs": str(args.out), "count": count}
     folder, out = resolve_folders(args)
@@ -149,9 +149,9 @@ def scene_kind(scene: Path | None, capture: Capture, progress: Progress) -> str:
 def with_supervision(capture: Capture, settings: FitSettings, progress: Progress) -> Capture:
     """Return the capture with the clean frames that a fit with these settings needs; they are made where missing."""
     # The exact scene of a rendered capture serves as its clean frames; a frozen scene needs none.
-    exact = settings.supervised and capture.has_truth
-    needed = settings.needs_clean_frames and not settings.scene.frozen and not exact
-    return with_removed(capture, progress, is_flared=settings.uses_plates) if needed else capture
+    has_exact = settings.supervised and capture.has_truth
+    needs_clean_frames = settings.needs_clean_frames and not settings.scene.frozen and not has_exact
+    return with_removed(capture, progress, is_flared=settings.uses_plates) if needs_clean_frames else capture
 
 
 def default_mode(capture: Capture, frozen: bool, progress: Progress) -> Mode:
@@ -182,8 +182,8 @@ def resolve_folders(args: argparse.Namespace) -> tuple[Path, Path]:
     if not 1 <= args.entry <= len(folders):
         raise SettingsError(f"{args.list_file} lists {len(folders)} captures; --entry {args.entry} is none of them.")
     names = [folder.resolve().name if folder.name in ("", "..") else folder.name for folder in folders]
-    name, same = names[args.entry - 1], [other.casefold() for other in names]  # "A" is "a" on Windows, macOS
-    is_unique = same.count(name.casefold()) == 1
+    name, casefolded_names = names[args.entry - 1], [each.casefold() for each in names]  # "A" is "a" on Windows, macOS
+    is_unique = casefolded_names.count(name.casefold()) == 1
     return folders[args.entry - 1], args.out / (name if is_unique else f"{args.entry:03d}_{name}")
 
 

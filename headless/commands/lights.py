@@ -83,11 +83,12 @@ def _follow(capture: Capture, args: argparse.Namespace, progress: Progress) -> d
     """Follow the lights of frames without a camera solve as the arguments say, and return the command's result."""
     from ...core.lights.file import check_replaceable
 
-    unused = {"--method": args.method != "exposure", "--threshold": args.threshold is not None,
-              "--scene": args.scene is not None}
-    if any(unused.values()):
-        raise SettingsError(f"{next(name for name, used in unused.items() if used)} needs a camera solve, and "
-                            f"{capture.folder} has none; leave it out, or run solve first.")
+    unusable_options = {"--method": args.method != "exposure", "--threshold": args.threshold is not None,
+                        "--scene": args.scene is not None}
+    if any(unusable_options.values()):
+        option = next(name for name, is_set in unusable_options.items() if is_set)
+        raise SettingsError(f"{option} needs a camera solve, and {capture.folder} has none; leave it out, or run solve "
+                            "first.")
     if args.focal is not None:
         camera = capture.views[0].camera
         write_json(capture.folder / CAMERA, {"focal_px": args.focal, "width": camera.width, "height": camera.height})

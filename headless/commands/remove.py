@@ -109,21 +109,21 @@ def _clean_plates(args: argparse.Namespace, progress: Progress) -> dict[str, Any
     from ...core.removal.jobs.mattes import Mattes
     from ...core.removal.jobs.video_frames import expand_videos
 
-    named = plate_space.named_space(args)
-    inputs, left_out = expand_videos(args.plates, args.out, progress, None if named is None else named.name)
+    named_space = plate_space.named_space(args)
+    inputs, left_out = expand_videos(args.plates, args.out, progress, None if named_space is None else named_space.name)
     for sentence in left_out:
         progress.say(f"Left out: {sentence}")
     failed = left_out if args.frames is None else []  # reported by the whole command, not by each part
     selected_paths = None
     if args.frames is not None or args.jobs != 1:
         plates = dict(collect_plates(inputs, [args.out, args.flare, args.matte]))
-        known = [NumberedFrame(str(path), number, "") for path, number in number_sequences(plates).items()]
-        chosen = frames.select_task(known, args, progress)
-        if not chosen:
+        available = [NumberedFrame(str(path), number, "") for path, number in number_sequences(plates).items()]
+        selected = frames.select_task(available, args, progress)
+        if not selected:
             return {"plates": str(args.out), "made": 0, "kept": 0}
-        selected_paths = {plates[Path(frame.view)] for frame in chosen}
+        selected_paths = {plates[Path(frame.view)] for frame in selected}
         if args.jobs != 1:
-            jobs.run_jobs(args, "remove", [frame.number for frame in chosen], progress, continue_on_failure=True)
+            jobs.run_jobs(args, "remove", [frame.number for frame in selected], progress, continue_on_failure=True)
             if failed:
                 raise FrameError(f"The other clean plates are in {args.out}. {join_failures(failed)}")
             progress.say(f"The clean plates are in {args.out}.")
@@ -139,8 +139,9 @@ def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[s
     from ...core.fit import Run
     from ...core.removal.jobs.fitted import remove_fitted_flare
 
-    network = (args.weights, args.working_size, args.matte, args.stills, args.base, args.sensitivity)
-    if args.jobs != 1 or args.model != "network" or glow.is_set(args) or any(network) or args.amount is not None:
+    uses_network = args.model != "network" or glow.is_set(args) or args.amount is not None or any(
+        (args.weights, args.working_size, args.matte, args.stills, args.base, args.sensitivity))
+    if args.jobs != 1 or uses_network:
         raise SettingsError("--run subtracts the fitted flare; only --out, --frames, --flare, --capture and "
                             "--overwrite go with it.")
     fitted = Run.open(args.run)
@@ -148,10 +149,10 @@ def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[s
     if fitted.settings.mode == "3dgs":
         raise RunError(fitted.missing_flare_message)
     capture = fitted.capture(args.capture)
-    chosen = frames.select_task(number_views([view.name for view in capture.views]), args, progress)
-    if not chosen:
+    selected = frames.select_task(number_views([view.name for view in capture.views]), args, progress)
+    if not selected:
         return {"plates": str(args.out), "made": 0, "kept": 0}
-    selected_names = {frame.view for frame in chosen}
+    selected_names = {frame.view for frame in selected}
     views = [view for view in capture.views if view.name in selected_names]
     return remove_fitted_flare(fitted, capture, views, args.out, progress, flare_folder=args.flare,
                                overwrite=args.overwrite, fit_digest=fitted.fingerprint,
@@ -162,7 +163,7 @@ def _make_remover(args: argparse.Namespace, progress: Progress) -> Remover:
     """Return the remover that the options select. Raises SettingsError and CaptureError."""
     from ...core.removal.inference.remover import WORKING_SIZE
 
-    remover = _make_model(args, WORKING_SIZE if args.working_size is None else args.working_size)
+    remover = _make_remover_of_model(args, WORKING_SIZE if args.working_size is None else args.working_size)
     remover.use_device(args.device)
     remover.use_controls(1.0 if args.amount is None else args.amount, args.sensitivity or "normal")
     space = plate_space.space_of_plates(args, args.plates, progress)
@@ -171,7 +172,7 @@ def _make_remover(args: argparse.Namespace, progress: Progress) -> Remover:
     return remover
 
 
-def _make_model(args: argparse.Namespace, size: int) -> Remover:
+def _make_remover_of_model(args: argparse.Namespace, size: int) -> Remover:
     """Return the remover of the model that the options select. Raises SettingsError."""
     from ...core.removal.inference.remover import Remover
 
@@ -202,9 +203,9 @@ def with_removed(capture: Capture, progress: Progress, *, is_flared: bool = Fals
         check_clean_frames_current(capture)
         return capture
     progress.say(f"{capture.folder} has no removed/; making clean frames there.")
-    flared = [view.name for view in capture.views if is_flared and any(
+    flared_views = [view.name for view in capture.views if is_flared and any(
         capture.light_state(light, view).on != 0 for light in capture.lights)]
-    clean_capture(capture, Remover(glow="remove"), progress, flared)
+    clean_capture(capture, Remover(glow="remove"), progress, flared_views)
     return capture.reopen()
 
 

@@ -58,12 +58,12 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.fit import fit as fit_capture
     from ...core.removal.jobs.fitted import remove_fitted_flare
 
-    began, out = time.monotonic(), args.out
+    start, out = time.monotonic(), args.out
     capture, kind = _open_capture(args, progress)
-    settings = _settings(args, kind, capture, progress)
+    settings = _fit_settings(args, kind, capture, progress)
     capture = fit.with_supervision(capture, settings, progress)
     run_ = fit_capture(capture, settings, out / RUN, progress, resume=True)
-    scores = _score(run_, progress)
+    scores = _score_held_out(run_, progress)
     capture = run_.capture()
     cameras = {view.name: view.camera for view in capture.views}
     bake(run_, number_views(cameras), cameras, out / LAYERS, progress=progress, overwrite=True)
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                         above_white=run_.settings.display_white > 1)
     write_sheet(capture, run_.settings.holdout, out)
     progress.say(f"The run, the layers of {len(cameras)} frames (EXR), the clean frames and {SHEET} are in {out}; "
-                 f"{time.monotonic() - began:.0f} s.")
+                 f"{time.monotonic() - start:.0f} s.")
     return {**scores, "scene": kind, "run": str(run_.folder), "layers": str(out / LAYERS), "clean": str(out / CLEAN),
             "sheet": str(out / SHEET)}
 
@@ -87,25 +87,25 @@ def _open_capture(args: argparse.Namespace, progress: Progress) -> tuple[Capture
     if not source.exists():
         raise CaptureError(f"{source} is missing; name a video or a folder of frames.")
     if args.scene != "plates":
-        solved, reason = _solved(args, progress)
+        solved, reason = _try_solve(args, progress)
         if solved is not None:
             capture = with_lights(solved, progress)
-            moving = [light.name for light in capture.lights if light.moves]
-            if not moving or args.scene == "gaussians":
+            moving_lights = [light.name for light in capture.lights if light.moves]
+            if not moving_lights or args.scene == "gaussians":
                 progress.say("The camera is solved: the scene is Gaussians in 3D.")
                 return capture, "gaussians"
-            reason = f"lights move ({', '.join(moving)})."
+            reason = f"lights move ({', '.join(moving_lights)})."
         elif args.scene == "gaussians":
             raise CaptureError(f"The camera cannot be solved: {reason}")
         progress.say(f"The scene is plates, one clean frame per frame: {reason}")
-    folder = _frames_folder(args, progress)
+    folder = _prepare_frames_folder(args, progress)
     if args.focal is not None:
         width = Capture.open(folder, need_cameras=False).views[0].camera.width
         write_json(folder / "camera.json", {"focal_px": args.focal, "width": width})
     return with_lights(Capture.open(folder, need_cameras=False), progress), "plates"
 
 
-def _solved(args: argparse.Namespace, progress: Progress) -> tuple[Capture | None, str]:
+def _try_solve(args: argparse.Namespace, progress: Progress) -> tuple[Capture | None, str]:
     """Return the source as a capture with cameras, and ""; or None, and the reason as a sentence."""
     from ...core.capture import Capture
     from ...core.capture.solve import SolveSettings, solve
@@ -124,7 +124,7 @@ def _solved(args: argparse.Namespace, progress: Progress) -> tuple[Capture | Non
     return Capture.open(args.out / SOLVED), ""
 
 
-def _frames_folder(args: argparse.Namespace, progress: Progress) -> Path:
+def _prepare_frames_folder(args: argparse.Namespace, progress: Progress) -> Path:
     """Return DIR/shot with the frames of the source in images/: extracted from a video, or copied."""
     from ...core.images.listing import pictures_below
     from ...core.images.video import is_video
@@ -140,16 +140,16 @@ def _frames_folder(args: argparse.Namespace, progress: Progress) -> Path:
         images = source / "images" if (source / "images").is_dir() else source
         with atomic_folder(folder) as temporary:
             for path in pictures_below(images):
-                target = temporary / "images" / path.relative_to(images)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(path, target)
+                copy_path = temporary / "images" / path.relative_to(images)
+                copy_path.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, copy_path)
             for name in ("camera.json", LIGHTS):
                 if (source / name).is_file():
                     shutil.copyfile(source / name, temporary / name)
     return folder
 
 
-def _settings(args: argparse.Namespace, kind: str, capture: Capture, progress: Progress) -> Any:
+def _fit_settings(args: argparse.Namespace, kind: str, capture: Capture, progress: Progress) -> Any:
     """Return the settings of the fit: those of an existing run, which is resumed, else new ones. kind: of the scene."""
     from ...core.conventions.run_files import CONFIG
     from ...core.fit import Run, preset
@@ -164,7 +164,7 @@ def _settings(args: argparse.Namespace, kind: str, capture: Capture, progress: P
     return override_settings(settings, {"width": args.size, "holdout": fit.parse_holdout(args.holdout)})
 
 
-def _score(run_: Run, progress: Progress) -> dict[str, Any]:
+def _score_held_out(run_: Run, progress: Progress) -> dict[str, Any]:
     """Score the held-out views, if there are any."""
     held_out = run_.capture().split(run_.settings.holdout)[1]
     return score_run(run_.folder, progress) if held_out else {}
@@ -176,9 +176,9 @@ def build_compositor(args: argparse.Namespace, progress: Progress) -> dict[str, 
 
     if (args.out / "compositor" / compose.BLEND).is_file():
         return {"blend": str(args.out / "compositor" / compose.BLEND)}
-    done = compose.compose_frames(LayerFolder.open(args.out / LAYERS), args.out / "compositor", progress, numbers=[])
-    progress.say(f"{done['blend']} opens in Blender, with the layers in its compositor.")
-    return {"blend": done["blend"]}
+    result = compose.compose_frames(LayerFolder.open(args.out / LAYERS), args.out / "compositor", progress, numbers=[])
+    progress.say(f"{result['blend']} opens in Blender, with the layers in its compositor.")
+    return {"blend": result["blend"]}
 
 
 COMMAND = Command(

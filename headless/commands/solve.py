@@ -13,8 +13,7 @@ from .. import plate_space, tallies
 from ..command import Command, Step, parse_seed, reject_unused_options
 
 SOLVE_DEFAULTS = {"frames": 0, "matching": "auto", "lens": "RADIAL", "work_size": 1000, "size": 0, "no_mask": False,
-              "seed": 0, "plate_space": None,
-                  "ocio": None}
+                  "seed": 0, "plate_space": None, "ocio": None}
 """Defaults of the options that apply to frames without cameras only."""
 
 
@@ -52,8 +51,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.capture.solve import PICTURE, REPORT, SolveSettings, solve
 
     if args.plates or args.lights:
-        what = "--plates is only for a .blend, .nk or .chan" if args.plates else "--lights is only for a .blend"
-        raise SettingsError(f"{what}; leave it out.")
+        message = "--plates is only for a .blend, .nk or .chan" if args.plates else "--lights is only for a .blend"
+        raise SettingsError(f"{message}; leave it out.")
     settings = SolveSettings(frames=args.frames, matching=args.matching, lens=args.lens.upper(),
                              size=args.work_size, output_size=args.size, mask=not args.no_mask, seed=args.seed,
                              plate_space="" if plate_space.named_space(args) is None else args.plate_space,

@@ -63,7 +63,6 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     from ...core.optics.prescription import built_in_lenses, read_lenses
     from ...core.removal.evaluation import held_out_lenses
-    from ...core.removal.model import recipe as recipes
     from ...core.removal.model.weights_file import default_weights
     from ...core.removal.training.backgrounds import (
         describe_unusable,
@@ -71,8 +70,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         read_backgrounds,
         shared_backgrounds,
     )
-    from ...core.removal.training.flare_bank import UserFlares
-    from ...core.removal.training.run import read_recipe, train
+    from ...core.removal.training.run import train
 
     if args.model == "network":
         reject_unused_options(args, {"base": None, "keep_glow": False, "lpips": None}, "--model diffusion")
@@ -84,6 +82,40 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.threads is not None:
         check_at_least_one("--threads", args.threads)
         torch.set_num_threads(args.threads)
+    recipe = _make_recipe(args, progress)
+    lenses = read_lenses(args.lenses, args.max_lenses) if args.lenses else []
+    train_lenses = [lens for lens in lenses if not is_held_out(lens.name)] + built_in_lenses()
+    test_lenses = held_out_lenses(lenses)
+    with shared_backgrounds(args.backgrounds, "train", augmented=True) as backgrounds:
+        try:
+            validation = read_backgrounds(args.backgrounds, "test"), test_lenses
+        except SettingsError:
+            validation = None
+            progress.say("There are too few clean pictures for a validation set; the log will have no validation "
+                         "scores.")
+        unusable = [*backgrounds.unusable, *(validation[0].unusable if validation else ())]
+        if sentence := describe_unusable(unusable):
+            progress.say(sentence)
+        user_flares = _read_user_flares(args.flares, recipe, progress) if args.flares else None
+        if args.model == "diffusion":
+            return _train_diffusion(args, recipe, backgrounds, train_lenses, user_flares, progress)
+        start = default_weights() if str(args.start) == "box" else args.start
+        progress.say(f"{len(backgrounds.photos)} photographs, {len(backgrounds.maps)} environment maps, "
+                     f"{len(train_lenses)} lenses, {len(user_flares) if user_flares else 'no'} flares of your own.")
+        path = train(recipe, args.out, backgrounds, train_lenses, validation=validation, user_flares=user_flares,
+                     resume=args.resume, start=start, processes=args.processes, progress=progress)
+        progress.say(f"The weights are in {path}; use them with `remove --weights`.")
+        return {"weights": str(path)}
+
+
+def _make_recipe(args: argparse.Namespace, progress: Progress) -> Recipe:
+    """Return the recipe of a resumed training, else the default one, with the changes of --iterations and --set.
+
+    Raises SettingsError.
+    """
+    from ...core.removal.model import recipe as recipes
+    from ...core.removal.training.run import read_recipe
+
     changes = dict(map(parse_setting, args.changes))
     if args.iterations is not None:
         changes["iterations"] = args.iterations
@@ -92,36 +124,21 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         stored_recipe = read_recipe(args.out)
         if stored_recipe is None:
             progress.say(f"{args.out} holds no training to resume; a new one starts there.")
-    recipe = recipes.from_dict({**recipes.as_dict(stored_recipe or recipes.Recipe()), **changes})
-    lenses = read_lenses(args.lenses, args.max_lenses) if args.lenses else []
-    train_on = [lens for lens in lenses if not is_held_out(lens.name)] + built_in_lenses()
-    test_on = held_out_lenses(lenses)
-    with shared_backgrounds(args.backgrounds, "train", augmented=True) as backgrounds:
-        try:
-            validation = read_backgrounds(args.backgrounds, "test"), test_on
-        except SettingsError:
-            validation = None
-            progress.say("There are too few clean pictures for a validation set; the log will have no validation "
-                         "scores.")
-        left_out = [*backgrounds.unusable, *(validation[0].unusable if validation else ())]
-        if sentence := describe_unusable(left_out):
-            progress.say(sentence)
-        user_flares = UserFlares(args.flares, recipe.canvas_size) if args.flares else None
-        if user_flares and user_flares.unreadable:
-            progress.say(f"Left out of your flares: {join_failures(user_flares.unreadable)}")
-        if user_flares and user_flares.missing_light:
-            progress.say(f"{len(user_flares.missing_light)} of your {len(user_flares)} flares have no picture of their "
-                         f"light in Light_Source, {user_flares.missing_light[0].name} first; it is learned as a part "
-                         "of the flare.")
-        if args.model == "diffusion":
-            return _train_diffusion(args, recipe, backgrounds, train_on, user_flares, progress)
-        start = default_weights() if str(args.start) == "box" else args.start
-        progress.say(f"{len(backgrounds.photos)} photographs, {len(backgrounds.maps)} environment maps, "
-                     f"{len(train_on)} lenses, {len(user_flares) if user_flares else 'no'} flares of your own.")
-        path = train(recipe, args.out, backgrounds, train_on, validation=validation, user_flares=user_flares,
-                     resume=args.resume, start=start, processes=args.processes, progress=progress)
-        progress.say(f"The weights are in {path}; use them with `remove --weights`.")
-        return {"weights": str(path)}
+    return recipes.from_dict({**recipes.as_dict(stored_recipe or recipes.Recipe()), **changes})
+
+
+def _read_user_flares(folder: Path, recipe: Recipe, progress: Progress) -> UserFlares:
+    """Read the user's flares, and report which are left out or lack their light. Raises SettingsError."""
+    from ...core.removal.training.flare_bank import UserFlares
+
+    user_flares = UserFlares(folder, recipe.canvas_size)
+    if user_flares and user_flares.unreadable:
+        progress.say(f"Left out of your flares: {join_failures(user_flares.unreadable)}")
+    if user_flares and user_flares.missing_light:
+        progress.say(f"{len(user_flares.missing_light)} of your {len(user_flares)} flares have no picture of their "
+                     f"light in Light_Source, {user_flares.missing_light[0].name} first; it is learned as a part "
+                     "of the flare.")
+    return user_flares
 
 
 def _train_diffusion(args: argparse.Namespace, recipe: Recipe, backgrounds: Backgrounds,

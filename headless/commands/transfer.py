@@ -111,17 +111,17 @@ def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, pr
         flare /= FLARE
     read_look(flare)
     scene = open_blend(options.to[0])
-    every = range(scene.frame_start, scene.frame_end + 1)
-    selected = {frame.number for frame in select_task_frames([NumberedFrame("", number, "") for number in every],
+    all_numbers = range(scene.frame_start, scene.frame_end + 1)
+    selected = {frame.number for frame in select_task_frames([NumberedFrame("", number, "") for number in all_numbers],
                                                              options.frames, options.job_frames)}
     # Neighbours too: visibility is smoothed over them (`smooth_visibility`), and a part of the frames must give the
     # result of the whole range.
-    around = range(-2 * options.smooth, 2 * options.smooth + 1)
-    numbers = [number for number in every if any(number + step in selected for step in around)]
+    neighbour_offsets = range(-2 * options.smooth, 2 * options.smooth + 1)
+    numbers = [number for number in all_numbers if any(number + offset in selected for offset in neighbour_offsets)]
     if options.query == "source" or options.fall_off == 0 or not selected:
         # The middle frame selects the training view of --query source, and the first one the distance of --fall-off 0.
         # Where no frame is selected, the engine step reports it.
-        numbers = list(every)
+        numbers = list(all_numbers)
     names = [name.strip() for name in (options.lights or "").split(",") if name.strip()]
     progress.stage("read the .blend", len(numbers))
     shot = read_shot(scene, flare, names, numbers, radius=options.radius, done=progress.advance)
@@ -177,7 +177,7 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     transfer = Transfer(flare, target, settings, training, args.ocio)
     selected = frames.select_task([target_frame.frame for target_frame in target.frames], args, progress)
     if not selected:
-        return layers.report_nothing(args.out)
+        return layers.empty_result(args.out)
     if args.jobs != 1:
         extra = ["--shot", str(targets.shot_path(options))] if targets.is_blend(options) else []
         jobs.run_jobs(args, step, [frame.number for frame in selected], progress, extra)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from blenders import ROOT
 
-from headless.handbook import write_pages
+from headless.handbook import render_pages
 
 
 @pytest.fixture(scope="session")
@@ -69,7 +69,7 @@ def test_one_button_bakes_and_composites(facts: Any) -> None:
 
 
 def test_links_of_the_handbook_lead_to_its_pages() -> None:
-    pages = write_pages(ROOT / "docs" / "handbook")
+    pages = render_pages(ROOT / "docs" / "handbook")
     for name, content in pages.items():
         if name.endswith(".html"):
             text = content.decode()
@@ -86,7 +86,7 @@ def test_the_handbook_keeps_code_and_drops_links_that_leave_it(tmp_path: Path) -
     (tmp_path / "README.md").write_text("# A & B\n\nSee [there](../x.md) and `a*b*c`, **bold** *this*.\n\n"
                                         "| a | b |\n| --- | --- |\n| 1 | `2` |\n\n1. one\n2. two\n\nThen:\n\n"
                                         "    code <x>\n")
-    page = re.sub(r"\n|</?t(head|body)>", "", write_pages(tmp_path)["index.html"].decode())
+    page = re.sub(r"\n|</?t(head|body)>", "", render_pages(tmp_path)["index.html"].decode())
     assert "<h1 id=\"a--b\">A &amp; B</h1>" in page
     assert "See there and <code>a*b*c</code>, <strong>bold</strong> <em>this</em>." in page
     assert "<tr><th>a</th><th>b</th></tr><tr><td>1</td><td><code>2</code></td></tr>" in page

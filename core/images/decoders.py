@@ -289,8 +289,8 @@ def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
         if spec.width * spec.height > MAX_PIXELS:
             raise FrameError(f"{path} claims {spec.width} x {spec.height} pixels, more than this program opens.")
         _check_claimed_pixels(path, kind, spec)
-        name = {"uint8": "uint8", "uint16": "uint16", "half": "half"}.get(str(spec.format), "float")
-        pixels = image_input.read_image(0, 0, 0, channels, name)
+        pixel_type = {"uint8": "uint8", "uint16": "uint16", "half": "half"}.get(str(spec.format), "float")
+        pixels = image_input.read_image(0, 0, 0, channels, pixel_type)
         problem = image_input.geterror()
         if "not configured" in problem:
             number = spec.get_int_attribute("tiff:Compression")

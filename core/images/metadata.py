@@ -166,9 +166,9 @@ def _without_resource_thumbnails(segments: list[tuple[int, bytes]]) -> list[tupl
     if (cleaned := without_thumbnails(resources)) == resources:
         return segments
     new_segments = [(jpeg.APP13, jpeg.PHOTOSHOP + cleaned[offset:offset + _MAX_RESOURCE_BYTES])
-             for offset in range(0, len(cleaned), _MAX_RESOURCE_BYTES)]
+                    for offset in range(0, len(cleaned), _MAX_RESOURCE_BYTES)]
     return [*segments[:indices[0]], *new_segments, *(segments[index] for index in range(indices[0], len(segments))
-                                              if index not in indices)]
+                                                     if index not in indices)]
 
 
 def _has_claims(segment: bytes) -> bool:

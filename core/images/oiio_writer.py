@@ -64,7 +64,7 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
     with atomic_path(path) as temporary:
         output = oiio.ImageOutput.create(format_name)
         is_written = (output is not None and output.open(str(temporary), spec)
-                and output.write_image(np.ascontiguousarray(pixels)) and output.close())
+                      and output.write_image(np.ascontiguousarray(pixels)) and output.close())
         if not is_written:
             raise FrameError(f"{path} could not be encoded as {suffix[1:].upper()} "
                              f"({output.geterror() if output is not None else oiio.geterror()}).")

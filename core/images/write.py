@@ -68,7 +68,7 @@ def save_exr_parts(path: Path | str, parts: Sequence[tuple[Mapping[str, Any], Ma
     strings, names = (non_utf8_strings(source), non_utf8_names(source)) if source is not None else ({}, {})
     first_header, first_channels = (dict(items) for items in parts[0])
     exr_file = (OpenEXR.File(first_header, first_channels) if len(parts) == 1 else
-              OpenEXR.File([OpenEXR.Part(dict(header), dict(channels)) for header, channels in parts]))
+                OpenEXR.File([OpenEXR.Part(dict(header), dict(channels)) for header, channels in parts]))
     with atomic_path(path, commit_lock) as temporary, exr_file as file:
         try:
             file.write(str(temporary))
@@ -90,7 +90,7 @@ def _restore_bytes(path: Path, strings: Mapping[str, bytes], names: Mapping[byte
     """
     with open(path, "r+b") as stream:
         replacements = [(offset, strings[name]) for name, (offset, text) in exr_header.locate_strings(stream).items()
-                  if len(strings.get(name, b"")) == len(text)]
+                        if len(strings.get(name, b"")) == len(text)]
         replacements += [(offset, names[name]) for _, offset, name in exr_header.locate_names(stream) if name in names]
         for offset, content in replacements:
             stream.seek(offset)

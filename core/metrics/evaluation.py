@@ -203,8 +203,8 @@ def format_table(scores: dict[str, Any]) -> str:
     """Return the means of eval.json as text, with the view that scored lowest in each layer."""
     count = len(scores["views"])
     reference_text = {"truth": "scene and flare against the exact layers",
-               "removed": "scene and flare against the frames of removed/",
-               "none": "without anything to score scene and flare against"}[scores["reference"]]
+                      "removed": "scene and flare against the frames of removed/",
+                      "none": "without anything to score scene and flare against"}[scores["reference"]]
     width, height = scores["size"]
     lines = [f"{count} views at {width} x {height}, {reference_text}",
              f"{'':13}{'PSNR':>8}{'empty':>8}{'SSIM':>8}{'LPIPS':>8}{'FLIP':>8}{'rel. L2':>9}  lowest PSNR"]

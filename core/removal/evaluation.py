@@ -209,7 +209,7 @@ def format_table(scores: dict[str, Any]) -> str:
 
 
 def draw_worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores: dict[str, Any],
-                width: int = 400) -> Pixels:
+                     width: int = 400) -> Pixels:
     """Return a sheet (rows, 4 * width, 3) of the pictures with the lowest gain, worst first: input | result | truth |
     removed flare times 2, display values.
 

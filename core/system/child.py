@@ -62,7 +62,7 @@ def run_in_child(function: Callable[..., Any], *args: Any, progress: Progress) -
 
 
 def _exchange_messages(to_child: IO[bytes], from_child: IO[bytes], call: tuple[Callable[..., Any], tuple[Any, ...]],
-              progress: Progress) -> Any:
+                       progress: Progress) -> Any:
     """Send a call to the child, call `progress` as the child asks, and return or raise what the call does.
 
     The reply to each message is whether to continue; what `progress` raises is raised when the child has ended its

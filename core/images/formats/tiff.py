@@ -245,12 +245,12 @@ def _directories(stream: BinaryIO, offset: int | None = None) -> Iterator[tuple[
     head = stream.read(16)
     order: _Order = "<" if head[:2] == b"II" else ">"
     if head[:4] in (b"II*\0", b"MM\0*") and len(head) >= 8:
-        layout, first = _Layout(order, "H", "I"), head[4:8]
+        layout, first_offset = _Layout(order, "H", "I"), head[4:8]
     elif head[:4] in BIG_TIFF and len(head) == 16:
-        layout, first = _Layout(order, "Q", "Q"), head[8:]
+        layout, first_offset = _Layout(order, "Q", "Q"), head[8:]
     else:
         return
-    offset = layout.number(first) if offset is None else offset
+    offset = layout.number(first_offset) if offset is None else offset
     for _ in range(_MAX_PAGES):
         stream.seek(min(offset, stream.seek(0, io.SEEK_END)))
         raw = stream.read(struct.calcsize(layout.length))
@@ -260,7 +260,7 @@ def _directories(stream: BinaryIO, offset: int | None = None) -> Iterator[tuple[
             return
         yield layout, [entries[k:k + layout.entry_size] for k in range(0, len(entries), layout.entry_size)]
         stream.seek(offset + len(raw) + len(entries))
-        following = stream.read(struct.calcsize(layout.offset))
-        offset = layout.number(following) if len(following) == struct.calcsize(layout.offset) else 0
+        next_offset = stream.read(struct.calcsize(layout.offset))
+        offset = layout.number(next_offset) if len(next_offset) == struct.calcsize(layout.offset) else 0
         if not offset:
             return

@@ -191,7 +191,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     frames = (CleanFrame(name, path, results[name])
               for path, name in sorted(plates, key=lambda plate: shot_sort_key(plate[0])))
     written, kept_counts = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
-                                       keep_finished=not overwrite, overwrite=overwrite, on_error=leave_out)
+                                              keep_finished=not overwrite, overwrite=overwrite, on_error=leave_out)
     manifest.report_kept(kept_counts, progress)
     tally = Tally("plate", "cleaned", written + kept_counts.total(), left_out_files(inputs, excluded))
     tally.skip("could not be cleaned", *failed_names)

@@ -87,7 +87,7 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
         return PreparedResults(write)
 
     written, kept_counts = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
-                                       keep_finished=not overwrite, overwrite=overwrite)
+                                              keep_finished=not overwrite, overwrite=overwrite)
     for light, count in dim_counts.items():
         progress.say(f"{count} of {written} frames show less than half of the flare that {light!r} has in the fit; no "
                      "more than they show was removed.")

@@ -90,25 +90,25 @@ def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, c
                 centre_distance = math.sqrt(dx * dx + dy * dy)
                 if centre_distance > 1 + edge:
                     continue
-                edge_distance = centre_distance  # distance from the centre, 1 at the edge
+                relative_radius = centre_distance  # 1 at the edge of the stop
                 if roundness < 1:
                     angle = math.atan2(dy, dx) - rotation
                     angle -= sector * math.floor(angle / sector + 0.5)  # from the middle of the nearest blade
-                    edge_distance = (roundness * centre_distance
+                    relative_radius = (roundness * centre_distance
                                      + (1 - roundness) * centre_distance * math.cos(angle) / apothem)
                 second_x, second_y = (x - second_centre[channel, 0]) / second_radius[channel], \
                     (y - second_centre[channel, 1]) / second_radius[channel]
-                edge_distance = max(edge_distance, math.sqrt(second_x * second_x + second_y * second_y))
+                relative_radius = max(relative_radius, math.sqrt(second_x * second_x + second_y * second_y))
                 clip_x, clip_y = (x - clip_centre[channel, 0]) / clip_radius[channel], \
                     (y - clip_centre[channel, 1]) / clip_radius[channel]
                 clip_distance = math.sqrt(clip_x * clip_x + clip_y * clip_y)
                 # 1 inside all three images, 0 outside, smooth over the width of the edge
-                coverage = min(max((1 - edge_distance) / edge + 0.5, 0.0), 1.0)
+                coverage = min(max((1 - relative_radius) / edge + 0.5, 0.0), 1.0)
                 coverage *= min(max((1 - clip_distance) * clip_radius[channel] / (edge * ghost_radius) + 0.5, 0.0), 1.0)
                 if coverage <= 0:
                     continue
                 coverage = coverage * coverage * (3 - 2 * coverage)
-                value = 1 - hollow * (1 - min(edge_distance * edge_distance, 1.0))
-                value += rim * math.exp(-((1 - edge_distance) / rim_width) ** 2)
+                value = 1 - hollow * (1 - min(relative_radius * relative_radius, 1.0))
+                value += rim * math.exp(-((1 - relative_radius) / rim_width) ** 2)
                 value *= max(1 + slope * (dx * away_x + dy * away_y), 0.0)
                 layer[row, column, channel] += weight[channel] * coverage * value

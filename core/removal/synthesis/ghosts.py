@@ -122,7 +122,7 @@ def _draw_coatings(random: Random, lens: Prescription) -> NDArray[np.float64]:
 
 
 def _brightness_and_radius(ghost: GhostPath, coating_wavelengths: NDArray[np.float64], stop: float,
-                entrance: float) -> tuple[NDArray[np.float64], float]:
+                           entrance: float) -> tuple[NDArray[np.float64], float]:
     """Return the light (3,) of a ghost by channel, before any exposure, and its radius on the sensor, mm.
 
     stop, entrance: radii of the stop and of the front surface, mm. Light is what both surfaces reflect, spread over the

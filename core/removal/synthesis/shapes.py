@@ -117,7 +117,7 @@ def draw_halo(random: Random, light: Point, x: Array, y: Array) -> Array:
             ring *= np.exp(-((angle_offset / opening_angle) ** 2))[..., None]
         if random.random() < 0.3:  # of fine rays
             ray_pattern = sum(random.normal(0, 0.3) * np.cos(k * angle + random.uniform(0, 7))
-                       for k in random.integers(8, 120, 6))
+                              for k in random.integers(8, 120, 6))
             ring *= np.exp(np.asarray(ray_pattern, np.float32))[..., None]
         layer += level * ring * (random_tint(random, 0.5) if spread == 0 else random_tint(random, 0.15))
     return layer / max(float(layer.max()), 1e-9)

@@ -125,7 +125,7 @@ class UserFlares:
         folder = Path(folder)
         # By the folder beside it, as in Flare7K++: another set may have flares of the same names.
         light_paths = {(path.parent.parent, path.stem): path for path in folder.glob("**/Light_Source/*")
-                  if path.suffix.lower() in SUFFIXES}
+                       if path.suffix.lower() in SUFFIXES}
         self._size = size
         self._files: list[tuple[Path, Path | None]] = []  # the flare, and its light alone if there is a picture of it
         for path in sorted(folder.rglob("*")):

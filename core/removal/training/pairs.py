@@ -139,7 +139,7 @@ def _place_against_bright_scene(random: Random, layers: FlareLayers, matrix: NDA
     brightness = cv2.resize(scene, (columns, rows), interpolation=cv2.INTER_AREA).mean(-1)
     best_level = -1.0
     other_placements = (random_cameras.draw_placement(random, layers.size, width, height)
-              for _ in range(random_cameras.PLACEMENTS - 1))
+                        for _ in range(random_cameras.PLACEMENTS - 1))
     for candidate in [matrix, *other_placements]:
         x, y = _canvas_to_frame(candidate, layers, layers.lights[0])
         light_level = float(brightness[int(np.clip(y / height * rows, 0, rows - 1)),

@@ -345,7 +345,7 @@ def on_lights_found(job: Job) -> None:
               if (capture := capture_folder(scene)) is not None and capture / "lights" == job.folder]
     for scene in scenes:
         try:
-            lights.import_new(scene, job.folder.parent)
+            lights.import_new_lights(scene, job.folder.parent)
         except FitFlareError as problem:
             job.error = str(problem)
     _push_undo("Lights", scenes)

@@ -37,7 +37,7 @@ WHITE: Gain = (1.0, 1.0, 1.0)
 MIN_CHANNEL = 1e-3
 """Smallest reference of a colour channel relative to the largest: a red lamp that turns blue has a finite factor."""
 MAX_FACTOR = 1e6
-_PATHS = ("energy", "exposure", "color")
+_POWER_PATHS = ("energy", "exposure", "color")
 _TEMPERATURE_PATHS = ("temperature", "use_temperature")
 SWITCHES = ("follow_power", "follow_visibility", "follow_direction", "follow_distance")
 """The switches of a flare."""
@@ -51,7 +51,7 @@ def is_lamp(target: Any) -> bool:
     return target is not None and target.type == "LIGHT"
 
 
-def factor(scene: Any, depsgraph: Any, item: Any) -> Gain:
+def power_factor(scene: Any, depsgraph: Any, item: Any) -> Gain:
     """Return the linear RGB factor of a flare (`item`) at the current frame: the light of its lamp over the reference.
 
     It is 1 where the flare does not follow its lamp's power, and where the reference is dark.
@@ -70,12 +70,12 @@ def factor(scene: Any, depsgraph: Any, item: Any) -> Gain:
     return red, green, blue
 
 
-def gain(scene: Any, depsgraph: Any, item: Any, matrix: Any, eye: Any) -> Gain:
+def flare_gain(scene: Any, depsgraph: Any, item: Any, matrix: Any, eye: Any) -> Gain:
     """Return the linear RGB factor of a flare by the power and the direction of its lamp.
 
     matrix: matrix_world of the lamp. eye: position of the camera in the world.
     """
-    red, green, blue = factor(scene, depsgraph, item)
+    red, green, blue = power_factor(scene, depsgraph, item)
     share = direction_factor(item, depsgraph, matrix, eye) if item.follow_direction else 1.0
     return red * share, green * share, blue * share
 
@@ -123,9 +123,9 @@ def direction_factor(item: Any, depsgraph: Any, matrix: Any, eye: Any) -> float:
         return 1.0
     edge = float(np.cos(data.spot_size / 2))
     # 0 at the edge of the cone, 1 where its soft border ends, measured in cosines.
-    inside = (-local.z / local.length - edge) / max((1 - edge) * data.spot_blend, _MIN_BLEND)
-    share = min(max(inside, 0.0), 1.0)
-    return share * share * (3 - 2 * share)  # as Blender's renderers soften the edge
+    border_position = (-local.z / local.length - edge) / max((1 - edge) * data.spot_blend, _MIN_BLEND)
+    clamped = min(max(border_position, 0.0), 1.0)
+    return clamped * clamped * (3 - 2 * clamped)  # as Blender's renderers soften the edge
 
 
 def _cosine(rotation: Any, offset: Any) -> float:
@@ -155,8 +155,8 @@ def report_dark(operator: Any, scene: Any) -> None:
     """Report the first flare that is dark by its switches; operators that add flares call it."""
     depsgraph = depsgraph_of(scene)
     for item in scene.fit_flare.lights:
-        placed = item.target is not None and scene.objects.get(item.target.name) == item.target
-        if placed and (reason := dark_reason(scene, depsgraph, item)):
+        is_placed = item.target is not None and scene.objects.get(item.target.name) == item.target
+        if is_placed and (reason := dark_reason(scene, depsgraph, item)):
             operator.report({"WARNING"}, reason)
             return
 
@@ -175,11 +175,11 @@ def keyed_reference(scene: Any, data: Any) -> NDArray[np.float64] | None:
 
     For a lamp that is off in the first frame it is its light at the brightest key.
     """
-    curves = [curve for curve in _curves(data) if curve.data_path in _PATHS]
+    curves = [curve for curve in _curves(data) if curve.data_path in _POWER_PATHS]
     if not curves or _has_moving_temperature(data):
         return None
     frames = [float(scene.frame_start), *(float(key.co[0]) for curve in curves for key in curve.keyframe_points)]
-    lights = [_light_at(data, curves, frame) for frame in frames]
+    lights = [_light_at_frame(data, curves, frame) for frame in frames]
     return lights[0] if lights[0].any() else max(lights, key=lambda light: float(light.sum()))
 
 
@@ -188,7 +188,7 @@ def _curves(data: Any) -> Iterator[Any]:
         yield from group
 
 
-def _light_at(data: Any, curves: list[Any], frame: float) -> NDArray[np.float64]:
+def _light_at_frame(data: Any, curves: list[Any], frame: float) -> NDArray[np.float64]:
     """Return the light of a lamp at a frame by its curves; properties without a curve have their present value."""
     energy, exposure, colour = float(data.energy), float(getattr(data, "exposure", 0.0)), list(data.color)
     for curve in curves:
@@ -208,7 +208,7 @@ def is_driven(target: Any) -> bool:
     """Return whether the power or colour of a lamp is moved by drivers, or by keys of its temperature."""
     animation = target.data.animation_data if is_lamp(target) else None
     return animation is not None and (_has_moving_temperature(target.data)
-                                      or any(curve.data_path in _PATHS for curve in animation.drivers))
+                                      or any(curve.data_path in _POWER_PATHS for curve in animation.drivers))
 
 
 def _has_moving_temperature(data: Any) -> bool:
@@ -218,29 +218,29 @@ def _has_moving_temperature(data: Any) -> bool:
     return any(curve.data_path in _TEMPERATURE_PATHS for curve in (*_curves(data), *drivers))
 
 
-def measure(scene: Any, item: Any) -> None:
+def measure_references(scene: Any, item: Any) -> None:
     """Store the references of a flare: the distance of its light now, and the power of its lamp, in the first frame of
     the scene for a driven lamp, else now.
 
     For a driven lamp this moves the timeline to the first frame and back.
     """
     target = item.target
-    item.reference_distance = _distance(scene, target)
+    item.reference_distance = _camera_distance(scene, target)
     if not is_lamp(target):
         return
     layer = view_layer_of(scene)
-    before, subframe = scene.frame_current, scene.frame_subframe
-    driven = is_driven(target) and before != scene.frame_start
-    if driven:
+    current_frame, subframe = scene.frame_current, scene.frame_subframe
+    is_at_other_frame = is_driven(target) and current_frame != scene.frame_start
+    if is_at_other_frame:
         scene.frame_set(scene.frame_start)
     light = light_of(target.evaluated_get(layer.depsgraph).data)
-    if driven:
-        scene.frame_set(before, subframe=subframe)
+    if is_at_other_frame:
+        scene.frame_set(current_frame, subframe=subframe)
     item.reference_light = light.tolist()
     item.reference_is_driven = is_driven(target)
 
 
-def _distance(scene: Any, target: Any) -> float:
+def _camera_distance(scene: Any, target: Any) -> float:
     """Return the distance from the scene's camera to a light object; 0 without a camera, and for a sun."""
     if scene.camera is None or is_sun(target):
         return 0.0
@@ -253,10 +253,10 @@ def measure_driven(scene: Any) -> None:
     """Measure the references of driven lamps that were not driven when they were measured; a bake begins with it."""
     for item in scene.fit_flare.lights:
         if item.follow_power and is_lamp(item.target) and is_driven(item.target) and not item.reference_is_driven:
-            measure(scene, item)
+            measure_references(scene, item)
 
 
-def on_target(item: Any, _context: Any) -> None:
+def update_for_target(item: Any, _context: Any) -> None:
     """Measure the references of a flare that gets another light object, and set its switches.
 
     At a light of the capture they are switched off. At an object of the artist they are switched on, unless the flare
@@ -265,12 +265,12 @@ def on_target(item: Any, _context: Any) -> None:
     scene, target = item.id_data, item.target
     if not isinstance(scene, bpy.types.Scene) or target is None:
         return
-    of_capture = target.fit_flare.is_light
-    if of_capture or not item.is_at_artists_light:
+    is_capture_light = target.fit_flare.is_light
+    if is_capture_light or not item.is_at_artists_light:
         for name in SWITCHES:
-            setattr(item, name, not of_capture)
-    item.is_at_artists_light = not of_capture
-    item.reference_distance = _distance(scene, target)
+            setattr(item, name, not is_capture_light)
+    item.is_at_artists_light = not is_capture_light
+    item.reference_distance = _camera_distance(scene, target)
     if is_lamp(target):
         item.reference_light = light_of(target.data).tolist()
         item.reference_is_driven = False  # `measure_driven` measures a driven lamp at the first frame

@@ -24,8 +24,8 @@ def _time_left(job: jobs.Job) -> str:
         return ", stopping …"
     if not job.eta_s:
         return ""
-    left = job.eta_s
-    return f", {left / 60:.0f} min left" if left >= 90 else f", {left:.0f} s left"
+    seconds = job.eta_s
+    return f", {seconds / 60:.0f} min left" if seconds >= 90 else f", {seconds:.0f} s left"
 
 
 def label_lines(layout: Any, text: str, icon: str = "NONE", width: int = 44) -> None:
@@ -40,15 +40,21 @@ def label_lines(layout: Any, text: str, icon: str = "NONE", width: int = 44) -> 
         width = max(int((region.width - 50 * scale) / (6.4 * scale)), 16)
     column = layout.column(align=True)
     column.scale_y = 0.85
-    words, line, first = text.split(), "", True
-    for word in [*words, ""]:
-        if not word or len(line) + len(word) + 1 > width:
-            while len(line) > width + 4:  # a path without spaces
-                column.label(text=line[:width], icon=icon if first else "BLANK1" if icon != "NONE" else "NONE")
-                line, first = line[width:], False
-            if line:
-                column.label(text=line, icon=icon if first else "BLANK1" if icon != "NONE" else "NONE")
-                first = False
-            line = word
-        else:
+    for number, line in enumerate(_wrapped(text, width)):
+        # Further lines are indented by the width of the icon.
+        column.label(text=line, icon=icon if number == 0 else "BLANK1" if icon != "NONE" else "NONE")
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Return a text as lines of `width` characters; a longer word, such as a path, is cut into pieces."""
+    lines, line = [], ""
+    for word in [*text.split(), ""]:
+        if word and len(line) + len(word) + 1 <= width:
             line = f"{line} {word}".strip()
+            continue
+        while len(line) > width + 4:  # a short rest stays on the line
+            lines.append(line[:width])
+            line = line[width:]
+        lines += [line] if line else []
+        line = word
+    return lines

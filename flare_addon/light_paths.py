@@ -22,8 +22,10 @@ from ..core.system.files import follow_link, read_json, round_for_text, write_js
 from . import lamp_drive
 from .paths import absolute
 
-STANDING = 1e-4
+MAX_STANDING_MOTION = 1e-4
 """Motion of a light below which it stands, relative to its largest coordinate; world units where that is below 1."""
+MAX_UNMOVED_PX = 0.02
+"""Distance of a marker from its earlier place, up to which it was not moved."""
 
 
 def frame_numbers(folder: Path) -> dict[str, int]:
@@ -34,7 +36,7 @@ def frame_numbers(folder: Path) -> dict[str, int]:
     return {frame.view: frame.number for frame in number_views(PictureIndex(images).names)}
 
 
-def moves(item: Any, root: Any) -> bool:
+def may_move(item: Any, root: Any) -> bool:
     """Return whether an object may move: by animation, constraints, physics, a vertex or bone as its parent, or a
     parent below `root` that moves."""
     while item is not None and item != root:
@@ -49,31 +51,31 @@ def has_animated_light(item: Any) -> bool:
     return item.type == "LIGHT" and item.data.animation_data is not None
 
 
-def world_paths(scene: Any, items: Mapping[str, Any], numbers: Mapping[str, int], place: Callable[[Any], Any]
+def world_paths(scene: Any, items: Mapping[str, Any], numbers: Mapping[str, int], position_of: Callable[[Any], Any]
                 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Return the keys of the lights that move or change, by name and by picture: {"xyz": [x, y, z], "on": 0..1}.
 
     The scene goes to the frame of each picture, and back afterwards. "on" is the power relative to the light's largest
     one. A light that stands has keys without xyz, one that does not change has keys without on. items: light objects by
-    name. numbers: frames of the scene by picture. place: returns the place (3,) of an object at the scene's current
-    frame, in the capture's coordinates.
+    name. numbers: frames of the scene by picture. position_of: returns the position (3,) of an object at the scene's
+    current frame, in the capture's coordinates.
     """
     animated = {name: item for name, item in items.items()
-                if moves(item, scene.fit_flare.root) or has_animated_light(item)}
+                if may_move(item, scene.fit_flare.root) or has_animated_light(item)}
     if not animated or not numbers:
         return {}
-    places: dict[str, list[Any]] = {name: [] for name in animated}
+    positions: dict[str, list[Any]] = {name: [] for name in animated}
     powers: dict[str, list[float]] = {name: [] for name in animated}
-    before, subframe = scene.frame_current, scene.frame_subframe
+    current_frame, subframe = scene.frame_current, scene.frame_subframe
     try:
         for number in numbers.values():
             scene.frame_set(number)
             for name, item in animated.items():
-                places[name].append(np.asarray(place(item), np.float64))
+                positions[name].append(np.asarray(position_of(item), np.float64))
                 powers[name].append(_power(item))
     finally:
-        scene.frame_set(before, subframe=subframe)
-    return {name: keys for name in animated if (keys := _keys(list(numbers), places[name], powers[name]))}
+        scene.frame_set(current_frame, subframe=subframe)
+    return {name: keys for name in animated if (keys := _path_keys(list(numbers), positions[name], powers[name]))}
 
 
 def _power(item: Any) -> float:
@@ -86,56 +88,57 @@ def _power(item: Any) -> float:
     return float(lamp_drive.light_of(item.data).max()) if item.type == "LIGHT" else 1.0
 
 
-def _keys(names: Sequence[str], places: Sequence[Any], powers: Sequence[float]) -> dict[str, dict[str, Any]]:
+def _path_keys(names: Sequence[str], positions: Sequence[Any], powers: Sequence[float]) -> dict[str, dict[str, Any]]:
     """Return the keys of a light by picture; {} if it neither moves nor changes.
 
-    names: of the pictures, with the place (3,) and the power of the light in each.
+    names: of the pictures. positions (3,), powers: of the light in each.
     """
-    xyz = np.array(places)
-    is_standing = np.ptp(xyz, axis=0).max() <= STANDING * max(1.0, float(np.abs(xyz).max()))
+    xyz = np.array(positions)
+    is_standing = np.ptp(xyz, axis=0).max() <= MAX_STANDING_MOTION * max(1.0, float(np.abs(xyz).max()))
     is_constant = max(powers) - min(powers) <= 1e-6 * max(max(powers), 1e-9)
     if is_standing and is_constant:
         return {}
     keys: dict[str, dict[str, Any]] = {name: {} for name in names}
-    for name, place, power in zip(names, places, powers, strict=True):
+    for name, position, power in zip(names, positions, powers, strict=True):
         if not is_standing:
-            keys[name]["xyz"] = [round_for_text(float(value)) for value in place]
+            keys[name]["xyz"] = [round_for_text(float(value)) for value in position]
         if not is_constant:
             keys[name]["on"] = round(max(power, 0.0) / max(max(powers), 1e-9), 4)
     return keys
 
 
-def merge_entry(known: Mapping[str, Any], name: str, xyz: Sequence[float], keys: Mapping[str, Mapping[str, Any]]
+def merge_entry(known_entry: Mapping[str, Any], name: str, xyz: Sequence[float], keys: Mapping[str, Mapping[str, Any]]
                 ) -> dict[str, Any]:
     """Return the entry of a light for lights.json.
 
-    known: its entry so far, whose other values stay. xyz: its place if it does not move. keys: from `world_paths`.
+    known_entry: its entry so far, whose other values stay. xyz: its place if it stands. keys: from `world_paths`.
     Brightness and confidence of the entry stay where the scene does not animate them. A place that an artist corrected
     is no longer doubtful.
     """
-    earlier = known.get("frames") or {}
-    moved = any("xyz" in key for key in keys.values())
-    entry = {**known, "name": name}
+    known_frames = known_entry.get("frames") or {}
+    has_path = any("xyz" in key for key in keys.values())
+    entry = {**known_entry, "name": name}
     frames: dict[str, Any] = {}
-    for frame in dict.fromkeys((*earlier, *keys)):
-        key = {label: value for label, value in (earlier.get(frame) or {}).items() if label not in ("xyz", "xy")}
-        new = keys.get(frame, {})
-        before = (earlier.get(frame) or {}).get("xyz")
-        if "xyz" in new and before is not None and not np.allclose(before, new["xyz"], rtol=1e-3, atol=1e-4):
+    for frame in dict.fromkeys((*known_frames, *keys)):
+        key = {label: value for label, value in (known_frames.get(frame) or {}).items() if label not in ("xyz", "xy")}
+        new_key = keys.get(frame, {})
+        known_xyz = (known_frames.get(frame) or {}).get("xyz")
+        is_known = "xyz" in new_key and known_xyz is not None
+        if is_known and not np.allclose(known_xyz, new_key["xyz"], rtol=1e-3, atol=1e-4):
             key.pop("confidence", None)
-        merged = {**key, **new}
+        merged = {**key, **new_key}
         if {"xyz", "on"} & merged.keys():
             frames[frame] = merged
     for label in ("frames", "xyz", "xy"):
         entry.pop(label, None)
-    if not moved:
+    if not has_path:
         entry["xyz"] = list(xyz)
     if frames:
         entry["frames"] = frames
     return entry
 
 
-def key_path(item: Any, light: Light, capture: Capture, scene_frames: Mapping[str, int]) -> None:
+def key_light_path(item: Any, light: Light, capture: Capture, scene_frames: Mapping[str, int]) -> None:
     """Key the location of an empty, a child of the root, along the path of a light of lights.json.
 
     A light that is known on the picture alone is put on the rays of its pixels (`Capture.light_state`). scene_frames:
@@ -147,7 +150,7 @@ def key_path(item: Any, light: Light, capture: Capture, scene_frames: Mapping[st
         item.keyframe_insert("location", frame=scene_frames[view.name])
 
 
-def keyed_capture(folder: Path, lights: Sequence[Light]) -> tuple[Capture, dict[str, int]] | None:
+def capture_of_moving_lights(folder: Path, lights: Sequence[Light]) -> tuple[Capture, dict[str, int]] | None:
     """Return the capture and the frame of each view where some light moves, else None. Raises CaptureError."""
     if not any(light.moves for light in lights):
         return None
@@ -196,22 +199,15 @@ def write_tracks(clip: Any, only_selected: bool = False) -> int:
     entries = {str(entry["name"]): entry for entry in data.get("lights", [])}
     count = 0
     for track in tracks:
-        known = entries.get(track.name, {})
-        earlier, frames = known.get("frames") or {}, {}
-        for marker in track.markers:
-            name = names.get(marker.frame)
-            if name is not None and not marker.mute:
-                # Markers are in parts of the picture, counted from the lower left corner.
-                place = [round(marker.co[0] * width, 3), round((1 - marker.co[1]) * height, 3)]
-                before = earlier.get(name) or {}
-                # A marker that stays within 0.02 px was not moved, and keeps place, brightness and confidence.
-                same = before.get("xy") is not None and np.allclose(before["xy"], place, atol=0.02)
-                values = before if same else {label: value for label, value in before.items() if label == "on"}
-                frames[name] = {**values, "xy": before["xy"] if same else place}
+        known_entry = entries.get(track.name, {})
+        known_frames = known_entry.get("frames") or {}
+        frames = _track_frames(track, names, (width, height), known_frames)
         if frames:
-            on_only = {name: {"on": key["on"]} for name, key in earlier.items() if name not in frames and "on" in key}
-            rest = {label: value for label, value in known.items() if label not in ("xyz", "xy", "frames")}
-            entries[track.name] = {**rest, "name": track.name, "frames": dict(sorted({**on_only, **frames}.items()))}
+            brightness = {name: {"on": key["on"]} for name, key in known_frames.items()
+                          if name not in frames and "on" in key}
+            others = {label: value for label, value in known_entry.items() if label not in ("xyz", "xy", "frames")}
+            entries[track.name] = {**others, "name": track.name,
+                                   "frames": dict(sorted({**brightness, **frames}.items()))}
             count += 1
     if not count:
         raise CaptureError(f"The clip {clip.name!r} has no {'selected ' if only_selected else ''}tracks with markers; "
@@ -220,7 +216,30 @@ def write_tracks(clip: Any, only_selected: bool = False) -> int:
     return count
 
 
-def read_tracks(clip: Any) -> int:
+def _track_frames(track: Any, names: Mapping[int, str], size: tuple[int, int],
+                  known_frames: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the keys of a track's markers by picture, without muted ones.
+
+    A marker that stays within MAX_UNMOVED_PX was not moved, and keeps place, brightness and confidence; another one
+    keeps its brightness. names: of the pictures, by frame of the clip. size: of the pictures, pixels. known_frames: the
+    keys of the light so far.
+    """
+    frames: dict[str, dict[str, Any]] = {}
+    width, height = size
+    for marker in track.markers:
+        name = names.get(marker.frame)
+        if name is None or marker.mute:
+            continue
+        # Markers are in parts of the picture, counted from the lower left corner.
+        xy = [round(marker.co[0] * width, 3), round((1 - marker.co[1]) * height, 3)]
+        known_key = known_frames.get(name) or {}
+        is_unmoved = known_key.get("xy") is not None and np.allclose(known_key["xy"], xy, atol=MAX_UNMOVED_PX)
+        values = known_key if is_unmoved else {label: value for label, value in known_key.items() if label == "on"}
+        frames[name] = {**values, "xy": known_key["xy"] if is_unmoved else xy}
+    return frames
+
+
+def add_light_tracks(clip: Any) -> int:
     """Add the paths on the picture of lights.json as tracks of a clip; return their number.
 
     A track of the same name is renamed to "... (before)", since scripts cannot delete tracks. Markers of doubtful
@@ -235,8 +254,8 @@ def read_tracks(clip: Any) -> int:
     for light in lights:
         markers = [(frame, light.keys[name]) for frame, name in sorted(names.items())
                    if name in light.keys and light.keys[name].xy is not None]
-        for old in [track for track in tracking.tracks if track.name == light.name]:
-            old.name = f"{light.name} (before)"
+        for earlier_track in [track for track in tracking.tracks if track.name == light.name]:
+            earlier_track.name = f"{light.name} (before)"
         track = tracking.tracks.new(name=light.name, frame=markers[0][0] if markers else 1)
         for frame, key in markers:
             assert key.xy is not None

@@ -76,8 +76,8 @@ def add_to_scene(scene: Any, position: Any, name: str = "") -> Any:
 def _collection_of(scene: Any) -> Any:
     """Return the collection for new lights: that of the root, unless it is of another scene or file."""
     root, collections = scene.fit_flare.root, {scene.collection, *scene.collection.children_recursive}
-    beside = () if root is None else root.users_collection
-    return next((item for item in beside
+    root_collections = () if root is None else root.users_collection
+    return next((item for item in root_collections
                  if item in collections and item.library is None and item.override_library is None), scene.collection)
 
 
@@ -118,22 +118,22 @@ def write_to_capture(scene: Any, folder: Path) -> int:
         raise CaptureError(f"Two lights have the name {duplicate!r}; rename one in the panel Lights.")
     path = folder / LIGHTS
     data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
-    known = {entry.get("name"): entry for entry in data.get("lights", []) if isinstance(entry, dict)}
-    lights = [known[name] for name in new_names(scene, folder)]
+    entries_by_name = {entry.get("name"): entry for entry in data.get("lights", []) if isinstance(entry, dict)}
+    lights = [entries_by_name[name] for name in new_light_names(scene, folder)]
     # The camera's position, from which a sun is placed.
     eye = scene.camera.matrix_world.translation if scene.camera is not None else objects[0].matrix_world.translation
 
-    def place(item: Any) -> Any:
-        """Return the light's place (3,) in the capture at the current frame of the scene."""
-        graph = depsgraph_of(scene)
-        return cameras.point_in_capture(light_position(item, world_matrix(item, graph), eye), scene.fit_flare.root,
-                                        graph)
+    def position_in_capture(item: Any) -> Any:
+        """Return the light's position (3,) in the capture's coordinates at the current frame of the scene."""
+        depsgraph = depsgraph_of(scene)
+        return cameras.point_in_capture(light_position(item, world_matrix(item, depsgraph), eye), scene.fit_flare.root,
+                                        depsgraph)
 
     paths = light_paths.world_paths(scene, dict(zip(names, objects, strict=True)),
-                                    light_paths.frame_numbers(folder), place)
+                                    light_paths.frame_numbers(folder), position_in_capture)
     for item, name in zip(objects, names, strict=True):
-        xyz = [round_for_text(float(value)) for value in place(item)]
-        lights.append(light_paths.merge_entry(known.get(name, {}), name, xyz, paths.get(name, {})))
+        xyz = [round_for_text(float(value)) for value in position_in_capture(item)]
+        lights.append(light_paths.merge_entry(entries_by_name.get(name, {}), name, xyz, paths.get(name, {})))
     if lights != data.get("lights"):
         write_json(follow_link(path), {**data, "lights": lights})
     remember_names(scene)
@@ -150,7 +150,7 @@ def remember_names(scene: Any) -> None:
     state.known_lights = "\n".join(sorted(names))
 
 
-def new_names(scene: Any, folder: Path) -> list[str]:
+def new_light_names(scene: Any, folder: Path) -> list[str]:
     """Return the names in the capture's lights.json that the scene never had.
 
     The engine may find lights while the .blend is closed. Empty for a .blend of an earlier version, which did not
@@ -159,38 +159,38 @@ def new_names(scene: Any, folder: Path) -> list[str]:
     if not scene.fit_flare.is_property_set("known_lights"):
         return []
     names = _names_in(folder / LIGHTS)
-    had = {*scene.fit_flare.known_lights.split("\n"), *map(light_name, scene_lights(scene))} if names else set()
-    return [name for name in names if name not in had]
+    known_names = {*scene.fit_flare.known_lights.split("\n"), *map(light_name, scene_lights(scene))} if names else set()
+    return [name for name in names if name not in known_names]
 
 
 def _names_in(path: Path) -> tuple[str, ...]:
     """Return the names in a lights.json, cached until the file changes; empty where it cannot be read."""
     try:
         stat = path.stat()
-        state = (stat.st_mtime_ns, stat.st_size)
-        if path not in _names_cache or _names_cache[path][0] != state:
-            _names_cache[path] = (state, tuple(light.name for light in read_lights(path)))
+        stamp = (stat.st_mtime_ns, stat.st_size)
+        if path not in _names_cache or _names_cache[path][0] != stamp:
+            _names_cache[path] = (stamp, tuple(light.name for light in read_lights(path)))
         return _names_cache[path][1]
     except (OSError, CaptureError):
         return ()
 
 
-def import_new(scene: Any, folder: Path) -> int:
+def import_new_lights(scene: Any, folder: Path) -> int:
     """Add the lights of lights.json that the scene never had, or all where it has no lights; return their number.
 
     Existing lights are not moved. Raises CaptureError.
     """
     existing = scene_lights(scene)
-    names = set(new_names(scene, folder)) if existing else None
+    names = set(new_light_names(scene, folder)) if existing else None
     new_lights = [light for light in read_lights(folder / LIGHTS) if names is None or light.name in names]
     collection = _collection_of(scene)
     size = max((item.empty_display_size for item in existing if item.type == "EMPTY"), default=0.2)
-    keyed = light_paths.keyed_capture(folder, new_lights)
+    capture_and_frames = light_paths.capture_of_moving_lights(folder, new_lights)
     for light in new_lights:
         # The position of a light that moves is NaN; its keys place it.
         item = add_light(collection, scene.fit_flare.root, light.name, np.nan_to_num(light.xyz), size)
-        if keyed is not None and light.moves:
-            light_paths.key_path(item, light, *keyed)
+        if capture_and_frames is not None and light.moves:
+            light_paths.key_light_path(item, light, *capture_and_frames)
     remember_names(scene)
     return len(new_lights)
 
@@ -211,17 +211,17 @@ def move_to_fit(scene: Any, fitted: Mapping[str, ArrayLike], capture: Path | Non
     coordinates. capture: its folder; None moves nothing.
     """
     path = None if capture is None else capture / LIGHTS
-    fitted_from = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}
+    captured = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}
     depsgraph = depsgraph_of(scene)
     for item in scene_lights(scene):
         name = light_name(item)
         is_still = item.parent == scene.fit_flare.root and item.animation_data is None
-        if name in fitted and name in fitted_from and is_still:
+        if name in fitted and name in captured and is_still:
             try:
                 position = capture_position(item, scene.fit_flare.root, depsgraph)
             except CaptureError:  # it is disabled, and its position is unknown
                 continue
-            is_unmoved = np.allclose(position, fitted_from[name], atol=1e-4)
+            is_unmoved = np.allclose(position, captured[name], atol=1e-4)
             if is_unmoved and not np.allclose(position, fitted[name], atol=1e-4):
                 _move_to(item, fitted[name])
     view_layer_of(scene).update()

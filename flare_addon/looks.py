@@ -100,7 +100,7 @@ def _place_at(scene: Any, look: Look, targets: Sequence[Any], add: bool) -> None
         item.target = remaining.pop(0)
         if len(look.lights) == 1 and item.name == item.source:  # a name of the file tells an artist nothing
             item.name = free_name(item.target.name, {entry.name for entry in state.lights if entry != item})
-        lamp_drive.measure(scene, item)
+        lamp_drive.measure_references(scene, item)
     for target in remaining if add else ():
         add_flare(scene, target, look.names[0])
 
@@ -219,7 +219,7 @@ def add_flare(scene: Any, target: Any, source: str) -> Any:
         name, number = f"{target.name} {number}", number + 1
     item = _new_flare(state, look, light)
     item.name, item.target = name, target
-    lamp_drive.measure(scene, item)
+    lamp_drive.measure_references(scene, item)
     state.light = len(state.lights) - 1
     return item
 
@@ -296,7 +296,7 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
     position = light_position(target, placed, eye)
     xyz = (to_capture @ np.array([*position, 1.0]))[:3]
     # A dark light has its visibility too, since a transfer smooths visibilities over neighbouring frames.
-    gain = lamp_drive.DARK if is_dark else lamp_drive.gain(scene, depsgraph, item, placed, eye)
+    gain = lamp_drive.DARK if is_dark else lamp_drive.flare_gain(scene, depsgraph, item, placed, eye)
     reference = item.reference_distance if item.follow_distance and not lamp_drive.is_sun(target) else 0.0
     reference *= float(np.cbrt(abs(np.linalg.det(to_capture[:3, :3]))))  # scene units to units of the capture
     extent = light_extents.extent_of(item, depsgraph, placed)

@@ -45,19 +45,19 @@ def draw_darkness(layout: Any, scene: Any) -> None:
         label_lines(layout, next(iter(reasons.values())), "INFO")
 
 
-def _changes(scene: Any, light: Any) -> bool:
+def _is_animated(scene: Any, light: Any) -> bool:
     """Return whether a light of the capture moves or changes."""
-    return light_paths.moves(light, scene.fit_flare.root) or light_paths.has_animated_light(light)
+    return light_paths.may_move(light, scene.fit_flare.root) or light_paths.has_animated_light(light)
 
 
 def light_icon(scene: Any, light: Any) -> str:
     """Return the icon of a light of the capture, another one where it moves or changes."""
-    return "ANIM" if _changes(scene, light) else "LIGHT_POINT"
+    return "ANIM" if _is_animated(scene, light) else "LIGHT_POINT"
 
 
 def draw_motion(layout: Any, scene: Any, objects: Sequence[Any]) -> None:
     """Draw what a fit does with the lights of the capture that move or change."""
-    names = [lights.light_name(light) for light in objects if _changes(scene, light)]
+    names = [lights.light_name(light) for light in objects if _is_animated(scene, light)]
     if not names:
         return
     folder = fits.capture_folder(scene)

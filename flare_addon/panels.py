@@ -105,7 +105,7 @@ class FITFLARE_PT_lights(_FitPanel, bpy.types.Panel):
             draw_progress(layout, job, "Searching for lights")
         elif job is not None and job.error:
             label_lines(layout, job.error, "ERROR")
-        elif folder is not None and (names := lights.new_names(scene, folder)):
+        elif folder is not None and (names := lights.new_light_names(scene, folder)):
             label_lines(layout, f"Found, but not in the scene yet: {', '.join(names)}.", "INFO")
             layout.operator("fit_flare.use_lights", icon="IMPORT")
         column = layout.column(align=True)
@@ -154,9 +154,9 @@ class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
             _draw_finished_fit(layout, scene, job)
         elif job is not None and job.state in ("failed", "stopped"):
             label_lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
-        why = fits.why_not_fit(scene)
-        if why and engine.find_engine() is not None:
-            label_lines(layout, f"{why}.", "INFO")
+        reason = fits.why_not_fit(scene)
+        if reason and engine.find_engine() is not None:
+            label_lines(layout, f"{reason}.", "INFO")
         row = layout.row()
         row.scale_y = 1.3
         row.operator("fit_flare.fit", text="Fit" if stage in ("none", "lost") else "New Fit", icon="RENDER_ANIMATION")
@@ -177,12 +177,12 @@ def _draw_clean_frames(layout: Any, state: Any, capture: Any, stage: str) -> Non
         label_lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
     exists = is_folder(capture / REMOVED) and (job is None or job.state == "done")
     # Clean frames without a job were filmed or made elsewhere; they are not made again by the network.
-    by_network = stage != "finished" and (not exists or job is not None)
+    offers_network = stage != "finished" and (not exists or job is not None)
     if not exists:
         label_lines(layout, "The fit can remove its flare from the frames." if stage == "finished" else
                     "No clean frames: the fit separates scene and flare by parallax." if state.mode == "split" else
                     "No clean frames yet: the fit starts by making them.", "INFO")
-    if by_network:
+    if offers_network:
         options = _settings_column(layout)
         options.prop(state, "matte")
         options.prop(state, "keep_glow")
@@ -190,8 +190,8 @@ def _draw_clean_frames(layout: Any, state: Any, capture: Any, stage: str) -> Non
             label_lines(layout, "Press Make Clean Frames first: a fit makes them without these options.", "INFO")
     if exists and state.mode == "split":  # they were made while the .blend was closed
         label_lines(layout, "There are clean frames: choose them under Learn From to use them.", "INFO")
-    by_fit = stage == "finished" and (job is None or "--run" not in job.args)
-    if not exists or by_network or by_fit:
+    offers_fit = stage == "finished" and (job is None or "--run" not in job.args)
+    if not exists or offers_network or offers_fit:
         layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if exists else "Make Clean Frames",
                         icon="BRUSH_DATA")
 
@@ -229,10 +229,10 @@ def _draw_finished_fit(layout: Any, scene: Any, job: jobs.Job | None) -> None:
     icon = fits.preview_icon(folder)
     if icon:
         _draw_preview(layout, icon)
-    used = looks.path_of(scene)
+    shown_flare = looks.path_of(scene)
     if job is not None and job.error:
         label_lines(layout, job.error, "ERROR")
-    if used is None or used != folder / FLARE:
+    if shown_flare is None or shown_flare != folder / FLARE:
         label_lines(layout, "The fit is finished.", "CHECKMARK")
         layout.operator("fit_flare.use_result", icon="LIGHT_SUN")
     else:

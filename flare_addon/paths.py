@@ -71,7 +71,7 @@ def _update_relative_paths(blend: str, *_: object) -> None:
 
 
 @bpy.app.handlers.persistent
-def _restore(blend: str, *_: object) -> None:
+def _restore_paths(blend: str, *_: object) -> None:
     """After a save of a copy, or a failed save: restore the paths, since the open file is still the earlier one."""
     if not blend or Path(blend).parent != Path(bpy.data.filepath).parent:
         for (scene, name), text in _paths_before_save.items():
@@ -91,7 +91,7 @@ def _update_appended_paths(context: Any, *_: object) -> None:
                 setattr(item.id.fit_flare, name, blend_relative(absolute(text, item.source_library)))
 
 
-_HANDLERS = [("save_pre", _update_relative_paths), ("save_post", _restore), ("save_post_fail", _restore)]
+_HANDLERS = [("save_pre", _update_relative_paths), ("save_post", _restore_paths), ("save_post_fail", _restore_paths)]
 if hasattr(bpy.app.handlers, "blend_import_post"):  # from 4.3 on
     _HANDLERS.append(("blend_import_post", _update_appended_paths))
 

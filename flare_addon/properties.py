@@ -59,9 +59,9 @@ def redraw_viewports(_self: Any = None, _context: Any = None) -> None:
 
 def _update_target(self: Any, context: Any) -> None:
     """Measure power and distance of a flare's new light object, set the flare's switches, and redraw."""
-    from .lamp_drive import on_target
+    from .lamp_drive import update_for_target
 
-    on_target(self, context)
+    update_for_target(self, context)
     redraw_viewports()
 
 

@@ -49,20 +49,20 @@ def read_shot(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[in
     else a part of the distance. done: called after each frame. Raises CaptureError for a scene without a camera, a
     light or a named object.
     """
-    light_objects = _find_lights(scene, names)
+    light_objects = _light_objects(scene, names)
     if not light_objects:
         raise CaptureError(f"The scene {scene.name!r} has no lights; name objects with --lights.")
     scene.frame_set(scene.frame_start)
-    items = [_flare_of(scene, obj, radius) for obj in light_objects]
+    items = [_flare_settings(scene, obj, radius) for obj in light_objects]
     shot_frames = []
     for frame in frames:
         scene.frame_set(frame)
         depsgraph = bpy.context.evaluated_depsgraph_get()
         camera = _active_camera(scene).evaluated_get(depsgraph)
-        core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
+        core_camera = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
         rendered = lamp_drive.rendered_collections(scene)
         placed = tuple(_place_light(scene, depsgraph, item, camera.matrix_world, rendered) for item in items)
-        shot_frames.append(ShotFrame(frame, scene.name, core, placed))
+        shot_frames.append(ShotFrame(frame, scene.name, core_camera, placed))
         done()
     return Shot(flare, tuple(shot_frames))
 
@@ -74,7 +74,7 @@ def _active_camera(scene: Any) -> Any:
     return scene.camera
 
 
-def _find_lights(scene: Any, names: Sequence[str]) -> list[Any]:
+def _light_objects(scene: Any, names: Sequence[str]) -> list[Any]:
     """Return the objects with these names, or all rendered lamps without names.
 
     Raises CaptureError for a wrong name.
@@ -98,19 +98,19 @@ def _is_keyed(obj: Any, path: str) -> bool:
         curve.data_path == path for group in (*fcurves.fcurves_of(obj), data.drivers) for curve in group)
 
 
-def _flare_of(scene: Any, obj: Any, radius: float) -> Any:
+def _flare_settings(scene: Any, obj: Any, radius: float) -> Any:
     """Return the settings of a flare at a light: those of the scene's flare at this object, else the default ones.
 
     They have the attributes of a flare in `scene.fit_flare.lights` that `looks.place_light` reads. The scene is at its
     first frame, to which the power of lamps is relative by default. radius: world units; 0 for that of the flare, else
     of the lamp.
     """
-    row = next((item for item in scene.fit_flare.lights if item.target == obj), None)
-    if row is not None:
+    scene_flare = next((item for item in scene.fit_flare.lights if item.target == obj), None)
+    if scene_flare is not None:
         names = (*lamp_drive.SWITCHES, "reference_light", "reference_distance", "extent")
         return SimpleNamespace(name=obj.name, source=obj.name, target=obj,
-                               radius=radius or row.radius or _lamp_radius(obj),
-                               **{name: getattr(row, name) for name in names})
+                               radius=radius or scene_flare.radius or _lamp_radius(obj),
+                               **{name: getattr(scene_flare, name) for name in names})
     light = lamp_drive.light_of(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data).tolist() \
         if lamp_drive.is_lamp(obj) else (0.0, 0.0, 0.0)
     return SimpleNamespace(name=obj.name, source=obj.name, target=obj, radius=radius or _lamp_radius(obj),
@@ -132,11 +132,11 @@ def _light_entries(scene: Any, light_objects: Sequence[Any], numbers: Mapping[st
 
     numbers: frames of the scene by the name of the capture's picture. Raises CaptureError as `_light_position` does.
     """
-    def place(obj: Any) -> cameras.Floats:
+    def position_of(obj: Any) -> cameras.Floats:
         return _light_position(bpy.context.evaluated_depsgraph_get(), obj, scene.camera.matrix_world.translation)
 
-    paths = light_paths.world_paths(scene, {obj.name: obj for obj in light_objects}, numbers, place)
-    return [light_paths.merge_entry({}, obj.name, place(obj).tolist(), paths.get(obj.name, {}))
+    paths = light_paths.world_paths(scene, {obj.name: obj for obj in light_objects}, numbers, position_of)
+    return [light_paths.merge_entry({}, obj.name, position_of(obj).tolist(), paths.get(obj.name, {}))
             for obj in light_objects]
 
 
@@ -152,8 +152,8 @@ def _light_position(depsgraph: Any, obj: Any, eye: Any) -> cameras.Floats:
 
 def _lamp_radius(obj: Any) -> float:
     """Return the radius of a lamp; 0 for a sun and for other objects."""
-    sized = obj.type == "LIGHT" and obj.data.type != "SUN"
-    return float(getattr(obj.data, "shadow_soft_size", 0.0)) if sized else 0.0
+    has_radius = obj.type == "LIGHT" and obj.data.type != "SUN"
+    return float(getattr(obj.data, "shadow_soft_size", 0.0)) if has_radius else 0.0
 
 
 def write_capture(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequence[str],
@@ -165,7 +165,7 @@ def write_capture(scene: Any, plates: Mapping[int, Path], folder: Path, names: S
     after each frame. Raises CaptureError where the scene has no camera, and as `exporter.write_frames` does.
     """
     _active_camera(scene)
-    light_objects = _find_lights(scene, names)
+    light_objects = _light_objects(scene, names)
     entries = exporter.write_frames(scene, None, plates, folder, done)
     if light_objects:
         numbers = {Path(entry["file_path"]).name: frame for entry, frame in zip(entries, sorted(plates), strict=True)}

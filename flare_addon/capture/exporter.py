@@ -83,11 +83,11 @@ def export_capture(scene: Any, folder: Path) -> int:
     if len(pictures) < 3:
         raise CaptureError(f"Only {len(pictures)} of the frames in the scene's range have a picture beside "
                            f"{footage.first}; set the frame range to that of the footage.")
-    before, subframe = scene.frame_current, scene.frame_subframe
+    current_frame, subframe = scene.frame_current, scene.frame_subframe
     try:
         entries = write_frames(scene, camera, pictures, folder)
     finally:
-        scene.frame_set(before, subframe=subframe)
+        scene.frame_set(current_frame, subframe=subframe)
     write_cameras(folder, entries)
     state = scene.fit_flare
     state.capture, state.root, state.mode, state.footage = blend_relative(folder), None, "estimated", "images"
@@ -125,9 +125,9 @@ def _check_free(folder: Path, plates: Mapping[int, Path]) -> None:
     plates: the picture of each frame.
     """
     is_capture = (folder / TRANSFORMS).exists()
-    known = read_json(folder / TRANSFORMS, CaptureError) if is_capture else {"made_by": MAKER}
-    ours = isinstance(known, dict) and known.get("made_by") == MAKER
-    if find_model(folder) is not None or not ours:
+    transforms = read_json(folder / TRANSFORMS, CaptureError) if is_capture else {"made_by": MAKER}
+    is_ours = isinstance(transforms, dict) and transforms.get("made_by") == MAKER
+    if find_model(folder) is not None or not is_ours:
         raise CaptureError(f"{folder} holds another capture already; choose another folder.")
     for frame, plate in plates.items():
         picture = folder / _picture_path(frame, plate)
@@ -156,27 +156,28 @@ def write_cameras(folder: Path, entries: list[dict[str, Any]]) -> None:
                {"made_by": MAKER, "camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})
 
 
-def write_frame(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> dict[str, Any]:
+def write_frame(scene: Any, camera: Any, frame: int, plate: Path, folder: Path) -> dict[str, Any]:
     """Link or copy the picture of a frame into the capture; return the frame's entry for transforms.json.
 
-    The scene must be at this frame. path: the picture. folder: of the capture. Raises CaptureError for a camera that is
-    mirrored or skewed.
+    The scene must be at this frame. plate: the picture. folder: of the capture. Raises CaptureError for a camera that
+    is mirrored or skewed.
     """
     depsgraph = bpy.context.evaluated_depsgraph_get()
     evaluated = camera.evaluated_get(depsgraph)
-    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    core_camera = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
     pose = _camera_pose(evaluated, frame)
-    name = _picture_path(frame, path)
+    name = _picture_path(frame, plate)
     target = folder / name
     target.parent.mkdir(parents=True, exist_ok=True)
-    if not _is_copy(target, path):
+    if not _is_copy(target, plate):
         remove_file(target)  # not overwritten in place, since it may be a hard link to an earlier plate
         try:
-            os.link(path.resolve(), target)  # resolved, since Linux would link a symbolic link itself
+            os.link(plate.resolve(), target)  # resolved, since Linux would link a symbolic link itself
         except OSError:  # another disk, or a file system without links
-            shutil.copy2(path, target)
-    return {"file_path": name, "w": core.width, "h": core.height, "fl_x": core.fx, "fl_y": core.fy, "cx": core.cx,
-            "cy": core.cy, **lens_distortion(camera, path), "transform_matrix": pose.tolist()}
+            shutil.copy2(plate, target)
+    return {"file_path": name, "w": core_camera.width, "h": core_camera.height,
+            "fl_x": core_camera.fx, "fl_y": core_camera.fy, "cx": core_camera.cx, "cy": core_camera.cy,
+            **lens_distortion(camera, plate), "transform_matrix": pose.tolist()}
 
 
 def _camera_pose(camera: Any, frame: int) -> cameras.Floats:
@@ -246,19 +247,19 @@ def scene_points(scene: Any, camera: Any) -> np.ndarray[Any, Any]:
 
     Of more than 2 MAX_POINTS, every second, third, ... is returned.
     """
-    parts: list[np.ndarray[Any, Any]] = []
+    clouds: list[np.ndarray[Any, Any]] = []
     for background in camera.data.background_images:
         if background.source == "MOVIE_CLIP" and background.clip is not None:
             bundles = [list(track.bundle) for track in background.clip.tracking.tracks if track.has_bundle]
             if bundles:
-                parts.append(_transform(np.array(bundles), bundle_matrix(camera)))
+                clouds.append(_transform(np.array(bundles), bundle_matrix(camera)))
     for item in scene.objects:
         if item.type == "MESH" and len(item.data.vertices):
             flat = np.empty(3 * len(item.data.vertices), np.float32)
             item.data.vertices.foreach_get("co", flat)
-            parts.append(_transform(flat.reshape(-1, 3), item.matrix_world))
-    every = np.concatenate(parts) if parts else np.zeros((0, 3))
-    return every[:: max(-(-len(every) // MAX_POINTS), 1)]
+            clouds.append(_transform(flat.reshape(-1, 3), item.matrix_world))
+    all_points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
+    return all_points[:: max(-(-len(all_points) // MAX_POINTS), 1)]
 
 
 def _transform(points: np.ndarray[Any, Any], matrix: Any) -> np.ndarray[Any, Any]:

@@ -168,7 +168,7 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
     scene_frames = {frame.view: frame.number for frame in number_views(view.name for view in capture.views)}
     for item, light in zip(lights, capture.lights, strict=True):
         if light.moves:
-            light_paths.key_path(item, light, capture, scene_frames)
+            light_paths.key_light_path(item, light, capture, scene_frames)
     yield  # the last place at which a cancel finds the scene's own state unchanged
     state = scene.fit_flare
     if state.root is not None:

@@ -42,7 +42,7 @@ class FITFLARE_OT_tracks_from_lights(_ClipOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def act(self, context: bpy.types.Context) -> None:
-        count = light_paths.read_tracks(_clip(context))
+        count = light_paths.add_light_tracks(_clip(context))
         self.report({"INFO"}, f"Lights added as tracks: {count}")
 
 

@@ -101,12 +101,12 @@ class FITFLARE_OT_use_lights(GuardedOperator, bpy.types.Operator):
         capture = fits.capture_folder(context.scene)
         if capture is None or not is_folder(capture):
             return NO_CAPTURE
-        return "" if lights.new_names(context.scene, capture) else "All lights that were found are in the scene"
+        return "" if lights.new_light_names(context.scene, capture) else "All lights that were found are in the scene"
 
     def act(self, context: bpy.types.Context) -> None:
         capture = fits.capture_folder(context.scene)
         assert capture is not None
-        lights.import_new(context.scene, capture)
+        lights.import_new_lights(context.scene, capture)
 
 
 _CLASSES = (FITFLARE_OT_add_light, FITFLARE_OT_lights_from_selected, FITFLARE_OT_remove_light, FITFLARE_OT_find_lights,

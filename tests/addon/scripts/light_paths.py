@@ -96,7 +96,7 @@ if bpy.ops.rigidbody.world_add.poll():
     with bpy.context.temp_override(object=body, selected_objects=[body], active_object=body):
         bpy.ops.rigidbody.object_add()
     mover.parent = body
-    facts["pushed by physics"] = light_paths.moves(mover, None)
+    facts["pushed by physics"] = light_paths.may_move(mover, None)
 
 # ---- read back, and corrected -----------------------------------------------------------------------
 data = json.loads(path.read_text())

@@ -124,7 +124,7 @@ for name in ("On", "Off", "Excluded"):
     group.objects.link(bpy.data.objects.new(f"Lamp {name}", bpy.data.lights.new(name, "POINT")))
 bpy.data.collections["Off"].hide_render = True
 bpy.context.view_layer.layer_collection.children["Excluded"].exclude = True
-facts["lamps"] = [thing.name for thing in part("flare_addon.capture.blend_shot")._find_lights(scene, ())]
+facts["lamps"] = [thing.name for thing in part("flare_addon.capture.blend_shot")._light_objects(scene, ())]
 
 # ---- an empty as the camera, and another file -------------------------------------------------------
 ops.open_flare(filepath=str(flare))
@@ -182,7 +182,7 @@ for how, x, y in (("beside the picture", 50, 100), ("below the view", 150, -5), 
     kind = library.FITFLARE_OT_pick_light
     operator = SimpleNamespace(_area=7, execute=lambda _context: {"FINISHED"},
                                why_not=lambda _context, how=how: "No" if how == "the camera is gone" else "")
-    operator._pick, operator.cancel = partial(kind._pick, operator), partial(kind.cancel, operator)
+    operator._store_position, operator.cancel = partial(kind._store_position, operator), partial(kind.cancel, operator)
     if how == "the view is gone":
         context.screen.areas.clear()
     left.clear()
@@ -219,14 +219,15 @@ for how in ("open", "closed"):
 path = capture / "lights.json"
 content = json.loads(path.read_text())
 path.write_text(json.dumps({"lights": [*content["lights"], {"name": "found", "xyz": [1, 2, 3], "score": 0.5}]}))
-facts["found"] = lights.new_names(scene, capture)
+facts["found"] = lights.new_light_names(scene, capture)
 lights.write_to_capture(scene, capture)
 facts["kept"] = [entry for entry in json.loads(path.read_text())["lights"] if entry["name"] == "found"]
 ops.use_lights()
-facts["used"] = [[lights.light_name(item) for item in lights.scene_lights(scene)], lights.new_names(scene, capture)]
+facts["used"] = [[lights.light_name(item) for item in lights.scene_lights(scene)],
+                 lights.new_light_names(scene, capture)]
 ops.remove_light(object="found")
 lights.write_to_capture(scene, capture)
-facts["taken out"] = [[light.name for light in read_lights(path)], lights.new_names(scene, capture)]
+facts["taken out"] = [[light.name for light in read_lights(path)], lights.new_light_names(scene, capture)]
 lamp = scene.objects["lamp"]
 lights.write_to_capture(scene, capture)
 lights.remember_names(scene)

@@ -93,7 +93,7 @@ class Ours:
 
     def __init__(self) -> None:
         self.times: dict[str, Times] = {}
-        timed(module("jobs"), "_tick", self._of("look at the engine"))
+        timed(module("jobs"), "_poll_jobs", self._of("look at the engine"))
         for panel in module("panels")._CLASSES:
             timed_draw(panel, self._of(f"panel {panel.bl_label}"))
         timed(module("looks"), "show_look", self._of("take the flare in"))

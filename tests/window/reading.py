@@ -39,7 +39,7 @@ def steps():
     scene.camera.keyframe_insert("location", frame=FRAMES)
     yield 1
     times: list[float] = []
-    tick = baking._tick
+    tick = baking._read_scene
 
     def timed():
         began = time.thread_time()
@@ -47,7 +47,7 @@ def steps():
         times.append(time.thread_time() - began)
         return result
 
-    baking._tick = timed
+    baking._read_scene = timed
     gaps = Gaps()
     began = time.perf_counter()
     with ui.override():

@@ -123,9 +123,9 @@ def merge_entry(known_entry: Mapping[str, Any], name: str, xyz: Sequence[float],
         key = {label: value for label, value in (known_frames.get(frame) or {}).items() if label not in ("xyz", "xy")}
         new_key = keys.get(frame, {})
         known_xyz = (known_frames.get(frame) or {}).get("xyz")
-        if known_xyz is not None and "xyz" in new_key:
-            if not np.allclose(known_xyz, new_key["xyz"], rtol=1e-3, atol=1e-4):
-                key.pop("confidence", None)
+        if known_xyz is not None and "xyz" in new_key and not np.allclose(known_xyz, new_key["xyz"], rtol=1e-3,
+                                                                          atol=1e-4):
+            key.pop("confidence", None)
         merged = {**key, **new_key}
         if {"xyz", "on"} & merged.keys():
             frames[frame] = merged

@@ -41,7 +41,7 @@ def _shader() -> Any:
     return gpu.shader.from_builtin("POINT_FLAT_COLOR" if bpy.app.version >= (4, 5, 0) else "FLAT_COLOR")
 
 
-def _draw_points() -> None:
+def _draw() -> None:
     """Draw the point clouds in the current 3D view."""
     import gpu
 
@@ -73,7 +73,7 @@ def clear_cache() -> None:
 def register() -> None:
     global _handle
     if not bpy.app.background:
-        _handle = bpy.types.SpaceView3D.draw_handler_add(_draw_points, (), "WINDOW", "POST_VIEW")
+        _handle = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
 
 
 def unregister() -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -43,8 +44,8 @@ class PictureCache:
 
     @contextlib.contextmanager
     def overflowing_into(self, folder: Path) -> Iterator[None]:
-        """Keep what exceeds memory in a temporary file in `folder`; it is deleted at the end, however this process
-        ends.
+        """Within the context, keep what exceeds memory in a temporary file in `folder`; it is deleted at the end,
+        however this process ends.
 
         Except on Windows the file has no name.
         """
@@ -79,7 +80,7 @@ class PictureCache:
             try:
                 if shutil.disk_usage(self._folder).free - codes.nbytes < MIN_FREE_DISK:
                     return
-                offset = self._file.seek(0, 2)  # the end
+                offset = self._file.seek(0, os.SEEK_END)
                 if self._file.write(codes.tobytes()) < codes.nbytes:
                     return  # the disk or the user's quota is full
             except OSError:

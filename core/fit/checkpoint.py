@@ -163,9 +163,9 @@ def _describe_light_change(old: list[Any], new: list[Any], tolerance: float) -> 
     It is about the names, else about the first light whose position (None if it moves) or other values differ.
     Positions may differ by `tolerance`, and by what Blender's single precision rounds to.
     """
-    before, after = ([name for name, *_ in lights] for lights in (old, new))
-    if before != after:
-        return f"its lights were {', '.join(map(repr, before))}, and are {', '.join(map(repr, after))} now"
+    old_names, new_names = ([name for name, *_ in lights] for lights in (old, new))
+    if old_names != new_names:
+        return f"its lights were {', '.join(map(repr, old_names))}, and are {', '.join(map(repr, new_names))} now"
     for (name, old_position, *old_path), (_, new_position, *new_path) in zip(old, new, strict=True):
         if None in (old_position, new_position):
             moved = old_position != new_position

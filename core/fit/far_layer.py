@@ -23,7 +23,7 @@ from ..colour.srgb_torch import expose
 from ..gaussians.far_sphere import FarSphere
 from ..gaussians.scene import SceneGaussians
 from ..images.picture import Picture
-from .frames import Frames, subsample
+from .frames import Frames, Targets, subsample
 from .sky import fibonacci_directions
 
 SWEEP_VIEWS, SWEEP_WIDTH = 24, 120
@@ -259,7 +259,6 @@ def _make_far_points(sphere: FarSphere, patches: Patches, views: Sequence[View],
 
     Colours are those at the usual exposure: medians of clean frames, else a low quantile of the frames.
     """
-    centre = np.array(sphere.centre)
     targets = [frames.targets(view) for view in views]
     focal = float(np.median([target.camera.focal_length for target in targets]))
     pitch = POINT_PITCH_PX / focal
@@ -269,23 +268,31 @@ def _make_far_points(sphere: FarSphere, patches: Patches, views: Sequence[View],
     if len(directions) > MAX_POINTS:
         directions = _visible_directions(cameras, pitch * (len(directions) / MAX_POINTS) ** 0.5)
         directions = directions[patches.are_far(directions)]
-    colours = np.full((len(views), len(directions), 3), np.nan, np.float32)
+    colours = _sample_views(directions, sphere, views, targets, frames)
     is_exact = all(target.clean is not None for target in targets)
+    visible = np.isfinite(colours[..., 0]).any(0)
+    chosen_colours = np.nanquantile(colours[:, visible], 0.5 if is_exact else COLOUR_QUANTILE, axis=0)
+    xyz = np.array(sphere.centre) + sphere.radius * directions[visible]
+    return PointCloud(xyz.astype(np.float32), (chosen_colours.clip(0, 1) * 255 + 0.5).astype(np.uint8),
+                      np.zeros(len(xyz), np.float32))
+
+
+def _sample_views(directions: Floats, sphere: FarSphere, views: Sequence[View], targets: Sequence[Targets],
+                  frames: Frames) -> Values:
+    """Return colours (views, n, 3), display values at the usual exposure, of the far sphere in directions (n, 3); NaN
+    where a view does not see a direction. targets: of the views."""
+    colours = np.full((len(views), len(directions), 3), np.nan, np.float32)
     for row, view, (camera, frame, clean) in zip(colours, views, targets, strict=True):
         # Points are then PITCH_PX apart, as the directions of the sweep are.
         small = camera.scaled(max(round(camera.width * PITCH_PX / POINT_PITCH_PX), 8))
         picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
         values = Picture(picture, "srgb").resized(*small.size).display()
-        inside, places = _project_sphere(small, centre, directions, 0.0)
+        inside, places = _project_sphere(small, np.array(sphere.centre), directions, 0.0)
         row[inside] = _bilinear(values, places)
         if (mask := frames.mask(view)) is not None:
             x, y = np.minimum((places / small.width * camera.width).astype(int), np.array(camera.size) - 1).T
             row[np.flatnonzero(inside)[~mask.numpy()[y, x]]] = np.nan
-    visible = np.isfinite(colours[..., 0]).any(0)
-    chosen_colours = np.nanquantile(colours[:, visible], 0.5 if is_exact else COLOUR_QUANTILE, axis=0)
-    xyz = centre + sphere.radius * directions[visible]
-    return PointCloud(xyz.astype(np.float32), (chosen_colours.clip(0, 1) * 255 + 0.5).astype(np.uint8),
-                      np.zeros(len(xyz), np.float32))
+    return colours
 
 
 def _camera_centre(cameras: list[Camera]) -> Floats:

@@ -115,7 +115,7 @@ class PointObservations:
         neither too dark nor clipped. frames: decoded, at the size of the fit."""
         # Points whose index is a multiple of `step`, so that views have them in common.
         step = max(int(np.median([len(view.points) for view in views])) // SAMPLED_POINTS, 1)
-        parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
+        samples = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
         progress.stage("look at exposures", len(views))
         for number, view in enumerate(views):
             progress.advance()
@@ -130,8 +130,8 @@ class PointObservations:
                 usable &= counts
             points = chosen[inside][usable]
             light = linear_from_srgb(observed[usable]).astype(np.float64) @ LUMINANCE
-            parts.append((np.full(len(points), number), points, light))
-        numbers, points, light = (np.concatenate(part) for part in zip(*parts, strict=True))
+            samples.append((np.full(len(points), number), points, light))
+        numbers, points, light = (np.concatenate(arrays) for arrays in zip(*samples, strict=True))
         return cls(len(views), numbers, points, light)
 
     def estimate_stops(self) -> Floats:

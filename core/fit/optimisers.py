@@ -108,6 +108,7 @@ class FlareOptimisers:
     grids that a view touched, and `brightness`, None for lights that stay on."""
 
     def __init__(self, flare: FlareModel, rates: FlareRates) -> None:
+        """rates: of the settings; those of lengths in the plane are multiplied by `LightFlare.scale`."""
         self._rates = rates
         gaussian_rates = {
             "positions": rates.position, "log_scales": rates.scale, "rotations": rates.rotation,

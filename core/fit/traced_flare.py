@@ -234,17 +234,18 @@ def fit_traced(settings: TracedFlareSettings, setup: LensSetup, traced: TracedPi
     pictures = torch.from_numpy(traced.pictures)
     lights, intrinsics = torch.tensor(traced.places, dtype=torch.float32), _intrinsics(camera)
     encoded, energies = _encode_light(pictures), pictures.square().sum((1, 2, 3)).clamp_min(1e-6)
-    order: list[int] = []
+    remaining: list[int] = []
     random = np.random.default_rng(settings.fit.seed)
     progress.stage("fit", fit.iterations)
     for iteration in range(1, fit.iterations + 1):
-        order = order or random.permutation(len(pictures)).tolist()
-        index = order.pop()
+        remaining = remaining or random.permutation(len(pictures)).tolist()
+        index = remaining.pop()
         optimisers.set_rates(iteration / fit.iterations)
         drawn = _draw_flare(flare, lights[index], intrinsics, camera)
         # Under the root, 1e-4 bounds the slope where the error vanishes.
-        squared_error = (drawn - pictures[index]).square().sum() / energies[index]
-        loss = (_encode_light(drawn) - encoded[index]).abs().mean() + SQUARED_WEIGHT * (squared_error + 1e-4).sqrt()
+        relative_squared_error = (drawn - pictures[index]).square().sum() / energies[index]
+        relative_error = (relative_squared_error + 1e-4).sqrt()
+        loss = (_encode_light(drawn) - encoded[index]).abs().mean() + SQUARED_WEIGHT * relative_error
         loss.backward()
         optimisers.step()
         if fit.flare.density.is_due(iteration):

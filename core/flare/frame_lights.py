@@ -25,6 +25,7 @@ class FrameLights(nn.Module):
     prior: Tensor
 
     def __init__(self, frames: Sequence[str], positions: Tensor, prior: Tensor) -> None:
+        """frames: names, in the order of the shot."""
         super().__init__()
         self.rows = {name: row for row, name in enumerate(frames)}
         """Row of each frame, by its name, in the order of the shot."""

@@ -50,9 +50,9 @@ def covariance_of_solid(means: Tensor, log_scales: Tensor, quaternions: Tensor) 
     rotation = rotation_matrices(quaternions)
     x, y = means[:, :1], means[:, 1:]
     # Rows of J R, scaled by the axes: (J R S)(J R S)^T is the projected covariance.
-    first = (rotation[:, 0] - x * rotation[:, 2]) * log_scales.exp() / PLANE_DEPTH
-    second = (rotation[:, 1] - y * rotation[:, 2]) * log_scales.exp() / PLANE_DEPTH
-    return torch.stack([(first * first).sum(-1), (first * second).sum(-1), (second * second).sum(-1)], -1)
+    row_x = (rotation[:, 0] - x * rotation[:, 2]) * log_scales.exp() / PLANE_DEPTH
+    row_y = (rotation[:, 1] - y * rotation[:, 2]) * log_scales.exp() / PLANE_DEPTH
+    return torch.stack([(row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)], -1)
 
 
 def covariance_of_ellipse(log_scales: Tensor, directions: Tensor) -> Tensor:

@@ -108,16 +108,16 @@ def clear_visibilities(scene: SceneGaussians, model: FlareModel, poses: Sequence
     """Return (lights,), the visibility of each light where nothing hides it: that which a tenth of these poses (4, 4)
     reach. frames: names of their frames, where lights move.
 
-    0 stands for unknown, where that is below MIN_CLEAR: the scene hides the light from everywhere, such as one that the
-    light was placed inside of. `relative_to_clear` gives 1 then.
+    0 stands for unknown, where that is below MIN_CLEAR: the scene hides the light from everywhere, for example if the
+    light lies inside an object. `relative_to_clear` gives 1 then.
     """
-    cameras = [-pose[:3, :3].double().T @ pose[:3, 3].double() for pose in poses]
+    eyes = [-pose[:3, :3].double().T @ pose[:3, 3].double() for pose in poses]
     places = [model.positions_in(frame) for frame in frames or [""] * len(poses)]
     quantiles = []
     for number in range(len(model.names)):
         visibilities = torch.stack([
-            light_visibility(scene, camera, lights[number], settings, kernels)
-            for camera, lights in zip(cameras, places, strict=True)])
+            light_visibility(scene, eye, lights[number], settings, kernels)
+            for eye, lights in zip(eyes, places, strict=True)])
         quantiles.append(visibilities.quantile(CLEAR_QUANTILE))
     clear = torch.stack(quantiles).clamp(max=1)
     return clear.masked_fill(clear < MIN_CLEAR, 0)

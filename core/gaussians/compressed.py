@@ -74,7 +74,7 @@ def read_compressed(path: Path) -> SceneGaussians:
 
 
 def _read_elements(data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the elements by name, as structured arrays."""
+    """Return the elements by name, as structured arrays. Raises ValueError for a damaged header."""
     header = ply.read_header(data)
     if header is None:
         raise ValueError("its header has no end")

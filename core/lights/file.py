@@ -185,11 +185,11 @@ def _free_name(used_names: set[str]) -> str:
 
 def _is_same_light(xyz: Any, other: Any, views: Sequence[tuple[str, Camera]]) -> bool:
     """True if two places fall on one spot in most views that have either in frame."""
-    same_views = other_views = 0
+    matching_views = differing_views = 0
     for _, camera in views:
         pixels, depth = camera.project([xyz, other])
         if camera.contains(pixels, depth).any():
             is_near = (depth > 0).all() and np.linalg.norm(pixels[0] - pixels[1]) < SAME_PLACE * np.hypot(*camera.size)
-            same_views += bool(is_near)
-            other_views += not is_near
-    return same_views > other_views
+            matching_views += bool(is_near)
+            differing_views += not is_near
+    return matching_views > differing_views

@@ -27,7 +27,7 @@ from .tracks import TrackedLight, TrackFindings, track_lights
 from .triangulation import TriangulationSettings, triangulate_lights
 
 SHEETS, REPORT = "lights", "report.json"
-STANDING = 0.006
+MAX_STATIC_DISTANCE = 0.006
 """Median distance of a light from the projections of one place, diagonals, below which it stands."""
 
 
@@ -111,29 +111,29 @@ def _is_well_supported(light: FoundLight, min_views: int, settings: Triangulatio
             and light.nfa <= settings.max_nfa)
 
 
-def track_moving_lights(capture: Capture, standing: Sequence[FoundLight], progress: Progress | None = None
+def track_moving_lights(capture: Capture, static_lights: Sequence[FoundLight], progress: Progress | None = None
                         ) -> TrackFindings:
     """Follow the lights of a solved capture whose frames are consecutive; return those that move.
 
-    A light that keeps to the projections of one of `standing`, the lights with one place, is left out.
+    A light that keeps to the projections of one of `static_lights`, the lights with one place, is left out.
     """
     findings = track_lights(capture, progress)
-    moving = [light for light in findings.lights if not _stands(capture, light, standing)]
+    moving = [light for light in findings.lights if not _is_static(capture, light, static_lights)]
     left_out = len(findings.lights) - len(moving)
     message = f"{len(moving)} lights move and have a path; {left_out} that were followed stand."
     return replace(findings, lights=moving, messages=[message])
 
 
-def _stands(capture: Capture, light: TrackedLight, standing: Sequence[FoundLight]) -> bool:
+def _is_static(capture: Capture, light: TrackedLight, static_lights: Sequence[FoundLight]) -> bool:
     """True if a light that was followed keeps to the projections of a standing one."""
     views = [(view.name, view.camera) for view in capture.views if view.name in light.support]
     pixels = np.array([light.keys[name].xy for name, _ in views])
-    for standing_light in standing:
+    for static_light in static_lights:
         distances = []
         for (_, camera), pixel in zip(views, pixels, strict=True):
-            projected, depth = camera.project(standing_light.xyz)
+            projected, depth = camera.project(static_light.xyz)
             distances.append(float(np.linalg.norm(projected[0] - pixel)) if depth[0] > 0 else np.inf)
-        if np.median(distances) < STANDING * float(np.hypot(*views[0][1].size)) + 0.5 * light.radius:
+        if np.median(distances) < MAX_STATIC_DISTANCE * float(np.hypot(*views[0][1].size)) + 0.5 * light.radius:
             return True
     return False
 
@@ -156,8 +156,8 @@ def write_findings(capture: Capture, findings: Findings, keep: bool = False, tra
     else:
         from .track_sheet import write_track_sheets
 
-        lit = capture.with_lights(read_lights(capture.folder / LIGHTS))
-        sheets = write_track_sheets(capture.folder / SHEETS, lit, tracked.sources)
+        lit_capture = capture.with_lights(read_lights(capture.folder / LIGHTS))
+        sheets = write_track_sheets(capture.folder / SHEETS, lit_capture, tracked.sources)
     report = {
         "lights": entries, "says": findings.messages,
         "doubtful": [{"xyz": light.xyz.round(5).tolist(), "far": light.far, "support": list(light.support),
@@ -184,8 +184,8 @@ def write_tracks(capture: Capture, findings: TrackFindings, keep: bool = False) 
 
     views = [(view.name, view.camera) for view in capture.views]
     entries = write_lights(capture.folder / LIGHTS, (), views, keep, findings.lights)
-    lit = capture.with_lights(read_lights(capture.folder / LIGHTS))
-    sheets = write_track_sheets(capture.folder / SHEETS, lit, findings.sources)
+    lit_capture = capture.with_lights(read_lights(capture.folder / LIGHTS))
+    sheets = write_track_sheets(capture.folder / SHEETS, lit_capture, findings.sources)
     report = {
         "lights": entries, "says": findings.messages,
         "followed": [{"support": list(light.support), "evidence": round(light.evidence, 3),

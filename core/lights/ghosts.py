@@ -36,6 +36,12 @@ WORKING_SIZE = 480
 """Largest side of the picture in which blobs are found, pixels."""
 BLOB_RADII = np.exp(np.linspace(np.log(0.007), np.log(0.06), 6))
 """Radii of blobs that are tested, relative to the diagonal."""
+SIGMA_RATIO = 1.6
+"""Ratio of the two Gaussians: at 1.6 their difference is close to a Laplacian of Gaussian (Marr and Hildreth 1980)."""
+MAX_LIGHT = 4.0
+"""Linear light at which pixels are clipped: one far above white would outshine the blobs near it."""
+MIN_SEPARATION = 0.7
+"""Smallest distance of a blob from a stronger one, in radii of that one."""
 MIN_STRENGTH = 0.004
 """Strength of a blob, see `Blob`, up to which it is noise."""
 MAX_VISIBLE_SHARE = 0.2
@@ -69,14 +75,14 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
     width, height = picture.size
     scale = min(1.0, WORKING_SIZE / max(width, height))
     size = (max(8, round(width * scale)), max(8, round(height * scale)))
-    small = np.sqrt(np.asarray(cv2.resize(np.minimum(light, 4.0), size, interpolation=cv2.INTER_AREA), np.float32))
+    reduced = cv2.resize(np.minimum(light, MAX_LIGHT), size, interpolation=cv2.INTER_AREA)
+    small = np.sqrt(np.asarray(reduced, np.float32))
     diagonal = float(np.hypot(*size))
     candidates: list[Blob] = []
     for radius in BLOB_RADII * diagonal:
-        sigma = radius / 1.6
+        sigma = radius / SIGMA_RATIO
         inner = cv2.GaussianBlur(small, (0, 0), sigma)
-        # At a ratio of 1.6 the difference is close to a Laplacian of Gaussian (Marr and Hildreth 1980).
-        difference = np.asarray(inner - cv2.GaussianBlur(small, (0, 0), 1.6 * sigma))
+        difference = np.asarray(inner - cv2.GaussianBlur(small, (0, 0), SIGMA_RATIO * sigma))
         window = 2 * max(1, round(radius)) + 1
         is_largest = difference == cv2.dilate(difference, np.ones((window, window), np.uint8))
         is_peak = is_largest & (difference > MIN_STRENGTH)
@@ -85,7 +91,7 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
             candidates.append(Blob(xy, float(radius / scale), float(difference[y, x])))
     strongest: list[Blob] = []
     for blob in sorted(candidates, key=lambda blob: -blob.strength):
-        if all(np.linalg.norm(blob.xy - other.xy) > 0.7 * other.radius for other in strongest):
+        if all(np.linalg.norm(blob.xy - other.xy) > MIN_SEPARATION * other.radius for other in strongest):
             strongest.append(blob)
         if len(strongest) == MAX_BLOBS:
             break

@@ -32,24 +32,25 @@ MAX_GAUSSIANS = 4000
 
 
 def lift_to_gaussians(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[Detection]], means: ArrayLike,
-                      opacities: ArrayLike, extent: float, min_views: int = 3, share: float = 0.3) -> list[FoundLight]:
+                      opacities: ArrayLike, extent: float, min_views: int = 3, min_share: float = 0.3
+                      ) -> list[FoundLight]:
     """Find lights from detections of each view and scene Gaussians: means (n, 3), opacities (n,) in 0..1.
 
-    At least `share` of the views that see a Gaussian, and `min_views`, must have it inside a detection. extent: of the
-    cameras' path (`Capture.extent`), world units.
+    At least `min_share` of the views that see a Gaussian, and `min_views`, must have it inside a detection. extent: of
+    the cameras' path (`Capture.extent`), world units.
     """
     xyz, opacity = np.asarray(means, np.float64), np.asarray(opacities, np.float64)
     xyz, opacity = xyz[opacity > MIN_OPACITY], opacity[opacity > MIN_OPACITY]
     inside, visible = np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64)
     for (_, camera), in_view in zip(views, detections, strict=True):
         pixels, depth = camera.project(xyz)
-        front = _visible_points(camera, pixels, depth)
-        visible[front] += 1
+        visible_rows = _visible_points(camera, pixels, depth)
+        visible[visible_rows] += 1
         if in_view:
             mask = union_mask(in_view, camera.size)
-            column, row = np.minimum(pixels[front].astype(int), np.array(camera.size) - 1).T
-            inside[front[mask[row, column]]] += 1
-    chosen = np.flatnonzero((inside >= min_views) & (inside >= share * np.maximum(visible, 1)))
+            column, row = np.minimum(pixels[visible_rows].astype(int), np.array(camera.size) - 1).T
+            inside[visible_rows[mask[row, column]]] += 1
+    chosen = np.flatnonzero((inside >= min_views) & (inside >= min_share * np.maximum(visible, 1)))
     chosen = chosen[np.argsort(-inside[chosen], kind="stable")][:MAX_GAUSSIANS]
     lights = []
     for members in _cluster(xyz[chosen], CLUSTER_DISTANCE * extent):

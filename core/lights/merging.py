@@ -83,11 +83,11 @@ def _is_same_light(light: FoundLight, other: FoundLight, views: Sequence[tuple[s
     max_distance = 0.02 * extent + 2 * (light.uncertainty + other.uncertainty)
     if not light.far and not other.far and np.linalg.norm(light.xyz - other.xyz) < min(max_distance, 0.3 * extent):
         return True
-    same_views = other_views = 0
+    matching_views = differing_views = 0
     for _, camera in views:
         (a, b), depth = camera.project([light.xyz, other.xyz])
         if (depth > 0).all() and camera.contains([a, b], depth).any():
             joint_radius = light.radius + other.radius + 0.004 * np.hypot(*camera.size)
-            same_views += bool(np.linalg.norm(a - b) < joint_radius)
-            other_views += bool(np.linalg.norm(a - b) >= joint_radius)
-    return same_views > 2 * other_views
+            matching_views += bool(np.linalg.norm(a - b) < joint_radius)
+            differing_views += bool(np.linalg.norm(a - b) >= joint_radius)
+    return matching_views > 2 * differing_views

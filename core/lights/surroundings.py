@@ -54,8 +54,8 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
     is_bright = []
     for name, detection in light.detections:
         direction = cameras[name].rays(detection.xy[None])[0]
-        for other, camera in cameras.items():
-            if other == name:
+        for other_name, camera in cameras.items():
+            if other_name == name:
                 continue
             pixel = _project_direction(camera, direction)
             if pixel is None:
@@ -66,9 +66,9 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
             # Both fall on one spot, so that a bright one does not tell a lamp from a far surrounding.
             if depth[0] > 0 and np.linalg.norm(place[0] - pixel) < clearance:
                 continue
-            height, width = maps[other].shape
+            height, width = maps[other_name].shape
             x, y = (pixel / camera.size * (width, height)).astype(int)
-            is_bright.append(bool(maps[other][min(y, height - 1), min(x, width - 1)]))
+            is_bright.append(bool(maps[other_name][min(y, height - 1), min(x, width - 1)]))
     return float(np.mean(is_bright)) if len(is_bright) >= MIN_TESTS else None
 
 

@@ -459,11 +459,11 @@ def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, 
     """
     current, renamed = {}, {}
     for name, value in values.items():
-        present = RENAMED.get(name, name)
-        if present != name:
-            renamed[name] = present
-        known = isinstance(value, str) and (present, value) in RENAMED_VALUES
-        current[present] = RENAMED_VALUES[present, value] if known else value
+        current_name = RENAMED.get(name, name)
+        if current_name != name:
+            renamed[name] = current_name
+        has_old_value = isinstance(value, str) and (current_name, value) in RENAMED_VALUES
+        current[current_name] = RENAMED_VALUES[current_name, value] if has_old_value else value
     return current, renamed
 
 

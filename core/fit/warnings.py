@@ -78,7 +78,7 @@ def moved_light_warnings(capture: Capture, flare: FlareModel) -> tuple[str, ...]
     places by frame."""
     if flare.frame_lights is not None:
         return ()
-    distances = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
-            zip(capture.lights, flare.positions.numpy(), strict=True)]
+    distances = [float(np.linalg.norm(xyz - light.xyz))
+                 for light, xyz in zip(capture.lights, flare.positions.numpy(), strict=True)]
     return tuple(f"The light {light.name!r} was moved to its flare, {distance:.3g} units from where lights.json has it."
                  for light, distance in zip(capture.lights, distances, strict=True) if distance > 0)

@@ -69,10 +69,10 @@ class HashGrid(nn.Module):
         weights = torch.where(corners.bool(), fraction, 1 - fraction).prod(-1)
         side = resolutions[:, None] + 1
         dense = corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])
-        mixed = corner * primes  # the paper's hash, eq. 4
-        hashed = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % rows[:, None]
-        fits = (side**3 <= rows[:, None])
-        return torch.where(fits, dense, hashed) + self._starts[:, None], weights.to(point.dtype)
+        scrambled = corner * primes  # the paper's hash, eq. 4
+        hashed = (scrambled[..., 0] ^ scrambled[..., 1] ^ scrambled[..., 2]) % rows[:, None]
+        is_dense = (side**3 <= rows[:, None])
+        return torch.where(is_dense, dense, hashed) + self._starts[:, None], weights.to(point.dtype)
 
 
 def frequency_encoding(values: Tensor, bands: int) -> Tensor:

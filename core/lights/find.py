@@ -27,6 +27,8 @@ from .tracks import TrackedLight, TrackFindings, track_lights
 from .triangulation import TriangulationSettings, triangulate_lights
 
 SHEETS, REPORT = "lights", "report.json"
+MAX_POINT_DISTANCE = 0.05
+"""Distance from a detection, diagonals, up to which points give the depth of a light in a single view."""
 MAX_STATIC_DISTANCE = 0.006
 """Median distance of a light from the projections of one place, diagonals, below which it stands."""
 
@@ -218,13 +220,13 @@ def _light_of_entry(entry: dict[str, Any], lights: Sequence[FoundLight]) -> Foun
 def _lights_from_one_view(capture: Capture, detections: Sequence[Detection]) -> list[FoundLight]:
     """Place each detection of a single view at the median depth of the points around it in the picture.
 
-    Without a point within 5 % of the diagonal it is placed far away. The uncertainty is
-    as large as the guessed distance, and 0 where the light is far.
+    Without a point within MAX_POINT_DISTANCE it is placed far away. The uncertainty is as large as the guessed
+    distance, and 0 where the light is far.
     """
     view = capture.views[0]
     pixels, depth = view.camera.project(capture.points.xyz)
     in_frame = view.camera.contains(pixels, depth)
-    reach = 0.05 * float(np.hypot(*view.camera.size))
+    reach = MAX_POINT_DISTANCE * float(np.hypot(*view.camera.size))
     lights = []
     for detection in detections:
         near = in_frame & (np.linalg.norm(pixels - detection.xy, axis=1) < reach)

@@ -2,7 +2,7 @@
 """Contact sheets of a search for lights: every view small, with its detections and the projections of the lights."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,17 +26,24 @@ def write_overlay_sheets(folder: Path, capture: Capture, detections: Sequence[Se
     A green ring is a detection; a cross with a name is a light's projection, thick where the view supports it. An arrow
     at the edge points to a light out of frame.
     """
+    return write_sheets(folder, len(capture.views),
+                        lambda number: _draw_tile(capture, number, detections[number], lights))
+
+
+def write_sheets(folder: Path, count: int, draw_tile: Callable[[int], NDArray[np.float32]]) -> list[Path]:
+    """Write sheet1.png, sheet2.png, ... of `count` tiles into `folder`, in place of older ones; return their paths.
+
+    draw_tile: draws the tile of a number, display values (height, TILE_WIDTH, 3); heights may differ.
+    """
     for old in folder.glob("sheet*.png"):
         remove_file(old)
     tiles_per_sheet = COLUMNS * ROWS
     paths = []
-    for start in range(0, len(capture.views), tiles_per_sheet):
-        tiles = [_draw_tile(capture, i, detections[i], lights)
-                 for i in range(start, min(start + tiles_per_sheet, len(capture.views)))]
+    for start in range(0, count, tiles_per_sheet):
+        tiles = [draw_tile(number) for number in range(start, min(start + tiles_per_sheet, count))]
         height = max(tile.shape[0] for tile in tiles)
         tiles = [np.pad(tile, ((0, height - tile.shape[0]), (0, 0), (0, 0))) for tile in tiles]
-        blank = np.zeros_like(tiles[0])
-        tiles += [blank] * (-len(tiles) % COLUMNS)
+        tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
         rows = [np.concatenate(tiles[i:i + COLUMNS], axis=1) for i in range(0, len(tiles), COLUMNS)]
         path = folder / f"sheet{start // tiles_per_sheet + 1}.png"
         write_png(path, np.concatenate(rows, axis=0))

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from ..capture import Capture, LightState
 from ..capture.lights import DOUBTFUL
-from ..images.write import write_png
-from ..system.files import remove_file
-from .overlay import COLUMNS, PALETTE, RING_COLOUR, ROWS, TILE_WIDTH
+from .overlay import PALETTE, RING_COLOUR, TILE_WIDTH, write_sheets
 from .sources import Source
 
 TAIL = 6
@@ -28,20 +26,7 @@ def write_track_sheets(folder: Path, capture: Capture, sources: Sequence[Sequenc
     dashed circle is a place that is doubtful. The line is the light's path through the frames before and after.
     """
     states = [[capture.light_state(light, view) for light in capture.lights] for view in capture.views]
-    for old in folder.glob("sheet*.png"):
-        remove_file(old)
-    tiles_per_sheet, paths = COLUMNS * ROWS, []
-    for start in range(0, len(capture.views), tiles_per_sheet):
-        tiles = [_draw_tile(capture, index, sources[index], states)
-                 for index in range(start, min(start + tiles_per_sheet, len(capture.views)))]
-        height = max(tile.shape[0] for tile in tiles)
-        tiles = [np.pad(tile, ((0, height - tile.shape[0]), (0, 0), (0, 0))) for tile in tiles]
-        tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
-        rows = [np.concatenate(tiles[i:i + COLUMNS], axis=1) for i in range(0, len(tiles), COLUMNS)]
-        path = folder / f"sheet{start // tiles_per_sheet + 1}.png"
-        write_png(path, np.concatenate(rows, axis=0))
-        paths.append(path)
-    return paths
+    return write_sheets(folder, len(capture.views), lambda index: _draw_tile(capture, index, sources[index], states))
 
 
 def _draw_tile(capture: Capture, index: int, sources: Sequence[Source], states: Sequence[Sequence[LightState]]

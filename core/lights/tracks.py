@@ -38,6 +38,11 @@ RECOVERY, MAX_RECOVERY = 0.012, 0.06
 largest sum of both; diagonals."""
 MIN_RECOVERED_SCORE, RECOVERED_SIZES = 0.5, (0.4, 1.5)
 """Smallest score of such a spot, and the range of its radius relative to the median of the light's."""
+PLACE_ERROR = 0.5
+"""Expected error of a measured place, pixels."""
+MAX_OUTLIER_SPAN, MAX_PARABOLA_SPAN = 4, 6
+"""Largest number of frames from the neighbour before a place to the one after it over which an outlier is recognised,
+and over which a parabola gives the velocity."""
 MAX_BEYOND = 12
 """Number of frames by which a path continues before and after those that show the light."""
 OUT_MARGIN = 0.25
@@ -316,7 +321,7 @@ def _velocities(frames: Floats, places: Floats) -> Floats:
     """Return the velocity (n, 2), pixels per frame, at each place (n, 2), in the frames of these numbers (n,).
 
     It is that of the parabola through the place and its two neighbours in time, at either end the two nearest. Where
-    the three span more than 6 frames, it is that of the straight line to the neighbour nearer in time.
+    the three span more than MAX_PARABOLA_SPAN, it is that of the straight line to the neighbour nearer in time.
     """
     if len(frames) < 2:
         return np.zeros_like(places)
@@ -326,7 +331,7 @@ def _velocities(frames: Floats, places: Floats) -> Floats:
         near = slice(start, min(start + 3, len(frames)))
         times = (frames[near] - frames[index]).astype(np.float64)
         degree = min(2, len(times) - 1)
-        if np.ptp(times) > 6:  # neighbours across a gap say nothing of the velocity here
+        if np.ptp(times) > MAX_PARABOLA_SPAN:  # neighbours across a gap say nothing of the velocity here
             before, after = max(index - 1, 0), min(index + 1, len(frames) - 1)
             sides = [pair for pair in ((before, index), (index, after)) if pair[0] != pair[1]]
             low, high = min(sides, key=lambda pair: frames[pair[1]] - frames[pair[0]])
@@ -350,16 +355,16 @@ def _hermite(part: float, span: float, start: Floats, out: Floats, end: Floats, 
 def _expected_error(chain: Chain, index: int, acceleration: float) -> float:
     """Return the expected error, pixels, of the measured place `index` of a chain.
 
-    It is 0.5, plus how much farther the place is from the straight line between its neighbours than acceleration can
-    bend a path. Without near neighbours on both sides it is 0.5.
+    It is PLACE_ERROR, plus how much farther the place is from the straight line between its neighbours than
+    acceleration can bend a path. Without neighbours within MAX_OUTLIER_SPAN it is PLACE_ERROR.
     """
     frames, places = chain.frames, chain.places
-    if not 0 < index < len(frames) - 1 or frames[index + 1] - frames[index - 1] > 4:
-        return 0.5
+    if not 0 < index < len(frames) - 1 or frames[index + 1] - frames[index - 1] > MAX_OUTLIER_SPAN:
+        return PLACE_ERROR
     part = (frames[index] - frames[index - 1]) / (frames[index + 1] - frames[index - 1])
     middle = (1 - part) * places[index - 1] + part * places[index + 1]
     span = frames[index + 1] - frames[index - 1]
-    return 0.5 + max(float(np.linalg.norm(places[index] - middle)) - acceleration * span * span / 8, 0.0)
+    return PLACE_ERROR + max(float(np.linalg.norm(places[index] - middle)) - acceleration * span * span / 8, 0.0)
 
 
 def fit_brightness(profiles: Floats, is_detected: NDArray[np.bool_]) -> Floats:

@@ -20,7 +20,7 @@ from .objects import depsgraph_of, world_matrix
 from .paths import absolute, blend_relative
 from .properties import EDIT_NAMES, edit_of, set_slider
 
-_cache: dict[str, tuple[tuple[float, int], Look | str]] = {}
+_look_cache: dict[str, tuple[tuple[float, int], Look | str]] = {}
 
 
 def path_of(scene: Any) -> Path | None:
@@ -38,16 +38,16 @@ def look_of(scene: Any) -> Look:
         stamp = (status.st_mtime, status.st_size)
     except OSError as problem:
         raise FlareFileError(f"{path} is missing; choose a .flare file that a fit wrote.") from problem
-    known = _cache.get(str(path))
-    if known is None or known[0] != stamp:
+    cached = _look_cache.get(str(path))
+    if cached is None or cached[0] != stamp:
         try:
             result: Look | str = read_look(path)
         except FlareFileError as problem:
             result = str(problem)  # kept too, so that a panel does not read a bad file at each redraw
-        known = _cache[str(path)] = (stamp, result)
-    if isinstance(known[1], str):
-        raise FlareFileError(known[1])
-    return known[1]
+        cached = _look_cache[str(path)] = (stamp, result)
+    if isinstance(cached[1], str):
+        raise FlareFileError(cached[1])
+    return cached[1]
 
 
 def is_placed(item: Any, scene: Any) -> bool:
@@ -79,23 +79,23 @@ def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add:
             item = _new_flare(state, look, light)
             item.name = free_name(light.name, {entry.name for entry in state.lights})
         lamp = objects.get(light.name)
-        if item is not None and item.target is None and lamp is not None and lamp not in _targets(state):
+        if item is not None and item.target is None and lamp is not None and lamp not in _used_targets(state):
             item.target = lamp
-    _place_at(scene, look, targets, add)
+    _place_flares(scene, look, targets, add)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
-    state.native = _was_learned_here(look, state, objects, depsgraph_of(scene))
+    state.native = _is_of_this_capture(look, state, objects, depsgraph_of(scene))
     return look
 
 
-def _targets(state: Any) -> list[Any]:
+def _used_targets(state: Any) -> list[Any]:
     """Return the light objects of all flares."""
     return [item.target for item in state.lights if item.target is not None]
 
 
-def _place_at(scene: Any, look: Look, targets: Sequence[Any], add: bool) -> None:
+def _place_flares(scene: Any, look: Look, targets: Sequence[Any], add: bool) -> None:
     """Place flares without a light object at these targets; with `add`, add a flare at each of the remaining ones."""
     state = scene.fit_flare
-    remaining = [target for target in targets if target not in _targets(state)]
+    remaining = [target for target in targets if target not in _used_targets(state)]
     for item in [item for item in state.lights if item.target is None][:len(remaining)]:
         item.target = remaining.pop(0)
         if len(look.lights) == 1 and item.name == item.source:  # a name of the file tells an artist nothing
@@ -120,15 +120,15 @@ def _change_look(scene: Any, before: LookEdits, look: Look) -> None:
     flare without a light object is removed where another flare has the look of its light.
     """
     state, neutral, after = scene.fit_flare, Edit(), look.edits
-    earlier = list(dict.fromkeys(item.source for item in state.lights))
+    earlier_sources = list(dict.fromkeys(item.source for item in state.lights))
     _follow_edit(state.master, before.master, after.master)
     for item in state.lights:
-        old = item.source
-        if old not in look.names:
-            item.source = look.names[earlier.index(old) % len(look.names)]
-        _follow_edit(item, before.lights.get(old, neutral), after.lights.get(item.source, neutral))
+        old_source = item.source
+        if old_source not in look.names:
+            item.source = look.names[earlier_sources.index(old_source) % len(look.names)]
+        _follow_edit(item, before.lights.get(old_source, neutral), after.lights.get(item.source, neutral))
         for element in item.elements:
-            _follow_edit(element, before.elements.get((old, element.name), neutral),
+            _follow_edit(element, before.elements.get((old_source, element.name), neutral),
                          after.elements.get((item.source, element.name), neutral))
         _sync_elements(item, look, next(light for light in look.lights if light.name == item.source))
     for index in reversed(range(len(state.lights))):
@@ -139,9 +139,9 @@ def _change_look(scene: Any, before: LookEdits, look: Look) -> None:
 
 def _follow_edit(sliders: Any, before: Edit, after: Edit) -> None:
     """Set each slider that still has the value of `before` to that of `after`."""
-    present = edit_of(sliders)
+    current = edit_of(sliders)
     for name in EDIT_NAMES:
-        if np.allclose(getattr(present, name), getattr(before, name), rtol=1e-5, atol=1e-6):
+        if np.allclose(getattr(current, name), getattr(before, name), rtol=1e-5, atol=1e-6):
             set_slider(sliders, name, getattr(after, name))
 
 
@@ -186,7 +186,7 @@ def remove_flare(scene: Any, number: int) -> None:
         drivers.connect_node(scene, remaining)
 
 
-def _was_learned_here(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> bool:
+def _is_of_this_capture(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> bool:
     """Return whether the look was learned from the scene's capture: lights of the same name are at the same positions.
 
     Positions may differ by 5% of the extent of the look's training cameras. objects: the scene's light objects by name.
@@ -234,9 +234,9 @@ def _sync_elements(item: Any, look: Look, light: LightLook) -> None:
     existing = {element.name for element in item.elements}
     for name, kind in kinds.items():
         if name not in existing:
-            added = item.elements.add()
-            added.name = name
-            _follow_edit(added, Edit(), look.edits.elements.get((light.name, name), Edit()))
+            new_element = item.elements.add()
+            new_element.name = name
+            _follow_edit(new_element, Edit(), look.edits.elements.get((light.name, name), Edit()))
         next(element for element in item.elements if element.name == name).kind = kind
 
 
@@ -286,28 +286,28 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
     eye, target = camera.translation, item.target
     is_dark = item.follow_visibility and not lamp_drive.is_visible(target, depsgraph, rendered)
     try:
-        placed = world_matrix(target, depsgraph)
+        matrix = world_matrix(target, depsgraph)
     except CaptureError:
         if not is_dark:
             raise
         # Of a disabled object the last known position is good enough, since its flare is dark.
         xyz = (to_capture @ np.array([*target.matrix_world.translation, 1.0]))[:3]
         return PlacedLight(item.name, item.source, xyz, 0.0, factor=lamp_drive.DARK)
-    position = light_position(target, placed, eye)
+    position = light_position(target, matrix, eye)
     xyz = (to_capture @ np.array([*position, 1.0]))[:3]
     # A dark light has its visibility too, since a transfer smooths visibilities over neighbouring frames.
-    gain = lamp_drive.DARK if is_dark else lamp_drive.flare_gain(scene, depsgraph, item, placed, eye)
+    gain = lamp_drive.DARK if is_dark else lamp_drive.flare_gain(scene, depsgraph, item, matrix, eye)
     reference = item.reference_distance if item.follow_distance and not lamp_drive.is_sun(target) else 0.0
     reference *= float(np.cbrt(abs(np.linalg.det(to_capture[:3, :3]))))  # scene units to units of the capture
-    extent = light_extents.extent_of(item, depsgraph, placed)
+    extent = light_extents.extent_of(item, depsgraph, matrix)
     if extent is None:
         visibility = occlusion.visibility(scene, depsgraph, eye, item) if hides else 1.0
         return PlacedLight(item.name, item.source, xyz, visibility, factor=gain, reference_distance=reference)
     extent, shares = extent.transformed(to_capture[:3, :3]), None
     if hides:
-        sampled = extent.sampled(xyz, cameras.transformed_pose(camera, to_capture))
-        points = (np.pad(sampled.points, ((0, 0), (0, 1)), constant_values=1) @ np.linalg.inv(to_capture).T)[:, :3]
-        shares = tuple(sampled.shares(occlusion.visible_points(scene, depsgraph, eye, item, points)).tolist())
+        cells = extent.sampled(xyz, cameras.transformed_pose(camera, to_capture))
+        points = (np.pad(cells.points, ((0, 0), (0, 1)), constant_values=1) @ np.linalg.inv(to_capture).T)[:, :3]
+        shares = tuple(cells.shares(occlusion.visible_points(scene, depsgraph, eye, item, points)).tolist())
     return PlacedLight(item.name, item.source, xyz, 1.0, extent, shares, gain, reference)
 
 
@@ -328,4 +328,4 @@ def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | 
 
 def clear_cache() -> None:
     """Forget all files that were read."""
-    _cache.clear()
+    _look_cache.clear()

@@ -89,10 +89,10 @@ def drawn_region(frame: CameraFrame, region: tuple[int, int], camera: Any) -> Dr
     if right <= left or top <= bottom or frame.width < 1 or frame.height < 1:
         return None
     x, y = frame.width / camera.width, frame.height / camera.height
-    above = frame.bottom + frame.height - top  # from the frame's upper edge down to the window's
-    k = np.array([[camera.fx * x, 0, camera.cx * x + frame.left - left],
-                  [0, camera.fy * y, camera.cy * y - above], [0, 0, 1.0]])
-    return DrawnRegion(left, bottom, right - left, top - bottom, k)
+    cut_rows = frame.bottom + frame.height - top  # from the frame's upper edge down to the window's
+    intrinsics = np.array([[camera.fx * x, 0, camera.cx * x + frame.left - left],
+                  [0, camera.fy * y, camera.cy * y - cut_rows], [0, 0, 1.0]])
+    return DrawnRegion(left, bottom, right - left, top - bottom, intrinsics)
 
 
 def camera_frame(context: Any, scene: Any, camera: Any) -> CameraFrame | None:
@@ -103,8 +103,8 @@ def camera_frame(context: Any, scene: Any, camera: Any) -> CameraFrame | None:
                for corner in camera.data.view_frame(scene=scene)]
     if any(corner is None for corner in corners):
         return None
-    across, up = [corner.x for corner in corners], [corner.y for corner in corners]
-    return CameraFrame(min(across), min(up), max(across) - min(across), max(up) - min(up))
+    xs, ys = [corner.x for corner in corners], [corner.y for corner in corners]
+    return CameraFrame(min(xs), min(ys), max(xs) - min(xs), max(ys) - min(ys))
 
 
 # ---- quads ----------------------------------------------------------------------------------------
@@ -131,13 +131,13 @@ class Quads:
 _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
 
 
-def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ring: Floats, arcs: Floats) -> Quads:
+def make_quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ring: Floats, arcs: Floats) -> Quads:
     """Return a quad about each ellipse, in their order.
 
     centres (n, 2) px, covariances (n, 3) xx, xy, yy in px², radii (n,) Mahalanobis, arcs (n, 2) px. light (n, 3) and
     ring (n, 3): as in `Quads`.
     """
-    centres, covariances, radii, arcs = (np.asarray(each, np.float32) for each in (centres, covariances, radii, arcs))
+    centres, covariances, radii, arcs = (np.asarray(item, np.float32) for item in (centres, covariances, radii, arcs))
     xx, xy, yy = covariances.T
     half, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     long, short = np.sqrt(np.maximum(half + root, 0)), np.sqrt(np.maximum(half - root, 0))
@@ -146,11 +146,11 @@ def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ri
     x, y = np.sqrt(np.clip((1 + cosine) / 2, 0, 1)), np.copysign(np.sqrt(np.clip((1 - cosine) / 2, 0, 1)), xy)
     count = len(centres)
     place, local = np.empty((2, count, 4, 2), np.float32)
-    for corner, (p, q) in enumerate(_CORNERS.tolist()):
-        local[:, corner, 0], local[:, corner, 1] = p * radii, q * radii
-        along, aside = p * radii * long, q * radii * short
-        place[:, corner, 0] = centres[:, 0] + along * x - aside * y
-        place[:, corner, 1] = centres[:, 1] + along * y + aside * x
+    for corner, (sign_u, sign_v) in enumerate(_CORNERS.tolist()):
+        local[:, corner, 0], local[:, corner, 1] = sign_u * radii, sign_v * radii
+        u, v = sign_u * radii * long, sign_v * radii * short
+        place[:, corner, 0] = centres[:, 0] + u * x - v * y
+        place[:, corner, 1] = centres[:, 1] + u * y + v * x
     long, short = np.maximum(long, 1e-6), np.maximum(short, 1e-6)
     arc = np.empty((count, 3), np.float32)
     arc[:, 0] = (x * arcs[:, 0] + y * arcs[:, 1]) / long
@@ -173,14 +173,14 @@ def level_indices(covariances: Floats, rings: Floats | None) -> NDArray[np.int64
     """
     xx, xy, yy = covariances.T
     half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-    narrow = np.sqrt(np.maximum(half - root, 0))
+    deviation = np.sqrt(np.maximum(half - root, 0))
     if rings is not None:
-        narrow = narrow * np.minimum(rings[:, 1], 1)  # the line of a ring is thinner than its ellipse
-    return np.clip(np.searchsorted(np.array(LEVELS), narrow / MIN_TEXELS, side="right") - 1, 0, len(LEVELS) - 1)
+        deviation = deviation * np.minimum(rings[:, 1], 1)  # the line of a ring is thinner than its ellipse
+    return np.clip(np.searchsorted(np.array(LEVELS), deviation / MIN_TEXELS, side="right") - 1, 0, len(LEVELS) - 1)
 
 
-def touch_region(centres: Floats, covariances: Floats, radii: Floats, width: int, height: int) -> NDArray[np.bool_]:
-    """Return which ellipses (n,) touch a picture of this size; degenerate ones do not. Arguments as in `quads`."""
+def touches_region(centres: Floats, covariances: Floats, radii: Floats, width: int, height: int) -> NDArray[np.bool_]:
+    """Return which ellipses (n,) touch a picture of this size; degenerate ones do not. Arguments as in `make_quads`."""
     xx, xy, yy = covariances.T
     reach_x, reach_y = radii * np.sqrt(np.maximum(xx, 0)), radii * np.sqrt(np.maximum(yy, 0))
     x, y = centres.T
@@ -195,7 +195,7 @@ def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -
     blend = look.blend
     centres, covariances = to_pixels(gaussians, window.intrinsics, look.pixel_grid)
     radii, arcs = extent(gaussians, blend), arcs_to_pixels(gaussians, window.intrinsics)
-    rows = np.flatnonzero(touch_region(centres, covariances, radii, window.width, window.height))
+    rows = np.flatnonzero(touches_region(centres, covariances, radii, window.width, window.height))
     opacities = gaussians.opacities if blend == "add" else np.minimum(gaussians.opacities, OPACITY_MAX)
     rings = gaussians.rings
     if rings is None:
@@ -203,15 +203,15 @@ def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -
     light, ring = gaussians.colours * opacities[:, None], np.concatenate([rings, opacities[:, None]], -1)
     if blend == "over":  # the first is in front, so it is drawn last
         rows = rows[::-1]
-        chosen = np.zeros(len(gaussians), np.int64)  # all at full size
+        levels = np.zeros(len(gaussians), np.int64)  # all at full size
     else:
-        chosen = level_indices(covariances, gaussians.rings)
+        levels = level_indices(covariances, gaussians.rings)
     by_level: dict[int, Quads] = {}
     for number, divisor in enumerate(LEVELS):
-        members = rows[chosen[rows] == number]
+        members = rows[levels[rows] == number]
         if len(members):
-            by_level[divisor] = quads(centres[members] / divisor, covariances[members] / divisor**2, radii[members],
-                                      light[members], ring[members], arcs[members] / divisor)
+            by_level[divisor] = make_quads(centres[members] / divisor, covariances[members] / divisor**2,
+                                           radii[members], light[members], ring[members], arcs[members] / divisor)
     return by_level
 
 
@@ -225,34 +225,34 @@ def _shader(name: str) -> Any:
     return _shaders[name]
 
 
-def _offscreen(divisor: int, width: int, height: int, form: str) -> Any:
+def _offscreen(divisor: int, width: int, height: int, texture_format: str) -> Any:
     """Return the buffer of a level for a region of this size; one of another size or format is freed."""
     import gpu
 
     size = max(-(-width // divisor), 1), max(-(-height // divisor), 1)
-    key = (divisor, *size, form)
+    key = (divisor, *size, texture_format)
     if key not in _offscreens:
-        for old in [other for other in _offscreens if other[0] == divisor]:
-            _offscreens.pop(old).free()
-        _offscreens[key] = gpu.types.GPUOffScreen(*size, format=form)
+        for outdated in [other for other in _offscreens if other[0] == divisor]:
+            _offscreens.pop(outdated).free()
+        _offscreens[key] = gpu.types.GPUOffScreen(*size, format=texture_format)
     return _offscreens[key]
 
 
-def _batch(vertices: Quads) -> Any:
+def _upload_quads(vertices: Quads) -> Any:
     """Upload quads to the GPU."""
     import gpu
 
-    form = gpu.types.GPUVertFormat()
+    vertex_format = gpu.types.GPUVertFormat()
     for name, size in (("place", 2), ("local", 2), ("light", 3), ("ring", 3), ("arc", 3)):
-        form.attr_add(id=name, comp_type="F32", len=size, fetch_mode="FLOAT")
-    buffer = gpu.types.GPUVertBuf(form, len(vertices.place))
+        vertex_format.attr_add(id=name, comp_type="F32", len=size, fetch_mode="FLOAT")
+    buffer = gpu.types.GPUVertBuf(vertex_format, len(vertices.place))
     for name in ("place", "local", "light", "ring", "arc"):
         buffer.attr_fill(name, np.ascontiguousarray(getattr(vertices, name)))
     triangles = gpu.types.GPUIndexBuf(type="TRIS", seq=vertices.triangles)
     return gpu.types.GPUBatch(type="TRIS", buf=buffer, elem=triangles)
 
 
-def render(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look) -> list[Any]:
+def render_levels(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look) -> list[Any]:
     """Draw Gaussians of a look into the offscreen buffers; return the buffer of each level, full size first.
 
     Needs a GPU context.
@@ -260,10 +260,10 @@ def render(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look) ->
     import gpu
 
     by_level = {} if gaussians is None else quads_by_level(gaussians, window, look)
-    form = "RGBA16F" if gaussians is None or len(gaussians) <= MAX_IN_HALF_FLOAT else "RGBA32F"
-    drawn = []
+    texture_format = "RGBA16F" if gaussians is None or len(gaussians) <= MAX_IN_HALF_FLOAT else "RGBA32F"
+    buffers = []
     for divisor in LEVELS:
-        offscreen = _offscreen(divisor, window.width, window.height, form)
+        offscreen = _offscreen(divisor, window.width, window.height, texture_format)
         with offscreen.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
             if divisor in by_level:
@@ -274,9 +274,9 @@ def render(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look) ->
                 shader.uniform_float("is_over", 0.0 if look.blend == "add" else 1.0)
                 # The size of the level, whose last pixels may reach past the edge of the region.
                 shader.uniform_float("size", (offscreen.width, offscreen.height))
-                _batch(by_level[divisor]).draw(shader)
-        drawn.append(offscreen)
-    return drawn
+                _upload_quads(by_level[divisor]).draw(shader)
+        buffers.append(offscreen)
+    return buffers
 
 
 def working_space() -> NDArray[np.float64]:
@@ -289,11 +289,11 @@ def working_space() -> NDArray[np.float64]:
     return np.array([Color(axis).from_rec709_linear_to_scene_linear()[:] for axis in np.eye(3).tolist()]).T
 
 
-def composite(drawn: list[Any], box: tuple[float, float, float, float], blend: str, window: DrawnRegion,
+def composite_levels(buffers: list[Any], box: tuple[float, float, float, float], blend: str, window: DrawnRegion,
               space: NDArray[np.float64]) -> None:
     """Add rendered levels to the bound framebuffer, inside box (left, bottom, right, top; 0..1 of its size).
 
-    drawn: the buffers of `render`. With the blend "over" they hold display values, which the shader converts to linear
+    buffers: of `render_levels`. With the blend "over" they hold display values, which the shader converts to linear
     light. space: matrix (3, 3) from linear Rec. 709 to the framebuffer's space.
     """
     import gpu
@@ -306,7 +306,7 @@ def composite(drawn: list[Any], box: tuple[float, float, float, float], blend: s
     shader.uniform_float("extent", (window.width, window.height))
     shader.uniform_float("is_display", 1.0 if blend == "over" else 0.0)
     shader.uniform_float("working_space", Matrix(space.tolist()).to_4x4())
-    for number, offscreen in enumerate(drawn):
+    for number, offscreen in enumerate(buffers):
         shader.uniform_sampler(f"level{number}", offscreen.texture_color)
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
     gpu.state.blend_set("ADDITIVE")
@@ -389,16 +389,16 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
         bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
     if gaussians is None:
         return
-    drawn = render(gaussians, window, look)
+    drawn = render_levels(gaussians, window, look)
     viewport = gpu.state.viewport_get()
     box = (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
            (window.y + window.height) / region[1])
     if _scene_buffer is None or has_display_footage(camera):
-        composite(drawn, box, look.blend, window, np.eye(3))  # Blender's overlays are linear Rec. 709
+        composite_levels(drawn, box, look.blend, window, np.eye(3))  # Blender's overlays are linear Rec. 709
     else:
         with _scene_buffer.bind():
             gpu.state.viewport_set(*viewport)
-            composite(drawn, box, look.blend, window, working_space())
+            composite_levels(drawn, box, look.blend, window, working_space())
     gpu.state.viewport_set(*viewport)
 
 
@@ -454,9 +454,9 @@ def add_to_picture(target: Any, scene: Any, depsgraph: Any, camera: Any, width: 
     window = drawn_region(CameraFrame(0, 0, width, height), (width, height), core)
     assert window is not None
     look = looks.look_of(scene)
-    drawn = render(concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values())), window, look)
+    drawn = render_levels(concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values())), window, look)
     with target.bind():
-        composite(drawn, (0, 0, 1, 1), look.blend, window, working_space())
+        composite_levels(drawn, (0, 0, 1, 1), look.blend, window, working_space())
 
 
 def render_picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> Floats:

@@ -279,19 +279,7 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
         if overlay.last_error:
             label_lines(layout, overlay.last_error, "ERROR")
         panel_parts.draw_darkness(layout, scene)
-        view = context.space_data if getattr(context.space_data, "type", "") == "VIEW_3D" else None
-        if scene.camera is None:
-            label_lines(layout, "The scene has no camera; add one to see the flare.", "ERROR")
-        elif view is not None and view.region_3d.view_perspective != "CAMERA":
-            layout.operator("view3d.view_camera", text="Look through the Camera", icon="VIEW_CAMERA")
-        elif view is not None and not view.overlay.show_overlays:
-            label_lines(layout, "Overlays are switched off in this view, and the flare with them.", "INFO")
-        elif view is not None and overlay.is_composited(view, scene):
-            label_lines(layout, "This view is composited: it shows the flare as it was baked.", "INFO")
-        elif state.show and state.native and state.footage == "images" and fits.has_clean_frames(scene):
-            label_lines(layout, "The frames behind the camera contain their own flare, and this one is drawn over it: "
-                                "choose "
-                          "Clean under Capture to see this one alone.", "INFO")
+        _draw_view_hint(layout, context)
         if looks.duplicate_name(state):
             label_lines(layout, f"Two flares have the name {looks.duplicate_name(state)}: rename one.", "ERROR")
         layout.label(text="All Flares", icon="OUTLINER_OB_LIGHT")
@@ -315,6 +303,23 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("fit_flare.reset_look", icon="LOOP_BACK")
         row.operator("fit_flare.open_flare", text="Open", icon="FILE_FOLDER")
+
+
+def _draw_view_hint(layout: Any, context: bpy.types.Context) -> None:
+    """Draw why this 3D view shows no flare, or not this one alone, and a button that helps."""
+    scene, state = context.scene, context.scene.fit_flare
+    view = context.space_data if getattr(context.space_data, "type", "") == "VIEW_3D" else None
+    if scene.camera is None:
+        label_lines(layout, "The scene has no camera; add one to see the flare.", "ERROR")
+    elif view is not None and view.region_3d.view_perspective != "CAMERA":
+        layout.operator("view3d.view_camera", text="Look through the Camera", icon="VIEW_CAMERA")
+    elif view is not None and not view.overlay.show_overlays:
+        label_lines(layout, "Overlays are switched off in this view, and the flare with them.", "INFO")
+    elif view is not None and overlay.is_composited(view, scene):
+        label_lines(layout, "This view is composited: it shows the flare as it was baked.", "INFO")
+    elif state.show and state.native and state.footage == "images" and fits.has_clean_frames(scene):
+        label_lines(layout, "The frames behind the camera contain their own flare, and this one is drawn over it: "
+                            "choose Clean under Capture to see this one alone.", "INFO")
 
 
 def _draw_sliders(layout: Any, sliders: Any, streak: bool = True) -> None:

@@ -127,11 +127,11 @@ def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) ->
     capture = yield from Capture.open_in_steps(folder, need_frames=settings.frames)
     collection = bpy.data.collections.new(folder.resolve().name)
     unlinked = bpy.data.collections.new("Imported Cameras")
-    before = _SceneState(scene)
+    previous_state = _SceneState(scene)
     try:
         imported = yield from _add_capture(scene, folder, settings, capture, collection, unlinked)
     except BaseException:  # GeneratorExit too
-        before.restore(collection, unlinked)
+        previous_state.restore(collection, unlinked)
         raise
     bpy.data.collections.remove(unlinked)
     return imported
@@ -170,6 +170,19 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
         if light.moves:
             light_paths.key_light_path(item, light, capture, scene_frames)
     yield  # the last place at which a cancel finds the scene's own state unchanged
+    _assign_to_scene(scene, folder, settings, capture, root)
+    scene.camera = camera_objects[0]
+    if settings.match_scene:
+        notes += [note for note in [show_as_filmed(scene)] if note]
+    if not lights:
+        notes.append("The capture has no lights yet; find or add them in the panel Lights.")
+    if any(view.lens for view in capture.views) and settings.frames:
+        notes.append("The frames behind the camera show the lens's distortion; the cameras have none.")
+    return Imported(root, camera_objects, lights, tuple(notes))
+
+
+def _assign_to_scene(scene: Any, folder: Path, settings: ImportSettings, capture: Capture, root: Any) -> None:
+    """Make an imported capture that of the scene: its root, its colour space, its lights, and the mode of a fit."""
     state = scene.fit_flare
     if state.root is not None:
         state.root.fit_flare.is_root = True  # earlier versions did not store it
@@ -182,14 +195,6 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
     if settings.frames:
         state.over = "plate"
     state.mode = "default" if has_exact_clean_frames(capture) else "estimated"
-    scene.camera = camera_objects[0]
-    if settings.match_scene:
-        notes += [note for note in [show_as_filmed(scene)] if note]
-    if not lights:
-        notes.append("The capture has no lights yet; find or add them in the panel Lights.")
-    if any(view.lens for view in capture.views) and settings.frames:
-        notes.append("The frames behind the camera show the lens's distortion; the cameras have none.")
-    return Imported(root, camera_objects, lights, tuple(notes))
 
 
 def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> Any:
@@ -211,10 +216,10 @@ def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, se
 
     extent: of the capture, world units; cameras are drawn at a part of it.
     """
-    frames = number_views(view.name for view in capture.views)
-    number = {frame.view: frame.number for frame in frames}
+    numbered_views = number_views(view.name for view in capture.views)
+    frame_numbers = {frame.view: frame.number for frame in numbered_views}
     folders: dict[str, list[View]] = {}
-    for frame in frames:
+    for frame in numbered_views:
         folders.setdefault(Path(frame.view).parent.as_posix(), []).append(capture.view(frame.view))
     first = capture.views[0].camera
     aspect = cameras.pixel_aspect(first.fx, first.fy)
@@ -223,19 +228,20 @@ def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, se
         render.resolution_x, render.resolution_y = first.size
         render.resolution_percentage = 100
         render.pixel_aspect_x, render.pixel_aspect_y = aspect
-        scene.frame_start, scene.frame_end = min(number.values()), max(number.values())
+        scene.frame_start, scene.frame_end = min(frame_numbers.values()), max(frame_numbers.values())
         scene.frame_set(scene.frame_start)
     notes += camera_differences([view.camera for view in capture.views])
     camera_objects: list[Any] = []
     for folder, views in folders.items():
-        label = "Camera" if folder == "." else f"Camera {folder}"
+        name = "Camera" if folder == "." else f"Camera {folder}"
         if settings.cameras == "animated":
-            camera = _add_camera(collection, root, label, views[0], aspect, 0.15 * extent)
+            camera = _add_camera(collection, root, name, views[0], aspect, 0.15 * extent)
             camera.fit_flare.view = folder
             yield
-            _animate(camera, views, [number[view.name] for view in views], aspect)
-            if settings.frames and not _show_sequence(camera, capture, views, [number[view.name] for view in views]):
-                notes.append(f"The frames of {label} have no common numbering, so only the first is shown behind it; "
+            numbers = [frame_numbers[view.name] for view in views]
+            _animate_camera(camera, views, numbers, aspect)
+            if settings.frames and not _show_sequence(camera, capture, views, numbers):
+                notes.append(f"The frames of {name} have no common numbering, so only the first is shown behind it; "
                              "import with one camera for each frame to see all.")
             camera_objects.append(camera)
             yield
@@ -280,18 +286,18 @@ def _add_camera(collection: Any, root: Any, name: str, view: View, aspect: tuple
     return camera
 
 
-def _animate(camera: Any, views: Sequence[View], numbers: Sequence[int], aspect: tuple[float, float]) -> None:
+def _animate_camera(camera: Any, views: Sequence[View], numbers: Sequence[int], aspect: tuple[float, float]) -> None:
     """Insert keys of location and rotation at the frames' numbers, and of focal length and shift where they change.
 
     numbers: frame of each view. aspect: the scene's pixel aspect.
     """
     matrices = [view.camera.camera_to_world @ FLIP_YZ for view in views]
-    places = np.array([matrix[:3, 3] for matrix in matrices])
-    turns = np.array([quaternion_from_rotation(matrix[:3, :3]) for matrix in matrices])
-    for index in range(1, len(turns)):  # q and -q are the same rotation; the nearer one interpolates correctly
-        if turns[index] @ turns[index - 1] < 0:
-            turns[index] *= -1
-    insert_keys(camera, {"location": places, "rotation_quaternion": turns}, numbers)
+    positions = np.array([matrix[:3, 3] for matrix in matrices])
+    rotations = np.array([quaternion_from_rotation(matrix[:3, :3]) for matrix in matrices])
+    for index in range(1, len(rotations)):  # q and -q are the same rotation; the nearer one interpolates correctly
+        if rotations[index] @ rotations[index - 1] < 0:
+            rotations[index] *= -1
+    insert_keys(camera, {"location": positions, "rotation_quaternion": rotations}, numbers)
     lenses = np.array([cameras.lens_of(view.camera, SENSOR, aspect) for view in views])
     if np.ptp(lenses, axis=0).max() > 1e-6:
         insert_keys(camera.data, {"lens": lenses[:, :1], "shift_x": lenses[:, 1:2], "shift_y": lenses[:, 2:]}, numbers)
@@ -350,9 +356,9 @@ def _show_sequence(camera: Any, capture: Capture, views: Sequence[View], numbers
     paths = [capture.frame_path(view) for view in views]
     patterns = {(path.parent, _NUMBER.sub("#", path.name)) for path in paths}
     matches = [_NUMBER.search(path.stem) for path in paths]
-    in_order = len(patterns) == 1 and all(match is not None and int(match[1]) == number
+    is_sequence = len(patterns) == 1 and all(match is not None and int(match[1]) == number
                                           for match, number in zip(matches, numbers, strict=True))
-    if len(paths) == 1 or not in_order:
+    if len(paths) == 1 or not is_sequence:
         _add_background(camera, load_image(paths[0]))
         return len(paths) == 1
     user = _add_background(camera, load_image(paths[0], "SEQUENCE")).image_user
@@ -363,31 +369,31 @@ def _show_sequence(camera: Any, capture: Capture, views: Sequence[View], numbers
     return True
 
 
-def show_footage(scene: Any, which: str) -> int:
-    """Show the frames of the capture's folder `which`, images/ or removed/; return how many images changed.
+def show_footage(scene: Any, frame_folder: str) -> int:
+    """Show the frames of the capture's folder `frame_folder`, images/ or removed/; return how many images changed.
 
     They are shown behind the cameras, and in the compositor's footage node. A frame without a picture of that name in
     the folder is not changed, nor are other users of an image.
     """
-    root, folder = scene.fit_flare.root, scene.fit_flare.capture
-    if root is None or not folder:
+    root, capture_path = scene.fit_flare.root, scene.fit_flare.capture
+    if root is None or not capture_path:
         return 0
-    base = absolute(folder, scene.library)
-    pictures = PictureIndex(base / which) if (base / which).is_dir() else None
-    showing: dict[Any, list[Any]] = {}
+    capture = absolute(capture_path, scene.library)
+    pictures = PictureIndex(capture / frame_folder) if (capture / frame_folder).is_dir() else None
+    users_by_image: dict[Any, list[Any]] = {}
     for user in (*_background_images(root), *footage_nodes(scene)):
-        showing.setdefault(user.image, []).append(user)
+        users_by_image.setdefault(user.image, []).append(user)
     changed = 0
-    for image, users in showing.items():
-        # inner: the picture's path in images/ or removed/; None for a picture from elsewhere
+    for image, users in users_by_image.items():
+        # relative_path: in images/ or removed/; None for a picture from elsewhere
         path = absolute(image.filepath, image.library).resolve()
-        inner = next((path.relative_to((base / name).resolve()) for name in ("images", REMOVED)
-                      if path.is_relative_to((base / name).resolve())), None)
-        if inner is None:
+        relative_path = next((path.relative_to((capture / name).resolve()) for name in ("images", REMOVED)
+                      if path.is_relative_to((capture / name).resolve())), None)
+        if relative_path is None:
             continue
-        match = pictures.find(inner) if pictures is not None else None
-        if match is not None and (base / which / match).resolve() != path:
-            _own_image(image, users).filepath = blend_relative(base / which / match)
+        match = pictures.find(relative_path) if pictures is not None else None
+        if match is not None and (capture / frame_folder / match).resolve() != path:
+            _exclusive_image(image, users).filepath = blend_relative(capture / frame_folder / match)
             changed += 1
     return changed
 
@@ -398,7 +404,7 @@ def _background_images(root: Any) -> Iterator[Any]:
         yield from (background for background in data.background_images if background.image is not None)
 
 
-def _own_image(image: Any, users: Sequence[Any]) -> Any:
+def _exclusive_image(image: Any, users: Sequence[Any]) -> Any:
     """Return the image of these users, or a copy that replaces it where it has other users too."""
     if image.users - image.use_fake_user > len(users):  # Blender counts a fake user as one
         image = image.copy()

@@ -72,13 +72,13 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Import at once for a script; for a person begin an import in steps, which `modal` goes on with."""
         with report_errors(self) as outcome:
-            chosen = Path(bpy.path.abspath(self.filepath or self.directory))
-            if not chosen.exists() and self.directory:
-                chosen = Path(bpy.path.abspath(self.directory))
+            path = Path(bpy.path.abspath(self.filepath or self.directory))
+            if not path.exists() and self.directory:
+                path = Path(bpy.path.abspath(self.directory))
             settings = ImportSettings(self.cameras, self.up, self.scale, self.frames, self.points, self.match_scene)
-            self._name, self._steps = chosen.name, import_in_steps(context.scene, chosen, settings)
+            self._name, self._steps = path.name, import_in_steps(context.scene, path, settings)
             if not self._in_steps:
-                self._show(context, finish(self._steps))
+                self._report_imported(context, finish(self._steps))
                 return outcome.status
             manager = context.window_manager
             self._timer = manager.event_timer_add(INTERVAL_S, window=context.window)
@@ -98,13 +98,13 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"RUNNING_MODAL"}
-        began = time.perf_counter()
+        start = time.perf_counter()
         with report_errors(self) as outcome:
             try:
-                while next(self._steps) != PAUSE and time.perf_counter() - began < STEP_S:
+                while next(self._steps) != PAUSE and time.perf_counter() - start < STEP_S:
                     pass
             except StopIteration as end:
-                self._show(context, end.value)
+                self._report_imported(context, end.value)
                 self._is_shown = True
             return {"RUNNING_MODAL"}
         self.cancel(context)
@@ -116,7 +116,7 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         context.window_manager.event_timer_remove(self._timer)
         context.workspace.status_text_set(None)
 
-    def _show(self, context: bpy.types.Context, imported: Imported) -> None:
+    def _report_imported(self, context: bpy.types.Context, imported: Imported) -> None:
         """Report what was imported, and turn the view to its camera. Raises RunError."""
         fits.clear_other_run(context.scene)
         fits.expose_cameras(context.scene, fits.run_folder(context.scene))

@@ -363,7 +363,7 @@ def speed_of(overlay, scene) -> dict[str, float]:
         gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
         overlay.quads_by_level(gaussians, window, look)
         middle = time.perf_counter()
-        drawn = overlay.render(gaussians, window, look)
+        drawn = overlay.render_levels(gaussians, window, look)
         with drawn[-1].bind():  # reading back waits for the drawing
             wait_for_gpu()
         numpy_ms.append(middle - began)

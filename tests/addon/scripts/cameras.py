@@ -89,7 +89,7 @@ facts["native"] = []
 for away in (0, 5):
     lamp.location = (away, 0, 0)
     depsgraph = part("flare_addon.objects").depsgraph_of(scene)
-    facts["native"].append([bool(looks._was_learned_here(learned, SimpleNamespace(root=its, capture=capture),
+    facts["native"].append([bool(looks._is_of_this_capture(learned, SimpleNamespace(root=its, capture=capture),
                                                          {"lamp": lamp},
                                               depsgraph))
                             for its, capture in ((root, "//capture"), (None, "//of this camera"), (None, ""))])

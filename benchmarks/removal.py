@@ -65,7 +65,7 @@ from core.images.write import write_exr, write_png
 from core.metrics.pictures import psnr
 from core.removal.inference.neighbours import ShotPredictor
 from core.removal.inference.remover import WORKING_SIZE, Remover
-from core.removal.jobs.batch import remove_all
+from core.removal.jobs.batch import clean_plates
 from core.system.progress import Progress
 
 DESK = ROOT / "sample_scenes" / "desk"
@@ -92,9 +92,9 @@ def measure_plate(plate: Path, size: int = WORKING_SIZE, weights: Path | None = 
     start = time.perf_counter()
     remover = Remover(weights, working_size=size)
     loaded = time.perf_counter()
-    remove_all([plate], plate.parent / "out", remover, Progress(), overwrite=True)
+    clean_plates([plate], plate.parent / "out", remover, Progress(), overwrite=True)
     first = time.perf_counter()
-    remove_all([plate], plate.parent / "out", remover, Progress(), overwrite=True)
+    clean_plates([plate], plate.parent / "out", remover, Progress(), overwrite=True)
     print(json.dumps({"load_s": loaded - start, "first_s": first - loaded, "again_s": time.perf_counter() - first,
                       "peak_mb": peak_memory()}))
 

@@ -36,7 +36,7 @@ from core.images.write import write_png
 from core.look import TrainedCamera
 from core.look.shot import Shot, ShotFrame
 from core.removal.inference.remover import Remover
-from core.removal.jobs.batch import remove_all
+from core.removal.jobs.batch import clean_plates
 from core.system.progress import Progress
 from tests.core.flared import cameras, flared_capture
 from tests.core.removal_cases import network_file
@@ -65,13 +65,13 @@ class MemorySampler(Progress):
         self.samples.append((self._units, resident_memory(), self._process.num_fds(), self._process.num_threads()))
 
 
-def clean_plates(folder: Path, count: int, progress: Progress) -> None:
+def clean_random_plates(folder: Path, count: int, progress: Progress) -> None:
     """Clean `count` plates."""
     random = np.random.default_rng(0)
     for number in range(count):
         write_png(folder / "plates" / f"{number:05d}.png", random.random((32, 48, 3), np.float32))
     remover = Remover(network_file(folder / "weights.safetensors", bias=0.2), working_size=128)
-    remove_all([folder / "plates"], folder / "clean", remover, progress, independent=True)
+    clean_plates([folder / "plates"], folder / "clean", remover, progress, independent=True)
 
 
 def bake_frames(folder: Path, count: int, progress: Progress) -> None:
@@ -99,7 +99,7 @@ def fit_growing_count(folder: Path, count: int, progress: Progress, **changes: i
 
 
 WORK: dict[str, Callable[[Path, int, Progress], None]] = {
-    "plates": clean_plates, "frames": bake_frames, "iterations": fit_fixed_count, "growing": fit_growing_count}
+    "plates": clean_random_plates, "frames": bake_frames, "iterations": fit_fixed_count, "growing": fit_growing_count}
 UNLIMITED = ("growing",)
 """Work whose memory may grow."""
 

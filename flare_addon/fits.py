@@ -203,7 +203,7 @@ def expose_cameras(scene: Any, folder: Path | None) -> None:
     if folder is None or capture is None or scene.fit_flare.root is None:
         return
     if _capture_of_run(folder) is not None and _may_belong_to(folder, capture):
-        set_exposures(scene.fit_flare.root, exposures.read(folder))
+        set_exposures(scene.fit_flare.root, exposures.read_exposures(folder))
 
 
 def clear_other_run(scene: Any) -> None:

@@ -42,7 +42,7 @@ def space_of_profile(profile: bytes) -> ColourSpace:
         space = space_of_code_points(*tags[b"cicp"][8:10])
         if space is not None:
             return space
-    name = _description(tags)
+    name = _read_description(tags)
     data_space = profile[16:20]  # of the header
     if data_space == b"GRAY" and b"kTRC" in tags:
         return _make_space(name, np.eye(3), [_parse_curve(tags[b"kTRC"])] * 3)
@@ -77,13 +77,13 @@ def _make_space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> 
 
     def from_linear(light: NDArray[Any]) -> Pixels:
         profile_light = np.asarray(light, np.float32) if is_709 else np.asarray(light, np.float32) @ inverse
-        values = np.stack([_invert(curves[k], increasing[k], ramp, profile_light[..., k]) for k in range(3)], -1)
+        values = np.stack([_invert_curve(curves[k], increasing[k], ramp, profile_light[..., k]) for k in range(3)], -1)
         return np.asarray(values, np.float32)
 
     return ColourSpace(f"profile {name}", to_linear, from_linear)
 
 
-def _invert(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) -> Pixels:
+def _invert_curve(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) -> Pixels:
     """Return the values 0..1 at which `curve` gives `light`: interpolated in its samples, then moved by one
     secant step.
 
@@ -115,7 +115,7 @@ def _read_tags(profile: bytes) -> dict[bytes, bytes]:
     return tags
 
 
-def _description(tags: dict[bytes, bytes]) -> str:
+def _read_description(tags: dict[bytes, bytes]) -> str:
     """Return the profile's name: of version 4 ("mluc") in its first language, of version 2 ("desc") in ASCII."""
     text = tags.get(b"desc", b"")
     if text[:4] == b"mluc" and len(text) >= 28:
@@ -144,7 +144,7 @@ def _parse_curve(data: bytes) -> Table:
         if count == 0:
             return lambda x: np.asarray(x, np.float32)  # linear
         if count == 1:
-            return _power(float(values[0]) / 256)  # the exponent, with 8 bits behind the point
+            return _power_function(float(values[0]) / 256)  # the exponent, with 8 bits behind the point
         table, positions = values.astype(np.float64) / 65535, np.linspace(0, 1, count)
         return lambda x: np.interp(x, positions, table).astype(np.float32)
     if data[:4] == b"para" and len(data) >= 12:
@@ -153,24 +153,24 @@ def _parse_curve(data: bytes) -> Table:
             parameter_count = (1, 3, 4, 5, 7)[function_type]  # fixed-point numbers of 16.16 bits
             if len(data) >= 12 + 4 * parameter_count:
                 numbers = struct.unpack(f">{parameter_count}i", data[12:12 + 4 * parameter_count])
-                return _parametric(function_type, [number / 65536 for number in numbers])
+                return _parametric_function(function_type, [number / 65536 for number in numbers])
     raise UnreadableProfile("is damaged")
 
 
-def _power(gamma: float) -> Table:
+def _power_function(gamma: float) -> Table:
     """Return the curve x**gamma, 0 below 0. Raises UnreadableProfile for an exponent that no picture has."""
     if not 0.1 <= gamma <= 10:
         raise UnreadableProfile("has a curve that no picture has")
     return lambda x: np.power(np.maximum(x, 0), np.float32(gamma)).astype(np.float32)
 
 
-def _parametric(function_type: int, parameters: list[float]) -> Table:
+def _parametric_function(function_type: int, parameters: list[float]) -> Table:
     """Return a parametric curve (ICC.1:2022, table 68): (a x + b)**g + e from x = d on, c x + f below.
 
     function_type: the number of the function, 0..4. parameters: its parameters, in the order g, a, b, c, d, e, f.
     """
     g, a, b, c, d, e, f = (parameters + [0.0] * 7)[:7]
-    power = _power(g)  # checks the exponent too
+    power = _power_function(g)  # checks the exponent too
     if function_type == 0:
         return power
     if a == 0:

@@ -19,7 +19,7 @@ DISPLAY_GAMMA = 2.2
 """Gamma by which display values follow the exposure."""
 
 
-def read(folder: Path) -> dict[str, float]:
+def read_exposures(folder: Path) -> dict[str, float]:
     """Read the exposures of the run in a folder; empty where there is no file. Raises RunError where it is damaged."""
     path = folder / FILE
     if not path.exists():

@@ -51,13 +51,13 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
                 continue
         tensors[name] = tensor
     description = json.dumps({"version": VERSION, "values": values, "shapes": shapes})
-    tensor_files.write(path, tensors, {"checkpoint": description})
+    tensor_files.write_tensors(path, tensors, {"checkpoint": description})
 
 
 def load(path: Path) -> State:
     """Read a state that `save` wrote. Raises RunError if the file is damaged or of another version."""
     try:
-        tensors, metadata = tensor_files.read(path)
+        tensors, metadata = tensor_files.read_tensors(path)
         description = parse_json(metadata["checkpoint"])
         if description["version"] != VERSION:
             raise RunError(f"{path} was written by another version of Fit Flare; start the fit anew.")

@@ -111,7 +111,7 @@ class Run:
     @cached_property
     def exposures(self) -> dict[str, float]:
         """Exposure of each view relative to the median frame; empty if all are equal. Raises RunError."""
-        return exposures.read(self.folder)
+        return exposures.read_exposures(self.folder)
 
     def capture(self, folder: Path | None = None, *, need_frames: bool = True) -> Capture:
         """Open the capture of the run, in `folder` or where it was fitted.

@@ -59,7 +59,7 @@ def save(path: Path | str, flare: FlareFile) -> None:
                    "notes": flare.notes}
     if flare.pixel_grid is not None:
         description["sampling"] = flare.pixel_grid.to_entry()
-    tensor_files.write(path, _pack(flare.model), {METADATA_KEY: json.dumps(description)})
+    tensor_files.write_tensors(path, _pack(flare.model), {METADATA_KEY: json.dumps(description)})
 
 
 def load(path: Path | str) -> FlareFile:
@@ -68,7 +68,7 @@ def load(path: Path | str) -> FlareFile:
     if not path.is_file():
         raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.")
     try:
-        tensors, metadata = tensor_files.read(path)
+        tensors, metadata = tensor_files.read_tensors(path)
     except (ValueError, OSError) as problem:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
     description = parse_description(path, metadata)

@@ -184,7 +184,7 @@ class Video:
         """Sentences about missing and damaged frames of the last iteration."""
         try:
             self._open()
-            decoded = self._decode()
+            decoded = self._decode_frames()
             first = next(decoded, None)
         except FrameError:
             self.close()
@@ -275,13 +275,13 @@ class Video:
             self.stream: Any = best if best in streams else streams[0]
             if self.stream.codec_context is None:  # no decoder
                 raise self._unreadable_error()
-            self._decoder = self._alpha_decoder() or self.stream.codec_context
+            self._decoder = self._create_alpha_decoder() or self.stream.codec_context
             self._decoder.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
             self._decoder.thread_type = "AUTO"
         except (av.error.FFmpegError, OSError, ValueError, MemoryError) as problem:
             raise self._unreadable_error() from problem
 
-    def _alpha_decoder(self) -> Any:
+    def _create_alpha_decoder(self) -> Any:
         """Return libvpx's decoder for VP8 and VP9 with alpha, which FFmpeg's own decoders leave out; None for others,
         and where FFmpeg is built without it."""
         name = _ALPHA_DECODERS.get(self.stream.codec_context.name)
@@ -301,7 +301,7 @@ class Video:
         return FrameError(f"{self.path} cannot be decoded: it is cut off, or not a video that this program knows; copy "
                           "it again, or convert it to MP4 (H.264).")
 
-    def _decode(self) -> Iterator[Any]:
+    def _decode_frames(self) -> Iterator[Any]:
         """Yield PyAV's frames from the present position on, without those that cannot be decoded."""
         av = import_av()
         errors = (av.error.FFmpegError, OSError, ValueError, RuntimeError, MemoryError)
@@ -334,24 +334,24 @@ class Video:
             return
         self._open()
         if number == 0:
-            yield from self._decode()
+            yield from self._decode_frames()
             return
         times = self._packet_times()
         if times is not None and number >= len(times):
             return
-        if times is not None and self._seek_time(times[number]):
-            frames = self._decode()
+        if times is not None and self._seek_key_frame(times[number]):
+            frames = self._decode_frames()
             first = next((frame for frame in frames if frame.pts is None or frame.pts >= times[number]), None)
             if first is not None and first.pts == times[number]:
                 yield first
                 yield from frames
                 return
         self._open()
-        for index, frame in enumerate(self._decode()):
+        for index, frame in enumerate(self._decode_frames()):
             if index >= number:
                 yield frame
 
-    def _seek_time(self, ticks: int) -> bool:
+    def _seek_key_frame(self, ticks: int) -> bool:
         """Go to the key frame before a time; False where the file cannot be searched."""
         av = import_av()
         self._open()

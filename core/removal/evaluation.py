@@ -142,19 +142,19 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
             continue
         result = clean(frame)
         row: dict[str, Any] = {"name": case.name, "category": case.category,
-                               "result": _scores(result, truth, mask, lpips),
-                               "input": _scores(frame, truth, mask, lpips)}
+                               "result": _score_picture(result, truth, mask, lpips),
+                               "input": _score_picture(frame, truth, mask, lpips)}
         row["gain_db"] = round(_psnr_or_identical(row["result"]) - _psnr_or_identical(row["input"]), 4)
         rows.append(row)
         progress.advance()
     if not rows:
         raise FrameError(f"None of {len(cases)} pairs could be read: {failed[0]}")
     categories = sorted({row["category"] for row in rows})
-    by_category = {name: _summary([row for row in rows if row["category"] == name]) for name in categories}
-    return {"failed": failed, "mean": _summary(rows), "categories": by_category, "pictures": rows}
+    by_category = {name: _summarise([row for row in rows if row["category"] == name]) for name in categories}
+    return {"failed": failed, "mean": _summarise(rows), "categories": by_category, "pictures": rows}
 
 
-def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
+def _score_picture(picture: Pixels, truth: Pixels, mask: Pixels | None,
             lpips: Perceptual | None) -> Scores:
     """Return the scores of a picture against the truth; None for one that is infinite or cannot be computed.
 
@@ -169,7 +169,7 @@ def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
             for name, value in scores.items()}
 
 
-def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return means over the cases, and the share that became worse by more than WORSE_BY_DB.
 
     rows: of `evaluate`, one dictionary per case.

@@ -12,7 +12,7 @@ from .files import atomic_path
 from .reading import check_regular
 
 
-def write(path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Write tensors and their metadata: the same bytes for the same arguments."""
     from safetensors.torch import save
 
@@ -33,7 +33,7 @@ def _with_sorted_metadata(data: bytes) -> bytes:
     return len(text).to_bytes(8, "little") + text + data[body:]
 
 
-def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
+def read_tensors(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read (tensors, metadata). Raises OSError, and ValueError where the file is damaged.
 
     Returns copies: safetensors gives views of the file, and while one of them exists Windows lets nobody replace the

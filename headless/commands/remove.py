@@ -105,7 +105,7 @@ def _clean_plates(args: argparse.Namespace, progress: Progress) -> dict[str, Any
     Raises FrameError for plates that failed, after the others are done.
     """
     from ...core.conventions.frame_numbers import NumberedFrame, number_sequences
-    from ...core.removal.jobs.batch import collect_plates, remove_all
+    from ...core.removal.jobs.batch import clean_plates, collect_plates
     from ...core.removal.jobs.mattes import Mattes
     from ...core.removal.jobs.video_frames import expand_videos
 
@@ -128,7 +128,7 @@ def _clean_plates(args: argparse.Namespace, progress: Progress) -> dict[str, Any
                 raise FrameError(f"The other clean plates are in {args.out}. {join_failures(failed)}")
             progress.say(f"The clean plates are in {args.out}.")
             return {"plates": str(args.out)}
-    return remove_all(inputs, args.out, _make_remover(args, progress), progress, flare_folder=args.flare,
+    return clean_plates(inputs, args.out, _make_remover(args, progress), progress, flare_folder=args.flare,
                       mattes=Mattes(args.matte) if args.matte else None, overwrite=args.overwrite, only=selected_paths,
                       independent=args.stills, failed_inputs=failed)
 

@@ -67,8 +67,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.removal.training.backgrounds import (
         describe_unusable,
         is_held_out,
+        open_shared_backgrounds,
         read_backgrounds,
-        shared_backgrounds,
     )
     from ...core.removal.training.run import train
 
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     lenses = read_lenses(args.lenses, args.max_lenses) if args.lenses else []
     train_lenses = [lens for lens in lenses if not is_held_out(lens.name)] + built_in_lenses()
     test_lenses = held_out_lenses(lenses)
-    with shared_backgrounds(args.backgrounds, "train", augmented=True) as backgrounds:
+    with open_shared_backgrounds(args.backgrounds, "train", augmented=True) as backgrounds:
         try:
             validation = read_backgrounds(args.backgrounds, "test"), test_lenses
         except SettingsError:

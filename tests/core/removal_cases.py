@@ -25,7 +25,7 @@ def network_file(path: Path, seed: int = 0, bias: float = 0.0) -> Path:
     with torch.no_grad():
         network.head.weight.mul_(0.1)
         network.head.bias[:3] = bias
-    weights.write(path, {name: value.half() for name, value in network.state_dict().items()},
+    weights.write_weights(path, {name: value.half() for name, value in network.state_dict().items()},
                   {"recipe": json.dumps(as_dict(TINY)), "iteration": "0"})
     return path
 

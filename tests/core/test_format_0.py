@@ -24,7 +24,7 @@ from core.look import LookEdits, read_look
 from core.look.shot import Shot
 from core.optics.prescription import built_in_lenses
 from core.removal.inference.remover import Remover
-from core.removal.jobs.batch import remove_all
+from core.removal.jobs.batch import clean_plates
 from core.removal.model import weights
 from core.removal.training import run as training_run
 from core.system.progress import Progress
@@ -91,10 +91,10 @@ def test_clean_frames_of_format_0_are_made_again_to_the_same_bytes(files: Path) 
     replaced without --overwrite."""
     before = {name: (files / "clean" / name).read_bytes() for name in ("0000.png", "0001.png")}
     remover = Remover(files / "weights.safetensors", working_size=64)
-    counts = remove_all([files / "plates"], files / "clean", remover, Progress())
+    counts = clean_plates([files / "plates"], files / "clean", remover, Progress())
     assert (counts["made"], counts["kept"]) == (2, 0)
     assert {name: (files / "clean" / name).read_bytes() for name in before} == before
-    counts = remove_all([files / "plates"], files / "clean", remover, Progress())
+    counts = clean_plates([files / "plates"], files / "clean", remover, Progress())
     assert (counts["made"], counts["kept"]) == (0, 2)
 
 

@@ -14,7 +14,7 @@ from core.images.exr_views import stereo_views
 from core.images.plates import read_plate
 from core.images.views import split_views, write_view_results
 from core.removal.inference.remover import Remover
-from core.removal.jobs.batch import remove_all
+from core.removal.jobs.batch import clean_plates
 from core.system.progress import Progress
 from core.transfer.target import plate_window
 
@@ -59,7 +59,7 @@ def test_views_are_identified_by_header_and_channels(channels: list[str], header
 def test_both_eyes_are_cleaned(flare_everywhere: Path, tmp_path: Path, header: dict[str, Any]) -> None:
     (tmp_path / "in").mkdir()
     path = write(tmp_path / "in" / "a.exr", RGB + RIGHT + ["A"], **header)
-    remove_all([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
+    clean_plates([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
                flare_folder=tmp_path / "flare")
     before, after, flare = read(path), read(tmp_path / "out" / "a.exr"), read(tmp_path / "flare" / "a.exr")
     assert before.keys() == after.keys()
@@ -72,7 +72,7 @@ def test_both_eyes_are_cleaned(flare_everywhere: Path, tmp_path: Path, header: d
 @pytest.mark.parametrize("colours", ["RGB", "Y"])
 def test_both_eyes_are_cleaned_where_none_is_at_the_root(colours: str, flare_everywhere: Path, tmp_path: Path) -> None:
     path = write(tmp_path / "a.exr", [f"{eye}.{colour}" for eye in ("left", "right") for colour in f"{colours}A"])
-    remove_all([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
+    clean_plates([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
                flare_folder=tmp_path / "flare")
     before, after, flare = read(path), read(tmp_path / "out" / "a.exr"), read(tmp_path / "flare" / "a.exr")
     assert before.keys() == after.keys()
@@ -132,7 +132,7 @@ def test_both_eyes_in_parts_of_their_own_are_cleaned(layout: str, flare_everywhe
     parts = {"Nuke": NUKE, "right first": [*NUKE[2:], *NUKE[:2]], "without attribute": [
         ({name: value for name, value in header.items() if name != "view"}, names) for header, names in NUKE]}[layout]
     path = write_parts(tmp_path / "a.exr", parts)
-    remove_all([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
+    clean_plates([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
                flare_folder=tmp_path / "flare")
     before, after, flare = read_parts(path), read_parts(tmp_path / "out" / "a.exr"), read(tmp_path / "flare" / "a.exr")
     assert len(before) == len(after) == 4

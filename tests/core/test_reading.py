@@ -74,7 +74,7 @@ def special(path: Path, kind: str) -> Path:
 def test_a_special_file_is_refused_by_name(tmp_path: Path, kind: str) -> None:
     path = special(tmp_path / "x", kind)
     for action in (lambda: open_regular(path), lambda: read_bytes(path), lambda: read_text(path),
-                   lambda: append_text(path, "line\n"), lambda: tensor_files.read(path),
+                   lambda: append_text(path, "line\n"), lambda: tensor_files.read_tensors(path),
                    lambda: write_text(path, "result")):
         problem = outcome(action)
         assert isinstance(problem, SpecialFileError)
@@ -88,7 +88,7 @@ def test_every_reader_refuses_a_special_file(tmp_path: Path, kind: str) -> None:
         "a.png": read_plate, "b.tif": read_plate, "c.exr": read_picture, "d.mp4": Video,
         "lights.json": read_lights, "look.flare": read_look, "edits.toml": KeyedEdits.read,
         "edits.json": KeyedEdits.read,
-        "config.ocio": lambda path: ocio_space("linear", path), "exposures.json": lambda path: exposures.read(
+        "config.ocio": lambda path: ocio_space("linear", path), "exposures.json": lambda path: exposures.read_exposures(
             path.parent), "bake.json": lambda path: read_manifest(path.parent)}
     for name, reader in readers.items():
         path = special(tmp_path / name, kind)

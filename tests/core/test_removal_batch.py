@@ -18,7 +18,7 @@ from core.images.plates import Plate, read_plate
 from core.images.write import write_exr
 from core.removal.inference.remover import Remover
 from core.removal.jobs import batch
-from core.removal.jobs.batch import collect_plates, remove_all
+from core.removal.jobs.batch import clean_plates, collect_plates
 from core.removal.jobs.manifest import MANIFEST
 from core.removal.jobs.mattes import Mattes
 from core.system.progress import Progress
@@ -43,7 +43,7 @@ def test_unreadable_plates_do_not_stop_the_others(tmp_path: Path, flare_everywhe
     bad = write_bad_files(tmp_path / "in")
     write_codes(tmp_path / "in" / "good.png", picture())
     with pytest.raises(FrameError) as error:
-        remove_all([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+        clean_plates([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
     assert f"{len(bad)} of {len(bad) + 1} plates" in str(error.value)
     assert all(path.name in str(error.value) for path in bad)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["good.png", MANIFEST]
@@ -59,7 +59,7 @@ def test_a_plate_under_the_suffix_of_another_format_keeps_depth_and_alpha(
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / named).write_bytes(cv2.imencode(kind, codes)[1].tobytes())
     said = RecordingProgress()
-    remove_all([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), said)
+    clean_plates([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), said)
     before, after = (read_plate(tmp_path / folder / named) for folder in ("in", "out"))
     assert after.codes.dtype == before.codes.dtype == depth and (after.codes < before.codes).any()
     assert (after.alpha is None) == (channels == 3)
@@ -74,7 +74,7 @@ def test_a_broken_link_is_reported_as_a_missing_plate(tmp_path: Path, flare_ever
         write_codes(tmp_path / "in" / f"{name}.png", picture())
     (tmp_path / "in" / "a.2.png").symlink_to(tmp_path / "away" / "a.2.png")
     with pytest.raises(FrameError, match=r"1 of 3 plates could not be cleaned: .*a\.2\.png is missing"):
-        remove_all([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+        clean_plates([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
     assert (tmp_path / "out" / "a.3.png").exists()
 
 
@@ -85,7 +85,7 @@ def test_results_are_refused_where_a_file_is(tmp_path: Path, flare_everywhere: P
     (tmp_path / "file").touch()
     for folders in ({"folder": tmp_path / place}, {"folder": tmp_path / "out", "flare_folder": tmp_path / place}):
         with pytest.raises(SettingsError, match=r"file is not a folder, so .* cannot be written to; choose another"):
-            remove_all([source], remover=Remover(flare_everywhere, working_size=64), progress=Progress(), **folders)
+            clean_plates([source], remover=Remover(flare_everywhere, working_size=64), progress=Progress(), **folders)
     assert not (tmp_path / "out").exists()
 
 
@@ -94,7 +94,7 @@ def test_a_link_to_itself_does_not_stop_the_others(tmp_path: Path, flare_everywh
     write_codes(tmp_path / "in" / "a.1.png", picture())
     (tmp_path / "in" / "a.0.png").symlink_to(tmp_path / "in" / "a.0.png")
     with pytest.raises(FrameError, match=r"1 of 2 plates could not be cleaned: .*a\.0\.png is missing: it is a link"):
-        remove_all([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+        clean_plates([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
     assert (tmp_path / "out" / "a.1.png").exists()
 
 
@@ -112,11 +112,11 @@ def test_a_full_disk_ends_the_batch(tmp_path: Path, no_flare: Path, monkeypatch:
 
     monkeypatch.setattr(batch, "write_view_results", refused(errno.ENOSPC))
     with pytest.raises(OSError) as full:
-        remove_all([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
+        clean_plates([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
     assert (full.value.errno, tried) == (errno.ENOSPC, ["a.png"])
     monkeypatch.setattr(batch, "write_view_results", refused(errno.EACCES))
     with pytest.raises(FrameError, match=r"3 of 3 plates could not be cleaned: The system refused: Permission denied"):
-        remove_all([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
+        clean_plates([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
 
 
 @pytest.mark.parametrize("short", [
@@ -136,7 +136,7 @@ def test_a_plate_that_does_not_fit_into_memory_is_left_out(tmp_path: Path, no_fl
 
     monkeypatch.setattr(Remover, "to_network_input", network_input_or_error)
     with pytest.raises(FrameError, match=r"1 of 2 plates could not be cleaned: \S*a\.png does not fit into memory"):
-        remove_all([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
+        clean_plates([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
     assert (tmp_path / "out" / "b.png").exists()
 
 
@@ -150,12 +150,12 @@ def test_what_is_left_out_is_counted_and_named(tmp_path: Path, no_flare: Path) -
     progress.say = sentences.append  # type: ignore[method-assign]
     remover = Remover(no_flare, working_size=64)
     with pytest.raises(FrameError, match="1 of 4 plates"):
-        remove_all([tmp_path / "in"], tmp_path / "in" / "out", remover, progress)
+        clean_plates([tmp_path / "in"], tmp_path / "in" / "out", remover, progress)
     assert sentences[-1].startswith("3 plates cleaned; 3 left out: ")
     for text in ("clip.mp4", "sub/notes.txt", "damaged.png (could not be cleaned)"):
         assert text in sentences[-1]
     (tmp_path / "in" / "damaged.png").unlink()
-    done = remove_all([tmp_path / "in"], tmp_path / "in" / "out", remover, progress)  # its own results are no inputs
+    done = clean_plates([tmp_path / "in"], tmp_path / "in" / "out", remover, progress)  # its own results are no inputs
     assert (done["used"], done["left_out"]) == (3, 2)
 
 
@@ -164,7 +164,7 @@ def test_a_programming_error_is_not_taken_for_a_bad_plate(tmp_path: Path, no_fla
     write_codes(tmp_path / "in" / "a.png", picture())
     monkeypatch.setattr(Remover, "to_network_input", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        remove_all([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
+        clean_plates([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS])
@@ -183,7 +183,7 @@ def test_a_read_only_folder_ends_the_batch(tmp_path: Path, no_flare: Path, numbe
     monkeypatch.setattr("core.system.files._MAX_REFUSALS", 0)
     monkeypatch.setattr("core.system.files.os.open", refuse)
     with pytest.raises(FrameError, match=r"^[^ ]*out cannot be written to \([^)]*\); choose another folder"):
-        remove_all([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
+        clean_plates([tmp_path / "in"], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
     assert len(tried) == 1
 
 
@@ -191,7 +191,7 @@ def test_inputs_without_plates_or_with_one_name_are_refused(tmp_path: Path, flar
     source = write_codes(tmp_path / "plate.png", picture())
     remover = Remover(flare_everywhere, working_size=64)
     with pytest.raises(SettingsError, match="overwritten"):
-        remove_all([source], tmp_path, remover, Progress())
+        clean_plates([source], tmp_path, remover, Progress())
     (tmp_path / "other").mkdir()
     with pytest.raises(SettingsError, match="no pictures"):
         collect_plates([tmp_path / "other"])
@@ -207,17 +207,17 @@ def test_no_input_is_overwritten_and_no_result_written_twice(tmp_path: Path, no_
     write_exr(shot / "a.exr", dict.fromkeys("RGB", np.full((60, 90), 0.5)))
     before = (shot / "a.exr").read_bytes()
     with pytest.raises(SettingsError, match=r"a\.exr would be overwritten"):
-        remove_all([shot], tmp_path / "out", remover, Progress(), flare_folder=shot)
+        clean_plates([shot], tmp_path / "out", remover, Progress(), flare_folder=shot)
     with pytest.raises(SettingsError, match="Two results"):
-        remove_all([shot], tmp_path / "out", remover, Progress(), flare_folder=tmp_path / "out")
+        clean_plates([shot], tmp_path / "out", remover, Progress(), flare_folder=tmp_path / "out")
     write_codes(shot / "a.png", picture())
     with pytest.raises(SettingsError, match="Two results"):
-        remove_all([shot], tmp_path / "out", remover, Progress(), flare_folder=tmp_path / "flare")
+        clean_plates([shot], tmp_path / "out", remover, Progress(), flare_folder=tmp_path / "flare")
     assert (shot / "a.exr").read_bytes() == before and not (tmp_path / "out").exists()
     matte = write_codes(tmp_path / "roto" / "a.png", picture())
     for roto in (matte.parent, matte):
         with pytest.raises(SettingsError, match=r"a\.png would be overwritten"):
-            remove_all([shot], matte.parent, remover, Progress(), mattes=Mattes(roto), overwrite=True)
+            clean_plates([shot], matte.parent, remover, Progress(), mattes=Mattes(roto), overwrite=True)
 
 
 def test_results_mattes_and_hidden_files_below_a_folder_are_no_plates(tmp_path: Path, flare_everywhere: Path) -> None:
@@ -226,7 +226,7 @@ def test_results_mattes_and_hidden_files_below_a_folder_are_no_plates(tmp_path: 
         (shot / name).parent.mkdir(parents=True, exist_ok=True)
         write_codes(shot / name, picture())
     for _ in range(2):
-        found = remove_all([shot], shot / "clean", Remover(flare_everywhere, working_size=64), Progress(),
+        found = clean_plates([shot], shot / "clean", Remover(flare_everywhere, working_size=64), Progress(),
                            flare_folder=shot / "flare", mattes=Mattes(shot / "roto"))
         assert found["made"] + found["kept"] == 1
     assert sorted(path.name for path in (shot / "clean").rglob("*")) == ["a.png", MANIFEST]
@@ -236,9 +236,9 @@ def test_clean_plates_of_an_earlier_run_are_no_plates_of_the_next(tmp_path: Path
     shot, remover = tmp_path / "shot", Remover(flare_everywhere, working_size=64)
     write_codes(shot / "day" / "a.png", picture())
     for out in ("clean", "day/clean2"):
-        assert remove_all([shot], shot / out, remover, Progress())["made"] == 1
+        assert clean_plates([shot], shot / out, remover, Progress())["made"] == 1
         assert [path.name for path in (shot / out).rglob("*.png")] == ["a.png"]
-    again = remove_all([shot / "clean"], tmp_path / "again", remover, Progress())
+    again = clean_plates([shot / "clean"], tmp_path / "again", remover, Progress())
     assert again["made"] == 1, "they are where their folder is given"
     write_codes(shot / "clean" / "own.png", picture())
     assert {name for _, name in collect_plates([shot])} == {Path("day/a.png"), Path("clean/own.png")}, "no result"
@@ -270,8 +270,8 @@ def test_a_long_shot_with_results_below_it_is_searched_once(tmp_path: Path, monk
 def test_flares_of_an_earlier_run_are_no_plates_of_the_next(tmp_path: Path, flare_everywhere: Path) -> None:
     shot, remover = tmp_path / "shot", Remover(flare_everywhere, working_size=64)
     write_codes(shot / "day" / "a.png", picture())
-    remove_all([shot], shot / "clean", remover, Progress())
-    remove_all([shot], shot / "clean", remover, Progress(), flare_folder=shot / "flare")
+    clean_plates([shot], shot / "clean", remover, Progress())
+    clean_plates([shot], shot / "clean", remover, Progress(), flare_folder=shot / "flare")
     assert (shot / "flare" / "day" / "a.exr").is_file()
     shot = shot.rename(tmp_path / "moved")
     assert {name for _, name in collect_plates([shot])} == {Path("day/a.png")}, "wherever they were moved together"

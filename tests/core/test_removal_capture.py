@@ -16,7 +16,7 @@ from core.capture import Capture
 from core.errors import Cancelled, CaptureError
 from core.removal.inference.prediction import single_prediction
 from core.removal.inference.remover import Remover
-from core.removal.jobs.batch import remove_all
+from core.removal.jobs.batch import clean_plates
 from core.removal.jobs.capture import UNFINISHED_FOLDER, _clean_names, clean_capture
 from core.removal.jobs.provenance import check_clean_frames_current, has_exact_clean_frames
 from core.system.progress import Progress
@@ -37,11 +37,11 @@ def test_a_capture_is_cleaned_as_its_remover_says(tmp_path: Path, flare_everywhe
     views = single_prediction(flare)._replace(glow_fraction=np.ones_like(flare))
     monkeypatch.setattr(Remover, "predict_with_tta", lambda *_: views)
     whole = Remover(flare_everywhere, working_size=224, glow="remove")
-    remove_all(frames, tmp_path / "plates", Remover(flare_everywhere, working_size=224), Progress())
+    clean_plates(frames, tmp_path / "plates", Remover(flare_everywhere, working_size=224), Progress())
     ours, plates = (cv2.imread(str(folder / frames[0].name)) for folder in
                     (clean_capture(capture, whole, Progress()), tmp_path / "plates"))
     assert (ours[58, 55:59] < plates[58, 55:59] - 5).all() and (ours[65, 65] == plates[65, 65]).all()
-    assert remove_all([capture.folder / "images"], capture.folder / "removed", whole, Progress())["made"] == 0
+    assert clean_plates([capture.folder / "images"], capture.folder / "removed", whole, Progress())["made"] == 0
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
@@ -70,7 +70,7 @@ def test_clean_frames_of_changed_frames_are_refused(by_the_fit: bool, tmp_path: 
     if by_the_fit:
         clean_capture(Capture.open(capture.folder), remover, Progress())
     else:
-        remove_all([capture.folder / "images"], removed, remover, Progress())
+        clean_plates([capture.folder / "images"], removed, remover, Progress())
     check_clean_frames_current(Capture.open(capture.folder))
     frame = capture.frame_path(capture.views[2])
     cv2.imwrite(str(frame), 255 - cv2.imread(str(frame)))
@@ -142,8 +142,8 @@ def test_a_stopped_cleaning_of_a_capture_resumes(tmp_path: Path, flare_everywher
     made = clean_capture(capture, remover, Progress())
     assert (made / first.name).stat().st_mtime_ns == begun
     frames = [capture.frame_path(view) for view in capture.views]
-    assert remove_all(frames, made, remover, Progress())["kept"] == 3
-    assert remove_all(frames, made, Remover(flare_everywhere, working_size=96), Progress())["made"] == 3
+    assert clean_plates(frames, made, remover, Progress())["kept"] == 3
+    assert clean_plates(frames, made, Remover(flare_everywhere, working_size=96), Progress())["made"] == 3
 
 
 def test_frames_without_leading_zeros_are_predicted_once_each(

@@ -13,7 +13,7 @@ from core.removal.inference import confidence
 from core.removal.inference.prediction import single_prediction
 from core.removal.inference.remover import Remover
 from core.removal.inference.test_time_augmentation import shot_confidence
-from core.removal.jobs.batch import remove_all
+from core.removal.jobs.batch import clean_plates
 from core.removal.jobs.mattes import Mattes
 from core.removal.model.image_formation import flare_to_linear
 from tests.core.recording_progress import RecordingProgress
@@ -91,7 +91,7 @@ def test_the_log_says_that_a_flare_may_be_a_grade(flare_everywhere: Path, tmp_pa
         write_codes(tmp_path / name / f"{name}.png", (display * 255 + 0.5).astype(np.uint8))
     plates = [tmp_path / name / f"{name}.png" for name in ("grade", "veil")]
     heard = RecordingProgress()
-    remove_all(plates, tmp_path / "clean", Remover(flare_everywhere), heard)
+    clean_plates(plates, tmp_path / "clean", Remover(flare_everywhere), heard)
     assert [said for said in heard.texts if said.startswith("In 1 of them") and "all-white matte" in said
             and "grade.png (0.00)" in said]
     codes = [cv2.imread(str(path)) for path in (plates[0], tmp_path / "clean" / "grade.png")]
@@ -99,7 +99,7 @@ def test_the_log_says_that_a_flare_may_be_a_grade(flare_everywhere: Path, tmp_pa
 
     heard = RecordingProgress()  # as the message says
     matte = Mattes(tmp_path / "white" / "white.png")
-    remove_all(plates[:1], tmp_path / "clean", Remover(flare_everywhere), heard, mattes=matte)
+    clean_plates(plates[:1], tmp_path / "clean", Remover(flare_everywhere), heard, mattes=matte)
     assert not [said for said in heard.texts if "its grade" in said]
     assert cv2.imread(str(tmp_path / "clean" / "grade.png")).mean() < codes[0].mean() - 1
 

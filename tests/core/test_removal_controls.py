@@ -16,7 +16,7 @@ from core.removal.inference.device import select_device
 from core.removal.inference.prediction import TtaPrediction, single_prediction
 from core.removal.inference.remover import Remover
 from core.removal.inference.test_time_augmentation import shot_confidence
-from core.removal.jobs.batch import remove_all
+from core.removal.jobs.batch import clean_plates
 from core.removal.jobs.manifest import Manifest
 from core.system.progress import Progress
 from tests.core.removal_cases import picture, write_codes
@@ -93,10 +93,10 @@ def test_the_report_has_the_confidence_of_each_plate(flare_everywhere: Path, tmp
     for name in ("a", "b"):
         write_codes(tmp_path / name / f"{name}.png", picture(64, 96))
     plates = [tmp_path / "a" / "a.png", tmp_path / "b" / "b.png"]
-    result = remove_all(plates, tmp_path / "clean", Remover(flare_everywhere, working_size=64), Progress())
+    result = clean_plates(plates, tmp_path / "clean", Remover(flare_everywhere, working_size=64), Progress())
     assert set(result["confidence"]) == {"a.png", "b.png"}
     assert all(0 <= value <= 1 for value in result["confidence"].values())
-    again = remove_all(plates, tmp_path / "clean", Remover(flare_everywhere, working_size=64), Progress())
+    again = clean_plates(plates, tmp_path / "clean", Remover(flare_everywhere, working_size=64), Progress())
     assert again["kept"] == 2 and again["confidence"] == result["confidence"], "kept frames keep theirs"
     assert Manifest(tmp_path / "clean").confidence([Path("a.png"), Path("c.png")]).keys() == {"a.png"}
 

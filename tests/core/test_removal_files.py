@@ -18,7 +18,7 @@ from core.images.plates import read_plate
 from core.images.read import read_picture
 from core.images.write import save_exr, write_exr
 from core.removal.inference.remover import Remover
-from core.removal.jobs.batch import remove_all
+from core.removal.jobs.batch import clean_plates
 from core.system.progress import Progress
 from tests.core.removal_cases import picture, write_codes, write_tiff
 
@@ -29,7 +29,7 @@ def test_a_clean_plate_has_the_format_and_depth_of_its_plate(
         tmp_path: Path, flare_everywhere: Path, suffix: str, dtype: type) -> None:
     codes = picture(max_code=1 if dtype is np.float32 else np.iinfo(dtype).max, dtype=dtype)
     source = write_codes(tmp_path / f"plate{suffix}", codes)
-    remove_all([source], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+    clean_plates([source], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
     result = cv2.imread(str(tmp_path / "out" / source.name), cv2.IMREAD_UNCHANGED)
     assert result.dtype == dtype
     assert result.shape == codes.shape
@@ -41,7 +41,7 @@ def test_grey_and_alpha_are_preserved(tmp_path: Path, flare_everywhere: Path) ->
     (tmp_path / "in").mkdir()
     write_codes(tmp_path / "in" / "grey.png", grey)
     write_codes(tmp_path / "in" / "alpha.png", alpha)
-    remove_all([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+    clean_plates([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
     assert cv2.imread(str(tmp_path / "out" / "grey.png"), cv2.IMREAD_UNCHANGED).shape == (60, 90)
     result = cv2.imread(str(tmp_path / "out" / "alpha.png"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(result[..., 3], alpha[..., 3])
@@ -59,7 +59,7 @@ def test_an_exr_keeps_values_above_one_other_channels_and_nans(
     write_exr(tmp_path / "plate.exr", {**channels, "A": np.full((48, 64), 0.5), "depth.Z": np.full((48, 64), 7.25)},
               half=half, header={"comments": "shot 10"})
     stored = read_plate(tmp_path / "plate.exr")
-    remove_all([tmp_path / "plate.exr"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+    clean_plates([tmp_path / "plate.exr"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
     clean = read_plate(tmp_path / "out" / "plate.exr")
     assert clean.codes.dtype == stored.codes.dtype == (np.float16 if half else np.float32)
     assert clean.codes[11, 11].min() > 38
@@ -83,7 +83,7 @@ def test_a_tiff_keeps_its_alpha_profile_and_orientation(tmp_path: Path, flare_ev
     plate = read_plate(source)
     assert np.array_equal(plate.codes, codes[..., 2::-1]) and np.array_equal(plate.alpha, codes[..., 3])
     assert np.array_equal(read_picture(source).pixels, codes[..., 2::-1] / np.float32(np.iinfo(dtype).max))
-    remove_all([source], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+    clean_plates([source], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
     clean = read_plate(tmp_path / "out" / "plate.tif")
     assert np.array_equal(clean.alpha, codes[..., 3]) and clean.codes.mean() < plate.codes.mean()
     with open(tmp_path / "out" / "plate.tif", "rb") as stream:
@@ -100,7 +100,7 @@ def test_a_plate_without_a_flare_is_copied(tmp_path: Path, no_flare: Path, suffi
     else:
         _, data = cv2.imencode(suffix, picture(), [cv2.IMWRITE_JPEG_QUALITY, 60] if suffix == ".jpg" else [])
         source.write_bytes(data.tobytes())
-    remove_all([source], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
+    clean_plates([source], tmp_path / "out", Remover(no_flare, working_size=64), Progress())
     assert (tmp_path / "out" / source.name).read_bytes() == source.read_bytes()
 
 
@@ -114,7 +114,7 @@ def test_the_profile_of_a_grey_png_is_not_copied_to_colours(tmp_path: Path, flar
     size = chunk(b"pHYs", bytes(9)) + chunk(b"tEXt", b"Author\0someone")
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + profile + size
                                      + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b""))
-    remove_all([tmp_path / "a.png"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+    clean_plates([tmp_path / "a.png"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
     clean = (tmp_path / "out" / "a.png").read_bytes()
     assert size in clean and b"iCCP" not in clean
     assert (read_plate(tmp_path / "out" / "a.png").alpha == 200).all()
@@ -124,7 +124,7 @@ def test_each_channel_of_an_exr_keeps_its_depth(tmp_path: Path, flare_everywhere
     light = np.random.default_rng(0).uniform(0.2, 0.6, (48, 64)).astype(np.float16)
     save_exr(tmp_path / "plate.exr", {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage},
              {"R": light, "G": light.astype(np.float32), "B": light})
-    remove_all([tmp_path / "plate.exr"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+    clean_plates([tmp_path / "plate.exr"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
     channels = read_plate(tmp_path / "out" / "plate.exr").extras["channels"]
     assert [channels[name].dtype for name in "RGB"] == [np.float16, np.float32, np.float16]
     assert (channels["R"] < light).all()
@@ -135,7 +135,7 @@ def test_the_flare_of_an_exr_has_the_windows_and_colours_of_its_plate(tmp_path: 
     header = {"chromaticities": AP1, "dataWindow": (np.array([-5, -5], np.int32), np.array([58, 42], np.int32)),
               "displayWindow": (np.array([0, 0], np.int32), np.array([53, 37], np.int32)), "pixelAspectRatio": 2.0}
     write_exr(tmp_path / "plate.exr", dict.fromkeys("RGB", light), half=False, header=header)
-    remove_all([tmp_path / "plate.exr"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
+    clean_plates([tmp_path / "plate.exr"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
                flare_folder=tmp_path / "flare")
     placings = []
     for folder in ("", "out", "flare"):
@@ -148,7 +148,7 @@ def test_the_flare_of_an_exr_has_the_windows_and_colours_of_its_plate(tmp_path: 
 
 def test_the_written_flare_is_the_difference_of_plate_and_clean_plate(tmp_path: Path, flare_everywhere: Path) -> None:
     write_codes(tmp_path / "plate.png", picture())
-    remove_all([tmp_path / "plate.png"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
+    clean_plates([tmp_path / "plate.png"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
                flare_folder=tmp_path / "flare")
     flare = read_exr(tmp_path / "flare" / "plate.exr")
     before, after = (read_picture(path).linear() for path in (tmp_path / "plate.png", tmp_path / "out" / "plate.png"))
@@ -165,7 +165,7 @@ def test_a_grey_png_with_alpha_stays_grey(tmp_path: Path, flare_everywhere: Path
     (tmp_path / "in" / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
         for name, data in chunks))
-    remove_all([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+    clean_plates([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
     clean = cv2.imread(str(tmp_path / "out" / "a.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(clean[..., 3], with_alpha[..., 1])
     assert np.ptp(clean[..., :3], axis=-1).max() == 0

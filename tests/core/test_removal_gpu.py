@@ -21,7 +21,7 @@ from core.removal.synthesis import flare
 from core.removal.training import pairs, random_cameras, run
 from core.removal.training.backgrounds import Backgrounds
 from core.removal.training.gpu import composition, cuda_graphs, jpeg, pools
-from core.removal.training.gpu.batches import compose_batches, gpu_batches
+from core.removal.training.gpu.batches import compose_batches, open_gpu_batches
 from core.removal.training.trainer import RemovalTrainer
 
 CPU = torch.device("cpu")
@@ -175,7 +175,7 @@ def test_pools_are_filled_by_processes_and_trained_on() -> None:
     assert {(shape.width, shape.height) for shape in shapes} == {(96, 64), (64, 64), (64, 96)}
     filled = pools.Pools(shapes, CANVAS, CPU, scene_count=100, flare_count=6)
     trainer = RemovalTrainer(RECIPE)
-    with pools.filled_pools(filled, RECIPE, flat(), built_in_lenses(), None, 2):
+    with pools.keep_pools_filled(filled, RECIPE, flat(), built_in_lenses(), None, 2):
         assert len(multiprocessing.active_children()) == 2
         drawn = compose_batches(filled, RECIPE, np.random.default_rng(1))
         for _ in range(8):
@@ -211,7 +211,7 @@ def test_pool_sizes_fit_the_free_memory_of_a_gpu() -> None:
 def test_drawing_processes_that_end_raise_an_error() -> None:
     filled = pools.Pools(pools.frame_shapes(RECIPE, SIZE_MULTIPLE), CANVAS, CPU, scene_count=8, flare_count=2)
     with pytest.raises(RunError, match="draw pictures for the training ended"), \
-            pools.filled_pools(filled, RECIPE, Backgrounds([], []), built_in_lenses(), None, 2):
+            pools.keep_pools_filled(filled, RECIPE, Backgrounds([], []), built_in_lenses(), None, 2):
         pass
     assert not multiprocessing.active_children()
 
@@ -237,7 +237,7 @@ def test_a_training_runs_on_a_gpu(tmp_path: Path) -> None:
         given = torch.rand(side, side, device=card)
         doubled, whole = twice(given)
         assert torch.equal(doubled, given * 2) and torch.allclose(whole, given.sum())
-    with gpu_batches(RECIPE, 0, flat(), built_in_lenses(), None, card, 2) as drawn:
+    with open_gpu_batches(RECIPE, 0, flat(), built_in_lenses(), None, card, 2) as drawn:
         batch = next(drawn)
         trainer, plain = RemovalTrainer(RECIPE), RemovalTrainer(RECIPE)
         trainer.step(batch)

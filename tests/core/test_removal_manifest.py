@@ -13,7 +13,7 @@ from core.errors import FrameError
 from core.images.write import write_exr
 from core.removal.inference import remover as remover_module
 from core.removal.inference.remover import Remover
-from core.removal.jobs.batch import remove_all
+from core.removal.jobs.batch import clean_plates
 from core.removal.jobs.manifest import MANIFEST, Manifest, digest_inputs
 from core.removal.jobs.mattes import Mattes
 from core.system.progress import Progress
@@ -28,14 +28,14 @@ def test_a_clean_plate_is_made_again_for_other_weights_options_or_mattes(
         write_codes(tmp_path / "in" / f"{name}.png", picture())
     remover = Remover(flare_everywhere, working_size=64)
     with pytest.raises(FrameError, match=r"c\.png is missing"):
-        remove_all([tmp_path / "in" / "c.png"], tmp_path / "none", remover, Progress())
+        clean_plates([tmp_path / "in" / "c.png"], tmp_path / "none", remover, Progress())
     for name, values in (("left", 0), ("right", 255)):
         for plate in "ab":
             write_codes(tmp_path / name / f"{plate}.png", np.full((60, 90, 3), values, np.uint8))
 
     def made(remover: Remover, matte: str = "", **options: bool) -> int:
         mattes = Mattes(tmp_path / matte) if matte else None
-        found = remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes, **options)
+        found = clean_plates([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes, **options)
         return int(found["made"])
 
     first = Remover(flare_everywhere, working_size=64)
@@ -57,7 +57,7 @@ def test_a_clean_plate_is_made_again_when_its_plate_or_a_neighbour_changes(
 
     def made(**options: bool) -> set[str]:
         before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.png")}
-        remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), **options)
+        clean_plates([tmp_path / "in"], tmp_path / "out", remover, Progress(), **options)
         return {path.stem for path in (tmp_path / "out").glob("*.png")
                 if path.stat().st_mtime_ns != before.get(path.name)}
 
@@ -76,13 +76,13 @@ def test_a_foreign_file_is_not_overwritten(tmp_path: Path, flare_everywhere: Pat
     source, remover = write_codes(tmp_path / "in" / "a.png", picture()), Remover(flare_everywhere, working_size=64)
     work = write_codes(tmp_path / "out" / "a.png", np.zeros((60, 90, 3), np.uint8)).read_bytes()
     with pytest.raises(FrameError, match=r"a\.png exists and is not listed in .*remove\.json"):
-        remove_all([source], tmp_path / "out", remover, Progress())
+        clean_plates([source], tmp_path / "out", remover, Progress())
     assert (tmp_path / "out" / "a.png").read_bytes() == work
-    assert remove_all([source], tmp_path / "out", remover, Progress(), overwrite=True)["made"] == 1
-    assert remove_all([source], tmp_path / "out", remover, Progress())["kept"] == 1
+    assert clean_plates([source], tmp_path / "out", remover, Progress(), overwrite=True)["made"] == 1
+    assert clean_plates([source], tmp_path / "out", remover, Progress())["kept"] == 1
     (tmp_path / "out" / MANIFEST).unlink()
     with pytest.raises(FrameError, match="choose another folder"):
-        remove_all([source], tmp_path / "out", remover, Progress())
+        clean_plates([source], tmp_path / "out", remover, Progress())
 
 
 def test_a_foreign_file_is_not_overwritten_by_a_flare(tmp_path: Path, flare_everywhere: Path) -> None:
@@ -91,11 +91,11 @@ def test_a_foreign_file_is_not_overwritten_by_a_flare(tmp_path: Path, flare_ever
     write_exr(render, dict.fromkeys("RGB", np.zeros((60, 90))))
     work = render.read_bytes()
     with pytest.raises(FrameError, match=r"a\.exr exists and is not listed in .*remove\.json"):
-        remove_all([source], tmp_path / "out", remover, Progress(), flare_folder=render.parent)
+        clean_plates([source], tmp_path / "out", remover, Progress(), flare_folder=render.parent)
     assert render.read_bytes() == work
     for another in (remover, Remover(flare_everywhere, working_size=64, glow="keep")):
-        remove_all([source], tmp_path / "out", another, Progress(), flare_folder=tmp_path / "flares")
-    remove_all([source], tmp_path / "out", remover, Progress(), flare_folder=render.parent, overwrite=True)
+        clean_plates([source], tmp_path / "out", another, Progress(), flare_folder=tmp_path / "flares")
+    clean_plates([source], tmp_path / "out", remover, Progress(), flare_folder=render.parent, overwrite=True)
     assert render.read_bytes() != work
 
 
@@ -123,19 +123,19 @@ def test_a_clean_plate_of_an_earlier_revision_is_made_again(tmp_path: Path, flar
     made = []
     for revision in (remover_module.REVISION, remover_module.REVISION, remover_module.REVISION + 1):
         monkeypatch.setattr(remover_module, "REVISION", revision)
-        made.append(remove_all([source], out, Remover(flare_everywhere, working_size=64), Progress())["made"])
+        made.append(clean_plates([source], out, Remover(flare_everywhere, working_size=64), Progress())["made"])
     assert made == [1, 0, 1]
 
 
 def test_a_clean_plate_that_was_begun_is_made(tmp_path: Path, flare_everywhere: Path) -> None:
     """A kill after the manifest, before the plate: an earlier clean plate is not taken for it."""
     source, remover = write_codes(tmp_path / "in" / "a.png", picture()), Remover(flare_everywhere, working_size=64)
-    remove_all([source], tmp_path / "out", remover, Progress())
+    clean_plates([source], tmp_path / "out", remover, Progress())
     other = Remover(flare_everywhere, working_size=96)
     how = digest_inputs(other.cache_key, [source])
     Manifest(tmp_path / "out").begin(Path("a.png"), source, how, [tmp_path / "out" / "a.png"], overwrite=False)
     assert not (tmp_path / "out" / "a.png").exists()
-    assert remove_all([source], tmp_path / "out", other, Progress())["made"] == 1
+    assert clean_plates([source], tmp_path / "out", other, Progress())["made"] == 1
 
 
 def test_a_clean_plate_whose_hash_a_kill_prevented_is_kept_once_edited(
@@ -143,25 +143,25 @@ def test_a_clean_plate_whose_hash_a_kill_prevented_is_kept_once_edited(
     """A kill after the plate, before its hash is in the manifest: a later call adds it."""
     source, remover = write_codes(tmp_path / "in" / "a.png", picture()), Remover(flare_everywhere, working_size=64)
     clean, manifest = tmp_path / "out" / "a.png", tmp_path / "out" / MANIFEST
-    remove_all([source], tmp_path / "out", remover, Progress())
+    clean_plates([source], tmp_path / "out", remover, Progress())
     complete = manifest.read_text()
     manifest.write_text(json.dumps({**json.loads(complete), "written": {}}))
-    assert remove_all([source], tmp_path / "out", remover, Progress())["kept"] == 1
+    assert clean_plates([source], tmp_path / "out", remover, Progress())["kept"] == 1
     assert json.loads(manifest.read_text()) == json.loads(complete)
     work = write_codes(clean, picture() // 2).read_bytes()
-    assert remove_all([source], tmp_path / "out", Remover(no_flare, working_size=64), Progress())["kept"] == 1
+    assert clean_plates([source], tmp_path / "out", Remover(no_flare, working_size=64), Progress())["kept"] == 1
     assert clean.read_bytes() == work
 
 
 def test_a_clean_plate_stays_when_its_plate_can_no_longer_be_read(tmp_path: Path, flare_everywhere: Path) -> None:
     write_codes(tmp_path / "in" / "a.png", picture())
     remover = Remover(flare_everywhere, working_size=64)
-    remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress())
+    clean_plates([tmp_path / "in"], tmp_path / "out", remover, Progress())
     before = (tmp_path / "out" / "a.png").read_bytes()
     plate = tmp_path / "in" / "a.png"
     plate.write_bytes(plate.read_bytes()[:200])
     with pytest.raises(FrameError, match="1 of 1 plates could not be cleaned"):
-        remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress())
+        clean_plates([tmp_path / "in"], tmp_path / "out", remover, Progress())
     assert (tmp_path / "out" / "a.png").read_bytes() == before
 
 
@@ -170,12 +170,12 @@ def test_a_flare_of_an_outdated_clean_plate_is_made_again(tmp_path: Path, flare_
     write_codes(tmp_path / "in" / "a.png", picture())
     one, other = (Remover(flare_everywhere, working_size=size) for size in (64, 96))
     args = ([tmp_path / "in"], tmp_path / "out")
-    remove_all(*args, one, Progress(), flare_folder=tmp_path / "flares")
+    clean_plates(*args, one, Progress(), flare_folder=tmp_path / "flares")
     stale = (tmp_path / "flares" / "a.exr").read_bytes()
-    remove_all(*args, other, Progress())
-    assert remove_all(*args, other, Progress(), flare_folder=tmp_path / "flares")["made"] == 1
+    clean_plates(*args, other, Progress())
+    assert clean_plates(*args, other, Progress(), flare_folder=tmp_path / "flares")["made"] == 1
     assert (tmp_path / "flares" / "a.exr").read_bytes() != stale
-    assert remove_all(*args, other, Progress(), flare_folder=tmp_path / "flares")["kept"] == 1
+    assert clean_plates(*args, other, Progress(), flare_folder=tmp_path / "flares")["kept"] == 1
 
 
 def test_an_edited_clean_plate_is_kept(tmp_path: Path, flare_everywhere: Path) -> None:
@@ -184,37 +184,37 @@ def test_an_edited_clean_plate_is_kept(tmp_path: Path, flare_everywhere: Path) -
         write_codes(tmp_path / "in" / f"{name}.png", picture())
     one, other = (Remover(flare_everywhere, working_size=size) for size in (64, 96))
     plates, out = [tmp_path / "in"], tmp_path / "out"
-    remove_all(plates, out, one, Progress(), flare_folder=tmp_path / "flares")
+    clean_plates(plates, out, one, Progress(), flare_folder=tmp_path / "flares")
     retouched = write_codes(out / "a.png", picture()[:, ::-1]).read_bytes()
     heard = RecordingProgress()
-    found = remove_all(plates, out, other, heard, flare_folder=tmp_path / "flares")
+    found = clean_plates(plates, out, other, heard, flare_folder=tmp_path / "flares")
     assert (found["made"], found["kept"]) == (1, 1) and any("were edited" in text for text in heard.texts)
     assert (out / "a.png").read_bytes() == retouched
     write_codes(tmp_path / "in" / "a.png", 255 - picture())
     with pytest.raises(FrameError, match=r"a\.png was edited after it was made"):
-        remove_all(plates, out, other, Progress())
+        clean_plates(plates, out, other, Progress())
     assert (out / "a.png").read_bytes() == retouched
-    remove_all(plates, out, other, Progress(), overwrite=True)
+    clean_plates(plates, out, other, Progress(), overwrite=True)
     assert (out / "a.png").read_bytes() != retouched
-    assert remove_all(plates, out, one, Progress())["made"] == 2  # and it is no one's work any more
+    assert clean_plates(plates, out, one, Progress())["made"] == 2  # and it is no one's work any more
 
 
 def test_a_foreign_flare_is_not_taken_for_the_plates(tmp_path: Path, flare_everywhere: Path) -> None:
     write_codes(tmp_path / "in" / "a.png", picture())
     remover = Remover(flare_everywhere, working_size=64)
-    remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress())
+    clean_plates([tmp_path / "in"], tmp_path / "out", remover, Progress())
     (tmp_path / "flares").mkdir()
     (tmp_path / "flares" / "a.exr").write_bytes(b"another's")
     with pytest.raises(FrameError, match="someone's work"):
-        remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), flare_folder=tmp_path / "flares")
+        clean_plates([tmp_path / "in"], tmp_path / "out", remover, Progress(), flare_folder=tmp_path / "flares")
     assert (tmp_path / "flares" / "a.exr").read_bytes() == b"another's"
 
 
 def test_an_existing_clean_plate_is_kept(tmp_path: Path, flare_everywhere: Path) -> None:
     source = write_codes(tmp_path / "plate.png", picture())
     remover = Remover(flare_everywhere, working_size=64)
-    assert remove_all([source], tmp_path / "out", remover, Progress())["made"] == 1
-    assert remove_all([source], tmp_path / "out", remover, Progress())["kept"] == 1
-    assert remove_all([source], tmp_path / "out", remover, Progress(), overwrite=True)["made"] == 1
+    assert clean_plates([source], tmp_path / "out", remover, Progress())["made"] == 1
+    assert clean_plates([source], tmp_path / "out", remover, Progress())["kept"] == 1
+    assert clean_plates([source], tmp_path / "out", remover, Progress(), overwrite=True)["made"] == 1
     (tmp_path / "out" / "plate.png").unlink()
-    assert remove_all([source], tmp_path / "out", remover, Progress())["made"] == 1
+    assert clean_plates([source], tmp_path / "out", remover, Progress())["made"] == 1

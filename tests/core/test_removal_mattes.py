@@ -15,7 +15,7 @@ from core.images.formats.exif import apply_orientation
 from core.images.window import DataWindow
 from core.images.write import write_exr
 from core.removal.inference.remover import Remover
-from core.removal.jobs.batch import remove_all
+from core.removal.jobs.batch import clean_plates
 from core.removal.jobs.manifest import MANIFEST
 from core.removal.jobs.mattes import Mattes
 from core.system.progress import Progress
@@ -40,8 +40,8 @@ def test_flares_are_removed_only_where_the_matte_is_white(tmp_path: Path, flare_
                                                           dtype: type) -> None:
     source = write_codes(tmp_path / "plate.png", picture())
     matte = half_matte(tmp_path / "matte.png", 90 // scale, 60 // scale, dtype)
-    remove_all([source], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(), mattes=Mattes(matte),
-               flare_folder=tmp_path / "flare")
+    clean_plates([source], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
+                 mattes=Mattes(matte), flare_folder=tmp_path / "flare")
     clean, flare = cv2.imread(str(tmp_path / "out" / "plate.png")), read_exr(tmp_path / "flare" / "plate.exr")
     difference = np.abs(clean.astype(int) - cv2.imread(str(source))).max(-1)
     assert (difference[:, :44] > 0).mean() > 0.9, "black has nothing to take"
@@ -114,16 +114,16 @@ def test_each_plate_has_its_own_matte(tmp_path: Path, flare_everywhere: Path) ->
     write_exr(tmp_path / "mattes" / "b.exr", {"Y": np.full((60, 90), np.nan)})
     remover, mattes = Remover(flare_everywhere, working_size=64), Mattes(tmp_path / "mattes")
     with pytest.raises(FrameError, match=r"1 of 3 plates .*c\.png has no matte"):
-        remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
+        clean_plates([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png", MANIFEST]
     assert np.array_equal(cv2.imread(str(tmp_path / "out" / "b.png")), cv2.imread(str(tmp_path / "in" / "b.png")))
     half_matte(tmp_path / "mattes" / "c.png", 90, 60)
     mattes = Mattes(tmp_path / "mattes")
     for made, kept in ((1, 2), (0, 3)):
-        found = remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
+        found = clean_plates([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
         assert (found["made"], found["kept"]) == (made, kept)
     half_matte(tmp_path / "mattes" / "a.png", 45, 30)
-    found = remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
+    found = clean_plates([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
     assert (found["made"], found["kept"]) == (1, 2), "a matte that was painted again"
 
 

@@ -56,27 +56,27 @@ def test_the_prediction_depends_on_the_opposite_corner() -> None:
 def test_weights_keep_their_recipe_and_damaged_files_are_refused(tmp_path: Path, flare_everywhere: Path) -> None:
     assert [conv.out_channels for conv in weights.load_network(flare_everywhere).input_convs] == list(TINY.widths)
     with pytest.raises(RunError, match="missing"):
-        weights.read(tmp_path / "none.safetensors")
+        weights.read_weights(tmp_path / "none.safetensors")
     (tmp_path / "bad.safetensors").write_bytes(b"no weights")
     with pytest.raises(RunError, match="damaged"):
-        weights.read(tmp_path / "bad.safetensors")
-    weights.write(tmp_path / "other.safetensors", {"a": torch.zeros(2)}, {})
+        weights.read_weights(tmp_path / "bad.safetensors")
+    weights.write_weights(tmp_path / "other.safetensors", {"a": torch.zeros(2)}, {})
     with pytest.raises(RunError, match="no weights of the removal network"):
         weights.load_network(tmp_path / "other.safetensors")
-    tensors, about = weights.read(flare_everywhere)
+    tensors, about = weights.read_weights(flare_everywhere)
     tensors[next(iter(tensors))].view(-1)[0] = torch.nan
-    weights.write(tmp_path / "nan.safetensors", tensors, about)
+    weights.write_weights(tmp_path / "nan.safetensors", tensors, about)
     with pytest.raises(RunError, match="no finite numbers"):
         weights.load_network(tmp_path / "nan.safetensors")
 
 
 def test_weights_are_read_under_the_tensor_names_of_format_0(tmp_path: Path, flare_everywhere: Path) -> None:
-    tensors, metadata = weights.read(flare_everywhere)
+    tensors, metadata = weights.read_weights(flare_everywhere)
     retired = {present: name for name, present in weights.RETIRED_NAMES.items()}
     renamed = {".".join(retired.get(part, part) for part in name.split(".")): value for name, value in tensors.items()}
     assert "enter.1.0.first.weight" in renamed and "attention.0.asked.weight" in renamed
-    weights.write(tmp_path / "format_0.safetensors", renamed, metadata)
-    assert weights.read(tmp_path / "format_0.safetensors")[0].keys() == tensors.keys()
+    weights.write_weights(tmp_path / "format_0.safetensors", renamed, metadata)
+    assert weights.read_weights(tmp_path / "format_0.safetensors")[0].keys() == tensors.keys()
     frame = torch.rand(1, 3, 64, 96)
     assert torch.equal(weights.load_network(tmp_path / "format_0.safetensors")(frame).flare,
                        weights.load_network(flare_everywhere)(frame).flare)

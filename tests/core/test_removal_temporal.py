@@ -23,7 +23,7 @@ from core.removal.inference.temporal import (
     frame_features,
     shot_similarity,
 )
-from core.removal.jobs.batch import collect_plates, collect_with_neighbours, remove_all
+from core.removal.jobs.batch import clean_plates, collect_plates, collect_with_neighbours
 from core.removal.jobs.manifest import MANIFEST
 from core.system.progress import Progress
 
@@ -226,10 +226,10 @@ def means(folder: Path) -> dict[str, float]:
 def test_a_shot_is_steady_and_each_frame_is_predicted_once(shot: Path, tmp_path: Path) -> None:
     remover = WaveringRemover()
     with pytest.raises(FrameError, match=r"1 of 12 plates.*f6\.png"):
-        remove_all([shot], tmp_path / "out", remover, Progress())
+        clean_plates([shot], tmp_path / "out", remover, Progress())
     assert remover.runs == 11
     with pytest.raises(FrameError, match=r"1 of 12"):
-        remove_all([shot], tmp_path / "stills", WaveringRemover(), Progress(), independent=True)
+        clean_plates([shot], tmp_path / "stills", WaveringRemover(), Progress(), independent=True)
     steady, single = means(tmp_path / "out"), means(tmp_path / "stills")
     assert len(steady) == len(single) == 11
     assert np.std(list(steady.values())) < 0.35 * np.std(list(single.values()))
@@ -237,10 +237,10 @@ def test_a_shot_is_steady_and_each_frame_is_predicted_once(shot: Path, tmp_path:
 
 def test_a_clean_frame_does_not_depend_on_which_others_are_cleaned(shot: Path, tmp_path: Path) -> None:
     (shot / "f6.png").unlink()
-    remove_all([shot], tmp_path / "all", WaveringRemover(), Progress())
+    clean_plates([shot], tmp_path / "all", WaveringRemover(), Progress())
     for number in (1, 8):
-        remove_all([shot], tmp_path / "one", WaveringRemover(), Progress(), only={Path(f"f{number}.png")})
-    remove_all([shot / "f3.png"], tmp_path / "one", WaveringRemover(), Progress())
+        clean_plates([shot], tmp_path / "one", WaveringRemover(), Progress(), only={Path(f"f{number}.png")})
+    clean_plates([shot / "f3.png"], tmp_path / "one", WaveringRemover(), Progress())
     for path in (tmp_path / "one").glob("*.png"):
         assert path.read_bytes() == (tmp_path / "all" / path.name).read_bytes()
     assert sorted(path.name for path in (tmp_path / "one").iterdir()) == ["f1.png", "f3.png", "f8.png",
@@ -261,7 +261,7 @@ def test_neighbours_are_found_with_results_above_or_beside_them(shot: Path, tmp_
         for _ in range(2):
             assert sorted(collect_with_neighbours([shot / "f1.png"], [out, flare])) == frames
             assert sorted(path for path, _ in collect_plates([shot], [out, flare])) == frames
-            remove_all([shot / "f1.png"], out, WaveringRemover(), Progress(), flare_folder=flare)
+            clean_plates([shot / "f1.png"], out, WaveringRemover(), Progress(), flare_folder=flare)
 
 
 def test_neighbours_are_of_the_same_folder(shot: Path) -> None:

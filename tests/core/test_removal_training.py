@@ -78,7 +78,7 @@ def test_a_resumed_training_ends_as_an_uninterrupted_one(tmp_path: Path) -> None
     with folder_lock(tmp_path / "parts"), pytest.raises(RunError, match="Another process"):
         run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in_lenses(), resume=True)
     parts = run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in_lenses(), resume=True, processes=2)
-    a, b = weights.read(whole)[0], weights.read(parts)[0]
+    a, b = weights.read_weights(whole)[0], weights.read_weights(parts)[0]
     assert a.keys() == b.keys()
     for name in a:
         assert a[name].dtype == torch.float16
@@ -106,7 +106,7 @@ def test_workers_share_the_frames_of_one_process(tmp_path: Path) -> None:
     by_three = run.train(RECIPE, tmp_path / "three", backgrounds(), built_in_lenses(), processes=3)
     logs = [json.loads((path.parent / run.LOG).read_text(encoding="utf-8")) for path in (alone, by_three)]
     assert logs[0]["untouched"] == pytest.approx(logs[1]["untouched"], rel=1e-4), "the pictures are the same"
-    a, b = weights.read(alone)[0], weights.read(by_three)[0]
+    a, b = weights.read_weights(alone)[0], weights.read_weights(by_three)[0]
     for name in a:
         torch.testing.assert_close(a[name], b[name], atol=1e-3, rtol=1e-2)
     assert torch.get_num_threads() == 1
@@ -196,7 +196,7 @@ def test_shared_backgrounds_equal_those_in_memory(tmp_path: Path, monkeypatch: p
         write_png(tmp_path / f"{number}.png", np.random.default_rng(number).random((80, 96, 3)).astype(np.float32))
     (tmp_path / "cut_off.png").write_bytes(b"\x89PNG")
     held_in_memory = removal_backgrounds.read_backgrounds([tmp_path], augmented=True)
-    with removal_backgrounds.shared_backgrounds([tmp_path], augmented=True) as found:
+    with removal_backgrounds.open_shared_backgrounds([tmp_path], augmented=True) as found:
         assert found.unusable == [tmp_path / "cut_off.png"]
         sent = pickle.loads(pickle.dumps(found))
         assert sent.augmented
@@ -209,7 +209,7 @@ def test_shared_backgrounds_equal_those_in_memory(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(removal_backgrounds, "SharedArrays", full)
     with pytest.raises(RunError, match=r"No space left on device.*TMPDIR"), \
-            removal_backgrounds.shared_backgrounds([tmp_path]):
+            removal_backgrounds.open_shared_backgrounds([tmp_path]):
         pass
 
 
@@ -342,12 +342,12 @@ def test_frame_sizes_follow_the_stages_of_the_recipe() -> None:
 def test_a_training_starts_from_weights(tmp_path: Path) -> None:
     first = run.train(RECIPE, tmp_path / "first", backgrounds(), built_in_lenses(), processes=1)
     second = run.train(RECIPE, tmp_path / "second", backgrounds(), built_in_lenses(), start=first, processes=1)
-    assert weights.read(second)[1]["iteration"] == "4"
+    assert weights.read_weights(second)[1]["iteration"] == "4"
     other = Recipe(**{**RECIPE.__dict__, "widths": (16, 8, 8, 8, 8)})
     third = run.train(other, tmp_path / "third", backgrounds(), built_in_lenses(), start=first, processes=1)
     assert widths_of(third) == RECIPE.widths, "the network is that of the weights"
-    tensors, _ = weights.read(first)
-    weights.write(tmp_path / "foreign.safetensors", tensors, {"recipe": "{}"})
+    tensors, _ = weights.read_weights(first)
+    weights.write_weights(tmp_path / "foreign.safetensors", tensors, {"recipe": "{}"})
     with pytest.raises(RunError, match="holds no weights"):
         run.train(RECIPE, tmp_path / "fourth", backgrounds(), built_in_lenses(), start=tmp_path / "foreign.safetensors")
 
@@ -376,11 +376,11 @@ def test_added_blocks_leave_the_prediction_unchanged(tmp_path: Path) -> None:
     assert before.flare.std() > 0
     torch.testing.assert_close(after.flare, before.flare, rtol=1e-3, atol=1e-6)  # a fused layout adds up otherwise
     grown_to = run.train(large, tmp_path / "second", backgrounds(), built_in_lenses(), start=first, processes=1)
-    form = weights.read_architecture(grown_to, weights.read(grown_to)[1])
+    form = weights.read_architecture(grown_to, weights.read_weights(grown_to)[1])
     assert form == (small.widths, (1, 1, 2, 1, 3), (0, 1))
     longer = replace(large, iterations=5, blocks=(4, 4, 4, 4, 4), attention=(2, 2))
     run.train(longer, tmp_path / "second", backgrounds(), built_in_lenses(), resume=True, processes=1)
-    assert weights.read_architecture(grown_to, weights.read(grown_to)[1]) == form, "none grows on the way"
+    assert weights.read_architecture(grown_to, weights.read_weights(grown_to)[1]) == form, "none grows on the way"
     of_before = {name: value for name, value in as_dict(small).items() if name != "attention"}
     assert weights.read_architecture(first, {"recipe": json.dumps(of_before)}).attention == (0, 0)
 
@@ -419,13 +419,13 @@ def test_the_weights_of_the_best_validation_are_written(tmp_path: Path, monkeypa
     tests = backgrounds(), built_in_lenses()
 
     def kept(folder: str) -> str:
-        return weights.read(tmp_path / folder / run.WEIGHTS)[1]["iteration"]
+        return weights.read_weights(tmp_path / folder / run.WEIGHTS)[1]["iteration"]
 
     train(tmp_path / "whole", validation=tests)
     assert kept("whole") == "2"
     with pytest.raises(Cancelled):
         train(tmp_path / "parts", validation=tests, progress=StopAfter(3))
-    assert weights.read(tmp_path / "parts" / run.CHECKPOINT)[1]["iteration"] == "3"
+    assert weights.read_weights(tmp_path / "parts" / run.CHECKPOINT)[1]["iteration"] == "3"
     train(tmp_path / "parts", validation=tests, resume=True)
     assert kept("parts") == "2", "what a part before had found is still the best"
     longer = replace(RECIPE, iterations=6)
@@ -448,7 +448,7 @@ def test_a_training_with_a_non_finite_loss_stops(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(RemovalTrainer, "step", broken)
     with pytest.raises(RunError, match=r"iteration 3 is not finite.*learning_rate"):
         run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), processes=1, save_every_s=0)
-    state, about = weights.read(tmp_path / run.CHECKPOINT)
+    state, about = weights.read_weights(tmp_path / run.CHECKPOINT)
     assert about["iteration"] == "2", "what was saved last is whole"
     assert all(torch.isfinite(value).all() for value in state.values())
 
@@ -606,7 +606,7 @@ def test_lpips_uses_the_user_s_weights(tmp_path: Path) -> None:
     features |= {f"features.{index}.bias": torch.zeros(shape[0]) for index, shape in shapes.items()}
     torch.save(features, tmp_path / "alexnet.pth")
     lines = {f"lin{k}.model.1.weight": torch.rand(1, shape[0], 1, 1) for k, shape in enumerate(shapes.values())}
-    weights.write(tmp_path / "alex.safetensors", lines, {})
+    weights.write_weights(tmp_path / "alex.safetensors", lines, {})
     measure = Lpips(tmp_path)
     a = np.random.default_rng(0).random((64, 64, 3)).astype(np.float32)
     assert measure(a, a) == 0
@@ -622,8 +622,8 @@ def test_final_weights_contain_a_share_of_the_initial_ones(tmp_path: Path) -> No
         with pytest.raises(Cancelled):
             run.train(recipe, folder, backgrounds(), built_in_lenses(), start=first, processes=1, progress=StopAfter(2))
         run.train(recipe, folder, backgrounds(), built_in_lenses(), start=first, processes=1, resume=True)
-        kept[share] = weights.read(folder / run.WEIGHTS)[0]
-    initial = weights.read(first)[0]
+        kept[share] = weights.read_weights(folder / run.WEIGHTS)[0]
+    initial = weights.read_weights(first)[0]
     assert any(not torch.equal(kept[0.0][name], value) for name, value in initial.items())
     for name, value in initial.items():
         assert torch.equal(kept[1.0][name], value)
@@ -638,7 +638,7 @@ def test_added_layers_are_interpolated_by_the_same_share(tmp_path: Path) -> None
     first = run.train(small, tmp_path / "first", backgrounds(), built_in_lenses(), processes=1)
     grown = run.train(large, tmp_path / "grown", backgrounds(), built_in_lenses(), start=first, processes=1)
     name = "inner_attention.0.0.qkv.weight"
-    assert weights.read(grown)[0][name].any()
+    assert weights.read_weights(grown)[0][name].any()
     frame = torch.rand(1, 3, 64, 64)
     with torch.no_grad():
         before, after = weights.load_network(first)(frame).flare, weights.load_network(grown)(frame).flare

@@ -136,7 +136,8 @@ def formats(base: Path) -> list[Format]:
     add("lights.json", "lights.json", lambda folder: read_lights(folder / "lights.json"), with_lights)
     add("split.json", "split.json", lambda folder: Capture.open(folder / "c").split(str(folder / "split.json")),
         with_lights)
-    add("exposures.json", "exposures.json", exposures.read, file("exposures.json", '{"1.png": 1.5, "2.png": 0.7}'))
+    add("exposures.json", "exposures.json", exposures.read_exposures,
+        file("exposures.json", '{"1.png": 1.5, "2.png": 0.7}'))
     add("config.toml", "config.toml", lambda folder: read_config(folder / "config.toml"),
         lambda folder: write_config(folder / "config.toml", preset("draft")))
 

@@ -122,11 +122,11 @@ def locate_names(stream: BinaryIO) -> list[tuple[int, int, bytes]]:
         names.append((part, name_offset, name))
         if kind == b"chlist" and length <= _MAX_ATTRIBUTE_BYTES:
             value_offset, value = stream.tell(), stream.read(length)
-            names += [(part, value_offset + offset, channel) for offset, channel in _channels(value)]
+            names += [(part, value_offset + offset, channel) for offset, channel in _iterate_channels(value)]
     return names
 
 
-def _channels(value: bytes) -> Iterator[tuple[int, bytes]]:
+def _iterate_channels(value: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield the offset and the name of each channel in the value of a "chlist"."""
     offset = 0
     while (end := value.find(b"\0", offset)) > offset:

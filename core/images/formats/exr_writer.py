@@ -39,21 +39,21 @@ def write_scanlines(path: Path | str, channels: Mapping[str, NDArray[Any]], head
     height, width = pixels[0].shape
     window = ((0, 0), (width - 1, height - 1))
     attributes = {"dataWindow": window, "displayWindow": window, "pixelAspectRatio": 1.0, **header}
-    head = _header(names, pixels, attributes)
+    head = _encode_header(names, pixels, attributes)
     count = -(-height // _LINES)
     with open(path, "wb") as stream:
         stream.write(head)
         table, offsets = stream.tell(), []
         stream.write(b"\0" * 8 * count)
         top = int(attributes["dataWindow"][0][1])
-        for start, data in _chunks(pixels, height):
+        for start, data in _encode_chunks(pixels, height):
             offsets.append(stream.tell())
             stream.write(struct.pack("<ii", top + start, len(data)) + data)
         stream.seek(table)
         stream.write(struct.pack(f"<{count}Q", *offsets))
 
 
-def _header(names: list[str], pixels: list[NDArray[Any]], attributes: Mapping[str, Any]) -> bytes:
+def _encode_header(names: list[str], pixels: list[NDArray[Any]], attributes: Mapping[str, Any]) -> bytes:
     """Return magic number, version and attributes. names, pixels: of the channels, in the file's order. attributes: as
     `header` of `write_scanlines`, with both windows."""
     # Of each channel: name, type, whether it is perceptually linear, and sampling of columns and lines.
@@ -61,30 +61,33 @@ def _header(names: list[str], pixels: list[NDArray[Any]], attributes: Mapping[st
                             for name, channel in zip(names, pixels, strict=True)) + b"\0"
     flags = _LONG_NAMES if max(len(name.encode()) for name in (*names, *attributes)) > 31 else 0
     parts = [MAGIC, struct.pack("<i", 2 | flags),  # version 2 of the format
-             _attribute("channels", "chlist", channel_list),
-             _attribute("compression", "compression", bytes([_ZIP])), _attribute("lineOrder", "lineOrder", b"\0"),
-             _attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0, 0)),
-             _attribute("screenWindowWidth", "float", struct.pack("<f", 1))]
+             _encode_attribute("channels", "chlist", channel_list),
+             _encode_attribute("compression", "compression", bytes([_ZIP])),
+             _encode_attribute("lineOrder", "lineOrder", b"\0"),
+             _encode_attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0, 0)),
+             _encode_attribute("screenWindowWidth", "float", struct.pack("<f", 1))]
     for name, value in attributes.items():
         if name.endswith("Window"):
             (left, top), (right, bottom) = value
-            parts.append(_attribute(name, "box2i", struct.pack("<4i", int(left), int(top), int(right), int(bottom))))
+            corners = struct.pack("<4i", int(left), int(top), int(right), int(bottom))
+            parts.append(_encode_attribute(name, "box2i", corners))
         elif name == "chromaticities":
-            parts.append(_attribute(name, name, struct.pack("<8f", *(float(coordinate) for coordinate in value))))
+            coordinates = struct.pack("<8f", *(float(coordinate) for coordinate in value))
+            parts.append(_encode_attribute(name, name, coordinates))
         elif isinstance(value, str):
-            parts.append(_attribute(name, "string", value.encode()))
+            parts.append(_encode_attribute(name, "string", value.encode()))
         elif isinstance(value, int | float):
-            parts.append(_attribute(name, "float", struct.pack("<f", value)))
+            parts.append(_encode_attribute(name, "float", struct.pack("<f", value)))
         else:
             raise TypeError(f"the attribute {name} cannot be written")
     return b"".join(parts) + b"\0"
 
 
-def _attribute(name: str, kind: str, value: bytes) -> bytes:
+def _encode_attribute(name: str, kind: str, value: bytes) -> bytes:
     return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
 
 
-def _chunks(pixels: list[NDArray[Any]], height: int) -> Iterator[tuple[int, bytes]]:
+def _encode_chunks(pixels: list[NDArray[Any]], height: int) -> Iterator[tuple[int, bytes]]:
     """Yield the first line and the stored bytes of each chunk; uncompressed where ZIP does not make it smaller."""
     for start in range(0, height, _LINES):
         lines = range(start, min(start + _LINES, height))

@@ -96,10 +96,10 @@ class DiffusionRemoval(nn.Module):
                                          target_modules=_UNET_LAYERS))
         self.vae.add_adapter(LoraConfig(r=rank, lora_alpha=rank, init_lora_weights="gaussian",
                                         target_modules=_VAE_LAYERS))
-        self.skips = self._new_skips()
+        self.skips = self._create_skips()
         self.vae.decoder.conv_out.requires_grad_(True)
 
-    def _new_skips(self) -> nn.ModuleList:
+    def _create_skips(self) -> nn.ModuleList:
         """Return 1x1 convolutions from the input of each block of the encoder to that of the decoder, deepest first;
         almost zero at first."""
         encoder, decoder = self.vae.encoder, self.vae.decoder
@@ -150,13 +150,13 @@ class DiffusionRemoval(nn.Module):
 
     def save(self, path: Path | str, metadata: Mapping[str, str] | None = None) -> None:
         """Write the trained tensors, for use with the same base model."""
-        weights.write(path, {name: value.contiguous() for name, value in self.trained_tensors().items()},
+        weights.write_weights(path, {name: value.contiguous() for name, value in self.trained_tensors().items()},
                       {"kind": KIND, "rank": str(self.rank), **(metadata or {})})
 
     def load(self, path: Path | str) -> dict[str, str]:
         """Read the file that `save` wrote, and return the text of its header. Raises RunError where it is another kind
         of file, or belongs to another base model."""
-        tensors, metadata = weights.read(path)
+        tensors, metadata = weights.read_weights(path)
         trained = self.trained_tensors()
         if metadata.get("kind") != KIND or tensors.keys() != trained.keys() or any(
                 tensors[name].shape != trained[name].shape for name in trained):
@@ -171,7 +171,7 @@ class DiffusionRemoval(nn.Module):
 
 def read_rank(path: Path | str) -> int:
     """Return the rank of the LoRAs in a file that `DiffusionRemoval.save` wrote."""
-    return int(weights.read(path)[1].get("rank", RANK))
+    return int(weights.read_weights(path)[1].get("rank", RANK))
 
 
 @torch.no_grad()

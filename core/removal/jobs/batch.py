@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Removes the flares from a list of plates, folders and shots; interrupted, it resumes.
 
-`headless/commands/remove.py` calls `remove_all`. Plates that cannot be read are reported at the end and do not stop the
-others.
+`headless/commands/remove.py` calls `clean_plates`. Plates that cannot be read are reported at the end and do not stop
+the others.
 """
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _check_creatable(folder: Path) -> None:
         raise SettingsError(f"{nearest} is not a folder, so {folder} cannot be written to; choose another folder.")
 
 
-def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
+def clean_plates(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
                flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
                only: Container[Path] | None = None, independent: bool = False,
                failed_inputs: Sequence[str] = ()) -> dict[str, Any]:

@@ -57,7 +57,7 @@ class Manifest:
 
     def is_up_to_date(self, name: Path, digest: str, results: Sequence[Path]) -> bool:
         """Return whether all files of a frame exist and were made with this digest (`digest_inputs`)."""
-        return self._is_up_to_date(self._read(), name, digest, results)
+        return self._is_up_to_date(self._read_tables(), name, digest, results)
 
     def reason_to_keep(self, name: Path, source: Path, digest: str, results: Sequence[Path]) -> KeepReason | None:
         """Return why the files of a frame are kept, or None if they are to be made.
@@ -66,7 +66,7 @@ class Manifest:
         `source` still holds. Where a process was killed before it wrote down the content of finished files, that is
         done now, so that later edits are noticed.
         """
-        tables = self._read()
+        tables = self._read_tables()
         if self._is_up_to_date(tables, name, digest, results):
             if not all(_relative_path(self._folder, path) in tables["written"] for path in results):
                 with contextlib.suppress(OSError):  # a frame is kept in a read-only folder too
@@ -87,7 +87,7 @@ class Manifest:
         """
         key = name.as_posix()
         with file_lock(self._folder / LOCK):
-            old = self._read()
+            old = self._read_tables()
             new = {table: {**rows} for table, rows in old.items()}
             for table, value in {**self._entries(digest, results), "sources": content_hash(source)}.items():
                 new[table][key] = value
@@ -109,19 +109,19 @@ class Manifest:
                 if old[table].get(key) != digest:
                     remove_file(path)
             if new != old:
-                self._write(new)
+                self._write_tables(new)
 
     def finish(self, results: Sequence[Path]) -> None:
         """Enter the content of a frame's files after they were written."""
         with file_lock(self._folder / LOCK):
-            tables = self._read()
+            tables = self._read_tables()
             tables["written"] |= {_relative_path(self._folder, path): content_hash(path) for path in results}
-            self._write(tables)
+            self._write_tables(tables)
 
     def confidence(self, names: Iterable[Path]) -> dict[str, float]:
         """Return the confidence that each frame's flare is one, 0..1, by the frame's name; without those of frames
         that have none, such as those with a matte or of a fit."""
-        table = self._read()["confidence"]
+        table = self._read_tables()["confidence"]
         values: dict[str, float] = {}
         for name in names:
             with contextlib.suppress(KeyError, ValueError):  # edited by hand
@@ -138,7 +138,7 @@ class Manifest:
 
     def changed_sources(self, sources: Mapping[Path, Path]) -> list[Path]:
         """Return the names of those frames that were made from another content than `sources` (by name) has now."""
-        recorded = self._read()["sources"]
+        recorded = self._read_tables()["sources"]
         return [name for name, source in sources.items()
                 if name.as_posix() in recorded and recorded[name.as_posix()] != content_hash(source)]
 
@@ -147,7 +147,7 @@ class Manifest:
 
         Each one's file is read when its turn comes.
         """
-        tables = self._read()
+        tables = self._read_tables()
         for name in names:
             path = self._folder / name
             if name.as_posix() in tables["plates"] and path.is_file() and not self._edited_files(tables, [path]):
@@ -155,7 +155,7 @@ class Manifest:
 
     def result_paths(self) -> list[Path]:
         """Return the paths of the clean frames and flares that are listed, whether they exist or not."""
-        tables = self._read()
+        tables = self._read_tables()
         return [(self._folder / name).resolve() for name in (*tables["plates"], *tables["flares"].values())]
 
     def is_write_error(self, error: OSError) -> bool:
@@ -182,7 +182,7 @@ class Manifest:
         flare = ({"flares": _relative_path(self._folder, results[1]), "flares_made": digest} if results[1:] else {})
         return {"plates": digest, **flare}
 
-    def _read(self) -> _Tables:
+    def _read_tables(self) -> _Tables:
         """Return all tables; one that is missing or damaged is empty."""
         try:
             data = read_json(self._folder / MANIFEST, FrameError)
@@ -196,7 +196,7 @@ class Manifest:
                 tables[table] = {}
         return tables
 
-    def _write(self, tables: _Tables) -> None:
+    def _write_tables(self, tables: _Tables) -> None:
         write_json(self._folder / MANIFEST, {table: dict(sorted(rows.items())) for table, rows in tables.items()})
 
 

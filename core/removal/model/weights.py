@@ -28,12 +28,12 @@ RETIRED_NAMES = {"see": "input_convs", "enter": "encoder", "leave": "decoder", "
 """Parts of tensor names in files of format 0, and their present names."""
 
 
-def write(path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+def write_weights(path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Write tensors, and text in the header, atomically."""
-    tensor_files.write(path, tensors, metadata)
+    tensor_files.write_tensors(path, tensors, metadata)
 
 
-def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
+def read_weights(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Return the tensors under their present names, and the text of the header. Raises RunError where the file is
     missing or damaged."""
     if not Path(path).is_file():
@@ -41,7 +41,7 @@ def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
                        f"{WEIGHTS_VARIABLE}, download them in the preferences of the extension, or train them with "
                        "train-removal.")
     try:
-        tensors, metadata = tensor_files.read(path)
+        tensors, metadata = tensor_files.read_tensors(path)
     except (OSError, ValueError) as problem:
         raise RunError(f"{path} is damaged ({problem}); get it again.") from problem
     return {_present_name(name): value for name, value in tensors.items()}, metadata
@@ -85,7 +85,7 @@ def _not_weights_error(path: Path | str) -> RunError:
 @lru_cache(maxsize=2)
 def load_network(path: Path) -> RemovalNetwork:
     """Load the network of a weights file on the CPU, in evaluation mode. Raises RunError."""
-    tensors, metadata = read(path)
+    tensors, metadata = read_weights(path)
     if not all(bool(value.isfinite().all()) for value in tensors.values()):
         raise RunError(f"{path} holds weights that are no finite numbers; get it again, or train it anew.")
     architecture = read_architecture(path, metadata)

@@ -48,7 +48,7 @@ def augment(random: Random, draw_view: DrawView, width: int, height: int) -> Pix
     elif random.random() < 0.2:
         scene = _combine_scenes(random, scene, _random_pose(random, draw_view, width, height))
     if random.random() < 0.4:
-        scene = _grade(random, scene)
+        scene = _random_grade(random, scene)
     if random.random() < 0.15:
         scene = _add_haze(random, scene)
     if random.random() < 0.15:
@@ -163,7 +163,7 @@ def _draw_polygon(corners: NDArray[np.float64], width: int, height: int) -> Pixe
     return mask
 
 
-def _grade(random: Random, scene: Pixels) -> Pixels:
+def _random_grade(random: Random, scene: Pixels) -> Pixels:
     """Change contrast, saturation and colour balance; exchange channels in a few."""
     level = np.float32(max(float(scene.mean()), 1e-4))  # contrast changes about the mean
     if random.random() < 0.5:

@@ -28,7 +28,7 @@ from ..synthesis.flare import FLARE_CLASSES
 from .backgrounds import Backgrounds
 from .batches import Batch, Batches
 from .flare_bank import SingleFlareBank, UserFlares
-from .gpu.batches import gpu_batches
+from .gpu.batches import open_gpu_batches
 from .pairs import Pair, make_pair
 from .trainer import METRICS, RemovalTrainer, device
 from .workers import SINGLE_WORKER, Worker, worker_group
@@ -68,7 +68,7 @@ def read_recipe(folder: Path | str) -> Recipe | None:
     path = Path(folder) / CHECKPOINT
     if not path.exists():
         return None
-    _, metadata = weights.read(path)
+    _, metadata = weights.read_weights(path)
     weights.read_architecture(path, metadata)  # raises for a foreign file
     return from_dict(parse_json(metadata["recipe"]))
 
@@ -123,7 +123,7 @@ class TrainingSetup(NamedTuple):
         """
         if self.source is None:
             return RemovalTrainer(self.recipe, worker)
-        state, metadata = weights.read(self.source)
+        state, metadata = weights.read_weights(self.source)
         architecture = weights.read_architecture(self.source, metadata)
         recipe = replace(self.recipe, widths=architecture.widths,
                          blocks=tuple(map(max, self.recipe.blocks, architecture.blocks)),
@@ -144,7 +144,7 @@ class TrainingSetup(NamedTuple):
             all_batches = Batches(trainer.recipe, self.backgrounds, self.lenses, self.user_flares, trainer.worker)
             yield (all_batches[iteration] for iteration in range(trainer.iteration, trainer.recipe.iterations))
         else:
-            with gpu_batches(trainer.recipe, trainer.iteration, self.backgrounds, self.lenses, self.user_flares,
+            with open_gpu_batches(trainer.recipe, trainer.iteration, self.backgrounds, self.lenses, self.user_flares,
                              trainer.device, max(drawing_processes, 2)) as batches:
                 yield batches
 
@@ -205,7 +205,7 @@ def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
 def _save_checkpoint(trainer: RemovalTrainer, folder: Path, best: float | None) -> None:
     """Write the checkpoint, and the weights too unless a validation has chosen some: those are better than the last
     when a training begins to overfit."""
-    weights.write(folder / CHECKPOINT, trainer.state(), _metadata(trainer))
+    weights.write_weights(folder / CHECKPOINT, trainer.state(), _metadata(trainer))
     if best is None:
         _write_weights(trainer, folder, _metadata(trainer))
 
@@ -235,13 +235,13 @@ def _read_best_gain(folder: Path) -> float | None:
     path = folder / WEIGHTS
     if not path.exists():
         return None
-    _, metadata = weights.read(path)
+    _, metadata = weights.read_weights(path)
     return float(metadata[GAIN]) if GAIN in metadata else None
 
 
 def _write_weights(trainer: RemovalTrainer, folder: Path, metadata: Mapping[str, str]) -> None:
     half = {name: value.half().contiguous() for name, value in trainer.final_weights().items()}
-    weights.write(folder / WEIGHTS, half, metadata)
+    weights.write_weights(folder / WEIGHTS, half, metadata)
 
 
 def _metadata(trainer: RemovalTrainer) -> dict[str, str]:

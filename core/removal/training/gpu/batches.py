@@ -16,11 +16,11 @@ from ..backgrounds import Backgrounds
 from ..batches import Batch
 from ..flare_bank import UserFlares
 from .composition import compose, draw_flare_placements, draw_frame_parameters
-from .pools import Pools, filled_pools, frame_shapes, pool_sizes
+from .pools import Pools, frame_shapes, keep_pools_filled, pool_sizes
 
 
 @contextmanager
-def gpu_batches(recipe: Recipe, start_iteration: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
+def open_gpu_batches(recipe: Recipe, start_iteration: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
                 user_flares: UserFlares | None, device: torch.device, process_count: int) -> Iterator[Iterator[Batch]]:
     """Yield endless batches from `start_iteration` on; `process_count` processes draw the scenes and flares.
 
@@ -30,7 +30,7 @@ def gpu_batches(recipe: Recipe, start_iteration: int, backgrounds: Backgrounds, 
     shapes = frame_shapes(recipe, SIZE_MULTIPLE)
     sizes = pool_sizes(torch.cuda.mem_get_info(device)[0], shapes, recipe.canvas_size)
     pools = Pools(shapes, recipe.canvas_size, device, *sizes)
-    with filled_pools(pools, recipe, backgrounds, lenses, user_flares, process_count):
+    with keep_pools_filled(pools, recipe, backgrounds, lenses, user_flares, process_count):
         yield compose_batches(pools, recipe, np.random.default_rng((recipe.seed, start_iteration)))
 
 

@@ -170,7 +170,7 @@ class Pools:
 
 
 @contextmanager
-def filled_pools(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
+def keep_pools_filled(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
                  user_flares: UserFlares | None, process_count: int) -> Iterator[None]:
     """Keep `process_count` processes drawing into the pools within this context: half draw scenes, half flares.
 

@@ -155,7 +155,7 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
 
 
 def _score_picture(picture: Pixels, truth: Pixels, mask: Pixels | None,
-            lpips: Perceptual | None) -> Scores:
+                   lpips: Perceptual | None) -> Scores:
     """Return the scores of a picture against the truth; None for one that is infinite or cannot be computed.
 
     mask: display values (height, width, 3), above 0.5 in a channel where masked_psnr counts; None for no such score.

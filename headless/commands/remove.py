@@ -129,8 +129,8 @@ def _clean_plates(args: argparse.Namespace, progress: Progress) -> dict[str, Any
             progress.say(f"The clean plates are in {args.out}.")
             return {"plates": str(args.out)}
     return clean_plates(inputs, args.out, _make_remover(args, progress), progress, flare_folder=args.flare,
-                      mattes=Mattes(args.matte) if args.matte else None, overwrite=args.overwrite, only=selected_paths,
-                      independent=args.stills, failed_inputs=failed)
+                        mattes=Mattes(args.matte) if args.matte else None, overwrite=args.overwrite,
+                        only=selected_paths, independent=args.stills, failed_inputs=failed)
 
 
 def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:

@@ -26,7 +26,7 @@ def network_file(path: Path, seed: int = 0, bias: float = 0.0) -> Path:
         network.head.weight.mul_(0.1)
         network.head.bias[:3] = bias
     weights.write_weights(path, {name: value.half() for name, value in network.state_dict().items()},
-                  {"recipe": json.dumps(as_dict(TINY)), "iteration": "0"})
+                          {"recipe": json.dumps(as_dict(TINY)), "iteration": "0"})
     return path
 
 

@@ -60,7 +60,7 @@ def test_both_eyes_are_cleaned(flare_everywhere: Path, tmp_path: Path, header: d
     (tmp_path / "in").mkdir()
     path = write(tmp_path / "in" / "a.exr", RGB + RIGHT + ["A"], **header)
     clean_plates([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
-               flare_folder=tmp_path / "flare")
+                 flare_folder=tmp_path / "flare")
     before, after, flare = read(path), read(tmp_path / "out" / "a.exr"), read(tmp_path / "flare" / "a.exr")
     assert before.keys() == after.keys()
     np.testing.assert_array_equal(before["A"], after["A"])
@@ -73,7 +73,7 @@ def test_both_eyes_are_cleaned(flare_everywhere: Path, tmp_path: Path, header: d
 def test_both_eyes_are_cleaned_where_none_is_at_the_root(colours: str, flare_everywhere: Path, tmp_path: Path) -> None:
     path = write(tmp_path / "a.exr", [f"{eye}.{colour}" for eye in ("left", "right") for colour in f"{colours}A"])
     clean_plates([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
-               flare_folder=tmp_path / "flare")
+                 flare_folder=tmp_path / "flare")
     before, after, flare = read(path), read(tmp_path / "out" / "a.exr"), read(tmp_path / "flare" / "a.exr")
     assert before.keys() == after.keys()
     for name in before:
@@ -133,7 +133,7 @@ def test_both_eyes_in_parts_of_their_own_are_cleaned(layout: str, flare_everywhe
         ({name: value for name, value in header.items() if name != "view"}, names) for header, names in NUKE]}[layout]
     path = write_parts(tmp_path / "a.exr", parts)
     clean_plates([path], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
-               flare_folder=tmp_path / "flare")
+                 flare_folder=tmp_path / "flare")
     before, after, flare = read_parts(path), read_parts(tmp_path / "out" / "a.exr"), read(tmp_path / "flare" / "a.exr")
     assert len(before) == len(after) == 4
     first = before[0][0]["name"].rpartition(".")[2]

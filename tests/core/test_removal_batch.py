@@ -227,7 +227,7 @@ def test_results_mattes_and_hidden_files_below_a_folder_are_no_plates(tmp_path: 
         write_codes(shot / name, picture())
     for _ in range(2):
         found = clean_plates([shot], shot / "clean", Remover(flare_everywhere, working_size=64), Progress(),
-                           flare_folder=shot / "flare", mattes=Mattes(shot / "roto"))
+                             flare_folder=shot / "flare", mattes=Mattes(shot / "roto"))
         assert found["made"] + found["kept"] == 1
     assert sorted(path.name for path in (shot / "clean").rglob("*")) == ["a.png", MANIFEST]
 

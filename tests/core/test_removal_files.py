@@ -136,7 +136,7 @@ def test_the_flare_of_an_exr_has_the_windows_and_colours_of_its_plate(tmp_path: 
               "displayWindow": (np.array([0, 0], np.int32), np.array([53, 37], np.int32)), "pixelAspectRatio": 2.0}
     write_exr(tmp_path / "plate.exr", dict.fromkeys("RGB", light), half=False, header=header)
     clean_plates([tmp_path / "plate.exr"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
-               flare_folder=tmp_path / "flare")
+                 flare_folder=tmp_path / "flare")
     placings = []
     for folder in ("", "out", "flare"):
         with OpenEXR.File(str(tmp_path / folder / "plate.exr"), header_only=True) as file:
@@ -149,7 +149,7 @@ def test_the_flare_of_an_exr_has_the_windows_and_colours_of_its_plate(tmp_path: 
 def test_the_written_flare_is_the_difference_of_plate_and_clean_plate(tmp_path: Path, flare_everywhere: Path) -> None:
     write_codes(tmp_path / "plate.png", picture())
     clean_plates([tmp_path / "plate.png"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress(),
-               flare_folder=tmp_path / "flare")
+                 flare_folder=tmp_path / "flare")
     flare = read_exr(tmp_path / "flare" / "plate.exr")
     before, after = (read_picture(path).linear() for path in (tmp_path / "plate.png", tmp_path / "out" / "plate.png"))
     np.testing.assert_allclose(np.stack([flare[name] for name in "RGB"], -1), before - after, atol=1e-3)

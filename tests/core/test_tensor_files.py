@@ -15,7 +15,7 @@ MAPS = Path("/proc/self/maps")
 def test_written_tensors_are_read_back(tmp_path: Path) -> None:
     table = torch.arange(12.0).reshape(3, 4)
     tensor_files.write_tensors(tmp_path / "a.safetensors", {"table": table.T, "one": torch.ones(2, dtype=torch.half)},
-                       {"who": "me"})
+                               {"who": "me"})
     read, about = tensor_files.read_tensors(tmp_path / "a.safetensors")
     assert about == {"who": "me"}
     assert torch.equal(read["table"], table.T)

@@ -151,7 +151,7 @@ class DiffusionRemoval(nn.Module):
     def save(self, path: Path | str, metadata: Mapping[str, str] | None = None) -> None:
         """Write the trained tensors, for use with the same base model."""
         weights.write_weights(path, {name: value.contiguous() for name, value in self.trained_tensors().items()},
-                      {"kind": KIND, "rank": str(self.rank), **(metadata or {})})
+                              {"kind": KIND, "rank": str(self.rank), **(metadata or {})})
 
     def load(self, path: Path | str) -> dict[str, str]:
         """Read the file that `save` wrote, and return the text of its header. Raises RunError where it is another kind

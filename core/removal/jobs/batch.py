@@ -123,9 +123,9 @@ def _check_creatable(folder: Path) -> None:
 
 
 def clean_plates(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
-               flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
-               only: Container[Path] | None = None, independent: bool = False,
-               failed_inputs: Sequence[str] = ()) -> dict[str, Any]:
+                 flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
+                 only: Container[Path] | None = None, independent: bool = False,
+                 failed_inputs: Sequence[str] = ()) -> dict[str, Any]:
     """Clean every plate into `folder`; return the counts, and the confidence of each plate's flare, 0..1, by name. The
     events of `remove` have the same keys.
 

@@ -95,7 +95,7 @@ def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, c
                     angle = math.atan2(dy, dx) - rotation
                     angle -= sector * math.floor(angle / sector + 0.5)  # from the middle of the nearest blade
                     relative_radius = (roundness * centre_distance
-                                     + (1 - roundness) * centre_distance * math.cos(angle) / apothem)
+                                       + (1 - roundness) * centre_distance * math.cos(angle) / apothem)
                 second_x, second_y = (x - second_centre[channel, 0]) / second_radius[channel], \
                     (y - second_centre[channel, 1]) / second_radius[channel]
                 relative_radius = max(relative_radius, math.sqrt(second_x * second_x + second_y * second_y))

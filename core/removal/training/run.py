@@ -145,7 +145,7 @@ class TrainingSetup(NamedTuple):
             yield (all_batches[iteration] for iteration in range(trainer.iteration, trainer.recipe.iterations))
         else:
             with open_gpu_batches(trainer.recipe, trainer.iteration, self.backgrounds, self.lenses, self.user_flares,
-                             trainer.device, max(drawing_processes, 2)) as batches:
+                                  trainer.device, max(drawing_processes, 2)) as batches:
                 yield batches
 
 

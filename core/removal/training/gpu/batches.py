@@ -21,7 +21,8 @@ from .pools import Pools, frame_shapes, keep_pools_filled, pool_sizes
 
 @contextmanager
 def open_gpu_batches(recipe: Recipe, start_iteration: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
-                user_flares: UserFlares | None, device: torch.device, process_count: int) -> Iterator[Iterator[Batch]]:
+                     user_flares: UserFlares | None, device: torch.device,
+                     process_count: int) -> Iterator[Iterator[Batch]]:
     """Yield endless batches from `start_iteration` on; `process_count` processes draw the scenes and flares.
 
     Unlike those on a CPU they are no function of the recipe: what is in the pools depends on how fast it was drawn.

@@ -171,7 +171,7 @@ class Pools:
 
 @contextmanager
 def keep_pools_filled(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
-                 user_flares: UserFlares | None, process_count: int) -> Iterator[None]:
+                      user_flares: UserFlares | None, process_count: int) -> Iterator[None]:
     """Keep `process_count` processes drawing into the pools within this context: half draw scenes, half flares.
 
     The context is entered when the pools hold enough to begin with. Raises RunError where the processes draw nothing.

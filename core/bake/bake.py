@@ -141,12 +141,8 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
     """
     settings, progress, out = settings or BakeSettings(), progress or Progress(), Path(out)
     keyed, lights, elements = settings.keyed.with_always(settings.edits), source.lights, source.elements
-
-    def parse_edits(frame: NumberedFrame) -> LookEdits:
-        keyed_edits, frame_edits = keyed.edits_at(frame.number, lights, elements), renderer_for(frame).edit_texts
-        return LookEdits.parse([*frame_edits, *keyed_edits.texts()], lights, elements) if frame_edits else keyed_edits
-
-    edits = {frame.view: parse_edits(frame) for frame in frames}  # invalid edits raise before any file is deleted
+    # Invalid edits raise before any file is deleted.
+    edits = {frame.view: _parse_edits(frame.number, renderer_for(frame), keyed, lights, elements) for frame in frames}
     space = settings.colour_space()
     cache_key = _cache_key(source.fingerprint, settings, keyed)
     layer_by_light = layer_names(lights)
@@ -188,6 +184,13 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
                                     [_manifest_entry(out, frame, renderer_for(frame).extra_files)])
         progress.advance()
     return manifest
+
+
+def _parse_edits(number: int, renderer: FrameRenderer, keyed: KeyedEdits, lights: Sequence[str],
+                 elements: Mapping[str, Sequence[str]]) -> LookEdits:
+    """Return the edits of the frame `number`: its renderer's, combined with the keyed ones. Raises SettingsError."""
+    keyed_edits, frame_edits = keyed.edits_at(number, lights, elements), renderer.edit_texts
+    return LookEdits.parse([*frame_edits, *keyed_edits.texts()], lights, elements) if frame_edits else keyed_edits
 
 
 def _render_layers(renderer: CameraRenderer, camera: Camera, edits: LookEdits, lights: Sequence[str]) -> FrameLayers:

@@ -208,8 +208,8 @@ def sample_surface(vertices: ArrayLike, triangles: ArrayLike, count: int = SAMPL
     Raises ValueError for a surface without area.
     """
     positions, indices = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64).reshape(-1, 3)
-    rest = positions if reference is None else np.asarray(reference, np.float64)  # the vertices at rest
-    a, b, c = (rest[indices[:, corner]] for corner in range(3))
+    rest_positions = positions if reference is None else np.asarray(reference, np.float64)  # the vertices at rest
+    a, b, c = (rest_positions[indices[:, corner]] for corner in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     if not len(indices) or not 0 < areas.sum() < math.inf:
         raise ValueError("the surface of the light has no area")
@@ -222,7 +222,7 @@ def sample_surface(vertices: ArrayLike, triangles: ArrayLike, count: int = SAMPL
     u, v = _radical_inverse(sample_numbers + 1, 2), _radical_inverse(sample_numbers + 1, 3)
     sqrt_u = np.sqrt(u)  # uniform over a triangle (Osada et al. 2002)
     barycentric = np.stack([1 - sqrt_u, sqrt_u * (1 - v), sqrt_u * v], -1)[:, :, None]
-    at_rest = (barycentric * rest[indices[chosen]]).sum(1)
+    at_rest = (barycentric * rest_positions[indices[chosen]]).sum(1)
     return np.asarray((barycentric * positions[indices[chosen]]).sum(1)[_morton_order(at_rest)], np.float64)
 
 

@@ -62,7 +62,8 @@ def draw_with_transmittance(flares: Iterable[PlaneGaussians], intrinsics: ArrayL
             continue
         ring = None if gaussians.rings is None else gaussians.rings[index]
         profile = profile_in_box(box, centres[index], covariances[index], ring, arcs[index])
-        rows, columns = slice(box[1], box[3]), slice(box[0], box[2])
+        left, top, right, bottom = box
+        rows, columns = slice(top, bottom), slice(left, right)
         if blend == "add":
             profile = np.where(profile >= PROFILE_MIN, profile, 0) * gaussians.opacities[index]
         else:

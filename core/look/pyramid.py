@@ -78,12 +78,13 @@ def _add_gaussian(grid: Floats, centre: Floats, covariance: Floats, radius: floa
 
     radius: see `drawing.extent`. arc: see `arcs_to_pixels`. light: RGB at the peak."""
     box = bounding_box(centre, covariance, radius, grid.shape[1], grid.shape[0])
-    for part in () if box is None else _bands(box, centre, covariance, radius):
-        profile = profile_in_box(part, centre, covariance, ring, arc)
+    for band in () if box is None else _bands(box, centre, covariance, radius):
+        left, top, right, bottom = band
+        profile = profile_in_box(band, centre, covariance, ring, arc)
         profile[profile < PROFILE_MIN] = 0
-        target = grid[part[1]:part[3], part[0]:part[2]]
+        pixels = grid[top:bottom, left:right]
         for channel in range(3):
-            target[..., channel] += profile * light[channel]
+            pixels[..., channel] += profile * light[channel]
 
 
 def _bands(box: Box, centre: Floats, covariance: Floats, radius: float) -> Iterator[Box]:

@@ -63,6 +63,7 @@ class SolveSettings:
     ocio: str | None = None
 
     def __post_init__(self) -> None:
+        """Raise SettingsError for an invalid setting."""
         if self.lens not in MODELS or self.lens == "EQUIRECTANGULAR":
             raise SettingsError(f"{self.lens!r} is not a camera model to solve with; take one of "
                                f"{', '.join(name for name in MODELS if name != 'EQUIRECTANGULAR')}.")

@@ -57,14 +57,14 @@ def draw_model(solved: Solved, path: Path) -> None:
     # The pictures hold all cameras and most points, with a margin of a tenth.
     low, high = np.percentile(xyz, (2, 98), axis=0)
     low, high = np.minimum(low, positions.min(axis=0)), np.maximum(high, positions.max(axis=0))
-    centre, reach = (low + high) / 2, 0.55 * float((high - low).max())
+    centre, half_extent = (low + high) / 2, 0.55 * float((high - low).max())
     sheet = np.full((PANEL, 2 * PANEL + 8, 3), PAPER, np.float32)
     for left, axes, title in ((0, (0, 1), "from above"), (PANEL + 8, (0, 2), "from the front")):
         panel = np.full((PANEL, PANEL, 3), PAPER, np.float32)
 
         def to_pixels(points: Floats, axes: tuple[int, int] = axes) -> Any:
             """Return the pixels (n, 2) of points (n, 3) on the panel."""
-            flat = (points[:, axes] - centre[list(axes)]) / reach * (1, -1)
+            flat = (points[:, axes] - centre[list(axes)]) / half_extent * (1, -1)
             return (0.5 * PANEL * (1 + flat)).round().astype(int)
 
         pixels = to_pixels(xyz)
@@ -74,7 +74,7 @@ def draw_model(solved: Solved, path: Path) -> None:
         camera_pixels = to_pixels(positions)
         if len(camera_pixels) > 1:
             cv2.polylines(panel, [camera_pixels.reshape(-1, 1, 2)], False, PATH, 1, cv2.LINE_AA)
-        for pixel, tip in zip(camera_pixels, to_pixels(positions + 0.06 * reach * ahead), strict=True):
+        for pixel, tip in zip(camera_pixels, to_pixels(positions + 0.06 * half_extent * ahead), strict=True):
             cv2.line(panel, tuple(map(int, pixel)), tuple(map(int, tip)), INK, 1, cv2.LINE_AA)
             cv2.circle(panel, tuple(map(int, pixel)), 3, INK, -1, cv2.LINE_AA)
         cv2.putText(panel, title, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.6, INK, 1, cv2.LINE_AA)

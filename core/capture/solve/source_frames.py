@@ -289,9 +289,10 @@ def _ghost_lines(clipped: NDArray[np.uint8], thickness: int) -> NDArray[np.bool_
     centre = np.array([width, height]) / 2
     spots = []
     for label in range(1, number):
-        _, _, wide, high, area = map(int, boxes[label])
+        _, _, box_width, box_height, area = map(int, boxes[label])
         # A disc fills 0.79 of its box; a spot with spikes less, a window frame or a text far less.
-        if 9 <= area <= 0.01 * width * height and area >= 0.4 * wide * high and max(wide, high) <= 3 * min(wide, high):
+        is_compact = area >= 0.4 * box_width * box_height and max(box_width, box_height) <= 3 * min(box_width, box_height)
+        if 9 <= area <= 0.01 * width * height and is_compact:
             spots.append((area, label))
     for _, label in sorted(spots, reverse=True)[:MAX_GHOST_LINES]:
         direction = centre - centres[label]

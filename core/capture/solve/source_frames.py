@@ -291,8 +291,9 @@ def _ghost_lines(clipped: NDArray[np.uint8], thickness: int) -> NDArray[np.bool_
     for label in range(1, number):
         _, _, box_width, box_height, area = map(int, boxes[label])
         # A disc fills 0.79 of its box; a spot with spikes less, a window frame or a text far less.
-        is_compact = area >= 0.4 * box_width * box_height and max(box_width, box_height) <= 3 * min(box_width, box_height)
-        if 9 <= area <= 0.01 * width * height and is_compact:
+        is_filled = area >= 0.4 * box_width * box_height
+        is_round = max(box_width, box_height) <= 3 * min(box_width, box_height)
+        if 9 <= area <= 0.01 * width * height and is_filled and is_round:
             spots.append((area, label))
     for _, label in sorted(spots, reverse=True)[:MAX_GHOST_LINES]:
         direction = centre - centres[label]

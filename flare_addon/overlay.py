@@ -30,6 +30,7 @@ from . import baking, cameras, highlight, looks
 from .compositor.flare_node import find_node
 from .overlay_shaders import gaussian_shader, sum_shader
 from .properties import redraw_viewports
+from .views import camera_of
 
 LEVELS = (1, 2, 4, 8, 16)
 MIN_TEXELS = 4.0  # standard deviation of the narrow side of a Gaussian, in the level that it is drawn in
@@ -347,7 +348,7 @@ def _draw_with(draw: Callable[[Any, Any, Any], None]) -> None:
     if scene is None or context.region_data is None or context.region_data.view_perspective != "CAMERA":
         return
     state = scene.fit_flare
-    camera = space.camera if space.use_local_camera and space.camera else scene.camera
+    camera = camera_of(space, scene)
     is_shown = (state.show and state.flare and space.overlay.show_overlays and baking.preparation() is None
                 and not is_composited(space, scene))
     if not is_shown or camera is None or camera.type != "CAMERA":
@@ -373,7 +374,7 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
     import gpu
 
     depsgraph = context.view_layer.depsgraph
-    window = _window_of(context, scene, camera)
+    window = drawn_part(context, scene, camera)
     if window is None:
         return
     region = context.region.width, context.region.height
@@ -402,7 +403,7 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
     gpu.state.viewport_set(*viewport)
 
 
-def _window_of(context: Any, scene: Any, camera: Any) -> DrawnRegion | None:
+def drawn_part(context: Any, scene: Any, camera: Any) -> DrawnRegion | None:
     """Return the part of the camera's frame that the region of a context shows; None where it shows nothing."""
     evaluated = camera.evaluated_get(context.view_layer.depsgraph)
     core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
@@ -415,7 +416,7 @@ def draw_outline(context: Any, scene: Any, camera: Any) -> None:
     import gpu
     from gpu_extras.batch import batch_for_shader
 
-    window, chosen = _window_of(context, scene, camera), highlight.current_highlight(scene)
+    window, chosen = drawn_part(context, scene, camera), highlight.current_highlight(scene)
     if window is None or chosen is None:
         return
     edits = highlight.isolate(chosen, looks.edits_of(scene.fit_flare))

@@ -355,6 +355,7 @@ def _draw_flare(layout: Any, scene: Any, item: Any, look: Look) -> None:
     row = box.row()
     row.alignment = "LEFT"
     row.prop(item, "show_elements", icon="TRIA_DOWN" if item.show_elements else "TRIA_RIGHT", emboss=False)
+    row.operator("fit_flare.pick_element", text="Pick", icon="EYEDROPPER")
     if item.show_elements:
         box.template_list("FITFLARE_UL_elements", "", item, "elements", item, "element", rows=4)
         if 0 <= item.element < len(item.elements):

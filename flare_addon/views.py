@@ -26,3 +26,8 @@ def largest_view(context: Any) -> tuple[Any, Any, Any] | None:
         return None
     area = max(areas, key=lambda area: area.width * area.height)
     return area, next(region for region in area.regions if region.type == "WINDOW"), area.spaces.active
+
+
+def camera_of(space: Any, scene: Any) -> Any:
+    """Return the camera that a 3D view looks through: its own where it has one, else the scene's; None without."""
+    return space.camera if space.use_local_camera and space.camera else scene.camera

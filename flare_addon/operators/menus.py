@@ -52,7 +52,8 @@ class FITFLARE_MT_object(bpy.types.Menu):
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
         for name, icon in (("add_library_flare", "LIGHT_SUN"), ("open_flare", "FILE_FOLDER"),
-                           ("add_flare", "ADD"), ("choose_flare", "RESTRICT_SELECT_OFF")):
+                           ("add_flare", "ADD"), ("choose_flare", "RESTRICT_SELECT_OFF"),
+                           ("pick_element", "EYEDROPPER")):
             layout.operator(f"fit_flare.{name}", icon=icon)
         layout.separator()
         for name, icon in (("import_capture", "IMPORT"), ("find_lights", "VIEWZOOM"),

@@ -135,6 +135,20 @@ def test_a_touched_row_shows_its_element_in_the_view(facts: Any) -> None:
     assert facts["outlined"] == [True, True]
 
 
+def test_a_click_chooses_the_brightest_element(facts: Any) -> None:
+    """Block of flares.py: "an element is picked"."""
+    assert len(facts["picked"]) > 1 and all(facts["picked"])
+    assert facts["picked in the dark"] == [False, True]
+
+
+def test_elements_are_picked_in_a_camera_view_alone_until_escape(facts: Any) -> None:
+    """Block of flares.py: "an element is picked"."""
+    assert facts["view at a place"] == [True, False, False, False], "not on a sidebar, nor in another view"
+    assert "Picking needs Blender's window" in facts["picking without a window"]
+    assert facts["picking ends"] == [["PASS_THROUGH"], ["RUNNING_MODAL"], ["RUNNING_MODAL"], ["CANCELLED"]]
+    assert facts["picking leaves"] == ["window.cursor_modal_restore", "workspace.status_text_set"]
+
+
 def test_a_viewport_render_is_saved_as_the_view_transform_shows_it(facts: Any) -> None:
     """What is drawn into it needs a window: tests/window/agreement.py compares it with a render.
 

@@ -267,6 +267,62 @@ parts = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scen
                               highlight.isolate(chosen, edits))[names[1]]
 left, top, right, bottom = highlight.outline_box(parts, parts.means, parts.covariances)
 facts["outlined"] = [left < float(parts.means[:, 0].mean()) < right, top < float(parts.means[:, 1].mean()) < bottom]
+# ---- an element is picked -------------------------------------------------------------------------------
+picking, core_look = part("flare_addon.operators.pick_element"), part("core.look")
+state.lights[1].elements[0].mute = False
+state.lights[0].mute = False
+width, height = 192, 108
+intrinsics = np.array([[160.0, 0, 96], [0, 160.0, 54], [0, 0, 1]])
+depsgraph = bpy.context.evaluated_depsgraph_get()
+pictures = {}
+for item in state.lights:
+    for entry in item.elements:
+        element = highlight.Highlight(scene.name, item.name, entry.name, 0.0)
+        by_itself = highlight.isolate(element, looks.edits_of(state))
+        flares = looks.evaluate_flares(scene, depsgraph, scene.camera, by_itself)
+        pictures[item.name, entry.name] = core_look.draw(flares.values(), intrinsics, width, height).sum(-1)
+picked = []
+for name, picture in pictures.items():
+    others = np.max([other for key, other in pictures.items() if key != name], axis=0)
+    y, x = np.unravel_index(np.argmax(picture - others), picture.shape)
+    if (picture - others)[y, x] > 0.1 * picture[y, x]:
+        state.lights[0].show_elements = state.lights[1].show_elements = False
+        is_picked = picking.choose_element(scene, depsgraph, scene.camera, intrinsics, (x + 0.5, y + 0.5))
+        item = state.lights[state.light]
+        shown = highlight.current_highlight(scene)
+        picked.append(is_picked and item.show_elements
+                      and (item.name, item.elements[item.element].name) == name == (shown.flare, shown.element))
+facts["picked"] = picked
+before = state.light, state.lights[state.light].element
+facts["picked in the dark"] = [picking.choose_element(scene, depsgraph, scene.camera, intrinsics, (1e7, 0)),
+                               before == (state.light, state.lights[state.light].element)]
+
+
+def place_on_screen(kind, x, y, width, height):
+    return SimpleNamespace(type=kind, x=x, y=y, width=width, height=height)
+
+
+def view(perspective, *regions):
+    return SimpleNamespace(type="VIEW_3D", regions=regions, spaces=SimpleNamespace(
+        active=SimpleNamespace(region_3d=SimpleNamespace(view_perspective=perspective))))
+
+
+main = place_on_screen("WINDOW", 0, 0, 800, 600)
+screen = SimpleNamespace(areas=[SimpleNamespace(type="OUTLINER"),
+                                view("PERSP", place_on_screen("WINDOW", 800, 0, 90, 90)),
+                                view("CAMERA", main, place_on_screen("UI", 600, 0, 200, 600))])
+facts["view at a place"] = [found is not None and found[1] is main for found in (
+    picking.view_at(screen, 100, 100), picking.view_at(screen, 700, 100), picking.view_at(screen, 850, 50),
+    picking.view_at(screen, 100, 601))]
+facts["picking without a window"] = refusal(lambda: ops.pick_element("INVOKE_DEFAULT"))
+window_calls = MagicMock()
+event = SimpleNamespace(type="ESC", value="PRESS", mouse_x=0, mouse_y=0)
+operator = picking.FITFLARE_OT_pick_element
+waiting = SimpleNamespace(cancel=lambda context: operator.cancel(None, context), report=MagicMock())
+facts["picking ends"] = [sorted(operator.modal(waiting, window_calls, SimpleNamespace(**{**vars(event), **change})))
+                         for change in ({"type": "MIDDLEMOUSE"}, {"type": "A"}, {"type": "LEFTMOUSE"}, {})]
+facts["picking leaves"] = [call[0] for call in window_calls.mock_calls if "cursor" in call[0] or "status" in call[0]]
+
 # ---- panels of other editors ------------------------------------------------------------------------
 editors = part("flare_addon.editor_panels")
 scene = shot(["lamp"])

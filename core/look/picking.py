@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Finds the element of a flare that is brightest at a point of the picture; the add-on picks elements by a click."""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..choices import Blend
+from ..colour.srgb import LUMINANCE
+from ..conventions.pixel_grid import PixelGrid
+from ..conventions.splatting import ALPHA_MIN, PROFILE_MIN
+from .drawing import OPACITY_MAX
+from .edits import LookEdits
+from .look import LightLook, Look
+from .placed_light import PlacedLight
+from .plane import Floats, PlaneGaussians, arc_log_peak, arc_strengths, arcs_to_pixels, concatenate, to_pixels
+
+MIN_LIGHT = 3e-4
+"""Luminance of an element at a point below which nothing is picked there: 1 code of 8 bits."""
+
+
+def light_at(gaussians: PlaneGaussians, intrinsics: ArrayLike, point: ArrayLike, blend: Blend,
+             pixel_grid: PixelGrid | None = None) -> Floats:
+    """Return the luminance (n,) that each Gaussian adds at a point (2,) of the picture, px, pixel centres at + 0.5.
+
+    With the blend "over", that is what the Gaussians in front of it leave. intrinsics, pixel_grid: see `drawing.draw`.
+    """
+    centres, covariances = to_pixels(gaussians, intrinsics, pixel_grid)
+    profiles = _profiles(gaussians, np.asarray(point, np.float64) - centres, covariances,
+                         arcs_to_pixels(gaussians, intrinsics))
+    luminance = np.maximum(gaussians.colours, 0) @ LUMINANCE.astype(np.float32)
+    if blend == "add":
+        weights = np.where(profiles >= PROFILE_MIN, profiles, 0) * gaussians.opacities
+    else:
+        alphas = profiles * np.minimum(gaussians.opacities, OPACITY_MAX)
+        alphas = np.where(alphas >= ALPHA_MIN, alphas, 0)
+        weights = alphas * np.concatenate([[1.0], np.cumprod(1 - alphas)[:-1]])  # the first lies in front
+    return np.asarray(weights * luminance, np.float32)
+
+
+def _profiles(gaussians: PlaneGaussians, offsets: NDArray[np.float64], covariances: Floats, pixel_arcs: Floats
+              ) -> NDArray[np.float64]:
+    """Return the profiles (n,) at offsets (n, 2) px from the centres, 1 at a peak, as `drawing.profile_in_box`.
+
+    0 for degenerate Gaussians. covariances (n, 3), px². pixel_arcs (n, 2): see `arcs_to_pixels`."""
+    xx, xy, yy = covariances.T.astype(np.float64)
+    dx, dy = offsets.T
+    with np.errstate(all="ignore"):
+        determinant = xx * yy - xy * xy
+        q = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant
+        if gaussians.rings is None:
+            exponents = q / 2
+        else:
+            r0, w = gaussians.rings.T.astype(np.float64)
+            x, y = pixel_arcs.T.astype(np.float64)
+            slopes = ((yy * x - xy * y) * dx + (xx * y - xy * x) * dy) / determinant
+            log_peaks = arc_log_peak(arc_strengths(pixel_arcs, covariances), gaussians.rings)
+            exponents = (np.sqrt(np.maximum(q, 1e-12)) - r0) ** 2 / (2 * w * w) - (slopes - log_peaks)
+        profiles = np.exp(-exponents)
+        return np.where((determinant > 0) & np.isfinite(profiles), profiles, 0)
+
+
+def brightest_element(look: Look, lights: Sequence[PlacedLight], flares: Mapping[str, PlaneGaussians],
+                      edits: LookEdits, intrinsics: ArrayLike, point: ArrayLike) -> tuple[str, str] | None:
+    """Return the names of the placed light and of its element that has most light at a point (2,), px; None where no
+    element has MIN_LIGHT.
+
+    flares: of the placed lights with these edits, as `Look.evaluate_lights` returns them.
+    """
+    whole = concatenate(list(flares.values()))
+    if whole is None:
+        return None
+    sources = {light.name: light for light in look.lights}
+    source_of = {light.name: sources[light.source] for light in lights if light.source in sources}
+    luminance = light_at(whole, intrinsics, point, look.blend, look.pixel_grid)
+    brightest, most, start = None, MIN_LIGHT, 0
+    for name, gaussians in flares.items():
+        own = luminance[start:start + len(gaussians)]
+        start += len(gaussians)
+        source = source_of[name]
+        indices = _element_indices(source, name, edits, len(gaussians))
+        sums = np.bincount(indices[indices >= 0], own[indices >= 0], len(source.elements))
+        if len(sums) and sums.max() >= most:
+            brightest, most = (name, source.elements[int(sums.argmax())].name), float(sums.max())
+    return brightest
+
+
+def _element_indices(source: LightLook, name: str, edits: LookEdits, count: int) -> NDArray[np.int64]:
+    """Return the index of the element of each of `count` evaluated Gaussians of a placed light; -1 for none.
+
+    Gaussians of hidden elements are not evaluated. A light with an extent has the Gaussians of its cells, one cell
+    after the other."""
+    hidden = edits.hidden_elements(name, source.elements)
+    indices = np.full(source.count, -1, np.int64)
+    is_evaluated = np.ones(source.count, bool)
+    for index, element in enumerate(source.elements):
+        indices[element.members] = index
+        is_evaluated[element.members] = element.name not in hidden
+    indices = indices[is_evaluated]
+    return np.tile(indices, count // len(indices)) if len(indices) else indices

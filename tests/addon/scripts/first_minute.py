@@ -126,7 +126,7 @@ browser = part("flare_addon.asset_browser")
 facts["reports drops"] = hasattr(bpy.app.handlers, "blend_import_post")
 if facts["reports drops"]:
     before = len(bpy.data.objects)
-    facts["not listed by itself"] = browser.listed() is None
+    facts["not listed by itself"] = browser.library_entry() is None
     ops.list_assets()
     ops.list_assets()
     entries = bpy.context.preferences.filepaths.asset_libraries
@@ -143,7 +143,7 @@ if facts["reports drops"]:
     dropped = scene.objects["Torch"]
     facts["dropped"] = [Path(scene.fit_flare.flare).stem, rows(scene), dropped.asset_data is None]
     ops.unlist_assets()
-    facts["taken out"] = browser.listed() is None
+    facts["taken out"] = browser.library_entry() is None
 
 # ---- bake without an engine -----------------------------------------------------------------------------
 def rendered(scene):

@@ -164,7 +164,7 @@ class Lens:
             zoom = high
         return fx * zoom, fy * zoom, cx, cy
 
-    def maps(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def undistortion_maps(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the maps for `cv2.remap`: the pixel of the distorted frame for each pixel of `camera`'s view.
 
         `camera` may be of another size than the lens; the distorted frame is then of that size too.
@@ -206,7 +206,7 @@ class Lens:
 
 
 def undistort_picture(picture: Picture, maps: tuple[NDArray[np.float32], NDArray[np.float32]]) -> Picture:
-    """Remap a distorted picture by `Lens.maps`."""
+    """Remap a distorted picture by `Lens.undistortion_maps`."""
     import cv2
 
     # Cubic is sharper, but rings where linear light steps from 1 to 100.

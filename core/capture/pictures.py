@@ -94,7 +94,7 @@ class PictureCache:
         with self._lock:
             maps = self._maps.get(key)
         if maps is None:
-            maps = view.lens.maps(camera)
+            maps = view.lens.undistortion_maps(camera)
             with self._lock:
                 self._maps[key] = maps
                 while len(self._maps) > MAX_CACHED_MAPS:

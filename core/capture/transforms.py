@@ -142,12 +142,12 @@ def _read_split_lists(path: Path, meta: dict[str, Any], result: Transforms) -> N
             raise CaptureError(f"{path}: {key} should be a list of names of frames; correct it or export the file "
                                "again.")
         lists[key] = {_with_suffix(path.parent, name) for name in names}
-    known = {canonical_name(frame.name): frame.name for frame in result.frames}
+    name_by_canonical = {canonical_name(frame.name): frame.name for frame in result.frames}
     for key, names in lists.items():
-        if unknown := sorted(name for name in names if canonical_name(name) not in known):
+        if unknown := sorted(name for name in names if canonical_name(name) not in name_by_canonical):
             raise CaptureError(f"{path}: {key} names {unknown[0]}, which is not a frame of the file; correct it or "
                                "export the file again.")
-    frames_by_list = {key: {known[canonical_name(name)] for name in names} for key, names in lists.items()}
+    frames_by_list = {key: {name_by_canonical[canonical_name(name)] for name in names} for key, names in lists.items()}
     result.training = frames_by_list.get("train_filenames")
     if "val_filenames" in frames_by_list or "test_filenames" in frames_by_list:
         result.held_out = frames_by_list.get("val_filenames", set()) | frames_by_list.get("test_filenames", set())

@@ -124,8 +124,10 @@ def _colour(values: Any) -> tuple[float, float, float]:
 def _classify(gaussians: PlaneGaussians) -> NDArray[np.str_]:
     """Return "ring", "streak" or "compact" for each Gaussian (n,)."""
     xx, xy, yy = gaussians.covariances.T
-    mean_variance, deviation = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-    is_long = np.sqrt((mean_variance + deviation) / np.maximum(mean_variance - deviation, 1e-12)) >= MIN_STREAK_RATIO
+    # The variances along the axes are the mean plus and minus half their difference.
+    mean_variance, half_difference = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    axis_ratios = np.sqrt((mean_variance + half_difference) / np.maximum(mean_variance - half_difference, 1e-12))
+    is_long = axis_ratios >= MIN_STREAK_RATIO
     kinds = np.where(is_long, "streak", "compact")
     if gaussians.rings is not None:
         kinds = np.where(gaussians.rings[:, 0] >= MIN_RING_RADIUS, "ring", kinds)

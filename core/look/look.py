@@ -276,7 +276,7 @@ def read_description(path: Path | str) -> dict[str, Any]:
 
     Raises FlareFileError for a file that is missing, damaged, of a newer version, or not a flare.
     """
-    return _parse_unchecked(Path(path), container.read_tensors(path)[1])
+    return _parse_description_unchecked(Path(path), container.read_tensors(path)[1])
 
 
 def store_elements(path: Path | str) -> None:
@@ -284,7 +284,7 @@ def store_elements(path: Path | str) -> None:
     look = read_look(path)
     _, metadata = container.read_tensors(path)
     entries = [element.to_json(light.name) for light in look.lights for element in light.elements]
-    description = {**_parse_unchecked(Path(path), metadata), "elements": entries}
+    description = {**_parse_description_unchecked(Path(path), metadata), "elements": entries}
     container.rewrite_metadata(path, path, {**metadata, METADATA_KEY: json.dumps(description)})
 
 
@@ -294,13 +294,13 @@ def write_annotated(source: Path | str, target: Path | str, *, notes: str, licen
 
     Raises FlareFileError if `source` is not a flare."""
     _, metadata = container.read_tensors(source)
-    description = {**_parse_unchecked(Path(source), metadata), "notes": notes, "licence": licence}
+    description = {**_parse_description_unchecked(Path(source), metadata), "notes": notes, "licence": licence}
     if edits is not None:
         description["edits"] = edits.texts()
     container.rewrite_metadata(source, target, {**metadata, METADATA_KEY: json.dumps(description)})
 
 
-def _parse_unchecked(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+def _parse_description_unchecked(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     """Parse the description in a .flare's metadata; check its version alone. Raises FlareFileError."""
     if METADATA_KEY not in metadata:
         raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.")
@@ -318,7 +318,7 @@ def parse_description(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]
     """Parse and validate the description in a .flare's metadata, for all readers, so that they accept the same files.
 
     Raises FlareFileError if it is missing, of a newer version, or invalid. Does not compare it with the tensors."""
-    description = _parse_unchecked(path, metadata)
+    description = _parse_description_unchecked(path, metadata)
     try:
         names = [_check_light(path, entry, description.get("elements", [])) for entry in description["lights"]]
         if len(set(names)) < len(names):

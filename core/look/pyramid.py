@@ -42,8 +42,9 @@ def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, 
     It is the coarsest grid on which the Gaussian's narrow side deviates by `min_texels` or more, else the finest.
     """
     xx, xy, yy = covariances.T
-    mean_variance, deviation = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-    narrow = np.sqrt(np.maximum(mean_variance - deviation, 0))
+    # The variances along the axes are the mean plus and minus half their difference.
+    mean_variance, half_difference = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    narrow = np.sqrt(np.maximum(mean_variance - half_difference, 0))
     if rings is not None:  # the line of a ring is w times as wide as its ellipse
         narrow = narrow * np.minimum(rings[:, 1], 1)
     return np.clip(np.searchsorted(np.array(levels), narrow / min_texels, side="right") - 1, 0, len(levels) - 1)

@@ -14,7 +14,7 @@ NAME = "highlights"
 """Name of the light that stands for all highlights."""
 
 
-def at_highlights(light: PlacedLight, highlights: Highlights, camera: Camera) -> PlacedLight:
+def move_to_highlights(light: PlacedLight, highlights: Highlights, camera: Camera) -> PlacedLight:
     """Return the light with a flare at each highlight, at the light's own distance from the camera.
 
     highlights: at least one, in pixels of `camera`.

@@ -126,14 +126,14 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
     Raises SettingsError if no picture has a light, and for two pictures of one name.
     """
     paths = list(dict.fromkeys(paths))
-    by_name = {path.name: path for path in paths}
-    if len(by_name) < len(paths):
-        duplicate = next(path for path in paths if by_name[path.name] != path)
-        raise SettingsError(f"{duplicate} and {by_name[duplicate.name]} have one name; put the flare on them one after "
-                            "the other, each with an --out of its own.")
+    path_by_name = {path.name: path for path in paths}
+    if len(path_by_name) < len(paths):
+        duplicate = next(path for path in paths if path_by_name[path.name] != path)
+        raise SettingsError(f"{duplicate} and {path_by_name[duplicate.name]} have one name; put the flare on them one "
+                            "after the other, each with an --out of its own.")
     frames, unlit = [], []
-    for frame in number_views(by_name):
-        path = by_name[frame.view]
+    for frame in number_views(path_by_name):
+        path = path_by_name[frame.view]
         orientation = read_exif(path)[0]
         window = plate_window(path, orientation)
         camera = _picture_camera(look, window, focal, centre)
@@ -232,13 +232,14 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
                                    light.extent) for light, state in zip(target_lights, states, strict=True))
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)
         frames.append(TargetFrame(frame, shot, path, undistorted, window, space=capture.plate_space))
-    return Target(_share_windows(frames), _scene_in_view(scene, frames) if scene else None, scene_is_background)
+    return Target(_share_windows(frames), _read_scene_in_view(scene, frames) if scene else None, scene_is_background)
 
 
-def _scene_in_view(path: Path, frames: Sequence[TargetFrame]) -> SceneGaussians:
+def _read_scene_in_view(path: Path, frames: Sequence[TargetFrame]) -> SceneGaussians:
     """Read a 3DGS PLY. Raises CaptureError where fewer than half of the cameras have any of its Gaussians in view."""
     scene = read_ply(path)
     means, seeing = scene.means.detach().numpy(), 0
+    # A sample first, then all Gaussians.
     for points in (means[::max(len(means) // _SAMPLED_POINTS, 1)], means):
         seeing = sum(bool(frame.shot.camera.contains(*frame.shot.camera.project(points)).any()) for frame in frames)
         if seeing >= _MIN_SHARE_OF_SEEING_VIEWS * len(frames):

@@ -40,7 +40,7 @@ from ..system.files import check_no_overwrite
 from ..system.progress import Progress
 from ..system.reading import read_bytes
 from . import query as queries
-from .highlights import at_highlights
+from .highlights import move_to_highlights
 from .plates import AUTO, ColouredPlate, alpha_with_light
 from .target import Target, TargetFrame, plate_window, undistorted_background
 from .visibility import smooth_visibility
@@ -133,7 +133,7 @@ class Transfer:
         lights: Sequence[PlacedLight] = self.target.frames[index].shot.lights
         if self.settings.highlights is not None and scene is not None:
             highlights = find_highlights(scene, self.settings.highlights, self.settings.highlight_gain)
-            lights = [at_highlights(light, highlights, camera) for light in lights] if len(highlights) else []
+            lights = [move_to_highlights(light, highlights, camera) for light in lights] if len(highlights) else []
         splats: dict[str, Splats] = {}
         for light, source in self.look.visible_lights(lights, edits):
             def evaluate(view: ViewOfLight, visibility: float, light: PlacedLight = light, source: LightLook = source
@@ -320,7 +320,9 @@ class _FrameRenderer:
                                   for name in self._transfer.lights}, depth)
 
     def _background(self, camera: Camera) -> tuple[Pixels, Pixels]:
-        """Return scene light (h, w, 3) and depth (h, w) behind the flare: the plate, the rendered scene, or black."""
+        """Return scene light (h, w, 3) and depth (h, w) behind the flare: the plate, the rendered scene, or black.
+
+        Keeps a plate of the layers' size for `finish`."""
         target, frame = self._transfer.target, self._frame
         no_depth = np.zeros((camera.height, camera.width), np.float32)
         if frame.plate is not None:
@@ -330,7 +332,7 @@ class _FrameRenderer:
             plate = self._transfer.plate(frame)
             stored_window = plate_window(frame.plate, frame.orientation)
             if frame.window is not None and frame.window.size == camera.size:
-                self._plate = plate  # for `finish`
+                self._plate = plate
                 return move_to_window(plate.linear, stored_window, frame.window), no_depth
             picture = Picture(crop_to_display_window(plate.linear, stored_window), "linear")
             return np.asarray(picture.resized(*camera.size).pixels, np.float32), no_depth

@@ -52,7 +52,7 @@ def draw_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     if args.run.suffix.lower() != ".json":
         raise SettingsError("--without-engine is for a shot; leave it out.")
-    return _bake_frames(args, progress, "draw", LookRenderer)
+    return _bake_shot(args, progress, "draw", LookRenderer)
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -121,11 +121,11 @@ def run_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Bake a shot, whose file holds its edits, in the engine."""
     from ...core.bake.shot import ShotRenderer
 
-    return _bake_frames(args, progress, "bake", ShotRenderer)
+    return _bake_shot(args, progress, "bake", ShotRenderer)
 
 
-def _bake_frames(args: argparse.Namespace, progress: Progress, step: str,
-                 renderer: Callable[[Shot], ShotSource]) -> dict[str, Any]:
+def _bake_shot(args: argparse.Namespace, progress: Progress, step: str,
+               make_renderer: Callable[[Shot], ShotSource]) -> dict[str, Any]:
     """Bake the selected frames of a shot with this renderer; step: the name of the command's step, for --jobs."""
     from ...core.bake.shot_frames import bake_shot_frames
     from ...core.conventions.frame_numbers import NumberedFrame
@@ -145,7 +145,7 @@ def _bake_frames(args: argparse.Namespace, progress: Progress, step: str,
     if args.jobs != 1:
         jobs.run_jobs(args, step, [frame.number for frame in selected], progress)
     # After jobs, this keeps their finished frames and returns the record of all.
-    record = bake_shot_frames(renderer(shot), args.out, half=not args.float, overwrite=args.overwrite,
+    record = bake_shot_frames(make_renderer(shot), args.out, half=not args.float, overwrite=args.overwrite,
                               progress=progress, frame_numbers={frame.number for frame in selected}, space=args.space,
                               config=args.ocio)
     return layers.report_layers(selected, args.out, len(record["frames"]), progress)

@@ -86,7 +86,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         reject_unused_options(args, {"entry": None, "jobs": 1}, "--list")
     check_at_least_one("--jobs", args.jobs)
     if args.list_file is not None and args.entry is None:
-        count = len(read_list(args.list_file))
+        count = len(read_capture_list(args.list_file))
         part_options = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]
         jobs.run_parts(args, "fit", part_options, args.jobs, count, progress, continue_on_failure=True)
         progress.say(f"{count} runs are in {args.out}.")
@@ -132,7 +132,8 @@ def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress)
 
 
 def scene_kind(scene: Path | None, capture: Capture, progress: Progress) -> str:
-    """Return the kind of scene of a fit, "gaussians" or "plates", by the option or by the capture.
+    """Return the kind of scene of a fit, "gaussians" or "plates", by the option or by the capture; report plates that
+    the capture requires.
 
     Raises CaptureError for Gaussians without a camera solve.
     """
@@ -157,7 +158,8 @@ def with_supervision(capture: Capture, settings: FitSettings, progress: Progress
 def default_mode(capture: Capture, frozen: bool, progress: Progress) -> Mode:
     """Return the mode of a fit without --mode.
 
-    It is "default" with exact clean frames or a frozen scene, else "estimated".
+    It is "default" with exact clean frames or a frozen scene, else "estimated", which is reported for a capture with
+    cameras.
     """
     from ...core.removal.jobs.provenance import has_exact_clean_frames
 
@@ -178,7 +180,7 @@ def resolve_folders(args: argparse.Namespace) -> tuple[Path, Path]:
         if args.capture is None:
             raise SettingsError("fit needs a capture: name its folder, or a list of them with --list and --entry.")
         return args.capture, args.out
-    folders = read_list(args.list_file)
+    folders = read_capture_list(args.list_file)
     if not 1 <= args.entry <= len(folders):
         raise SettingsError(f"{args.list_file} lists {len(folders)} captures; --entry {args.entry} is none of them.")
     names = [folder.resolve().name if folder.name in ("", "..") else folder.name for folder in folders]
@@ -187,7 +189,7 @@ def resolve_folders(args: argparse.Namespace) -> tuple[Path, Path]:
     return folders[args.entry - 1], args.out / (name if is_unique else f"{args.entry:03d}_{name}")
 
 
-def read_list(path: Path) -> list[Path]:
+def read_capture_list(path: Path) -> list[Path]:
     """Read a list of captures: one folder per line, relative to the list; # begins a comment. Raises SettingsError."""
     try:
         lines = read_text(path, encoding=UTF8_SIG).splitlines()

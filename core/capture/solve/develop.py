@@ -51,9 +51,9 @@ def write_capture(sources: Sequence[SourceFrame], solved: Solved, out: Path, wor
                                              frame.points[valid]))
         progress.advance()
     # Errors are in pixels of the small pictures; the model has them in pixels of the frames.
-    scale = sum(frame.lens.width for frame in observed_frames) / sum(frame.lens.width for frame in solved.frames)
+    error_scale = sum(frame.lens.width for frame in observed_frames) / sum(frame.lens.width for frame in solved.frames)
     model = solved.model
-    cloud = PointCloud(model.xyz.astype(np.float32), model.rgb, (model.error * scale).astype(np.float32))
+    cloud = PointCloud(model.xyz.astype(np.float32), model.rgb, (model.error * error_scale).astype(np.float32))
     write_model(work / "sparse" / "0", observed_frames, cloud)
     for name in ("images", "sparse"):
         shutil.rmtree(out / name, ignore_errors=True)
@@ -95,7 +95,7 @@ def _write_frame(source: SourceFrame, frame: SolvedFrame, camera: Camera, target
         return
     picture = read_full_size(source)
     if is_distorted:
-        picture = undistort_picture(picture, frame.lens.maps(camera.scaled(*picture.size)))
+        picture = undistort_picture(picture, frame.lens.undistortion_maps(camera.scaled(*picture.size)))
     picture = picture.resized(*camera.size)
     if target.suffix == ".exr":
         channels = dict(zip("RGB", np.moveaxis(picture.pixels, 2, 0), strict=True))

@@ -176,14 +176,8 @@ def clean_plates(inputs: Sequence[Path], folder: Path, remover: Remover, progres
         return PreparedResults(write, float(prediction.confidence) if matte is None else None)
 
     def leave_out(frame: CleanFrame, error: Exception) -> None:
-        """Note a plate that cannot be cleaned; raise an error that concerns all plates."""
-        if not is_plate_error(error):
-            raise error
-        if isinstance(error, OSError) and error.errno in DISK_FULL:
-            raise error  # no later frame would fit either
-        if isinstance(error, OSError) and manifest.is_write_error(error):
-            raise FrameError(f"{folder} cannot be written to ({error.strerror}); choose another folder for the clean "
-                             "frames, or get write permission for this one.") from error
+        """Record a plate that cannot be cleaned; raise an error that concerns all plates."""
+        _raise_if_fatal(error, manifest, folder)
         failed.append(_failure_message(frame.source, error))
         failed_names.append(frame.name.as_posix())
         progress.say(f"Left out: {failed[-1]}")
@@ -205,6 +199,17 @@ def clean_plates(inputs: Sequence[Path], folder: Path, remover: Remover, progres
     progress.say(tally.sentence())
     return {"plates": str(folder), "made": written, "kept": kept_counts.total(), "confidence": confidence,
             **tally.as_result()}
+
+
+def _raise_if_fatal(error: Exception, manifest: Manifest, folder: Path) -> None:
+    """Raise an error that concerns all plates: a defect, a full disk, or an output folder that cannot be written to."""
+    if not is_plate_error(error):
+        raise error
+    if isinstance(error, OSError) and error.errno in DISK_FULL:
+        raise error  # no later frame would fit either
+    if isinstance(error, OSError) and manifest.is_write_error(error):
+        raise FrameError(f"{folder} cannot be written to ({error.strerror}); choose another folder for the clean "
+                         "frames, or get write permission for this one.") from error
 
 
 def _failure_message(path: Path, error: Exception) -> str:

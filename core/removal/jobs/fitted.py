@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...capture import Capture, View
+from ...capture import Camera, Capture, View
 from ...capture.discs import light_disc_mask
 from ...capture.renderer import ViewRenderer
 from ...colour.srgb import Pixels, linear_from_srgb, srgb_from_linear
@@ -27,6 +27,7 @@ from ...errors import CaptureError, FrameError
 from ...images.exr import read_data_window
 from ...images.plates import Plate, clean_name, finite_light, read_plate, write_results
 from ...images.views import split_views
+from ...images.window import DataWindow
 from ...system.files import check_no_overwrite, safe_join
 from ...system.least_squares import robust_bounded_fit
 from ...system.progress import Progress
@@ -131,19 +132,13 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View, above_whit
     is_direct = stored.is_rec709 or (stored.encoding == "linear" and stored.space.is_linear)
     plate = stored if is_direct else stored.in_rec709
     height, width = plate.codes.shape[:2]
-    window = read_data_window(capture.frame_path(view))  # an EXR may have overscan or be cropped
-    camera = view.camera if view.camera.size == window.frame else view.camera.scaled(*window.frame)
-    camera = camera if window.is_frame else camera.cropped(*window.origin, *window.size)
+    camera = _stored_pixels_camera(view.camera, read_data_window(capture.frame_path(view)))
     layers = renderer.render(camera)
+    scene = _to_plate_light(plate, layers.scene)
+    flares = {light: _to_plate_light(plate, pixels) for light, pixels in layers.flare_by_light.items()}
+    gains = _fit_flare_gains(plate, scene, flares)
     flare = np.zeros((height, width, 3), np.float32)
     fitted_part = plate.picture_area.slices  # the borders were not fitted, and stay
-    flares, scene = layers.flare_by_light, layers.scene
-    if plate.encoding == "linear":  # the fit was given Rec. 709
-        flares = {light: plate.space.from_linear(pixels) for light, pixels in flares.items()}
-        scene = plate.space.from_linear(scene)
-    flares = {light: plate.to_plate_channels(pixels) for light, pixels in flares.items()}
-    scene = plate.to_plate_channels(scene)
-    gains = _fit_flare_gains(plate, scene, flares)
     for light, light_flare in flares.items():
         flare[fitted_part] += np.float32(gains[light]) * light_flare[fitted_part]
     light_discs = light_disc_mask(_display_values(plate), camera,
@@ -157,6 +152,17 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View, above_whit
         return _CleanView(stored, codes, flare, gains)
     clean = replace(plate, codes=codes)
     return _CleanView(stored, stored.without_light(_linear_light(plate) - _linear_light(clean)), flare, gains)
+
+
+def _stored_pixels_camera(camera: Camera, window: DataWindow) -> Camera:
+    """Return the camera of a frame's stored pixels: an EXR may have overscan or be cropped."""
+    camera = camera if camera.size == window.frame else camera.scaled(*window.frame)
+    return camera if window.is_frame else camera.cropped(*window.origin, *window.size)
+
+
+def _to_plate_light(plate: Plate, light: Pixels) -> Pixels:
+    """Return a fit's light (height, width, 3), linear Rec. 709, in the plate's primaries and channels."""
+    return plate.to_plate_channels(plate.space.from_linear(light) if plate.encoding == "linear" else light)
 
 
 def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) -> dict[str, float]:

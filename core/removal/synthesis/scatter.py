@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .canvas import GREEN_WAVELENGTH, Array, Point, Random, log_uniform, spectral_colour
 
@@ -48,8 +49,6 @@ def draw_starburst(random: Random, light: Point, size: int) -> Array:
 def _draw_stop(random: Random, dirt: float) -> Array:
     """Return the transmission of the stop (STOP_SAMPLES, STOP_SAMPLES). dirt: 0 for a clean stop (spikes alone) to 1.
     """
-    import cv2
-
     axis = np.linspace(-1, 1, STOP_SAMPLES)
     x, y = np.meshgrid(axis, axis)
     blades = int(random.integers(5, 10))
@@ -65,7 +64,14 @@ def _draw_stop(random: Random, dirt: float) -> Array:
         along = x * math.cos(angle) + y * math.sin(angle)
         across = x * -math.sin(angle) + y * math.cos(angle)
         opening *= 1 / (1 + np.exp(np.clip((along + bend * across**2 - edge) * edge_steepness, -60, 60)))
-    mask = opening.astype(np.float32)
+    return _add_dirt(random, opening.astype(np.float32), dirt)
+
+
+def _add_dirt(random: Random, stop: Array, dirt: float) -> Array:
+    """Return a stop (STOP_SAMPLES, STOP_SAMPLES) with dust and scratches. dirt: as for `_draw_stop`."""
+    import cv2
+
+    mask = stop
     for _ in range(int(random.poisson(60 * dirt))):  # dust
         middle = (random.uniform(0.25, 0.75, 2) * STOP_SAMPLES).astype(int)
         spot = np.ones_like(mask)
@@ -106,19 +112,7 @@ def draw_shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
     dx, dy = x - light[0], y - light[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
     direction_count = 2048  # over the whole circle
-    strength = np.zeros(direction_count)
-    ray_draw = random.random()
-    if ray_draw < 0.4:  # a few long ones
-        ray_count, ray_width = int(random.integers(4, 30)), log_uniform(random, 0.002, 0.03)
-    else:  # a curtain of them
-        ray_count, ray_width = int(random.integers(40, 300)), log_uniform(random, 0.001, 0.01)
-    positions = np.arange(direction_count) / direction_count
-    for _ in range(ray_count):
-        centre = random.random()
-        gap = np.abs(positions - centre)
-        strength += random.exponential(1) * np.exp(
-            -(np.minimum(gap, 1 - gap) / (ray_width * random.uniform(0.5, 2))) ** 2)
-    strength = strength / strength.max() + random.uniform(0, 0.3)
+    strength = _draw_ray_strengths(random, direction_count)
     # Strong rays are long too; the small random turn loosens that.
     reach = log_uniform(random, 0.08, 0.8) * (0.5 + 0.5 * np.roll(strength, int(random.integers(20))))
     position = ((angle / (2 * math.pi)) % 1) * direction_count
@@ -133,6 +127,22 @@ def draw_shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
         layer = layer * (1 - np.exp(-(r / max(inner, 1e-3)) ** 2))
     hue = _radial_tint(random, r)
     return (layer[..., None] * hue).astype(np.float32)
+
+
+def _draw_ray_strengths(random: Random, direction_count: int) -> NDArray[np.float64]:
+    """Return the strength of light in each direction, (direction_count,), of a few broad rays or a curtain of fine
+    ones; the maximum is between 1 and 1.3."""
+    strength = np.zeros(direction_count)
+    if random.random() < 0.4:
+        ray_count, ray_width = int(random.integers(4, 30)), log_uniform(random, 0.002, 0.03)
+    else:
+        ray_count, ray_width = int(random.integers(40, 300)), log_uniform(random, 0.001, 0.01)
+    positions = np.arange(direction_count) / direction_count
+    for _ in range(ray_count):
+        gap = np.abs(positions - random.random())
+        strength += random.exponential(1) * np.exp(
+            -(np.minimum(gap, 1 - gap) / (ray_width * random.uniform(0.5, 2))) ** 2)
+    return np.asarray(strength / strength.max() + random.uniform(0, 0.3))
 
 
 def _radial_tint(random: Random, r: Array) -> Array:

@@ -95,8 +95,6 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", max_side
     Raises SettingsError for a path that is no folder and where no picture is found; EngineError where `augmented` is
     set and OpenCV lacks a module for it.
     """
-    import cv2
-
     if augmented:
         background_augmentation.require_ximgproc()
     photos, maps, searched = [], [], []
@@ -105,20 +103,13 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", max_side
         searched.append(str(folder))
         for path in list_pictures(Path(folder), PHOTO_SUFFIXES | MAP_SUFFIXES, part):
             if path.suffix.lower() in PHOTO_SUFFIXES:
-                picture = decode_by_opencv(path, cv2.IMREAD_COLOR)
-                if picture is None or min(picture.shape[:2]) < MIN_SIDE:
-                    unusable.append(path)
+                if (photo := _read_photo(path, max_side)) is not None:
+                    photos.append(photo)
                     continue
-                scale = max_side / max(picture.shape[:2])
-                if scale < 1:
-                    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-                photos.append(np.ascontiguousarray(picture[..., ::-1]))
-            else:
-                light = _read_environment_map(path)
-                if light is None:
-                    unusable.append(path)
-                else:
-                    maps.append(light)
+            elif (light := _read_environment_map(path)) is not None:
+                maps.append(light)
+                continue
+            unusable.append(path)
     if not photos and not maps:
         raise SettingsError(f"There are no pictures in {', '.join(searched) or 'no folder'}; name a folder of clean "
                             "photographs or environment maps.")
@@ -154,6 +145,20 @@ def list_pictures(folder: Path, suffixes: Set[str], part: Part) -> list[Path]:
     return [path for path in sorted(folder.rglob("*"))
             if path.suffix.lower() in suffixes and path.is_file() and not path.name.startswith(".")
             and (part == "all" or is_held_out(path.name) == (part == "test"))]
+
+
+def _read_photo(path: Path, max_side: int) -> NDArray[np.uint8] | None:
+    """Return a photograph, (height, width, 3) display codes, its long side at most `max_side` pixels; None if it is
+    unusable."""
+    import cv2
+
+    picture = decode_by_opencv(path, cv2.IMREAD_COLOR)
+    if picture is None or min(picture.shape[:2]) < MIN_SIDE:
+        return None
+    scale = max_side / max(picture.shape[:2])
+    if scale < 1:
+        picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(picture[..., ::-1])
 
 
 def _read_environment_map(path: Path) -> NDArray[np.float16] | None:

@@ -76,21 +76,9 @@ def make_pair(random: Random, bank: FlareSource, backgrounds: Backgrounds, width
     """
     gamma = float(random.uniform(*GAMMA_RANGE))
     scene: Pixels = backgrounds.draw(random, width, height, gamma) * random_cameras.draw_exposure(random)
-    rest, glow, light = (np.zeros_like(scene) for _ in range(3))
     without_flare = random.random() < clean_share
     faces_light = against_light_share > 0 and random.random() < against_light_share
-    for number in range(1 if random.random() < 1 - random_cameras.SECOND_FLARE_SHARE else 2):
-        layers = bank.draw(random)
-        strength = 1.0 if number == 0 else random_cameras.draw_second_strength(random)
-        matrix = random_cameras.draw_placement(random, layers.size, width, height)
-        if faces_light and layers.lights:
-            matrix, light_level = _place_against_bright_scene(random, layers, matrix, scene)
-            if number == 0 and (target_light := random_cameras.draw_target_light(random)):
-                exposure = np.clip(target_light / max(light_level, 1e-3), *random_cameras.EXPOSURE_LIMITS)
-                scene = scene * np.float32(exposure)
-        appearance = random_cameras.draw_appearance(random, strength)
-        warped_rest, warped_glow, warped_light = _warp_to_frame(layers, appearance, matrix, width, height)
-        rest, glow, light = rest + warped_rest, glow + warped_glow, np.maximum(light, warped_light)
+    scene, rest, glow, light = _draw_flares(random, bank, scene, faces_light=faces_light)
     if without_flare:  # half of these frames still show the lights
         rest, glow, light = rest * 0, glow * 0, light * float(random.random() < 0.5)
     scene = scene + light
@@ -110,6 +98,29 @@ def make_pair(random: Random, bank: FlareSource, backgrounds: Backgrounds, width
     if without_flare:  # not quantised: frame and scene are equal, so that the flare to predict is exactly 0
         return Pair(frame, clean_scene, scene_with_glow)
     return Pair(_quantise(random, frame), clean_scene, scene_with_glow)
+
+
+def _draw_flares(random: Random, bank: FlareSource, scene: Pixels, *,
+                 faces_light: bool) -> tuple[Pixels, Pixels, Pixels, Pixels]:
+    """Return the scene, then rest, glow and light of the one or two flares of a frame, (height, width, 3) each.
+
+    faces_light: put the lights where the scene is bright, and in half of the cases expose the scene by its light there.
+    """
+    height, width = scene.shape[:2]
+    rest, glow, light = (np.zeros_like(scene) for _ in range(3))
+    for number in range(1 if random.random() < 1 - random_cameras.SECOND_FLARE_SHARE else 2):
+        layers = bank.draw(random)
+        strength = 1.0 if number == 0 else random_cameras.draw_second_strength(random)
+        matrix = random_cameras.draw_placement(random, layers.size, width, height)
+        if faces_light and layers.lights:
+            matrix, light_level = _place_against_bright_scene(random, layers, matrix, scene)
+            if number == 0 and (target_light := random_cameras.draw_target_light(random)):
+                exposure = np.clip(target_light / max(light_level, 1e-3), *random_cameras.EXPOSURE_LIMITS)
+                scene = scene * np.float32(exposure)
+        appearance = random_cameras.draw_appearance(random, strength)
+        warped_rest, warped_glow, warped_light = _warp_to_frame(layers, appearance, matrix, width, height)
+        rest, glow, light = rest + warped_rest, glow + warped_glow, np.maximum(light, warped_light)
+    return scene, rest, glow, light
 
 
 def _add_grain(random: Random, scene: Pixels) -> Pixels:

@@ -299,7 +299,7 @@ def _score_held_out(renderer: Run | _SceneRenderer, folder: Path, settings: FitS
     held_out = capture.split(settings.holdout)[1]
     frames = Frames(capture, settings.width)
     evaluation = evaluate(renderer, capture, {view: frames.camera(view) for view in held_out}, progress,
-                         frames.picture_area)
+                          frames.picture_area)
     scores: dict[str, Any] = {layer: values for layer, values in evaluation.items() if isinstance(values, dict)}
     if settings.mode == "3dgs":  # it has no flare to score
         scores = {layer: layer_scores for layer, layer_scores in scores.items() if not layer.startswith("flare")}

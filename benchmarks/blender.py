@@ -58,7 +58,7 @@ def make_capture(folder: Path, cameras: int = CAMERAS) -> Path:
         name = f"{number + 1:04d}.png"
         (images / name).write_bytes(png)
         records.append(struct.pack("<i7di", number + 1, np.cos(angle), 0, np.sin(angle), 0, 0, 0, 4, 1) + name.encode()
-                     + b"\0" + struct.pack("<Q", 0))
+                       + b"\0" + struct.pack("<Q", 0))
     (model / "images.bin").write_bytes(b"".join(records))
     xyz = np.random.default_rng(0).normal(size=(POINTS, 3))
     points = [struct.pack("<Q", POINTS)]

@@ -55,7 +55,7 @@ def score_flare(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
         picture = composite(targets.clean, flare, trainer.settings.blend)
         rendered_display = (picture - targets.clean).abs().numpy()
         scene, truth = (read_layer(view, targets.camera.size) for read_layer in (trainer.capture.truth_scene,
-                                                                       trainer.capture.truth_flare))
+                                                                                 trainer.capture.truth_flare))
         if scene is None or truth is None:
             display_psnr.append(psnr(rendered_display, (targets.frame - targets.clean).abs().numpy()))
             continue

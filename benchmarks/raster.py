@@ -199,7 +199,7 @@ def raster_section(rasterizers: dict[str, Rasterizer], thread_counts: list[int],
         head += [f"cpu, {min_threads} to {max_threads} threads", f"tiles / cpu, {_thread_label(max_threads)}"]
         rows = []
         for case in RASTER_CASES:
-            cells = {(n, count): times.get(f"{case}|{n}|{count}|{kind}") for n in names for count in thread_counts}
+            cells = {(name, c): times.get(f"{case}|{name}|{c}|{kind}") for name in names for c in thread_counts}
             speedup = _ratio_text(cells.get(("cpu", min_threads)), cells.get(("cpu", max_threads)))
             relative_to_tiles = _ratio_text(cells.get(("tiles", max_threads)), cells.get(("cpu", max_threads)))
             rows.append([str(case), *[milliseconds(value) for value in cells.values()], speedup, relative_to_tiles])
@@ -289,7 +289,7 @@ def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
         seconds[function.__name__] = seconds.get(function.__name__, 0.0) + time.perf_counter() - start
 
     kernel_modules = [module for name, module in sys.modules.items()
-             if name.startswith("core.gaussians.cpu.") and getattr(module, "parallel", None) is parallel]
+                      if name.startswith("core.gaussians.cpu.") and getattr(module, "parallel", None) is parallel]
     samples: dict[str, list[float]] = {name: [] for name in (*STAGES, "between the kernels", "iteration")}
     for module in kernel_modules:
         module.parallel = timed  # type: ignore[attr-defined]
@@ -418,11 +418,11 @@ def probe(measurement: str, kernel_set: str) -> dict[str, float]:
         return {"import": imported, "first": times[0], "second": times[1]}
     if measurement == "both":
         return median_times({"both": Raster(case, our_rasterizer(kernel_set), kernel_set, "cpu").forward_backward}, 5)
-    before = resident_memory()
+    memory_before = resident_memory()
     iteration = Iteration(case, kernel_set)
     for _ in range(5):
         iteration.step()
-    return {"before": before, "peak": peak_memory()}
+    return {"before": memory_before, "peak": peak_memory()}
 
 
 def _thread_label(threads: int) -> str:

@@ -96,7 +96,7 @@ def read_pictures(folder: Path) -> int:
 
 
 def fastest_times(readers: dict[str, Callable[[Path], int]], path: Path, frames: int,
-            rounds: int) -> dict[str, tuple[float, float]]:
+                  rounds: int) -> dict[str, tuple[float, float]]:
     """Return for each reader the milliseconds per frame by the clock and by processor time, of its fastest round."""
     fastest = dict.fromkeys(readers, (np.inf, np.inf))
     for _ in range(rounds):

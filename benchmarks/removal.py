@@ -82,7 +82,7 @@ def draw_plate(path: Path, width: int, height: int) -> None:
     pixels = np.stack([waves + glow, waves * 0.8 + glow, waves * 0.6 + glow], -1).astype(np.float32)
     pixels[np.hypot(x - 0.4, y + 0.3) < 0.03] = 4.0
     if path.suffix == ".exr":
-        write_exr(path, {name: pixels[..., k] for k, name in enumerate("RGB")})
+        write_exr(path, {name: pixels[..., index] for index, name in enumerate("RGB")})
     else:
         write_png(path, pixels)
 
@@ -122,7 +122,7 @@ def measure_speed(weights: Path | None = None) -> None:
 
 
 def score_sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | None = None,
-           sheet: Path | None = None) -> None:
+                 sheet: Path | None = None) -> None:
     """Measure the PSNR of every frame against the exact scene, and flicker."""
     previous_errors: Any = None
     scores, flicker, rows = [], [], []
@@ -376,7 +376,7 @@ def _held_out_backgrounds(folders: list[Path]) -> Any:
 
 
 def _removal_gain(remover: Remover, seed: tuple[int, ...], bank: Any, backgrounds: Any,
-          against_light_share: float = 0.0) -> float:
+                  against_light_share: float = 0.0) -> float:
     """Return the gain of the removal in PSNR, dB, for the picture of a seed with a flare of the bank.
 
     against_light_share: probability that its lights stand in a bright part of the scene.

@@ -27,15 +27,15 @@ MAX_NEAR_ERROR = 0.012
 """Distance of a snapped light from the exact one that counts as near, relative to the frame's width."""
 
 
-def light_errors(capture: Capture, places: ArrayLike) -> NDArray[np.float64]:
-    """Return (lights,): the mean distance of each light from its place in `places` (lights, 3), in widths of the frame.
+def light_errors(capture: Capture, positions: ArrayLike) -> NDArray[np.float64]:
+    """Return (lights,): the mean distance of each light from its `positions` (lights, 3), in widths of the frame.
 
     Views in which one of the two is behind the camera are left out.
     """
     distances = []
     for view in capture.views:
         pixels, depth = view.camera.project([light.xyz for light in capture.lights])
-        other_pixels, other_depth = view.camera.project(places)
+        other_pixels, other_depth = view.camera.project(positions)
         distance = np.linalg.norm(pixels - other_pixels, axis=1) / view.camera.width
         distances.append(np.where((depth > 0) & (other_depth > 0), distance, np.nan))
     return np.asarray(np.nanmean(distances, 0))

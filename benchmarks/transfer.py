@@ -179,7 +179,7 @@ def score_frames(transfer: Transfer, frames: list[ExactFrame], look: Look) -> Fr
                      "flare": psnr(displayed, displayed_flare(scene + flare, scene)), "flare_linear": psnr(*clipped),
                      "empty": psnr(displayed, 0 * displayed)})
         if index % max(len(frames) // SHEET_ROWS, 1) == 0:
-            pictures.append(np.concatenate([srgb_from_linear(part) for part in clipped], 1))
+            pictures.append(np.concatenate([srgb_from_linear(picture) for picture in clipped], 1))
         print(f"frame {rows[-1]['frame']:3}  inside {inside!s:5}  shares "
               + " ".join(f"{share:.2f}" for share in rows[-1]["shares"])
               + "".join(f"  {name} {rows[-1][name]:.2f}" for name in ("flare", "flare_linear", "empty")),

@@ -245,7 +245,7 @@ def _is_full(folder: Path) -> bool:
 
 
 def start_job(kind: str, folder: Path, command: Sequence[str], environment: Mapping[str, str] | None = None, *,
-          args: Sequence[object] = ()) -> Job:
+              args: Sequence[object] = ()) -> Job:
     """Start a command whose events go to `folder`, and follow it.
 
     args: the arguments that identify the job. Without a window this returns when the job has ended. Raises EngineError
@@ -264,7 +264,7 @@ def start_job(kind: str, folder: Path, command: Sequence[str], environment: Mapp
             log_offset = log.tell()
             process = _launch(command, stdin=subprocess.DEVNULL, stdout=events, stderr=log,
                               env={**(os.environ if environment is None else environment),
-                                     STOP_FILE: str((folder / STOP).absolute())}, **process_options)
+                                   STOP_FILE: str((folder / STOP).absolute())}, **process_options)
         _lower_priority(process.pid)
         try:
             write_json(folder / RECORD, {"kind": kind, "host": HOST, "host_name": platform.node(), "pid": process.pid,

@@ -66,9 +66,9 @@ def _extent_of_geometry(evaluated: Any, linear: Floats) -> LightExtent:
     none. linear: (3, 3) of the object's matrix. Raises ValueError if it has no area or no length."""
     mesh = evaluated.to_mesh()
     try:
-        places = np.empty(3 * len(mesh.vertices), np.float32)
-        mesh.vertices.foreach_get("co", places)
-        vertices = places.reshape(-1, 3).astype(np.float64)
+        coordinates = np.empty(3 * len(mesh.vertices), np.float32)
+        mesh.vertices.foreach_get("co", coordinates)
+        vertices = coordinates.reshape(-1, 3).astype(np.float64)
         mesh.calc_loop_triangles()
         if len(mesh.loop_triangles):
             corners = np.empty(3 * len(mesh.loop_triangles), np.int32)

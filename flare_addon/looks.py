@@ -321,7 +321,7 @@ def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | 
     look = look_of(scene)
     pose, lights = place_lights(scene, depsgraph, camera)
     gaussians = look.evaluate_lights(pose, lights, edits or edits_of(scene.fit_flare), query_of(scene.fit_flare),
-                                    budget)
+                                     budget)
     exposure = camera.evaluated_get(depsgraph).fit_flare.exposure
     return {name: light_gaussians.with_exposure(exposure, look.blend) for name, light_gaussians in gaussians.items()}
 

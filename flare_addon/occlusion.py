@@ -94,7 +94,7 @@ def visible_points(scene: Any, depsgraph: Any, eye: Any, item: Any, points: NDAr
     for point in points.tolist():
         offset = Vector(point) - eye
         is_clear.append(offset.length < 1e-6 or _is_clear(scene, depsgraph, eye, offset.normalized(), offset.length,
-                                                       ignored, instances))
+                                                          ignored, instances))
     return np.array(is_clear, bool)
 
 

@@ -92,7 +92,7 @@ def drawn_region(frame: CameraFrame, region: tuple[int, int], camera: Any) -> Dr
     x, y = frame.width / camera.width, frame.height / camera.height
     cut_rows = frame.bottom + frame.height - top  # from the frame's upper edge down to the window's
     intrinsics = np.array([[camera.fx * x, 0, camera.cx * x + frame.left - left],
-                  [0, camera.fy * y, camera.cy * y - cut_rows], [0, 0, 1.0]])
+                           [0, camera.fy * y, camera.cy * y - cut_rows], [0, 0, 1.0]])
     return DrawnRegion(left, bottom, right - left, top - bottom, intrinsics)
 
 
@@ -140,7 +140,7 @@ def make_quads(centres: Floats, covariances: Floats, radii: Floats, light: Float
     """
     centres, covariances, radii, arcs = (np.asarray(item, np.float32) for item in (centres, covariances, radii, arcs))
     xx, xy, yy = covariances.T
-    half, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    half, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)  # the eigenvalues are half + root and half - root
     long, short = np.sqrt(np.maximum(half + root, 0)), np.sqrt(np.maximum(half - root, 0))
     cosine = (xx - yy) / np.maximum(2 * root, np.finfo(np.float32).tiny)  # of twice the angle of the long axis
     # Unit vector (x, y) of the long axis, by the half-angle formulas; (-y, x) is the short one.
@@ -291,7 +291,7 @@ def working_space() -> NDArray[np.float64]:
 
 
 def composite_levels(buffers: list[Any], box: tuple[float, float, float, float], blend: str, window: DrawnRegion,
-              space: NDArray[np.float64]) -> None:
+                     space: NDArray[np.float64]) -> None:
     """Add rendered levels to the bound framebuffer, inside box (left, bottom, right, top; 0..1 of its size).
 
     buffers: of `render_levels`. With the blend "over" they hold display values, which the shader converts to linear
@@ -381,7 +381,7 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
     look = looks.look_of(scene)
     chosen, edits = highlight.current_highlight(scene), looks.edits_of(scene.fit_flare)
     if chosen is not None:
-        names = {item.name: [part.name for part in item.elements] for item in scene.fit_flare.lights}
+        names = {item.name: [element.name for element in item.elements] for item in scene.fit_flare.lights}
         edits = highlight.emphasise(edits, chosen, names)
     budget = _budgets.setdefault(camera.name, OffsetsBudget(NETWORK_S))
     budget.begin()

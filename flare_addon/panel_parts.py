@@ -38,7 +38,7 @@ def _dark_reasons(scene: Any) -> dict[str, str]:
             if looks.is_placed(item, scene)}
 
 
-def draw_darkness(layout: Any, scene: Any) -> None:
+def draw_dark_reason(layout: Any, scene: Any) -> None:
     """Draw why there is no flare to see, where the switches make all flares dark."""
     reasons = _dark_reasons(scene)
     if reasons and all(reasons.values()):
@@ -55,7 +55,7 @@ def light_icon(scene: Any, light: Any) -> str:
     return "ANIM" if _is_animated(scene, light) else "LIGHT_POINT"
 
 
-def draw_motion(layout: Any, scene: Any, objects: Sequence[Any]) -> None:
+def draw_motion_note(layout: Any, scene: Any, objects: Sequence[Any]) -> None:
     """Draw what a fit does with the lights of the capture that move or change."""
     names = [lights.light_name(light) for light in objects if _is_animated(scene, light)]
     if not names:
@@ -68,7 +68,7 @@ def draw_motion(layout: Any, scene: Any, objects: Sequence[Any]) -> None:
                             f"images: {', '.join(names)}.", "INFO")
 
 
-def draw_bake(row: Any, state: Any) -> None:
+def draw_bake_buttons(row: Any, state: Any) -> None:
     """Draw the buttons that bake, and composite where this is chosen: for the scene's camera, for the selected ones."""
     label = "Bake and Composite" if state.bake_composite else "Bake Layers"
     for selected in (False, True):
@@ -77,7 +77,7 @@ def draw_bake(row: Any, state: Any) -> None:
         button.selected, button.composite = selected, state.bake_composite
 
 
-def draw_stereo(layout: Any, scene: Any) -> None:
+def draw_stereo_warning(layout: Any, scene: Any) -> None:
     """Draw what a stereo render shows of the flare."""
     if scene.render.use_multiview:
         label_lines(layout, STEREO, "ERROR")

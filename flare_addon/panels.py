@@ -98,7 +98,7 @@ class FITFLARE_PT_lights(_FitPanel, bpy.types.Panel):
             row = column.row(align=True)
             row.prop(light.fit_flare, "light", text="", icon=panel_parts.light_icon(scene, light))
             row.operator("fit_flare.remove_light", text="", icon="X").object = light.name
-        panel_parts.draw_motion(layout, scene, objects)
+        panel_parts.draw_motion_note(layout, scene, objects)
         folder = fits.capture_folder(scene)
         job = jobs.find_job(folder / "lights") if folder is not None else None
         if job is not None and job.running:
@@ -278,7 +278,7 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
             return
         if overlay.last_error:
             label_lines(layout, overlay.last_error, "ERROR")
-        panel_parts.draw_darkness(layout, scene)
+        panel_parts.draw_dark_reason(layout, scene)
         _draw_view_hint(layout, context)
         if looks.duplicate_name(state):
             label_lines(layout, f"Two flares have the name {looks.duplicate_name(state)}: rename one.", "ERROR")
@@ -319,7 +319,7 @@ def _draw_view_hint(layout: Any, context: bpy.types.Context) -> None:
         label_lines(layout, "This view is composited: it shows the flare as it was baked.", "INFO")
     elif state.show and state.native and state.footage == "images" and fits.has_clean_frames(scene):
         label_lines(layout, "The frames behind the camera contain their own flare, and this one is drawn over it: "
-                            "choose Clean under Capture to see this one alone.", "INFO")
+                    "choose Clean under Capture to see this one alone.", "INFO")
 
 
 def _draw_sliders(layout: Any, sliders: Any, streak: bool = True) -> None:
@@ -393,7 +393,7 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
             column.prop(state, "bake_live")
             column.prop(state, "bake_scene")
             column.prop(state, "bake_composite")
-            panel_parts.draw_stereo(layout, scene)
+            panel_parts.draw_stereo_warning(layout, scene)
             if state.flare and engine.find_engine() is None:
                 label_lines(layout, "Without an engine, Blender's own Python draws the layers: some seconds per frame.",
                             "INFO")
@@ -408,7 +408,7 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
                     label_lines(layout, warning, "ERROR")
             row = layout.row(align=True)
             row.scale_y = 1.3
-            panel_parts.draw_bake(row, state)
+            panel_parts.draw_bake_buttons(row, state)
             if job is not None:
                 _draw_bake_log(layout, job)
         self._draw_compositor(layout, scene)

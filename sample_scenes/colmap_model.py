@@ -84,7 +84,7 @@ def _posed_cameras(scene: SceneDescription, database: Path) -> Any:
         keypoints = {image.image_id: opened.read_keypoints(image.image_id) for image in images}
     for image in images:
         posed_image = pycolmap.Image(name=image.name, keypoints=np.asarray(keypoints[image.image_id])[:, :2],
-                                camera_id=1, image_id=image.image_id)
+                                     camera_id=1, image_id=image.image_id)
         true_cameras.add_image_with_trivial_frame(posed_image, pycolmap.Rigid3d(poses[image.name][:3]))
     return true_cameras
 

@@ -45,7 +45,7 @@ def add_flares(capture: Capture, out: Path, setup: LensSetup, light: NDArray[np.
     for view in capture.views:
         stem = Path(view.name).stem
         frame_path, clean_path, layer_path = (out / "images" / f"{stem}.png", out / "removed" / f"{stem}.png",
-                               out / "truth" / "flare" / f"{stem}.exr")
+                                              out / "truth" / "flare" / f"{stem}.exr")
         if not (frame_path.is_file() and clean_path.is_file() and layer_path.is_file()):
             camera = view.camera.scaled(width)
             photo = np.round(capture.frame(view, camera.size).display() * 255) / np.float32(255)  # as stored in 8 bits

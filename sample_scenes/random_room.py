@@ -49,6 +49,7 @@ class Room:
     """
 
     def __init__(self, random: Random, photos: Sequence[Path], maps: Sequence[Path]) -> None:
+        """Build the room: sky, walls, 2 to 9 objects, up to 7 lamps, and half of the time a light on the ceiling."""
         self.random, self.photos, self.maps = random, photos, maps
         self.scene = stage.empty_scene()
         self.width, self.depth, self.height = random.uniform((4, 6, 2.5), (10, 16, 5))
@@ -98,7 +99,7 @@ class Room:
                 stage.add_sheet(name, length, self.height, position, material, rotation, (90, 0))
         if random.random() < 0.85:
             stage.add_sheet("ceiling", self.width, side_length, (0, middle, self.height), self._surface_material(0.8),
-                        tilt=(180, 0))
+                            tilt=(180, 0))
 
     def _add_object(self) -> None:
         """Add a random solid at a random place."""

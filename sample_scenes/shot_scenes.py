@@ -169,7 +169,7 @@ def drive_shot(seed: int) -> ShotScene:
         car_z = start_distance + 0.22 * index - approach * index  # the camera drives 0.22 a frame
         sway = 0.12 * np.sin(index / 5)
         offset = np.array([lane + sway, 0.3, car_z])
-        car_sides = [part.moved(offset) for part in car]
+        car_sides = [side_of_car.moved(offset) for side_of_car in car]
         is_out = out_frame <= index < out_frame + OUT_FRAMES
         flickers = out_frame - 6 <= index < out_frame or out_frame + OUT_FRAMES <= index < out_frame + OUT_FRAMES + 4
         brightness = {"left": 1.0, "right": 0.0 if is_out else float(flicker[index]) if flickers else 1.0}
@@ -215,15 +215,15 @@ def pan_shot(seed: int) -> ShotScene:
     cart = box_sides((-0.6, -2.7, 0), (0.6, 0, 0.8), posters[2])
     walker = _make_walker(rng, 2.6, (0.9, 0.9, 0.88))
     colour = np.array([1.0, 0.82, 0.58]) if seed % 2 == 0 else np.array([1.0, 0.95, 0.9])
-    # reach: radians that the camera turns to either side. crossing_frames: in which walker and cart hide the lamp.
+    # max_angle: radians that the camera turns to either side. crossing_frames: in which walker and cart hide the lamp.
     direction, crossing_frames = rng.choice([-1.0, 1.0]), rng.uniform((12, 20), (16, 24))
-    reach = rng.uniform(0.50, 0.58)
+    max_angle = rng.uniform(0.50, 0.58)
     shake = np.cumsum(rng.normal(size=(FRAMES, 2)), 0) * 0.0006
 
     def state(index: int) -> FrameState:
         """Return frame `index`: the turned camera, walker and cart, and the lamp."""
         progress = index / (FRAMES - 1)
-        angle = direction * reach * np.cos(np.pi * (progress * 1.15 - 0.05)) + 0.12 + shake[index, 0]
+        angle = direction * max_angle * np.cos(np.pi * (progress * 1.15 - 0.05)) + 0.12 + shake[index, 0]
         rotation = _pitch_rotation(float(-0.05 + shake[index, 1])) @ _yaw_rotation(float(angle))
         moving = []
         for sides, depth, step, crossing_frame in ((walker, 4.6, 0.11, crossing_frames[0]),

@@ -76,7 +76,7 @@ def place(obj: Any, location: Vec, turn: float = 0.0, tilt: Vec = (0.0, 0.0)) ->
 
 
 def add_box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: float = 0.0,
-        tilt: Vec = (0.0, 0.0), bevel: float = 0.0) -> Any:
+            tilt: Vec = (0.0, 0.0), bevel: float = 0.0) -> Any:
     """Add a box of `size`, its base centre at `location`; turn and tilt as for `place`.
 
     materials: one for all faces, or one each for the sides (-y, +x, +y, -x) and top; the bottom has the last one. Each
@@ -104,7 +104,7 @@ def add_box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn:
 
 
 def add_sheet(name: str, width: float, height: float, location: Vec, material: Any, turn: float = 0.0,
-          tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
+              tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
     """Add a rectangle in x and y about its centre; tilt (90, 0) stands it up.
 
     repeat: how often the texture is repeated across and up. turn and tilt: as for `place`.
@@ -119,7 +119,7 @@ def add_sheet(name: str, width: float, height: float, location: Vec, material: A
 
 
 def add_lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, material: Any,
-          segments: int = 48, turn: float = 0.0, tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
+              segments: int = 48, turn: float = 0.0, tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
     """Add a surface of revolution about z: `profile` is (radius, height) from below to the top.
 
     segments: quads around. repeat: how often the texture is repeated around the axis and along the profile. turn and
@@ -128,7 +128,8 @@ def add_lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, 
     mesh = bmesh.new()
     uv = mesh.loops.layers.uv.new("UVMap")
     angles = np.linspace(0, 2 * np.pi, segments, endpoint=False)
-    rings = [[mesh.verts.new((r * np.cos(a), r * np.sin(a), h)) for a in angles] for r, h in profile]
+    rings = [[mesh.verts.new((radius * np.cos(angle), radius * np.sin(angle), height)) for angle in angles]
+             for radius, height in profile]
     lengths = np.hypot(*np.diff(np.array(profile), axis=0).T)
     profile_v = np.concatenate([[0.0], np.cumsum(lengths)]) / max(lengths.sum(), 1e-9)
     for low in range(len(profile) - 1):  # quads from the ring `low` to the next above
@@ -143,7 +144,7 @@ def add_lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, 
 
 
 def add_ball(name: str, radius: float, location: Vec, material: Any, turn: float = 0.0,
-         tilt: Vec = (0.0, 0.0)) -> Any:
+             tilt: Vec = (0.0, 0.0)) -> Any:
     """Add a sphere about `location`."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, 33)
     # At the poles a tiny radius keeps the vertices of a ring apart.
@@ -155,7 +156,7 @@ def add_rod(name: str, start: Vec, end: Vec, radius: float, material: Any) -> An
     """Add a cylinder from `start` to `end`."""
     direction = Vector(end) - Vector(start)
     obj = add_lathe(name, [(1e-4, 0.0), (radius, 0.0), (radius, direction.length), (1e-4, direction.length)],
-                (0, 0, 0), material, 24)
+                    (0, 0, 0), material, 24)
     obj.matrix_world = Matrix.Translation(Vector(start)) @ direction.to_track_quat("Z", "Y").to_matrix().to_4x4()
     return obj
 
@@ -266,7 +267,7 @@ def add_dome(radius: float, texture: Texture, strength: float) -> Any:
 
 
 def add_poster_box(name: str, rng: np.random.Generator, size: Vec, location: Vec, palette: Palette,
-               turn: float = 0.0) -> Any:
+                   turn: float = 0.0) -> Any:
     """Add a box with a different drawing on each side, as crates, cubes and plinths have."""
     x, y, z = size
     sides = [(x, z), (y, z), (x, z), (y, z), (x, y)]

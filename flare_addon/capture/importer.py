@@ -357,7 +357,7 @@ def _show_sequence(camera: Any, capture: Capture, views: Sequence[View], numbers
     patterns = {(path.parent, _NUMBER.sub("#", path.name)) for path in paths}
     matches = [_NUMBER.search(path.stem) for path in paths]
     is_sequence = len(patterns) == 1 and all(match is not None and int(match[1]) == number
-                                          for match, number in zip(matches, numbers, strict=True))
+                                             for match, number in zip(matches, numbers, strict=True))
     if len(paths) == 1 or not is_sequence:
         _add_background(camera, load_image(paths[0]))
         return len(paths) == 1
@@ -388,7 +388,7 @@ def show_footage(scene: Any, frame_folder: str) -> int:
         # relative_path: in images/ or removed/; None for a picture from elsewhere
         path = absolute(image.filepath, image.library).resolve()
         relative_path = next((path.relative_to((capture / name).resolve()) for name in ("images", REMOVED)
-                      if path.is_relative_to((capture / name).resolve())), None)
+                              if path.is_relative_to((capture / name).resolve())), None)
         if relative_path is None:
             continue
         match = pictures.find(relative_path) if pictures is not None else None

@@ -78,7 +78,7 @@ def _add_nodes(group: Any, layers: Sequence[str]) -> None:
     scaled_layers = [scale_to_render_size(group, group_input.outputs[name], 1, -row)
                      for row, name in enumerate(layers, 1)]
     gained_layers = [_mix(group, "MULTIPLY", scaled_layer.outputs[0], group_input.outputs[gain_input(name)], 2, -row)
-              for row, (name, scaled_layer) in enumerate(zip(layers, scaled_layers, strict=True), 1)]
+                     for row, (name, scaled_layer) in enumerate(zip(layers, scaled_layers, strict=True), 1)]
     sum_of_layers = gained_layers[0]
     for column, layer in enumerate(gained_layers[1:], 3):
         sum_of_layers = _mix(group, "ADD", sum_of_layers, layer, column, -1)

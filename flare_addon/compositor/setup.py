@@ -86,8 +86,8 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
     _change_inputs(tree, node, names)
     _remove_crops(tree)
     if not layers.window().is_frame:  # the layers have overscan
-        shown = names if plate is not None or keep_image else ["scene", *names]
-        sockets.update(_crop_overscan(tree, layers, {name: sockets[name] for name in shown}))
+        shown_names = names if plate is not None or keep_image else ["scene", *names]
+        sockets.update(_crop_overscan(tree, layers, {name: sockets[name] for name in shown_names}))
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
     # artists_picture: the output socket under the flare, to which `remove_nodes` connects the output again.
@@ -380,8 +380,9 @@ def _restore_tree(scene: Any, tree: Any, state: dict[str, Any]) -> None:
         trees.discard_tree(scene, tree, bool(state["use_nodes"]))
     elif state["tree"]:
         if state.get("nodes") is not None:
-            known = state["nodes"].split("\n")
-            for extra in [node for node in tree.nodes if node.name not in known and node.bl_idname == _OUTPUT_TYPE]:
+            earlier_names = state["nodes"].split("\n")
+            for extra in [node for node in tree.nodes
+                          if node.name not in earlier_names and node.bl_idname == _OUTPUT_TYPE]:
                 if not any(socket.is_linked for socket in extra.inputs):
                     tree.nodes.remove(extra)
         if not GROUPS_ARE_TREES:

@@ -144,7 +144,7 @@ class FITFLARE_OT_set_up_compositor(GuardedOperator, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         set_up_compositor(self, context.scene, self.directory, keep_image=self.keep_image, plate=self.plate,
-               match=self.match_scene)
+                          match=self.match_scene)
 
 
 def connect_sliders(scene: Any, layers: LayerFolder) -> bool:

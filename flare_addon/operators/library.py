@@ -167,7 +167,7 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         area: the 3D view, as `invoke` turned it to the camera.
         """
         regions_under_mouse = [region for region in area.regions if 0 <= event.mouse_x - region.x < region.width
-                 and 0 <= event.mouse_y - region.y < region.height]
+                               and 0 <= event.mouse_y - region.y < region.height]
         space = area.spaces.active
         # The sidebar may lie over the view.
         if space.type != "VIEW_3D" or [region.type for region in regions_under_mouse] != ["WINDOW"]:

@@ -93,6 +93,7 @@ class FITFLARE_OT_remove_flare(GuardedOperator, bpy.types.Operator):
         return ""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove the chosen flare; warn where its layer stays in the compositor."""
         state = context.scene.fit_flare
         name = state.lights[state.light].name
         if state.light in drivers.connected_flares(context.scene).values():

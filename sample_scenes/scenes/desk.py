@@ -49,9 +49,21 @@ def build_scene(scene: SceneDescription) -> None:
         picture = p.framed(p.poster(rng, int(420 * height), int(420 * width), palette, 46))
         s.add_box(f"frame {index}", (width + 0.12, 0.07, height + 0.12), (x, 3.14, z - height / 2 - 0.06), [frame])
         s.add_sheet(f"poster {index}", width, height, (x, 3.09, z), s.picture_material(f"poster {index}", picture, 0.8),
-                tilt=(90, 0))
+                    tilt=(90, 0))
 
-    # Books that stand on the right, in front of the lantern from some places; a pile that lies on the left.
+    _add_books(rng)
+    _add_things(rng)
+    _add_lamps(scene)
+    s.add_softbox("window", (-4.5, -4.0, 5.0), (0, 0.8, 0.6), (3.0, 3.0), 215, (1.0, 0.96, 0.9))
+    s.add_softbox("room", (5.0, -3.0, 4.5), (0, 0.8, 0.6), (4.0, 4.0), 100, (0.75, 0.86, 1.0))
+    s.set_uniform_world((0.55, 0.65, 0.8), 0.14)
+
+
+def _add_books(rng: np.random.Generator) -> None:
+    """Add books on the right, in front of the lantern from some places, and a pile with a head on the left."""
+    from .. import patterns as p
+    from .. import stage as s
+
     x = 1.42
     for index, height in enumerate((1.12, 1.28, 1.05, 1.22, 1.36)):
         width = 0.15 + 0.05 * (index % 3)
@@ -75,10 +87,15 @@ def build_scene(scene: SceneDescription) -> None:
         s.add_box(f"pile {index}", (length, depth, height), (-1.75, 0.05, pile_top), materials, turn)
         pile_top += height
     s.add_monkey("head", 0.78, (-1.72, 0.02, pile_top + 0.36),
-             s.picture_material("head", p.marble(rng, 700, 700, ((70, 60, 56), (190, 176, 160), (236, 228, 214)))),
-             turn=18)
+                 s.picture_material("head", p.marble(rng, 700, 700, ((70, 60, 56), (190, 176, 160), (236, 228, 214)))),
+                 turn=18)
 
-    # The vase that the lantern passes behind.
+
+def _add_things(rng: np.random.Generator) -> None:
+    """Add a vase that the lantern passes behind, a globe, a mug, cubes, pages and a plant."""
+    from .. import patterns as p
+    from .. import stage as s
+
     outline = [(1e-3, 0.0), (0.24, 0.0), (0.27, 0.05), (0.36, 0.3), (0.4, 0.55), (0.36, 0.82), (0.2, 1.12),
                (0.13, 1.3), (0.13, 1.52), (0.2, 1.68), (0.17, 1.68), (0.1, 1.5)]
     glaze = p.tiles(rng, 900, 1400, p.SEA, 9, 16, (222, 214, 190), offset=True)
@@ -88,11 +105,11 @@ def build_scene(scene: SceneDescription) -> None:
     brass = s.plain_material("brass", (0.5, 0.36, 0.16), 0.4, 0.8)
     s.add_ball("globe", 0.52, (-0.38, 0.95, 0.82), globe, turn=40, tilt=(18, 0))
     s.add_lathe("globe foot", [(1e-3, 0), (0.34, 0), (0.32, 0.05), (0.06, 0.1), (0.05, 0.32), (1e-3, 0.32)],
-            (-0.38, 0.95, 0), brass)
+                (-0.38, 0.95, 0), brass)
 
     mug = p.tiles(rng, 420, 900, p.WARM, 4, 10, (240, 232, 214))
     s.add_lathe("mug", [(1e-3, 0.0), (0.19, 0.0), (0.2, 0.02), (0.2, 0.42), (0.175, 0.42), (0.17, 0.05), (1e-3, 0.05)],
-            (-0.52, -0.75, 0), s.picture_material("mug", mug, 0.5), 48)
+                (-0.52, -0.75, 0), s.picture_material("mug", mug, 0.5), 48)
     for index, (x, y, turn, side) in enumerate(((1.5, -0.95, 28, 0.36), (1.95, -0.75, -14, 0.36),
                                                 (1.7, -0.82, 8, 0.32), (-2.7, -0.6, 33, 0.44))):
         sides = [s.picture_material(f"cube {index} {face}", p.framed(
@@ -102,20 +119,24 @@ def build_scene(scene: SceneDescription) -> None:
     for index, (x, y, turn) in enumerate(((0.35, -1.25, -12), (-1.15, -1.35, 17), (2.6, 0.0, -20))):
         page = p.writing(rng, 700, 520, (238, 232, 216), (40, 44, 66), 30)
         s.add_sheet(f"page {index}", 0.7, 0.95, (x, y, 0.012 + 0.002 * index),
-                s.picture_material(f"page {index}", page, 0.9), turn)
+                    s.picture_material(f"page {index}", page, 0.9), turn)
     s.add_lathe("pot", [(1e-3, 0), (0.2, 0), (0.28, 0.45), (0.3, 0.45), (0.3, 0.52), (0.25, 0.52), (0.22, 0.4),
-                    (1e-3, 0.4)], (2.75, 1.35, 0),
-            s.picture_material("pot", p.marble(rng, 400, 800, p.STONE), 0.8))
+                        (1e-3, 0.4)], (2.75, 1.35, 0),
+                s.picture_material("pot", p.marble(rng, 400, 800, p.STONE), 0.8))
     leaf = s.picture_material("leaf", p.gradient_map(p.noise(rng, 256, 256, 40, 4), ((28, 54, 30), (76, 116, 58),
                                                                                 (140, 160, 90))), 0.7)
     for index in range(15):
         lean, azimuth = rng.uniform(20, 60), index * 137.5
-        reach = 0.32 * np.sin(np.radians(lean))
-        position = (2.75 + reach * np.cos(np.radians(azimuth)), 1.35 + reach * np.sin(np.radians(azimuth)),
-              0.62 + 0.4 * np.cos(np.radians(lean)) + 0.12 * (index % 3))
+        leaf_offset = 0.32 * np.sin(np.radians(lean))
+        position = (2.75 + leaf_offset * np.cos(np.radians(azimuth)), 1.35 + leaf_offset * np.sin(np.radians(azimuth)),
+                    0.62 + 0.4 * np.cos(np.radians(lean)) + 0.12 * (index % 3))
         s.add_sheet(f"leaf {index}", 0.66, 0.2, position, leaf, azimuth, (rng.uniform(-20, 20), -(90 - lean)))
 
-    # The desk lamp: a foot, two arms, a bulb without shade; the lantern hangs from a bracket on the wall.
+
+def _add_lamps(scene: SceneDescription) -> None:
+    """Add the desk lamp (a foot, two arms, a bulb without shade), and the lantern on a bracket on the wall."""
+    from .. import stage as s
+
     steel = s.plain_material("steel", (0.06, 0.06, 0.07), 0.45, 0.6)
     lamp, lantern = (np.array(light.xyz) for light in scene.lights)
     foot, elbow = np.array([-2.55, 1.3, 0.0]), np.array([-2.75, 1.25, 1.6])
@@ -127,9 +148,6 @@ def build_scene(scene: SceneDescription) -> None:
     s.add_rod("chain", (lantern[0], lantern[1], 2.0), lantern + np.array([0, 0, 0.1]), 0.012, steel)
     for light in scene.lights:
         s.add_lamp(light)
-    s.add_softbox("window", (-4.5, -4.0, 5.0), (0, 0.8, 0.6), (3.0, 3.0), 215, (1.0, 0.96, 0.9))
-    s.add_softbox("room", (5.0, -3.0, 4.5), (0, 0.8, 0.6), (4.0, 4.0), 100, (0.75, 0.86, 1.0))
-    s.set_uniform_world((0.55, 0.65, 0.8), 0.14)
 
 
 DESK = SceneDescription(

@@ -37,7 +37,7 @@ def build_scene(scene: SceneDescription) -> None:
     s.add_sheet("floor", 13, 12, (0, 0.5, 0), s.picture_material("floor", floor, 0.6))
     plaster = ((176, 168, 158), (150, 146, 142), (190, 182, 168))
     for name, width, position, turn in (("back", 13, (0, 4.2, 1.8), 0), ("left", 10, (-4.6, 0, 1.8), 90),
-                                  ("right", 10, (4.6, 0, 1.8), -90)):
+                                        ("right", 10, (4.6, 0, 1.8), -90)):
         wall = p.tiles(rng, 700, 2400, plaster, 5, 12, (120, 112, 104))
         s.add_sheet(name, width, 3.8, position, s.picture_material(name, wall, 0.95), turn, (90, 0))
     dark = s.plain_material("frame", (0.03, 0.03, 0.035), 0.5)
@@ -50,7 +50,7 @@ def build_scene(scene: SceneDescription) -> None:
         offset = np.array([np.sin(np.radians(turn)), -np.cos(np.radians(turn))]) * 0.05
         s.add_sheet(f"backing {index}", width + 0.12, height + 0.12, (x, y, z), dark, turn, (90, 0))
         s.add_sheet(f"art {index}", width, height, (x + offset[0], y + offset[1], z),
-                s.picture_material(f"art {index}", art, 0.8), turn, (90, 0))
+                    s.picture_material(f"art {index}", art, 0.8), turn, (90, 0))
     # The partition: the studio light stands behind it and shows past its edge and through its slot.
     panel = [s.picture_material(f"panel {i}", p.framed(p.poster(rng, 700, 420, p.STONE, 24), 0.05), 0.9)
              for i in range(2)]
@@ -59,13 +59,13 @@ def build_scene(scene: SceneDescription) -> None:
     for index, (x, y, width, height) in enumerate(((-1.7, 1.4, 0.6, 1.0), (-0.2, 0.2, 0.5, 0.75), (1.7, 0.6, 0.6, 0.9),
                                                (-3.1, 0.4, 0.55, 1.1), (3.1, -0.2, 0.5, 0.8))):
         s.add_poster_box(f"plinth {index}", rng, (width, width, height), (x, y, 0), (p.STONE, p.SEA, p.PLUM)[index % 3],
-                     rng.uniform(-20, 20))
+                         rng.uniform(-20, 20))
     vase = [(1e-3, 0), (0.16, 0), (0.26, 0.25), (0.2, 0.5), (0.08, 0.66), (0.13, 0.8), (0.1, 0.8)]
     s.add_lathe("vase", vase, (-1.7, 1.4, 1.0), s.picture_material("vase", p.tiles(rng, 500, 900, p.WARM, 7, 12), 0.5))
     s.add_monkey("bust", 0.55, (-0.2, 0.2, 1.03), s.picture_material("bust", p.marble(rng, 600, 600, p.STONE)), -8)
     s.add_ball("globe", 0.3, (1.7, 0.6, 1.2), s.picture_material("globe", p.map_of_islands(rng, 500, 1000), 0.6), 60)
     s.add_lathe("cone", [(1e-3, 0), (0.25, 0), (1e-3, 0.7)], (-3.1, 0.4, 1.1),
-            s.picture_material("cone", p.tiles(rng, 500, 700, p.MOSS, 8, 10), 0.6))
+                s.picture_material("cone", p.tiles(rng, 500, 700, p.MOSS, 8, 10), 0.6))
     s.add_poster_box("block", rng, (0.34, 0.34, 0.34), (3.1, -0.2, 0.8), p.WARM, 25)
     s.add_poster_box("bench", rng, (1.6, 0.5, 0.42), (1.1, -0.9, 0), p.SEA, -14)
     steel = s.plain_material("steel", (0.06, 0.06, 0.07), 0.4, 0.7)

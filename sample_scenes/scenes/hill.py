@@ -55,7 +55,7 @@ def build_scene(scene: SceneDescription) -> None:
     for index, (x, y, turn, size) in enumerate(((-1.5, -0.3, 20, 0.7), (-0.9, -0.8, -12, 0.5), (1.6, 0.4, 8, 0.8),
                                                (2.1, -0.5, 40, 0.55), (-2.6, 0.5, 5, 0.6), (1.7, 0.4, 30, 0.45))):
         s.add_poster_box(f"crate {index}", rng, (size, size, size), (x, y, 0.8 if index == 5 else 0),
-                     (p.WARM, p.SEA, p.MOSS, p.PLUM)[index % 4], turn)
+                         (p.WARM, p.SEA, p.MOSS, p.PLUM)[index % 4], turn)
     s.add_poster_box("plinth", rng, (0.8, 0.8, 1.0), (0.25, 0.5, 0), p.SEA, 15)
     s.add_monkey("head", 0.8, (0.25, 0.5, 1.62), s.picture_material("head", p.marble(rng, 600, 600, p.STONE)), 10)
     pot = [(1e-3, 0), (0.25, 0), (0.36, 0.5), (0.4, 0.5), (0.4, 0.6), (0.33, 0.6), (0.3, 0.45), (1e-3, 0.45)]

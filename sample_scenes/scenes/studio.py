@@ -54,7 +54,7 @@ def build_scene(scene: SceneDescription) -> None:
                     turn, (90, 0))
     # Columns in front of either light from a part of the path; the last hides nothing.
     for index, (x, y, radius, height) in enumerate(((-1.05, -0.75, 0.17, 2.7), (0.72, -0.5, 0.2, 2.5),
-                                                  (2.5, 1.7, 0.2, 2.2))):
+                                                    (2.5, 1.7, 0.2, 2.2))):
         profile = [(1e-3, 0.0), (radius * 1.5, 0.0), (radius * 1.5, 0.12), (radius, 0.18), (radius, height - 0.15),
                    (radius * 1.35, height), (1e-3, height)]
         bark = p.tiles(rng, 900, 600, (p.WARM, p.STONE, p.SEA)[index], 16, 8, (60, 50, 44), offset=True)
@@ -62,7 +62,7 @@ def build_scene(scene: SceneDescription) -> None:
     for index, (x, y, side, height) in enumerate(((-2.3, 0.4, 0.6, 0.8), (-0.3, 0.9, 0.7, 0.6), (1.9, 0.2, 0.5, 0.7),
                                                (0.2, -1.4, 0.4, 0.35))):
         s.add_poster_box(f"crate {index}", rng, (side, side, height), to_world(x, y, 0),
-                     (p.WARM, p.SEA, p.MOSS, p.PLUM)[index], turn + rng.uniform(-25, 25))
+                         (p.WARM, p.SEA, p.MOSS, p.PLUM)[index], turn + rng.uniform(-25, 25))
     bust = s.picture_material("bust", p.marble(rng, 500, 500, p.STONE))
     s.add_monkey("bust", 0.5, to_world(-0.3, 0.9, 0.92), bust, turn)
     globe = s.picture_material("globe", p.map_of_islands(rng, 500, 1000), 0.6)

@@ -79,17 +79,18 @@ class _SceneState:
 
     def __init__(self, scene: Any) -> None:
         self._scene, render = scene, scene.render
-        self._range = scene.frame_start, scene.frame_end, scene.frame_current
+        self._range = scene.frame_start, scene.frame_end
+        self._current_frame, self._subframe = scene.frame_current, scene.frame_subframe
         self._render = {name: getattr(render, name) for name in (
             "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y")}
 
     def restore(self, *collections: Any) -> None:
         """Restore size and frames of the scene, and remove collections with their objects and the objects' data."""
         scene = self._scene
-        scene.frame_start, scene.frame_end = self._range[:2]
+        scene.frame_start, scene.frame_end = self._range
         for name, value in self._render.items():
             setattr(scene.render, name, value)
-        scene.frame_set(self._range[2])
+        scene.frame_set(self._current_frame, subframe=self._subframe)
         for collection in collections:
             for item in list(collection.objects):
                 data = item.data

@@ -82,6 +82,13 @@ def test_a_cancelled_import_leaves_nothing(facts: Any) -> None:
     assert facts["cancelled import"] == [True, True, True]
 
 
+def test_the_scene_gets_the_cameras_of_a_capture_in_portions(facts: Any) -> None:
+    """Block of projects.py: "an import that is cancelled"."""
+    portions, count, unused_collections = facts["portions of cameras"]
+    assert count > 2 and portions == [*range(0, count, 2), count]
+    assert unused_collections == []
+
+
 def test_lights_follow_a_fit_in_a_scene_that_no_window_shows(facts: Any) -> None:
     """Block of projects.py: "a fit that ends while its scene is not the one in the window"."""
     assert facts["moved unseen"] < 1e-4

@@ -158,10 +158,12 @@ importer, scene = part("flare_addon.capture.importer"), empty()
 
 
 def all_of_it():
-    return [scene.frame_end, scene.render.resolution_x, scene.fit_flare.capture,
+    return [scene.frame_end, scene.frame_current, scene.frame_subframe, scene.render.resolution_x,
+            scene.fit_flare.capture,
             *(len(getattr(bpy.data, kind)) for kind in ("objects", "collections", "cameras", "meshes"))]
 
 
+scene.frame_set(3, subframe=0.25)
 before, steps_before_cameras = all_of_it(), 0
 steps = importer.import_in_steps(scene, capture, importer.ImportSettings("each"))
 for _ in steps:
@@ -171,6 +173,13 @@ for _ in steps:
 grown = all_of_it()
 steps.close()
 facts["cancelled import"] = [before == all_of_it(), grown != before, steps_before_cameras > 5]
+importer.CAMERAS_PER_LINK, portions = 2, []
+for pause in importer.import_in_steps(scene, capture, importer.ImportSettings("each")):
+    count = sum(item.type == "CAMERA" for item in scene.objects)
+    if pause is not None and (not portions or count > portions[-1]):
+        portions.append(count)
+facts["portions of cameras"] = [portions, len(bpy.data.cameras),
+                                [item.name for item in bpy.data.collections if not item.users]]
 
 # ---- a fit that ends while its scene is not the one in the window ---------------------------------------
 looks, lights = part("flare_addon.looks"), part("flare_addon.lights")

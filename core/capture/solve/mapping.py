@@ -48,6 +48,14 @@ MIN_MATCHES = 15
 """Number of verified matches from which two frames count as matched."""
 MIN_MOTION_PX = 1.0
 """Median motion of features, in pixels of the small pictures, below which the camera counts as still."""
+MIN_PARALLAX_SHARE = 0.02
+"""Share of the matched pairs of frames that must have parallax."""
+MAX_EQUAL_DIFFERENCE = 3
+"""Largest difference of two thumbnails' pixels, of 255, up to which the frames count as equal."""
+LOW_TEXTURE_THRESHOLD = 0.4
+"""Factor on the threshold of features for frames with little texture."""
+FEATURE_BATCH, MATCH_BATCH = 8, 100
+"""Frames, and pairs of frames, between two checks for a stop."""
 
 _SOURCE_LINE = re.compile(r"\[\w+\.(cc|h):\d+\]")
 """Start of the messages of pycolmap's checks."""
@@ -183,15 +191,15 @@ def load_pycolmap() -> Any:
 
 
 def _check_frames_differ(sources: Sequence[SourceFrame], work: Path) -> None:
-    """Raise CaptureError where every frame shows the same: no pixel of a thumbnail differs by more than 3 of 255."""
+    """Raise CaptureError where every frame shows the same, by thumbnails of 64 x 64 pixels."""
     import cv2
 
     first: Any = None
     for source in sources:
-        small = _read_grey(work / "small" / source.name)
-        tiny = cv2.resize(small, (64, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
-        first = tiny if first is None else first
-        if np.abs(tiny - first).max() > 3:
+        grey = _read_grey(work / "small" / source.name)
+        thumbnail = cv2.resize(grey, (64, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
+        first = thumbnail if first is None else first
+        if np.abs(thumbnail - first).max() > MAX_EQUAL_DIFFERENCE:
             return
     raise CaptureError(f"All {len(sources)} frames show the same picture; a solve needs a camera that moves.")
 
@@ -227,12 +235,13 @@ def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path,
     for (camera_id, has_little_texture), names in names_by_group.items():
         reader.existing_camera_id = camera_id
         # Walls and skies: weak features are better than none.
-        options.sift.peak_threshold = 0.4 * default_threshold if has_little_texture else default_threshold
-        for start in range(0, len(names), 8):  # in batches: a stop waits for one of them
-            pycolmap.extract_features(database, work / "small", image_names=names[start:start + 8],
+        options.sift.peak_threshold = (LOW_TEXTURE_THRESHOLD if has_little_texture else 1.0) * default_threshold
+        for start in range(0, len(names), FEATURE_BATCH):
+            batch = names[start:start + FEATURE_BATCH]
+            pycolmap.extract_features(database, work / "small", image_names=batch,
                                       camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
                                       extraction_options=options, device=pycolmap.Device.cpu)
-            progress.advance(len(names[start:start + 8]))
+            progress.advance(len(batch))
 
 
 def _has_little_texture(small: Path) -> bool:
@@ -275,8 +284,8 @@ def _match_frames(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, dat
     verification.ransac.random_seed = settings.seed
     listing = pycolmap.ImportedPairingOptions()
     listing.match_list_path = str(work / "pairs.txt")
-    for start in range(0, len(missing_pairs), 100):  # in batches: a stop waits for one of them
-        batch = missing_pairs[start:start + 100]
+    for start in range(0, len(missing_pairs), MATCH_BATCH):
+        batch = missing_pairs[start:start + MATCH_BATCH]
         write_text(work / "pairs.txt", "".join(f"{sources[i].name} {sources[j].name}\n" for i, j in batch))
         pycolmap.match_image_pairs(database, matching_options=options, pairing_options=listing,
                                    verification_options=verification, device=pycolmap.Device.cpu)
@@ -376,8 +385,7 @@ def _refine_principal_point(pycolmap: Any, model: Any) -> Any:
 def _check_parallax(pycolmap: Any, database: Path, size: int) -> None:
     """Raise CaptureError where matched features show that depth cannot be measured.
 
-    Mapping would take long and might return a wrong model. At least 2 % of the pairs of frames must have parallax.
-    size: long side of the small pictures, for the message.
+    Mapping would take long and might return a wrong model. size: long side of the small pictures, for the message.
     """
     configuration = pycolmap.TwoViewGeometryConfiguration
     without_parallax = (configuration.PLANAR_OR_PANORAMIC, configuration.PANORAMIC)
@@ -397,7 +405,7 @@ def _check_parallax(pycolmap: Any, database: Path, size: int) -> None:
     if np.median(motions) < MIN_MOTION_PX:
         raise CaptureError(f"The camera hardly moves: matched features shift by {np.median(motions):.2f} pixels at "
                            f"{size}; a solve needs a camera that travels.")
-    if with_parallax < 0.02 * len(motions):
+    if with_parallax < MIN_PARALLAX_SHARE * len(motions):
         raise CaptureError("The camera turns but does not travel, or sees one flat surface only: there is no parallax "
                            "to measure depth by.")
 

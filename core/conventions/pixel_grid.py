@@ -60,7 +60,7 @@ class PixelGrid:
         ratio = focal_length / min(max(focal_length, self.min_focal_length), self.max_focal_length)
         return 1.0 if abs(ratio - 1) < SIZE_TOLERANCE else ratio
 
-    def supersampling(self, focal_length: float, width: int, height: int) -> int:
+    def supersampling_factor(self, focal_length: float, width: int, height: int) -> int:
         """Return by which factor to render a picture larger and average it down; 1 where it is as fine as the frames.
 
         A factor with which no Gaussian falls between the pixels, limited by `MAX_PIXELS`.

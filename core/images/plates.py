@@ -300,8 +300,8 @@ def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
     """
     parts = read_exr_parts(path)
     check_parts(path, parts)
-    main = main_part([(number, channels) for number, (_, channels) in enumerate(parts)])
-    header, channels = parts[main]
+    main_number = main_part([(number, channels) for number, (_, channels) in enumerate(parts)])
+    header, channels = parts[main_number]
     if has_chroma(channels):  # written back as R, G, B, since chroma of half resolution cannot hold a clean edge
         if len(parts) > 1:
             raise FrameError(f"{path} has {len(parts)} parts, one of luminance and chroma; export the plate as a file "
@@ -321,7 +321,7 @@ def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
     codes = np.stack([np.asarray(channels[name]) for name in (names if len(names) == 3 else names * 3)], -1)
     extras: dict[str, Any] = {"header": header, "channels": channels, "names": names}
     if len(parts) > 1:
-        extras.update(parts=parts, main=main)
+        extras.update(parts=parts, main=main_number)
     return Plate(path, codes, "linear", len(names) == 1, None, extras, space)
 
 
@@ -426,7 +426,8 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
         channels[name] = np.ascontiguousarray(codes[..., index], channels[name].dtype)  # channels may differ in depth
     parts = list(plate.extras.get("parts", [None]))
     parts[plate.extras.get("main", 0)] = plate.extras["header"], channels
-    save_exr_parts(path, [(_scanline_header(header), others) for header, others in parts], source=plate.path)
+    save_exr_parts(path, [(_scanline_header(header), part_channels) for header, part_channels in parts],
+                   source=plate.path)
 
 
 def _scanline_header(stored: Mapping[str, Any]) -> dict[str, Any]:

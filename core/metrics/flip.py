@@ -67,8 +67,8 @@ def _to_perceived_lab(planes: Planes) -> Planes:
 
 def _filter_contrast(planes: Planes) -> Planes:
     """Filter each channel of Y C_x C_z by its contrast sensitivity, section 4.1.1."""
-    radius = math.ceil(3 * math.sqrt(max(b for part in _CONTRAST for _, b in part) / (2 * math.pi ** 2))
-                       * PIXELS_PER_DEGREE)
+    widest = max(b for gaussians in _CONTRAST for _, b in gaussians)
+    radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi ** 2)) * PIXELS_PER_DEGREE)  # three standard deviations
     degrees = np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE
     filtered = np.empty_like(planes)
     for channel, gaussians in enumerate(_CONTRAST):

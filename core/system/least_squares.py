@@ -13,32 +13,36 @@ L1_EPSILON = 0.01
 """Residuals below this count by their squares."""
 
 
-def robust_bounded_fit(columns: Floats, values: Floats, start: Floats, low: ArrayLike, high: ArrayLike,
+def robust_bounded_fit(columns: Floats, values: Floats, initial: Floats, low: ArrayLike, high: ArrayLike,
                        prior_weight: float) -> Floats:
     """Return x (n,) within bounds that brings columns (m, n) @ x nearest to values (m,), by least absolute errors.
 
-    low, high: the bounds, (n,) or one for all. prior_weight: per value, of the squared distance from `start`, which
+    low, high: the bounds, (n,) or one for all. prior_weight: per value, of the squared distance from `initial`, which
     decides where the values do not.
     """
-    lower, upper = np.broadcast_to(low, start.shape), np.broadcast_to(high, start.shape)
-    solution, weights = start.copy(), np.ones(len(values))
-    prior = prior_weight * max(len(values), 1) * np.eye(len(start))
+    lower, upper = np.broadcast_to(low, initial.shape), np.broadcast_to(high, initial.shape)
+    solution, weights = initial.copy(), np.ones(len(values))
+    prior = prior_weight * max(len(values), 1) * np.eye(len(initial))
     for _ in range(REWEIGHTINGS):
         weighted = columns.T * weights
-        solution = bounded_least_squares(weighted @ columns + prior, weighted @ values + prior @ start, solution,
+        solution = bounded_least_squares(weighted @ columns + prior, weighted @ values + prior @ initial, solution,
                                          lower, upper)
         # So weighted, the square of a residual counts as its absolute value.
         weights = 1 / (np.abs(values - columns @ solution) + L1_EPSILON)
     return solution
 
 
-def bounded_least_squares(product: Floats, target: Floats, start: Floats, low: Floats, high: Floats) -> Floats:
-    """Return x (n,) between bounds (n,) that minimises x^T product x / 2 - target^T x, by coordinate descent.
+def bounded_least_squares(normal_matrix: Floats, normal_vector: Floats, initial: Floats, lower: Floats,
+                          upper: Floats) -> Floats:
+    """Return x (n,) between bounds (n,) that solves least squares by coordinate descent from `initial` (n,).
 
-    product (n, n): of the normal equations product x = target, which x solves where no bound holds. start (n,)."""
-    solution = start.copy()
+    normal_matrix (n, n), normal_vector (n,): of the normal equations matrix x = vector, which x solves where no bound
+    holds; it minimises x^T matrix x / 2 - vector^T x.
+    """
+    solution = initial.copy()
     for _ in range(DESCENT_SWEEPS):
         for index in range(len(solution)):
-            residual = target[index] - product[index] @ solution + product[index, index] * solution[index]
-            solution[index] = min(max(residual / product[index, index], low[index]), high[index])
+            diagonal = normal_matrix[index, index]
+            residual = normal_vector[index] - normal_matrix[index] @ solution + diagonal * solution[index]
+            solution[index] = min(max(residual / diagonal, lower[index]), upper[index])
     return solution

@@ -95,10 +95,10 @@ def test_the_pixel_ratio_follows_the_focal_length() -> None:
 
 def test_coarse_pictures_are_supersampled_up_to_a_limit() -> None:
     grid = PixelGrid(1000.0, 1000.0)
-    factors = [grid.supersampling(focal, 100, 50) for focal in (2000, 1000, 990, 940, 500, 400, 100)]
+    factors = [grid.supersampling_factor(focal, 100, 50) for focal in (2000, 1000, 990, 940, 500, 400, 100)]
     assert factors == [1, 1, 1, 2, 2, 3, 10]
-    assert grid.supersampling(1.0, 1920, 1080) ** 2 * 1920 * 1080 <= MAX_PIXELS
-    assert grid.supersampling(500.0, 8192, 4320) == 1
+    assert grid.supersampling_factor(1.0, 1920, 1080) ** 2 * 1920 * 1080 <= MAX_PIXELS
+    assert grid.supersampling_factor(500.0, 8192, 4320) == 1
 
 
 @pytest.mark.parametrize("lengths", [(0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0, math.inf), (math.nan, 1.0),

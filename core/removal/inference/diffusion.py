@@ -200,12 +200,12 @@ class DiffusionTrainer:
         source, target = (torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1)))[None].to(device)
                           for picture in (frame, scene))
         prediction = self.model(source)
-        squared = F.mse_loss(prediction, target)
-        loss = squared if self._perceptual is None else squared + self._perceptual(prediction, target)
+        l2_loss = F.mse_loss(prediction, target)
+        loss = l2_loss if self._perceptual is None else l2_loss + self._perceptual(prediction, target)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.optimiser.step()
-        return {"loss": float(loss.detach()), "l2": float(squared.detach())}
+        return {"loss": float(loss.detach()), "l2": float(l2_loss.detach())}
 
 
 class DiffusionRemover(Remover):

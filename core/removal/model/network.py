@@ -161,6 +161,7 @@ class RemovalNetwork(nn.Module):
     HEADS = 4
 
     def __init__(self, widths: tuple[int, ...], blocks: tuple[int, ...], attention: tuple[int, ...]) -> None:
+        """Build the network with random weights. widths, blocks, attention: see the class."""
         super().__init__()
         # The finest level has the frame's own pixels beside what every level has.
         input_channels = (3 * SHUFFLE_FACTOR**2 + INPUT_CHANNELS, *(INPUT_CHANNELS for _ in widths[1:]))

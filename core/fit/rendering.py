@@ -112,7 +112,8 @@ def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels
                          depth: bool) -> Rendering:
     """Render at the camera's size. Where that is coarser than the fitted frames, pixels are means, in linear light, of
     a larger picture. sh_degree: of the colours; None for all degrees."""
-    samples = 1 if scene.pixel_grid is None else scene.pixel_grid.supersampling_factor(camera.focal_length, *camera.size)
+    grid = scene.pixel_grid
+    samples = 1 if grid is None else grid.supersampling_factor(camera.focal_length, *camera.size)
     if samples == 1:
         return scene.render(camera, sh_degree, kernels=kernels, depth=depth)
     large = scene.render(camera.scaled(samples * camera.width, samples * camera.height), sh_degree, kernels=kernels,

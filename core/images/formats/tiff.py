@@ -132,7 +132,7 @@ def page_count(stream: BinaryIO) -> int:
     for layout, entries in _directories(stream):
         # The numbers of 32 bits of the tag SUBFILE, of which a page has one at most.
         subfile_types = [layout.number(entry[layout.value_position:], "I") for entry in entries
-                 if layout.number(entry, "H") == SUBFILE]
+                         if layout.number(entry, "H") == SUBFILE]
         count += not any(subfile_type & 1 for subfile_type in subfile_types)  # bit 0: a reduced copy of another page
     return count
 

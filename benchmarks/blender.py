@@ -155,55 +155,72 @@ def time_lamp_overlay(looks: Any, overlay: Any, look: Path, window: Any) -> list
     return lines
 
 
+def time_import(importing: Any, capture: Path, kind: str) -> str:
+    """Return a line on the import of a capture into an empty file. importing: module of the add-on. kind: of cameras.
+    """
+    import bpy
+
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    start = time.perf_counter()
+    importing.import_capture(bpy.context.scene, capture, importing.ImportSettings(cameras=kind))
+    return f"import of {CAMERAS} cameras ({kind}), {POINTS} points: {time.perf_counter() - start:.2f} s"
+
+
+def time_events(jobs: Any, run: Path) -> str:
+    """Return a line on reading 3,000 events of a fit. jobs: module of the add-on. run: a new folder."""
+    run.mkdir()
+    event = {"type": "progress", "stage": "fit", "done": 1, "total": 3000, "left_s": 9.0, "figures": {"loss": 0.1}}
+    (run / jobs.EVENTS).write_text("".join(json.dumps({**event, "done": number}) + "\n" for number in range(3000)))
+    job = jobs.Job("fit", run, jobs.Origin(os.getpid()))
+    job._is_alive = lambda: True  # the process that is watched is this one
+    fast, slow = time_range(job.poll, 20)
+    return f"reading a fit's events, at most {jobs.READ_CHUNK >> 10} kB a time: {fast:.2f} to {slow:.2f} ms"
+
+
+def time_overlay(looks: Any, overlay: Any, window: Any) -> str:
+    """Return a line on the overlay of the scene's flare, with a camera that moves.
+
+    looks, overlay: modules of the add-on. window: the region that is drawn.
+    """
+    import bpy
+
+    scene, depsgraph = bpy.context.scene, bpy.context.evaluated_depsgraph_get()
+    look = looks.look_of(scene)
+
+    def draw_frame() -> None:
+        scene.camera.delta_location.x += 1e-4  # so that the network is needed again
+        bpy.context.view_layer.update()
+        gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
+        overlay.quads_by_level(gaussians, window, look)
+
+    draw_frame()
+    fast, slow = time_range(draw_frame, 20)
+    count = sum(map(len, looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
+    return f"overlay of {count} Gaussians, all but the GPU: {fast:.1f} to {slow:.1f} ms"
+
+
 def main() -> None:
     """Time the import of a capture, the reading of events, and the overlay, inside Blender."""
     import bpy
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     load_module("flare_addon").register()
-    importing, looks, overlay, cameras, jobs = (load_module(f"flare_addon.{name}") for name in (
-        "capture.importer", "looks", "overlay", "cameras", "jobs"))
+    importing, looks, overlay, cameras, jobs, library = (load_module(f"flare_addon.{name}") for name in (
+        "capture.importer", "looks", "overlay", "cameras", "jobs", "library"))
     lines = [f"Blender {bpy.app.version_string}, {os.cpu_count()} cores"]
     with tempfile.TemporaryDirectory() as base:
         folder = Path(base)
         capture, flare = make_capture(folder / "capture"), make_flare(folder / "lamp.flare")
-        for kind in ("each", "animated"):
-            bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-            scene = bpy.context.scene
-            start = time.perf_counter()
-            importing.import_capture(scene, capture, importing.ImportSettings(cameras=kind))
-            lines.append(f"import of {CAMERAS} cameras ({kind}), {POINTS} points: {time.perf_counter() - start:.2f} s")
+        lines += [time_import(importing, capture, kind) for kind in ("each", "animated")]
+        scene = bpy.context.scene
         looks.show_look(scene, flare)
         bpy.context.view_layer.update()
-
-        run = folder / "run"
-        run.mkdir()
-        event = {"type": "progress", "stage": "fit", "done": 1, "total": 3000, "left_s": 9.0, "figures": {"loss": 0.1}}
-        (run / jobs.EVENTS).write_text("".join(json.dumps({**event, "done": number}) + "\n" for number in range(3000)))
-        job = jobs.Job("fit", run, jobs.Origin(os.getpid()))
-        job._alive = lambda: True  # the process that is watched is this one
-        fast, slow = time_range(job.poll, 20)
-        lines.append(f"reading a fit's events, at most {jobs.READ_CHUNK >> 10} kB a time: {fast:.2f} to {slow:.2f} ms")
-
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        core = cameras.core_camera(scene.camera.data, scene.camera.matrix_world, scene.render)
-        window = overlay.drawn_region(overlay.CameraFrame(0, 0, 1920, 1080), (1920, 1080), core)
-
-        look = looks.look_of(scene)
-
-        def draw_frame(*, moves: bool = True) -> None:
-            if moves:  # the network is needed again
-                scene.camera.delta_location.x += 1e-4
-                bpy.context.view_layer.update()
-            gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
-            overlay.quads_by_level(gaussians, window, look)
-
-        draw_frame()
-        fast, slow = time_range(draw_frame, 20)
-        count = sum(map(len, looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
-        lines.append(f"overlay of {count} Gaussians, all but the GPU: {fast:.1f} to {slow:.1f} ms")
-        library_look = load_module("flare_addon.library").BOX / "Anamorphic Blue.flare"
-        lines += time_lamp_overlay(looks, overlay, library_look, window)
+        lines.append(time_events(jobs, folder / "run"))
+        bpy.context.view_layer.update()
+        camera = cameras.core_camera(scene.camera.data, scene.camera.matrix_world, scene.render)
+        window = overlay.drawn_region(overlay.CameraFrame(0, 0, 1920, 1080), (1920, 1080), camera)
+        lines.append(time_overlay(looks, overlay, window))
+        lines += time_lamp_overlay(looks, overlay, library.BOX / "Anamorphic Blue.flare", window)
     print("\n".join(lines))
     sys.stdout.flush()
     os._exit(0)

@@ -97,6 +97,14 @@ def error_columns(values: list[float]) -> str:
     return f"{np.median(values):5.2f} {np.percentile(values, 95):6.2f} {max(values):6.1f}"
 
 
+def score_columns(scores: TrackScores) -> str:
+    """Return the scores of a light as the columns of a row."""
+    return (f"{scores.visible:7d} {scores.followed:8d} |       {error_columns(scores.visible_errors)}    |"
+            f"       {error_columns(scores.confident_errors)}          | "
+            f"{scores.doubtful:3d} of {scores.keys:3d} ({scores.doubtful_visible:d})     |"
+            f"     {np.median(scores.brightness_errors):5.2f} {np.percentile(scores.brightness_errors, 95):5.2f}")
+
+
 def main() -> None:
     """Parse the arguments and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -117,20 +125,14 @@ def main() -> None:
             for truth, entry in zip(read_lights(folder / "truth" / "lights.json"), entries, strict=True):
                 light = match_light(truth, lights)
                 if light is None:
-                    print(f"{shot + '_' + str(seed):8s} {truth.name:6s} not found")
+                    print(f"{folder.name:8s} {truth.name:6s} not found")
                     continue
                 matched.append(light)
                 visible = {name: key["visible"] for name, key in entry["frames"].items()}
                 scores = score_track(capture, truth, visible, light)
-                print(f"{shot + '_' + str(seed):8s} {truth.name:6s} {scores.visible:7d} {scores.followed:8d} |"
-                      f"       {error_columns(scores.visible_errors)}    |"
-                      f"       {error_columns(scores.confident_errors)}          | "
-                      f"{scores.doubtful:3d} of {scores.keys:3d} ({scores.doubtful_visible:d})     |"
-                      f"     {np.median(scores.brightness_errors):5.2f}"
-                      f" {np.percentile(scores.brightness_errors, 95):5.2f}",
-                      flush=True)
+                print(f"{folder.name:8s} {truth.name:6s} {score_columns(scores)}", flush=True)
             false = sum(light not in matched for light in lights)
-            print(f"{shot + '_' + str(seed):8s} {len(lights)} lights, {false} of them false")
+            print(f"{folder.name:8s} {len(lights)} lights, {false} of them false")
 
 
 if __name__ == "__main__":

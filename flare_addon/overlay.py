@@ -390,16 +390,16 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
         bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
     if gaussians is None:
         return
-    drawn = render_levels(gaussians, window, look)
+    buffers = render_levels(gaussians, window, look)
     viewport = gpu.state.viewport_get()
     box = (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
            (window.y + window.height) / region[1])
     if _scene_buffer is None or has_display_footage(camera):
-        composite_levels(drawn, box, look.blend, window, np.eye(3))  # Blender's overlays are linear Rec. 709
+        composite_levels(buffers, box, look.blend, window, np.eye(3))  # Blender's overlays are linear Rec. 709
     else:
         with _scene_buffer.bind():
             gpu.state.viewport_set(*viewport)
-            composite_levels(drawn, box, look.blend, window, working_space())
+            composite_levels(buffers, box, look.blend, window, working_space())
     gpu.state.viewport_set(*viewport)
 
 
@@ -455,9 +455,9 @@ def add_to_picture(target: Any, scene: Any, depsgraph: Any, camera: Any, width: 
     window = drawn_region(CameraFrame(0, 0, width, height), (width, height), core)
     assert window is not None
     look = looks.look_of(scene)
-    drawn = render_levels(concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values())), window, look)
+    buffers = render_levels(concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values())), window, look)
     with target.bind():
-        composite_levels(drawn, (0, 0, 1, 1), look.blend, window, working_space())
+        composite_levels(buffers, (0, 0, 1, 1), look.blend, window, working_space())
 
 
 def render_picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> Floats:

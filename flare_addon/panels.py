@@ -123,13 +123,13 @@ class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw a running fit alone; else settings, clean frames, state of the last fit, and the button of a fit."""
         layout, scene = self.layout, context.scene
-        state, stage, folder = scene.fit_flare, fits.fit_state(scene), fits.run_folder(scene)
+        state, fit_state, folder = scene.fit_flare, fits.fit_state(scene), fits.run_folder(scene)
         job = jobs.find_job(folder)
-        for other in shots.orphaned_jobs():
-            draw_progress(layout, other, f"{other.folder.name} (used by no scene)")
+        for orphan in shots.orphaned_jobs():
+            draw_progress(layout, orphan, f"{orphan.folder.name} (used by no scene)")
         if engine.find_engine() is None:
             draw_missing_engine(layout)
-        if stage == "running" and job is not None:
+        if fit_state == "running" and job is not None:
             _draw_running_fit(layout, job)
             return
         settings = _settings_column(layout)
@@ -141,16 +141,16 @@ class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
             row.prop(state, "width", text="")
         capture = fits.capture_folder(scene)
         if capture is not None and (state.mode != "default" or fits.cleaning_job(capture) is not None):
-            _draw_clean_frames(layout, state, capture, stage)
-        if stage == "lost":
+            _draw_clean_frames(layout, state, capture, fit_state)
+        if fit_state == "lost":
             label_lines(layout, f"The folder of the run {folder} does not exist any more: start a new fit.", "ERROR")
-        elif stage == "resumable":
+        elif fit_state == "resumable":
             if job is not None and job.state == "failed":
                 label_lines(layout, job.error, "ERROR")
             else:
                 label_lines(layout, "The fit was stopped and can be resumed.", "INFO")
             layout.operator("fit_flare.resume", icon="PLAY")
-        elif stage == "finished":
+        elif fit_state == "finished":
             _draw_finished_fit(layout, scene, job)
         elif job is not None and job.state in ("failed", "stopped"):
             label_lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
@@ -159,12 +159,13 @@ class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
             label_lines(layout, f"{reason}.", "INFO")
         row = layout.row()
         row.scale_y = 1.3
-        row.operator("fit_flare.fit", text="Fit" if stage in ("none", "lost") else "New Fit", icon="RENDER_ANIMATION")
+        label = "Fit" if fit_state in ("none", "lost") else "New Fit"
+        row.operator("fit_flare.fit", text=label, icon="RENDER_ANIMATION")
         if folder is not None and is_folder(folder):
             _draw_log_buttons(layout, folder)
 
 
-def _draw_clean_frames(layout: Any, state: Any, capture: Any, stage: str) -> None:
+def _draw_clean_frames(layout: Any, state: Any, capture: Any, fit_state: str) -> None:
     """Draw the state of the clean frames, their options, and the button that makes them.
 
     Clean frames of the network can be made again with other options, or with the fit once it is finished.
@@ -177,9 +178,9 @@ def _draw_clean_frames(layout: Any, state: Any, capture: Any, stage: str) -> Non
         label_lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
     exists = is_folder(capture / REMOVED) and (job is None or job.state == "done")
     # Clean frames without a job were filmed or made elsewhere; they are not made again by the network.
-    offers_network = stage != "finished" and (not exists or job is not None)
+    offers_network = fit_state != "finished" and (not exists or job is not None)
     if not exists:
-        label_lines(layout, "The fit can remove its flare from the frames." if stage == "finished" else
+        label_lines(layout, "The fit can remove its flare from the frames." if fit_state == "finished" else
                     "No clean frames: the fit separates scene and flare by parallax." if state.mode == "split" else
                     "No clean frames yet: the fit starts by making them.", "INFO")
     if offers_network:
@@ -190,7 +191,7 @@ def _draw_clean_frames(layout: Any, state: Any, capture: Any, stage: str) -> Non
             label_lines(layout, "Press Make Clean Frames first: a fit makes them without these options.", "INFO")
     if exists and state.mode == "split":  # they were made while the .blend was closed
         label_lines(layout, "There are clean frames: choose them under Learn From to use them.", "INFO")
-    offers_fit = stage == "finished" and (job is None or "--run" not in job.args)
+    offers_fit = fit_state == "finished" and (job is None or "--run" not in job.args)
     if not exists or offers_network or offers_fit:
         layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if exists else "Make Clean Frames",
                         icon="BRUSH_DATA")

@@ -35,8 +35,8 @@ def open_blend(path: Path) -> Any:
     try:
         bpy.ops.wm.open_mainfile(filepath=str(path.resolve()), load_ui=False, use_scripts=False)
     except RuntimeError as problem:
-        why = " ".join(str(problem).removeprefix("Error: ").split())
-        raise CaptureError(f"{path} cannot be opened by Blender {bpy.app.version_string} ({why}).") from problem
+        reason = " ".join(str(problem).removeprefix("Error: ").split())
+        raise CaptureError(f"{path} cannot be opened by Blender {bpy.app.version_string} ({reason}).") from problem
     return bpy.context.scene
 
 

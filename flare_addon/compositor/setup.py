@@ -91,7 +91,7 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
     # artists_picture: the output socket under the flare, to which `remove_nodes` connects the output again.
-    end = _output_input(tree)
+    end = _final_input(tree)
     artists_picture = _feeding_socket(end)
     # Set up earlier, perhaps with nodes of the artist after it.
     is_set_up = artists_picture is not None and _depends_on(artists_picture.node, node)
@@ -215,7 +215,7 @@ def show_plate(scene: Any) -> bool:
     footage = _footage_node(tree, plate)
     if find_node(scene) is None:
         size = tree.nodes.get(SIZE) or _set_name(scale_to_render_size(tree, footage.outputs["Image"], -3, 1), SIZE)
-        tree.links.new(size.outputs[0], _output_input(tree))
+        tree.links.new(size.outputs[0], _final_input(tree))
     return True
 
 
@@ -320,7 +320,7 @@ def _tree_state(tree: Any) -> dict[str, Any]:
     nodes: names of the nodes, one a line. drivers: whether it has animation data. inputs: number of its inputs. from,
     socket: node and socket that feed its output; "" for none.
     """
-    end = _output_input(tree, make=False)
+    end = _final_input(tree, add=False)
     feeder = _feeding_socket(end)
     return {"nodes": "\n".join(node.name for node in tree.nodes if node.name not in (GROUP, LAYERS)),
             "drivers": tree.animation_data is not None, "inputs": len(trees.input_sockets(tree)),
@@ -347,22 +347,22 @@ def remove_nodes(scene: Any) -> None:
     state = dict(scene[STATE_PROPERTY]) if STATE_PROPERTY in scene else {**_scene_state(scene), **_tree_state(tree),
                                                                          "nodes": None}
     group, images = node.node_tree, [tree.nodes[name].image for name in (LAYERS, PLATE) if tree.nodes.get(name)]
-    # below: the output socket that takes the place of our node's.
-    below = _image_under_flare(tree, node, state)
-    if below is None and not state["tree"]:
-        below = _render_picture(tree)
-    for fed in [link.to_socket for link in tree.links if link.from_node == node
+    # The output socket that takes the place of our node's.
+    picture_below = _image_under_flare(tree, node, state)
+    if picture_below is None and not state["tree"]:
+        picture_below = _render_picture(tree)
+    for fed_input in [link.to_socket for link in tree.links if link.from_node == node
                 and (link.from_socket.name == "Image" or link.to_node.bl_idname == _OUTPUT_TYPE)]:
-        if below is not None:
-            tree.links.new(below, fed)
+        if picture_below is not None:
+            tree.links.new(picture_below, fed_input)
     drivers.disconnect_node(scene)
     if not state.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
         tree.animation_data_clear()
     _remove_crops(tree)
     for name in _OUR_NODES:
-        ours = tree.nodes.get(name)
-        if ours is not None and not (name == RENDER and any(socket.is_linked for socket in ours.outputs)):
-            tree.nodes.remove(ours)
+        our_node = tree.nodes.get(name)
+        if our_node is not None and not (name == RENDER and any(socket.is_linked for socket in our_node.outputs)):
+            tree.nodes.remove(our_node)
     _restore_tree(scene, tree, state)
     if STATE_PROPERTY in scene:
         del scene[STATE_PROPERTY]
@@ -418,15 +418,18 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
     """
     tree = trees.new_tree(scene)
     if keep_image and not tree.nodes:
-        tree.links.new(_render_picture(tree), _output_input(tree))
+        tree.links.new(_render_picture(tree), _final_input(tree))
     return tree
 
 
-def _output_input(tree: Any, make: bool = True) -> Any:
-    """Return the input socket of the final picture. Where there is none, add it, or with make=False return None."""
+def _final_input(tree: Any, add: bool = True) -> Any:
+    """Return the input socket of the tree's final picture.
+
+    add: add it where there is none, instead of returning None.
+    """
     outputs = sorted((node for node in tree.nodes if node.bl_idname == _OUTPUT_TYPE),
                      key=lambda node: not _is_active_output(tree, node))
-    if not make:
+    if not add:
         return outputs[0].inputs[0] if outputs and len(outputs[0].inputs) else None
     if GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")

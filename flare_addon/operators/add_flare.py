@@ -87,7 +87,7 @@ def _choose_camera(scene: Any) -> Any:
 
 
 def _add_camera(context: Any) -> Any:
-    """Add a camera that sees what the 3D view shows; return it."""
+    """Add a camera that sees what the 3D view shows, make it the scene's, and return it."""
     scene = context.scene
     camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.collection.objects.link(camera)

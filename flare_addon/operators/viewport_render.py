@@ -87,7 +87,7 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
             context.workspace.status_text_set(None)
 
     def _prepare_frames(self, context: bpy.types.Context) -> None:
-        """Prepare the frames. Raises SettingsError."""
+        """Check the output, note the current frame, and prepare the frames to render. Raises SettingsError."""
         scene = context.scene
         viewport_render.check_output(scene)
         self._frame_before = scene.frame_current, scene.frame_subframe

@@ -156,7 +156,7 @@ def _timecode(container: Any, stream: Any) -> str | None:
     return None
 
 
-def _output_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFormat:
+def _choose_pixel_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFormat:
     """Return the planar format to encode, the first of these that applies. first: the first frame of the video.
 
     The source's, if the encoder keeps it; the source's, without alpha where the encoder has none, if the encoder
@@ -191,7 +191,7 @@ def _add_video_stream(out: Any, video: Video, source: Any, encoder: Encoder, lef
     first = next(iter(video), None)
     if first is None:
         raise FrameError(f"{video.path} has no frame that can be read; copy it again.")
-    planar, raw = _output_format(encoder, video, first), first.raw
+    planar, raw = _choose_pixel_format(encoder, video, first), first.raw
     original = video.stream
     options = dict(encoder.options)
     mastering = x265_options(raw)

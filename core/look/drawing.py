@@ -100,14 +100,14 @@ def profile_in_box(box: Box, centre: Floats, covariance: Floats, ring: NDArray[A
     left, top, right, bottom = box
     dx = np.arange(left, right, dtype=np.float32) + 0.5 - centre[0]
     dy = (np.arange(top, bottom, dtype=np.float32) + 0.5 - centre[1])[:, None]
-    q = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
+    squared_distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
     if ring is None:
-        return np.asarray(np.exp(-q / 2), np.float32)
+        return np.asarray(np.exp(-squared_distance / 2), np.float32)
     r0, w = ring
-    exponent = (np.sqrt(np.maximum(q, 1e-12)) - r0) ** 2 / (2 * w * w)
+    exponent = (np.sqrt(np.maximum(squared_distance, 1e-12)) - r0) ** 2 / (2 * w * w)
     if pixel_arc.any():
-        x, y = pixel_arc
-        slope = np.array([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy * xy)
+        arc_x, arc_y = pixel_arc
+        slope = np.array([yy * arc_x - xy * arc_y, xx * arc_y - xy * arc_x]) / (xx * yy - xy * xy)
         log_peak = arc_log_peak(arc_strengths(pixel_arc[None], covariance[None])[0], ring)
         exponent = exponent - (slope[0] * dx + slope[1] * dy - log_peak)
     return np.asarray(np.exp(-exponent), np.float32)

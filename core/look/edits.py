@@ -296,10 +296,10 @@ def apply_edits(gaussians: PlaneGaussians, light: str, light_position: NDArray[A
         part = _apply_shape(gaussians.select(ungrouped), light_edit, light_position, False)
         parts.append(apply_colour(part, light_edit, blend))
         rows.append(np.flatnonzero(ungrouped))
-    whole_flare = concatenate(parts)
-    if whole_flare is None:
+    edited = concatenate(parts)
+    if edited is None:
         return gaussians.select(np.zeros(0, np.int64))
-    return whole_flare.select(np.argsort(np.concatenate(rows), kind="stable"))
+    return edited.select(np.argsort(np.concatenate(rows), kind="stable"))
 
 
 def apply_colour(gaussians: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:

@@ -81,6 +81,7 @@ class Transfer:
 
     def __init__(self, flare: Path, target: Target, settings: TransferSettings | None = None,
                  training: Sequence[ArrayLike] | None = None, config: str | None = None) -> None:
+        """Read the look of `flare`. Raises FlareFileError."""
         self.flare, self.target, self.settings, self.config = flare, target, settings or TransferSettings(), config
         self.look = read_look(flare)
         self.sources = {light.name: light for light in self.look.lights}

@@ -57,7 +57,7 @@ def grade(tree: bpy.types.NodeTree, name: str = "Grade") -> bpy.types.Node:
     node = tree.nodes.new("CompositorNodeExposure")
     node.name = name
     node.inputs["Exposure"].default_value = 1
-    end = setup._output_input(tree)
+    end = setup._final_input(tree)
     tree.links.new(end.links[0].from_socket, node.inputs[0])
     tree.links.new(node.outputs[0], end)
     return node
@@ -137,7 +137,7 @@ scene = empty()
 tree, colour = plate(scene)
 node = setup.set_up_nodes(scene, layers, keep_image=True)
 after = grade(tree)
-tree.links.new(node.outputs["Image"], setup._output_input(tree))
+tree.links.new(node.outputs["Image"], setup._final_input(tree))
 tree.links.new(after.outputs[0], node.inputs["Scene"])
 facts["a cycle"] = shown(scene)
 setup.set_up_nodes(scene, layers, keep_image=True)

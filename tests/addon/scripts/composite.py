@@ -66,7 +66,7 @@ facts["doubled"] = [count, (len(flare_node.tree_of(scene).nodes), len(bpy.data.n
 facts["sliders"] = [again.inputs["Intensity"].default_value, list(again.inputs["Tint"].default_value)]
 
 # ---- the flare alone ------------------------------------------------------------------------------
-flare_node.tree_of(scene).links.new(again.outputs["Flare"], setup._output_input(flare_node.tree_of(scene)))
+flare_node.tree_of(scene).links.new(again.outputs["Flare"], setup._final_input(flare_node.tree_of(scene)))
 render(scene, "flare", sorted(layers.files)[:1])
 
 # ---- over what is there: a plain colour in place of the baked scene, twice ------------------------
@@ -74,7 +74,7 @@ scene = empty()
 tree = setup._new_tree(scene, keep_image=False)
 plate = tree.nodes.new("CompositorNodeRGB")
 plate.outputs[0].default_value = (0.25, 0.5, 0.75, 1.0)
-tree.links.new(plate.outputs[0], setup._output_input(tree))
+tree.links.new(plate.outputs[0], setup._final_input(tree))
 for _ in range(2):
     setup.set_up_nodes(scene, layers, keep_image=True)
 facts["plate stays"] = plate.name in tree.nodes

@@ -178,7 +178,7 @@ scene = shot(["lamp"])
 setup._new_tree(scene, keep_image=False)
 colour = flare_node.tree_of(scene).nodes.new("CompositorNodeRGB")
 colour.outputs[0].default_value = (0.5, 0.5, 0.5, 1)
-flare_node.tree_of(scene).links.new(colour.outputs[0], setup._output_input(flare_node.tree_of(scene)))
+flare_node.tree_of(scene).links.new(colour.outputs[0], setup._final_input(flare_node.tree_of(scene)))
 scene.frame_start, scene.frame_end = 1, 3
 facts["all frames"] = set_up_warnings(scene)
 scene.frame_start, scene.frame_end = 0, 6

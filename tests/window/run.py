@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = 77
 VIEW, PREFERENCES = (0, 28, 1313, 908), (168, 55, 1313, 640)
 PICTURES = {
-    "preferences": ("01_preferences", PREFERENCES), "setting_up": ("11_setting_up", (168, 405, 1313, 560)),
+    "preferences": ("01_preferences", PREFERENCES), "setting_up": ("11_setting_up", (168, 335, 1313, 520)),
     "imported": ("03_imported", VIEW), "fitting": ("04_fitting", VIEW), "flare": ("05_flare", VIEW),
     "look": ("06_look_and_bake", (325, 75, 1312, 600)),
     "compositor": ("07_compositor", (0, 0, 1600, 1000)),
@@ -61,6 +61,9 @@ def main() -> int:
         if words.pictures and words.engine:  # their paths are to say nothing of this machine
             (folder / "engine").symlink_to(Path(words.engine).resolve())
             environment["FIT_FLARE_ENGINE"] = str(folder / "engine")
+        if words.pictures:
+            weights = Path(environment["FIT_FLARE_WEIGHTS"])
+            environment["FIT_FLARE_WEIGHTS"] = str(shutil.copy(weights, folder / weights.name))
         script = words.script.resolve()
         command = [words.blender, "--enable-event-simulate", "--window-geometry", "0", "0", *words.size.split("x"),
                    "-noaudio", "--python-exit-code", "1", "--python", str(script)]

@@ -33,7 +33,7 @@ class FITFLARE_OT_pick_element(GuardedOperator, bpy.types.Operator):
             return NO_CAMERA
         if bpy.app.background:
             return "Picking needs Blender's window"
-        return "" if any(map(_shows_flare, context.screen.areas)) else (
+        return "" if any(map(_is_camera_view, context.screen.areas)) else (
             "No 3D viewport here shows the flare through the camera: press Numpad 0 in one")
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
@@ -59,7 +59,7 @@ class FITFLARE_OT_pick_element(GuardedOperator, bpy.types.Operator):
         area, region = view
         with context.temp_override(area=area, region=region):
             try:
-                is_picked = pick(bpy.context, (event.mouse_x - region.x, event.mouse_y - region.y))
+                is_picked = choose_element_at(bpy.context, (event.mouse_x - region.x, event.mouse_y - region.y))
             except FitFlareError as problem:
                 self.report({"ERROR"}, str(problem))
                 return {"CANCELLED"}
@@ -74,15 +74,15 @@ class FITFLARE_OT_pick_element(GuardedOperator, bpy.types.Operator):
         context.workspace.status_text_set(None)
 
 
-def _shows_flare(area: Any) -> bool:
+def _is_camera_view(area: Any) -> bool:
     """Return whether an area is a 3D view through a camera."""
     return bool(area.type == "VIEW_3D" and area.spaces.active.region_3d.view_perspective == "CAMERA")
 
 
 def view_at(screen: Any, x: float, y: float) -> tuple[Any, Any] | None:
-    """Return area and region of the camera view at a place of the window, px; None outside, and on its sidebars."""
+    """Return area and region of the camera view at a position in the window, px; None outside, and on its sidebars."""
     for area in screen.areas:
-        if _shows_flare(area):
+        if _is_camera_view(area):
             regions = [region for region in area.regions
                        if region.x <= x < region.x + region.width and region.y <= y < region.y + region.height]
             if regions and all(region.type == "WINDOW" for region in regions):  # sidebars lie over the view
@@ -90,15 +90,15 @@ def view_at(screen: Any, x: float, y: float) -> tuple[Any, Any] | None:
     return None
 
 
-def pick(context: Any, place: tuple[float, float]) -> bool:
-    """Choose the element that is brightest at a place of the region, px from its lower left corner; return whether
+def choose_element_at(context: Any, position: tuple[float, float]) -> bool:
+    """Choose the element that is brightest at a position in the region, px from its lower left corner; return whether
     there is one. Raises FitFlareError."""
     scene = context.scene
     camera = camera_of(context.space_data, scene)
     window = overlay.drawn_part(context, scene, camera)
     if window is None:
         return False
-    point = place[0] + 0.5 - window.x, window.height - (place[1] + 0.5 - window.y)
+    point = position[0] + 0.5 - window.x, window.height - (position[1] + 0.5 - window.y)
     return choose_element(scene, context.view_layer.depsgraph, camera, window.intrinsics, point)
 
 
@@ -111,10 +111,11 @@ def choose_element(scene: Any, depsgraph: Any, camera: Any, intrinsics: Any, poi
     names = brightest_element(look, lights, flares, edits, intrinsics, point)
     if names is None:
         return False
-    index = next(index for index, item in enumerate(state.lights) if item.name == names[0])
+    flare_name, element_name = names
+    index = next(index for index, item in enumerate(state.lights) if item.name == flare_name)
     item = state.lights[index]
     state.light, item.show_elements = index, True
-    item.element = next(row for row, element in enumerate(item.elements) if element.name == names[1])
+    item.element = next(row for row, element in enumerate(item.elements) if element.name == element_name)
     return True
 
 

@@ -107,13 +107,13 @@ def test_a_clean_plate_of_another_process_stays(tmp_path: Path) -> None:
     source = write_codes(tmp_path / "in" / "b.png", picture())
     second = Manifest(tmp_path / "out")
     first = Manifest(tmp_path / "out")
-    first.begin(Path("b.png"), source, "one way", [plate], overwrite=False)
+    first.begin_frame(Path("b.png"), source, "one way", [plate], overwrite=False)
     write_codes(plate, picture())
     assert second.is_up_to_date(Path("b.png"), "one way", [plate])
     for overwrite in (False, True):
-        second.begin(Path("b.png"), source, "one way", [plate], overwrite)
+        second.begin_frame(Path("b.png"), source, "one way", [plate], overwrite)
         assert plate.exists()
-    second.begin(Path("b.png"), source, "another way", [plate], overwrite=False)
+    second.begin_frame(Path("b.png"), source, "another way", [plate], overwrite=False)
     assert not plate.exists() and not first.is_up_to_date(Path("b.png"), "one way", [plate])
 
 
@@ -133,7 +133,7 @@ def test_a_clean_plate_that_was_begun_is_made(tmp_path: Path, flare_everywhere: 
     clean_plates([source], tmp_path / "out", remover, Progress())
     other = Remover(flare_everywhere, working_size=96)
     how = digest_inputs(other.cache_key, [source])
-    Manifest(tmp_path / "out").begin(Path("a.png"), source, how, [tmp_path / "out" / "a.png"], overwrite=False)
+    Manifest(tmp_path / "out").begin_frame(Path("a.png"), source, how, [tmp_path / "out" / "a.png"], overwrite=False)
     assert not (tmp_path / "out" / "a.png").exists()
     assert clean_plates([source], tmp_path / "out", other, Progress())["made"] == 1
 

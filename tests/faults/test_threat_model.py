@@ -176,7 +176,7 @@ def test_a_removal_manifest_deletes_nothing_outside_its_folder(tmp_path: Path) -
         path.write_bytes(b"work")
     (out / "remove.json").write_text(json.dumps({"plates": {"a.png": "1"}, "flares": {"a.png": "../victim.exr"},
                                                  "flares_made": {"a.png": "1"}, "sources": {}, "written": {}}))
-    Manifest(out).begin(Path("a.png"), plate, "2", [out / "a.png"], overwrite=True)
+    Manifest(out).begin_frame(Path("a.png"), plate, "2", [out / "a.png"], overwrite=True)
     assert victim.read_bytes() == b"work"
 
 

@@ -58,9 +58,9 @@ def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progres
                 kept_counts[reason] += 1
             else:
                 prepared = clean(frame)
-                manifest.begin(frame.name, frame.source, key, frame.results, overwrite, prepared.confidence)
+                manifest.begin_frame(frame.name, frame.source, key, frame.results, overwrite, prepared.confidence)
                 prepared.write()
-                manifest.finish(frame.results)
+                manifest.record_results(frame.results)
                 written += 1
         except Exception as error:
             if on_error is None:

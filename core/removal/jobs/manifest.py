@@ -70,14 +70,14 @@ class Manifest:
         if self._is_up_to_date(tables, name, digest, results):
             if not all(_relative_path(self._folder, path) in tables["written"] for path in results):
                 with contextlib.suppress(OSError):  # a frame is kept in a read-only folder too
-                    self.finish(results)
+                    self.record_results(results)
             return "up to date"
         is_edited = (bool(self._edited_files(tables, results))
                      and tables["sources"].get(name.as_posix()) == content_hash(source))
         return "edited" if is_edited else None
 
-    def begin(self, name: Path, source: Path, digest: str, results: Sequence[Path], overwrite: bool,
-              confidence: float | None = None) -> None:
+    def begin_frame(self, name: Path, source: Path, digest: str, results: Sequence[Path], overwrite: bool,
+                    confidence: float | None = None) -> None:
         """Enter a frame before its files are written, and delete those that were made with another digest.
 
         confidence: that the removed flare is a flare, 0..1; None where nothing judged it.
@@ -111,7 +111,7 @@ class Manifest:
             if new != old:
                 self._write_tables(new)
 
-    def finish(self, results: Sequence[Path]) -> None:
+    def record_results(self, results: Sequence[Path]) -> None:
         """Enter the content of a frame's files after they were written."""
         with file_lock(self._folder / LOCK):
             tables = self._read_tables()

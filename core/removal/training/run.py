@@ -30,7 +30,7 @@ from .batches import Batch, Batches
 from .flare_bank import SingleFlareBank, UserFlares
 from .gpu.batches import open_gpu_batches
 from .pairs import Pair, make_pair
-from .trainer import METRICS, RemovalTrainer, device
+from .trainer import METRICS, RemovalTrainer, default_device
 from .workers import SINGLE_WORKER, Worker, worker_group
 
 CHECKPOINT, WEIGHTS, LOG = "checkpoint.safetensors", "removal.safetensors", "training.jsonl"
@@ -47,7 +47,7 @@ MAX_WORKERS = 4
 def default_process_count() -> int:
     """Return how many processes share a training on this machine by default: workers on a CPU; beside a GPU, the
     processes that draw scenes and flares."""
-    return min(available_cores(), MAX_WORKERS) if device().type == "cpu" else max(available_cores(), 3)
+    return min(available_cores(), MAX_WORKERS) if default_device().type == "cpu" else max(available_cores(), 3)
 
 
 def make_validation_pairs(backgrounds: Backgrounds, lenses: Sequence[Prescription],

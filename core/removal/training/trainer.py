@@ -40,7 +40,7 @@ ZERO_INITIALISED = (".conv2.", ".proj.")
 """Parts of the names of the last convolutions of blocks and attention layers, which are zero before training."""
 
 
-def device() -> torch.device:
+def default_device() -> torch.device:
     """Return the GPU if there is one, else the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
@@ -51,7 +51,7 @@ class RemovalTrainer:
     def __init__(self, recipe: Recipe, worker: Worker = SINGLE_WORKER) -> None:
         """Build a network with random weights by the recipe's seed, the same for all workers, at iteration 0."""
         self.recipe, self.iteration, self.worker = recipe, 0, worker
-        self.device = device()
+        self.device = default_device()
         torch.manual_seed(recipe.seed)
         self.network = RemovalNetwork(recipe.widths, recipe.blocks, recipe.attention).to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on CPUs

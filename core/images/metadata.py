@@ -29,6 +29,8 @@ _STRUCTURE_TAGS = frozenset({
     531, 532})
 """TIFF tags that say how the pixels are stored, which the encoder writes anew; and offsets of other directories."""
 EXIF_DIRECTORY, GPS_DIRECTORY = 34665, 34853
+_INTEROPERABILITY_TAG = 0xA005
+"""Exif tag with the offset of another directory, which is not copied."""
 _RESOURCES_TAG = 34377
 """TIFF tag of Photoshop's image resources."""
 _MAX_RESOURCE_BYTES = 65_000
@@ -219,8 +221,8 @@ def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
     encoded = tiff.with_tags(encoded, tags)
     for number, offset_tag in directories.items():
         if len(offset_tag.values) == 1:
-            # 0xA005 is the offset of another directory (interoperability), which is not copied.
-            directory = tiff.read_tags(io.BytesIO(data), _AllBut({0xA005}), int(np.uint32(offset_tag.values[0])))
+            directory = tiff.read_tags(io.BytesIO(data), _AllBut({_INTEROPERABILITY_TAG}),
+                                       int(np.uint32(offset_tag.values[0])))
             encoded = tiff.with_directory(encoded, number, directory)
     return encoded
 

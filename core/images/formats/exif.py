@@ -81,14 +81,14 @@ def without_thumbnail(block: bytes) -> bytes:
     The copy is cut off at the end of the block, and overwritten with zeros elsewhere, so that no offset changes.
     """
     order: Literal["little", "big"] = "little" if block[:2] == b"II" else "big"
-    first = int.from_bytes(block[4:8], order)
-    link = first + 2 + 12 * int.from_bytes(block[first:first + 2], order)  # offset of the second directory's offset
-    second = int.from_bytes(block[link:link + 4], order)
-    if block[:4] not in (b"II*\0", b"MM\0*") or not second or link + 4 > len(block):
+    first_directory = int.from_bytes(block[4:8], order)
+    link = first_directory + 2 + 12 * int.from_bytes(block[first_directory:first_directory + 2], order)  # offset of the second directory's offset
+    second_directory = int.from_bytes(block[link:link + 4], order)
+    if block[:4] not in (b"II*\0", b"MM\0*") or not second_directory or link + 4 > len(block):
         return block
     changed = bytearray(block)
     changed[link:link + 4] = bytes(4)
-    tags = tiff.integer_values(tiff.read_tags(io.BytesIO(block), (_THUMBNAIL, _THUMBNAIL_LENGTH), second))
+    tags = tiff.integer_values(tiff.read_tags(io.BytesIO(block), (_THUMBNAIL, _THUMBNAIL_LENGTH), second_directory))
     start = tags.get(_THUMBNAIL, 0)
     end = start + tags.get(_THUMBNAIL_LENGTH, 0)
     if start >= link + 4 and end <= len(block):  # else a damaged tag would have the first directory overwritten

@@ -106,8 +106,8 @@ class Recipe:
         The aspect is 1 to 1.9, one frame size in five is upright, and there are as many frames as the pixels of an
         iteration allow.
         """
-        low, high = map(math.log, self.size_range_at(iteration))
-        long_side = max(round(math.exp(random.uniform(low, high)) / SIZE_MULTIPLE), 2) * SIZE_MULTIPLE
+        min_log_side, max_log_side = map(math.log, self.size_range_at(iteration))
+        long_side = max(round(math.exp(random.uniform(min_log_side, max_log_side)) / SIZE_MULTIPLE), 2) * SIZE_MULTIPLE
         short_side = max(round(long_side / random.uniform(1.0, 1.9) / SIZE_MULTIPLE), 2) * SIZE_MULTIPLE
         width, height = long_side, short_side
         if random.random() < 0.2:

@@ -82,7 +82,8 @@ def without_thumbnail(block: bytes) -> bytes:
     """
     order: Literal["little", "big"] = "little" if block[:2] == b"II" else "big"
     first_directory = int.from_bytes(block[4:8], order)
-    link = first_directory + 2 + 12 * int.from_bytes(block[first_directory:first_directory + 2], order)  # offset of the second directory's offset
+    entry_count = int.from_bytes(block[first_directory:first_directory + 2], order)
+    link = first_directory + 2 + 12 * entry_count  # offset of the second directory's offset
     second_directory = int.from_bytes(block[link:link + 4], order)
     if block[:4] not in (b"II*\0", b"MM\0*") or not second_directory or link + 4 > len(block):
         return block

@@ -39,8 +39,8 @@ MAX_IN_HALF_FLOAT = 6_000
 """Gaussians up to which the buffers are half float. A sum of more, as for an area light, loses the light of faint ones
 to rounding."""
 
-NETWORK_S = 0.03
-"""Time for the look's network in one drawing; while a camera moves, more lights than fit into it take turns."""
+NETWORK_S, NETWORK_AT_REST_S = 0.03, 0.25
+"""Time for the look's network in one drawing while the camera moves, and at rest; more lights than fit take turns."""
 REFINE_S = 0.02
 """Time after which a drawing in which lights wait for their turn is followed by another."""
 
@@ -383,7 +383,7 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
     if chosen is not None:
         names = {item.name: [element.name for element in item.elements] for item in scene.fit_flare.lights}
         edits = highlight.emphasise(edits, chosen, names)
-    budget = _budgets.setdefault(camera.name, OffsetsBudget(NETWORK_S))
+    budget = _budgets.setdefault(camera.name, OffsetsBudget(NETWORK_S, NETWORK_AT_REST_S))
     budget.begin()
     gaussians = concatenate(list(looks.evaluate_flares(scene, depsgraph, camera, edits, budget).values()))
     if not budget.is_complete and not bpy.app.timers.is_registered(redraw_viewports):

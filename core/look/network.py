@@ -77,13 +77,18 @@ class OffsetsBudget:
     drawings complete them. A light that is drawn for the first time is always computed. For one camera.
     """
 
-    def __init__(self, seconds: float) -> None:
-        """seconds: for the network in one drawing."""
-        self._seconds, self._seconds_per_light = seconds, 0.0
+    def __init__(self, seconds: float, seconds_at_rest: float = 0.0) -> None:
+        """seconds: for the network in one drawing. seconds_at_rest: the same where view and lights are those of the
+        last two drawings, if that is more."""
+        self._seconds, self._seconds_at_rest = seconds, max(seconds, seconds_at_rest)
+        self._seconds_per_light = 0.0
         # Cache key and offsets of each light, by number of its network and its name; that which waited longest first.
         self._offsets: OrderedDict[tuple[int, str], tuple[tuple[int, bytes], Floats]] = OrderedDict()
-        self._drawn: set[tuple[int, str]] = set()
+        # Cache key of each light in the drawing since `begin`, and in the one before.
+        self._drawn: dict[tuple[int, str], tuple[int, bytes]] = {}
+        self._drawn_before: dict[tuple[int, str], tuple[int, bytes]] = {}
         self._due: set[tuple[int, str]] = set()
+        self._rested = False  # whether the last two drawings had the same view and lights
         self.is_complete = True
         """Whether the drawing since `begin` has exact offsets."""
 
@@ -91,12 +96,14 @@ class OffsetsBudget:
         """Begin a drawing; forget the lights that the last one did not have."""
         for light in [light for light in self._offsets if light not in self._drawn]:
             del self._offsets[light]
-        count = max(int(self._seconds / self._seconds_per_light), 1) if self._seconds_per_light else len(self._offsets)
-        self._due, self._drawn, self.is_complete = set(itertools.islice(self._offsets, count)), set(), True
+        self._rested, self.is_complete = self._drawn == self._drawn_before, True
+        self._drawn, self._drawn_before = {}, self._drawn
 
     def get(self, light: tuple[int, str], key: tuple[int, bytes], compute: Callable[[], Floats]) -> Floats:
         """Return the offsets of a light: those of the key if it is the light's turn, else its last ones."""
-        self._drawn.add(light)
+        if not self._drawn:
+            self._choose_due(self._rested and self._drawn_before.get(light) == key)
+        self._drawn[light] = key
         known = self._offsets.get(light)
         if known is None or (known[0] != key and light in self._due):
             known = self._offsets[light] = key, _cache.get(key, lambda: self._measure(compute))
@@ -105,6 +112,12 @@ class OffsetsBudget:
         else:
             self.is_complete = False
         return known[1]
+
+    def _choose_due(self, is_at_rest: bool) -> None:
+        """Choose the lights whose turn it is in this drawing."""
+        seconds = self._seconds_at_rest if is_at_rest else self._seconds
+        count = max(int(seconds / self._seconds_per_light), 1) if self._seconds_per_light else len(self._offsets)
+        self._due = set(itertools.islice(self._offsets, count))
 
     def _measure(self, compute: Callable[[], Floats]) -> Floats:
         """Compute offsets, and update the mean time of it."""

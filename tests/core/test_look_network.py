@@ -65,6 +65,14 @@ def test_lights_take_turns_until_all_are_exact(tmp_path: Path) -> None:
     assert counts == [1, 2, 3, 4, 5]
 
 
+def test_lights_are_completed_faster_at_rest(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", lights=1)
+    look, budget = read_look(tmp_path / "a.flare"), OffsetsBudget(1e-9, 60.0)
+    drawn(look, 0, budget)
+    counts = [len(exact_lights(look, view, drawn(look, view, budget))) for view in (1, 2, 2, 2, 1)]
+    assert counts == [1, 1, 2, 5, 1]
+
+
 def test_a_moving_camera_lets_no_light_wait_for_ever(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
     look, budget = read_look(tmp_path / "a.flare"), OffsetsBudget(1e-9)

@@ -284,7 +284,7 @@ def _link_capture(folder: Path, capture: Path, **origins: str) -> Capture:
 def _clean_copy(folder: Path, capture: Path, progress: Progress) -> Capture:
     """Return a copy of the capture, in `folder`, whose clean frames `remove` made."""
     linked = _link_capture(folder, capture)
-    if not linked.has_removed:
+    if not linked.has_clean_frames:
         clean_capture(linked, Remover(glow="remove"), progress)
     return Capture.open(folder)
 

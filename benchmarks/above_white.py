@@ -41,7 +41,7 @@ class FloatFrames(Capture):
             raise CaptureError(f"{self.folder} has no exact layers of {view.name}.")
         return Picture(scene.linear() + flare.linear(), "linear")
 
-    def removed(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
+    def clean_frame(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
         return self.truth_scene(view, size)
 
 

@@ -63,7 +63,7 @@ class BilateralTrainer(Trainer):
     def step(self) -> dict[str, float]:
         """Make one iteration on the next view, with a step of its grid and the penalty of its total variation."""
         figures = super().step()
-        index = self._view_index(self._view())
+        index = self._view_index(self._pick_view())
         (TOTAL_VARIATION_WEIGHT * self.grids.total_variation(index)).backward()
         self.grid_optimiser.step()
         self.grid_optimiser.zero_grad()
@@ -73,7 +73,7 @@ class BilateralTrainer(Trainer):
     def _flare_background(self, targets: Targets, scene: Tensor,  # noqa: ARG002 - the base class calls it with these
                           light_discs: Tensor | None) -> Tensor:  # noqa: ARG002
         """Return the scene through the grid of its view, which the trainer compares with the frame."""
-        return self.grids(self._view_index(self._view()), scene)
+        return self.grids(self._view_index(self._pick_view()), scene)
 
     def _view_index(self, view: View) -> int:
         views: Sequence[View] = self.views

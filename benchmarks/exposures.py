@@ -49,9 +49,9 @@ class DriftingCapture(Capture):
         """Return the frame as a camera of that exposure films it."""
         return self._filmed_frame(super().frame(view, size), view)
 
-    def removed(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
+    def clean_frame(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
         """Return its clean frame."""
-        picture = super().removed(view, size)
+        picture = super().clean_frame(view, size)
         return None if picture is None else self._filmed_frame(picture, view)
 
     def truth_scene(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
@@ -117,7 +117,7 @@ def main() -> None:
     args = parser.parse_args()
     for folder in args.captures:
         capture = Capture.open(folder)
-        modes = ["split", *(["default"] if capture.has_removed or capture.has_truth else [])]
+        modes = ["split", *(["default"] if capture.has_clean_frames or capture.has_truth else [])]
         rows = [row for mode in modes for row in compare_exposures(capture, mode, args)]
         print(f"{folder.name}, {args.stops:g} stops to either side, preset {args.preset}, {args.size} pixels\n")
         print(report.table(COLUMNS, rows))

@@ -27,7 +27,7 @@ class KnownScene(Trainer):
         """Make one iteration on the next view; return the loss."""
         self.iteration += 1
         settings = self.settings
-        targets = self.frames.targets(self._view())
+        targets = self.frames.targets(self._pick_view())
         if targets.clean is None:
             raise CaptureError(f"{self.capture.folder} has no flare-free frames; the exact scene must be known.")
         self.optimisers.set_rates(self.iteration)

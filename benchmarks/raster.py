@@ -146,7 +146,7 @@ class Iteration:
         self.camera = (torch.eye(4), workload.intrinsics(case.width, case.height))
         self.target = torch.rand(case.height, case.width, 3, generator=torch.Generator().manual_seed(0))
         parameters = dict(self.scene.named_parameters())
-        rates = Optimisers(self.scene, None, FitSettings(), extent=1.0, display_white=1.0).scene.rates
+        rates = Optimisers(self.scene, flare=None, settings=FitSettings(), extent=1.0, display_white=1.0).scene.rates
         if case.flares:
             parameters |= {f"flare{i}": p for i, p in enumerate(self.flares)}
             rates |= {f"flare{i}": 1e-6 for i in range(len(self.flares))}

@@ -30,7 +30,7 @@ from core.capture.lights import read_lights
 from core.colour.srgb import linear_from_srgb
 from core.conventions.run_files import FRAME_LIGHTS
 from core.fit import Run, fit, preset
-from core.fit.settings import over_plates, override_settings
+from core.fit.settings import adapt_to_plates, override_settings
 from core.images.read import read_picture
 from core.metrics.evaluation import displayed_flare, unscored_mask
 from core.metrics.pictures import psnr, relative_l2
@@ -72,7 +72,7 @@ def score(args: argparse.Namespace, name: str, seed: int) -> list[str]:
     folder = prepare(args.out, name, seed, args.tracks)
     capture = Capture.open(folder, need_cameras=False)
     mode: Any = "default" if args.plates == "exact" else "estimated"
-    settings = over_plates(preset("standard", mode=mode, iterations=args.iterations))
+    settings = adapt_to_plates(preset("standard", mode=mode, iterations=args.iterations))
     changes = dict(change.split("=", 1) for change in args.changes)
     settings = override_settings(settings, {"width": args.size, "seed": seed, **{
         key: float(value) for key, value in changes.items()}})
@@ -81,7 +81,7 @@ def score(args: argparse.Namespace, name: str, seed: int) -> list[str]:
         capture = _with_exact_plates(folder)
     run = fit(capture, settings, folder / f"run-{label}", resume=True)
     run = Run.open(run.folder)
-    opened = run.capture(capture.folder)
+    opened = run.open_capture(capture.folder)
     remove_fitted_flare(run, opened, opened.views, folder / f"clean-{label}", Progress())
     held_out = opened.split(None)[1]
     rows = [row for view in held_out if (row := _score_view(run, opened, view, args.size, folder, label)) is not None]

@@ -173,7 +173,7 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
                               scene=paths[0], scene_is_background=True)
     if kind == "run":
         capture = (Capture.open(options.cameras, need_frames=False) if options.cameras else
-                   Run.open(paths[0]).capture(need_frames=False))
+                   Run.open(paths[0]).open_capture(need_frames=False))
         return capture_target(capture, look, sources, lights=lights, scene=options.scene or paths[0] / SCENE,
                               scene_is_background=True)
     if paths[0].is_dir() and not any(paths[0].iterdir()):

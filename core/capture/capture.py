@@ -88,7 +88,7 @@ class Capture:
         self._frames = frames or {}
         self._pictures = PictureCache(cache_bytes)
         names = [view.name for view in self.views]
-        self._removed = matching_pictures(folder / REMOVED, names)
+        self._clean_frames = matching_pictures(folder / REMOVED, names)
         self._truth_scene = matching_pictures(folder / "truth" / "scene", names)
         self._truth_flare = matching_pictures(folder / "truth" / "flare", names)
         self._masks = mask_pictures(folder / MASKS, names)
@@ -256,23 +256,23 @@ class Capture:
         """The file of the view's frame."""
         return self._frames[view.name]
 
-    def removed(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
+    def clean_frame(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
         """Return the clean frame from removed/; None where there is none."""
         is_developed = self.has_other_format(view)
-        return self._optional_picture(self._removed, view, size, None if is_developed else self.plate_space)
+        return self._optional_picture(self._clean_frames, view, size, None if is_developed else self.plate_space)
 
     def has_other_format(self, view: View) -> bool:
         """True if a view's clean frame is an EXR and its frame is none: linear light, whatever the frame's space."""
-        path = self._removed.get(view.name)
+        path = self._clean_frames.get(view.name)
         return path is not None and path.suffix.lower() == ".exr" != self.frame_path(view).suffix.lower()
 
     def holds_light_above_white(self, view: View) -> bool:
         """True if the file of the view's frame may hold light above white. Raises FrameError."""
         return has_float_pixels(self.frame_path(view), self.plate_space)
 
-    def removed_path(self, view: View) -> Path:
-        """Return the file of the view in removed/, where `has_removed`."""
-        return self._removed[view.name]
+    def clean_frame_path(self, view: View) -> Path:
+        """Return the file of the view in removed/, where `has_clean_frames`."""
+        return self._clean_frames[view.name]
 
     def mask(self, view: View, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
         """Return (height, width), True for the pixels of the view that count; None without a mask.
@@ -306,9 +306,9 @@ class Capture:
         return self._optional_picture(self._truth_flare, view, size)
 
     @property
-    def has_removed(self) -> bool:
-        """True if every view has a clean frame."""
-        return len(self._removed) == len(self.views)
+    def has_clean_frames(self) -> bool:
+        """True if every view has a clean frame in removed/."""
+        return len(self._clean_frames) == len(self.views)
 
     @property
     def has_truth(self) -> bool:
@@ -435,11 +435,11 @@ class Capture:
     def _check_layer_sizes(self) -> Steps[None]:
         """Check the sizes of removed/, truth/ and masks/, and that removed/ is complete: an incomplete one is an
         interrupted run."""
-        if self._removed and len(self._removed) < len(self.views):
-            lacking = [view.name for view in self.views if view.name not in self._removed]
+        if self._clean_frames and len(self._clean_frames) < len(self.views):
+            lacking = [view.name for view in self.views if view.name not in self._clean_frames]
             raise CaptureError(f"{self.folder / 'removed'} lacks {len(lacking)} of {len(self.views)} frames, "
                                f"first {lacking[0]}; finish or remove it.")
-        for paths in (self._removed, self._truth_scene, self._truth_flare, self._masks):
+        for paths in (self._clean_frames, self._truth_scene, self._truth_flare, self._masks):
             for number, view in enumerate(self.views):
                 if number % FRAMES_PER_STEP == 0:
                     yield

@@ -104,14 +104,14 @@ def _leaves(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 class FitInputs:
-    """The lights of a capture, and a digest of each view's camera, frame, mask and, with `removed`, clean frame.
+    """The lights of a capture, and a digest of each view's camera, frame, mask and, with `clean_frames`, clean frame.
 
-    A checkpoint holds them; a fit resumes only with the same inputs. removed: True if the fit uses the clean frames in
-    removed/. lights: False for a fit without flare.
+    A checkpoint holds them; a fit resumes only with the same inputs. clean_frames: True if the fit uses those
+    in removed/. lights: False for a fit without flare.
     """
 
-    def __init__(self, capture: Capture, *, removed: bool, lights: bool) -> None:
-        self._capture, self._removed = capture, removed
+    def __init__(self, capture: Capture, *, clean_frames: bool, lights: bool) -> None:
+        self._capture, self._uses_clean_frames = capture, clean_frames
         self._lights = [light.numbers for light in capture.lights] if lights else None
         self._views: list[list[str]] | None = None
 
@@ -148,7 +148,7 @@ class FitInputs:
         """Hash the camera and the files of a view: frame, mask and, with `removed`, clean frame."""
         capture, camera = self._capture, view.camera
         mask = capture.mask_path(view)
-        files = [capture.frame_path(view), *([capture.removed_path(view)] if self._removed else []),
+        files = [capture.frame_path(view), *([capture.clean_frame_path(view)] if self._uses_clean_frames else []),
                  *([] if mask is None else [mask])]
         rotation, position = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
         # Adding 0 makes -0 from rounding 0, which has other text.

@@ -104,7 +104,7 @@ class FlareTrainer(abc.ABC):
         write_frame_lights(folder / FRAME_LIGHTS, self.capture, self.flare)
         return share_sentences(shares, flaring)
 
-    def _view(self) -> View:
+    def _pick_view(self) -> View:
         """Return the view of this iteration: each view once per round, in a random order given by seed and round."""
         done = self.iteration - 1
         order = torch.randperm(len(self.views), generator=self._generator(done // len(self.views), 1))

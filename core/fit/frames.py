@@ -64,10 +64,11 @@ class Targets(NamedTuple):
 class Frames:
     """The frames of a capture at the working size, with the clean frame of each where there is one.
 
-    display_white: display value at which they are clipped; above 1 for float frames with light above white. reference:
-    the source of the clean frames, "removed" (files in removed/), "truth" (exact scene layers, where there is no
-    removed/), or "" (none). Black borders that all frames share are cut off: they stay with the camera, so the fit
-    would take them for flare.
+    display_white: display value at which they are clipped; above 1 for float frames with light above white.
+    clean_source: the source of the clean frames, "removed" (files in removed/), "truth" (exact scene layers, where
+    there is no removed/), or "" (none).
+
+    Black borders that all frames share are cut off: they stay with the camera, so the fit would take them for flare.
     """
 
     def __init__(self, capture: Capture, width: int = 0, memory: int = MEMORY, *,
@@ -81,8 +82,8 @@ class Frames:
         # Codes per display value: 16 bit keep the smoothness of linear footage at half the size of float.
         self._codes_per_value = 65535 / display_white
         self.cache = PictureCache(memory)
-        self.reference = ("" if frames_only else "removed" if capture.has_removed else
-                          "truth" if truth and capture.has_truth else "")
+        self.clean_source = ("" if frames_only else "removed" if capture.has_clean_frames else
+                             "truth" if truth and capture.has_truth else "")
         self.picture_area = self._find_picture_area()
         """The area inside the borders; None without borders."""
 
@@ -140,9 +141,9 @@ class Frames:
 
     def clean(self, view: View) -> Tensor | None:
         """Return the clean frame without borders; None where the capture has none."""
-        if self.reference == "removed":
-            return self._load_display(view, "removed", self.capture.removed)
-        if self.reference == "truth":
+        if self.clean_source == "removed":
+            return self._load_display(view, "removed", self.capture.clean_frame)
+        if self.clean_source == "truth":
             return self._load_display(view, "truth", self.capture.truth_scene)
         return None
 

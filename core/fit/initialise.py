@@ -171,7 +171,7 @@ def _static_positions(capture: Capture, views: tuple[View, ...], frames: Frames,
         # Paper, appendix: the centroid of the points, offset by uniform noise in [0, 1) along each axis.
         centroid = torch.from_numpy(capture.points.xyz).double().mean(0)
         return centroid + torch.rand(positions.shape, generator=generator, dtype=torch.float64)
-    if settings.flare.snap_lights and frames.reference:
+    if settings.flare.snap_lights and frames.clean_source:
         return torch.from_numpy(snap_lights(_snap_views(views, frames), positions.numpy()))
     return positions
 

@@ -222,8 +222,8 @@ def resolve_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings,
     if not any(_is_above_white(capture, view) for view in views):
         return replace(settings, white=1.0), ()
     files = [(capture.frame_path(view), capture.plate_space) for view in views]
-    if capture.has_removed and settings.needs_clean_frames:
-        files += [(capture.removed_path(view), capture.plate_space) for view in views]
+    if capture.has_clean_frames and settings.needs_clean_frames:
+        files += [(capture.clean_frame_path(view), capture.plate_space) for view in views]
     clipped_file = next((path for path, space in files if not has_float_pixels(path, space)), None)
     if clipped_file is not None:
         return replace(settings, white=1.0), (

@@ -58,13 +58,14 @@ class PlateTrainer(FlareTrainer):
         self.exposures = exposures or {}
         self.capture = capture = capture.with_frame_names()
         self.frames = Frames(capture, settings.width, display_white=settings.display_white, truth=settings.supervised)
-        if not self.frames.reference:
+        if not self.frames.clean_source:
             raise CaptureError(f"{capture.folder} has no clean frames (removed/); run remove on it first.")
         self.views, _ = capture.split(settings.holdout)
         self.flare = initial_flare(capture, self.views, self.frames, settings)
         self.warnings = (*self.frames.warnings, *footage_warnings(capture, settings, self.views, self.frames))
-        self._inputs = FitInputs(capture, removed=self.frames.reference == "removed", lights=True)
-        self.optimisers = Optimisers(None, self.flare, settings, capture.extent, self.frames.display_white)
+        self._inputs = FitInputs(capture, clean_frames=self.frames.clean_source == "removed", lights=True)
+        self.optimisers = Optimisers(scene=None, flare=self.flare, settings=settings, extent=capture.extent,
+                                     display_white=self.frames.display_white)
         self._progress = progress or Progress()
         self._plates: dict[str, Tensor] = {}
         """Estimated plates by frame, where they are other than the clean frames."""
@@ -133,7 +134,7 @@ class PlateTrainer(FlareTrainer):
         """Run one iteration on the next view; return the loss of the composite."""
         self.iteration += 1
         assert self.flare is not None
-        settings, view = self.settings, self._view()
+        settings, view = self.settings, self._pick_view()
         targets, mask = self.frames.targets(view), self.frames.mask(view)
         self.optimisers.set_rates(self.iteration)
         flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels)

@@ -113,7 +113,7 @@ class Run:
         """Exposure of each view relative to the median frame; empty if all are equal. Raises RunError."""
         return exposures.read_exposures(self.folder)
 
-    def capture(self, folder: Path | None = None, *, need_frames: bool = True) -> Capture:
+    def open_capture(self, folder: Path | None = None, *, need_frames: bool = True) -> Capture:
         """Open the capture of the run, in `folder` or where it was fitted.
 
         It has the exposures and light positions of the fit.
@@ -138,7 +138,7 @@ class Run:
 
     def _opened_capture(self) -> Capture:
         """Return the capture that was opened last; opens it if there is none."""
-        return self._last_opened or self.capture(need_frames=False)
+        return self._last_opened or self.open_capture(need_frames=False)
 
     def find_capture(self, folder: Path | None) -> Path:
         """Return the folder of the capture: `folder`, else the one that was fitted. Raises RunError if that is missing.

@@ -386,8 +386,9 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
     return settings.validated()
 
 
-def over_plates(settings: FitSettings) -> FitSettings:
-    """Return the settings for a scene of plates: nothing in it hides lights, and no scene is fitted before the flare.
+def adapt_to_plates(settings: FitSettings) -> FitSettings:
+    """Return settings changed for a scene of plates: nothing in it hides lights, and no scene is fitted before the
+    flare.
 
     A shot shows its lights at fewer places than a capture, so the grids are coarser.
     """

@@ -87,7 +87,7 @@ class Trainer(FlareTrainer):
         self.capture = capture = capture.with_frame_names() if has_frame_lights(capture) else capture
         self.views, _ = capture.split(settings.holdout)
         self.extent = capture.extent
-        if settings.needs_clean_frames and not self.frames.reference and self.fits_scene:
+        if settings.needs_clean_frames and not self.frames.clean_source and self.fits_scene:
             raise CaptureError(f"{capture.folder} has no clean frames (removed/); run remove on it first, "
                                "or fit with --mode split.")
 
@@ -98,7 +98,8 @@ class Trainer(FlareTrainer):
                          *metering.exposure_warnings(self.exposures),
                          *footage_warnings(capture, settings, self.views, self.frames),
                          *(() if self.flare is None else moved_light_warnings(capture, self.flare)))
-        self._inputs = FitInputs(capture, removed=self.frames.reference == "removed", lights=self.flare is not None)
+        self._inputs = FitInputs(capture, clean_frames=self.frames.clean_source == "removed",
+                                 lights=self.flare is not None)
         self._scene_only_iterations = scene_only_iterations(settings.split, len(self.views), settings.iterations)
 
         # Optimisers and strategy hold the parameters of the models.
@@ -128,7 +129,7 @@ class Trainer(FlareTrainer):
         and "scene_loss", absent where nothing but the composite supervises the scene."""
         self.iteration += 1
         settings = self.settings
-        view = self._view()
+        view = self._pick_view()
         targets, mask = self.frames.targets(view), self.frames.mask(view)
         self.optimisers.set_rates(self.iteration)
         rendering = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)

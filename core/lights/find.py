@@ -245,7 +245,7 @@ def _find_by_ghosts(capture: Capture, progress: Progress, seed: int) -> list[Fou
     progress.stage("follow ghosts", len(capture.views))
     blobs = []
     for view in capture.views:
-        blobs.append(find_blobs(capture.frame(view), capture.removed(view)))
+        blobs.append(find_blobs(capture.frame(view), capture.clean_frame(view)))
         progress.advance()
     return locate_by_ghosts([(view.name, view.camera) for view in capture.views], blobs, capture.extent, seed, progress)
 

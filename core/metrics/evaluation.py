@@ -46,14 +46,14 @@ def evaluate(renderer: ViewRenderer, capture: Capture, cameras: Mapping[View, Ca
     pictures that cannot be read, and Cancelled. Pixels that a view's mask leaves out of the fit are not scored.
     """
     progress = progress or Progress()
-    reference: Reference = "truth" if capture.has_truth else "removed" if capture.has_removed else "none"
+    reference: Reference = "truth" if capture.has_truth else "removed" if capture.has_clean_frames else "none"
     progress.stage("eval", len(cameras))
     scored, masked = [], dict[str, float]()
     for view, camera in cameras.items():
         rendering = renderer.render(camera)
         composite = sum(rendering.flare_by_light.values(), rendering.scene)
         area_slices = (slice(None), slice(None)) if area is None else area.slices
-        read_scene = {"truth": capture.truth_scene, "removed": capture.removed}.get(reference, _no_picture)
+        read_scene = {"truth": capture.truth_scene, "removed": capture.clean_frame}.get(reference, _no_picture)
         read_flare = capture.truth_flare if reference == "truth" else _no_picture
         scene_reference, flare_truth = (  # None where the capture has none
             None if picture is None else replace(picture, pixels=picture.pixels[area_slices])

@@ -70,7 +70,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     run_ = Run.open(args.run)
     if not run_.finished:
         raise RunError(f"{args.run} is not finished; resume it with `fit --resume` first.")
-    capture = run_.capture(args.capture, need_frames=False)
+    capture = run_.open_capture(args.capture, need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
     selected = frames.select_task(number_views(cameras), args, progress)
     if not selected:

@@ -17,7 +17,7 @@ from ...core.system.progress import Progress
 from ..command import Command, Step
 from . import compose, evaluate, fit
 from .lights import with_lights
-from .remove import with_removed
+from .remove import with_clean_frames
 
 if TYPE_CHECKING:
     from ...core.capture import Capture
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     start = time.monotonic()
     capture = with_lights(Capture.open(args.capture or _copy_sample(out, args.remove)), progress)
     if args.remove:
-        capture = with_removed(capture, progress)
+        capture = with_clean_frames(capture, progress)
     mode: Mode = "split" if args.split else fit.default_mode(capture, False, progress)
     overrides = {"model": args.model} if args.model else {}
     settings = preset(args.preset, mode=mode, iterations=args.iterations, **overrides)
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     _check_resumable(out / "run", settings, capture)
     run_ = fit_capture(capture, settings, out / "run", progress, resume=True)
     result = evaluate.score_run(run_.folder, progress)
-    cameras = {view.name: view.camera for view in run_.capture(need_frames=False).views}
+    cameras = {view.name: view.camera for view in run_.open_capture(need_frames=False).views}
     bake(run_, number_views(cameras), cameras, out / "layers", progress=progress, overwrite=True)
     write_sheet(capture, run_.settings.holdout, out)
     progress.say(f"The run, the layers of {len(cameras)} frames (EXR) and {SHEET} are in {out}; "
@@ -114,7 +114,7 @@ def _describe_supervision(capture: Capture, mode: Mode) -> str:
         return "No clean frames are used."
     if mode == "estimated":
         return f"The clean frames are estimates that `remove` made in {capture.folder / REMOVED}."
-    if capture.has_removed:
+    if capture.has_clean_frames:
         return f"The clean frames are those in {capture.folder / REMOVED}; the removal network does not run."
     if capture.has_truth:
         return f"The clean frames are the exact ones in {capture.folder / 'truth' / 'scene'}."

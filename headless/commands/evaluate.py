@@ -51,7 +51,7 @@ def score_run(folder: Path, progress: Progress, *, view_set: str = "held-out",
 
         perceptual = Lpips(lpips_folder)
     run_ = Run.open(folder)
-    capture = run_.capture(capture_folder)
+    capture = run_.open_capture(capture_folder)
     tallies.report_capture(capture, progress)
     train, held_out = capture.split(run_.settings.holdout)
     views = {"held-out": held_out, "train": train, "all": capture.views}[view_set]

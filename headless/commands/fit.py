@@ -14,7 +14,7 @@ from ...core.typed import MAX_INT_DIGITS
 from .. import jobs, plate_space, tallies
 from ..command import Command, Step, check_at_least_one, parse_seed, reject_unused_options
 from .lights import with_lights
-from .remove import with_removed
+from .remove import with_clean_frames
 
 if TYPE_CHECKING:
     from ...core.capture import Capture
@@ -113,14 +113,14 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress) -> FitSettings:
     """Return the settings from the arguments. Raises SettingsError."""
-    from ...core.fit.settings import over_plates, override_settings, preset
+    from ...core.fit.settings import adapt_to_plates, override_settings, preset
 
     kind = scene_kind(args.scene, capture, progress)
     overrides = {"model": args.model} if args.model else {}
     mode = args.mode or default_mode(capture, args.freeze_scene, progress)
     settings = preset(args.preset, mode=mode, blend=args.blend, iterations=args.iterations, **overrides)
     if kind == "plates":
-        settings = over_plates(settings)
+        settings = adapt_to_plates(settings)
     changes = {"width": args.size, "seed": args.seed, "holdout": parse_holdout(args.holdout)}
     if args.scene and str(args.scene) not in SCENE_KINDS:
         if not args.scene.is_file():
@@ -152,7 +152,7 @@ def with_supervision(capture: Capture, settings: FitSettings, progress: Progress
     # The exact scene of a rendered capture serves as its clean frames; a frozen scene needs none.
     has_exact = settings.supervised and capture.has_truth
     needs_clean_frames = settings.needs_clean_frames and not settings.scene.frozen and not has_exact
-    return with_removed(capture, progress, is_flared=settings.uses_plates) if needs_clean_frames else capture
+    return with_clean_frames(capture, progress, is_flared=settings.uses_plates) if needs_clean_frames else capture
 
 
 def default_mode(capture: Capture, frozen: bool, progress: Progress) -> Mode:

@@ -148,7 +148,7 @@ def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[s
     plate_space.record(args, fitted.find_capture(args.capture))
     if fitted.settings.mode == "3dgs":
         raise RunError(fitted.missing_flare_message)
-    capture = fitted.capture(args.capture)
+    capture = fitted.open_capture(args.capture)
     selected = frames.select_task(number_views([view.name for view in capture.views]), args, progress)
     if not selected:
         return {"plates": str(args.out), "made": 0, "kept": 0}
@@ -189,7 +189,7 @@ def _make_remover_of_model(args: argparse.Namespace, size: int) -> Remover:
     return DiffusionRemover(args.base, args.weights, working_size=size)
 
 
-def with_removed(capture: Capture, progress: Progress, *, is_flared: bool = False) -> Capture:
+def with_clean_frames(capture: Capture, progress: Progress, *, is_flared: bool = False) -> Capture:
     """Return the capture with clean frames; they are made and written to its folder where it has none.
 
     is_flared: the lights of the capture are known to flare, so predicted flares are removed wherever one is on. Raises
@@ -199,7 +199,7 @@ def with_removed(capture: Capture, progress: Progress, *, is_flared: bool = Fals
     from ...core.removal.jobs.capture import clean_capture
     from ...core.removal.jobs.provenance import check_clean_frames_current
 
-    if capture.has_removed:
+    if capture.has_clean_frames:
         check_clean_frames_current(capture)
         return capture
     progress.say(f"{capture.folder} has no removed/; making clean frames there.")

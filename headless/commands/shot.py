@@ -64,7 +64,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture = fit.with_supervision(capture, settings, progress)
     run_ = fit_capture(capture, settings, out / RUN, progress, resume=True)
     scores = _score_held_out(run_, progress)
-    capture = run_.capture()
+    capture = run_.open_capture()
     cameras = {view.name: view.camera for view in capture.views}
     bake(run_, number_views(cameras), cameras, out / LAYERS, progress=progress, overwrite=True)
     remove_fitted_flare(run_, capture, capture.views, out / CLEAN, progress, fit_digest=run_.fingerprint,
@@ -153,20 +153,20 @@ def _fit_settings(args: argparse.Namespace, kind: str, capture: Capture, progres
     """Return the settings of the fit: those of an existing run, which is resumed, else new ones. kind: of the scene."""
     from ...core.conventions.run_files import CONFIG
     from ...core.fit import Run, preset
-    from ...core.fit.settings import over_plates, override_settings
+    from ...core.fit.settings import adapt_to_plates, override_settings
 
     if (args.out / RUN / CONFIG).is_file():
         return Run.open(args.out / RUN).settings
     mode = fit.default_mode(capture, False, progress)
     settings = preset(args.preset, mode=mode, iterations=args.iterations)
     if kind == "plates":
-        settings = over_plates(settings)
+        settings = adapt_to_plates(settings)
     return override_settings(settings, {"width": args.size, "holdout": fit.parse_holdout(args.holdout)})
 
 
 def _score_held_out(run_: Run, progress: Progress) -> dict[str, Any]:
     """Score the held-out views, if there are any."""
-    held_out = run_.capture().split(run_.settings.holdout)[1]
+    held_out = run_.open_capture().split(run_.settings.holdout)[1]
     return score_run(run_.folder, progress) if held_out else {}
 
 

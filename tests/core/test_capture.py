@@ -31,7 +31,7 @@ def test_a_text_model_is_read(tmp_path: Path) -> None:
     assert len(capture.points) == 20
     assert capture.points.rgb[3].tolist() == [3, 20, 30]
     assert capture.points.error[0] == 0.5
-    assert not capture.has_removed and not capture.has_truth and not capture.lights
+    assert not capture.has_clean_frames and not capture.has_truth and not capture.lights
     np.testing.assert_allclose(capture.frame(capture.views[2]).pixels, picture(2)[..., ::-1] / np.float32(255))
 
 
@@ -196,8 +196,8 @@ def test_clean_frames_and_truth_are_read(tmp_path: Path) -> None:
     write_exr(folder / "truth" / "flare" / "0001.exr", dict.fromkeys("RGB", np.full((48, 64), 3.0)))
     capture = Capture.open(folder)
     view = capture.views[1]
-    assert capture.has_removed and capture.has_truth
-    removed, scene, flare = capture.removed(view), capture.truth_scene(view), capture.truth_flare(view)
+    assert capture.has_clean_frames and capture.has_truth
+    removed, scene, flare = capture.clean_frame(view), capture.truth_scene(view), capture.truth_flare(view)
     assert removed is not None and scene is not None and flare is not None
     np.testing.assert_array_equal(removed.pixels, capture.frame(view).pixels)  # undistorted alike
     assert scene.size == SIZE and np.abs(scene.pixels - removed.pixels).mean() < 0.03
@@ -211,7 +211,7 @@ def test_a_capture_has_clean_frames_only_if_every_view_has_one(tmp_path: Path) -
     for i in range(4):
         cv2.imwrite(str(folder / "removed" / f"{i:04d}.png"), picture(i))
         capture = Capture.open(folder, need_frames=False)  # as Blender opens it
-        assert capture.has_removed == has_exact_clean_frames(capture) == (i == 3)
+        assert capture.has_clean_frames == has_exact_clean_frames(capture) == (i == 3)
 
 
 def test_clean_frames_may_have_another_suffix(tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_clean_frames_may_have_another_suffix(tmp_path: Path) -> None:
     for i in range(4):
         cv2.imwrite(str(folder / "removed" / f"{i:04d}.png"), picture(i))
         (folder / "removed" / f"{i:04d}.png").rename(folder / "removed" / f"{i:04d}.PNG")
-    assert Capture.open(folder).has_removed
+    assert Capture.open(folder).has_clean_frames
     for path in (folder / "removed").iterdir():
         path.rename(path.with_name(f"clean_{path.name}"))
     with pytest.raises(CaptureError, match=r"removed holds 4 pictures, the first clean_0000\.PNG, and none has"):

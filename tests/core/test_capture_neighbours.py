@@ -177,7 +177,7 @@ def test_names_are_found_in_any_case(tmp_path: Path, change: str) -> None:
         if path.name.casefold() == change.casefold():
             path.rename(path.with_name(change))
     capture = Capture.open(folder)
-    assert len(capture.views) == 4 and len(capture.lights) == 1 and capture.has_removed and capture.has_masks
+    assert len(capture.views) == 4 and len(capture.lights) == 1 and capture.has_clean_frames and capture.has_masks
     assert capture.frame(capture.views[0]).size == SIZE
 
 
@@ -278,9 +278,9 @@ def test_a_name_has_one_form_for_frames_and_layers(tmp_path: Path, form: str) ->
     (folder / "split.json").write_text(json.dumps({"test": [composed]}))
     capture = Capture.open(folder)
     view = capture.view(composed)
-    assert view.name == composed and capture.has_removed and not capture.sentences
+    assert view.name == composed and capture.has_clean_frames and not capture.sentences
     assert capture.split(None)[1] == (view,)
-    np.testing.assert_array_equal(capture.frame(view).pixels, capture.removed(view).pixels)  # type: ignore[union-attr]
+    np.testing.assert_array_equal(capture.frame(view).pixels, capture.clean_frame(view).pixels)  # type: ignore[union-attr]
 
 
 def test_views_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:

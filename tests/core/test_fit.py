@@ -167,7 +167,7 @@ def test_a_displaced_light_is_snapped_to_its_flare(tmp_path: Path) -> None:
         run = fit(capture, quick(4, **{"flare.snap_lights": snap}), tmp_path / f"run {snap}", heard)
         off = np.linalg.norm(run.flare.model.positions.numpy()[0] - lamp.xyz)
         assert off < 0.1 if snap else off > 0.35
-        assert np.linalg.norm(run.capture().lights[0].xyz - run.flare.model.positions.numpy()[0]) < 1e-6
+        assert np.linalg.norm(run.open_capture().lights[0].xyz - run.flare.model.positions.numpy()[0]) < 1e-6
     assert [text.split(" was moved")[0] for text in heard.texts if " was moved" in text] == ["The light 'lamp'"]
 
 
@@ -536,7 +536,7 @@ def test_a_fit_resumes_only_with_unchanged_views(what: str, tmp_path: Path, capt
         turned = replace(view, camera=replace(view.camera, fx=view.camera.fx * 1.01))
         own.views = tuple(turned if one == view else one for one in own.views)
     else:
-        path = own.frame_path(view) if what == "images" else own.removed_path(view)
+        path = own.frame_path(view) if what == "images" else own.clean_frame_path(view)
         write_png(path, 1 - read_picture(path).pixels)
     with pytest.raises(RunError, match=rf"1 of {len(own.views)} views have another frame.*, {view.name} first"):
         fit(own, quick(), tmp_path / "run", resume=True)

@@ -187,9 +187,9 @@ def drifting(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, dict[st
 def flare_error(capture: Capture, run: Run) -> float:
     """Mean square over the views, display values."""
     errors = []
-    for view in run.capture().views:
+    for view in run.open_capture().views:
         layers = run.render(view.camera)
-        clean = capture.removed(view)
+        clean = capture.clean_frame(view)
         assert clean is not None
         composite = np.clip(srgb_from_linear(sum(layers.flare_by_light.values(), clean.linear())), 0, 1)
         filmed = capture.frame(view).display()
@@ -217,7 +217,7 @@ def test_a_view_is_rendered_at_its_exposure(drifting: tuple[Capture, dict[str, f
     capture, exposures = drifting
     monkeypatch.setattr(metering, "measure_exposures", lambda *_: exposures)
     run = Run.open(fit(capture, quick(20, blend=blend), tmp_path / "run").folder)
-    view = next(view for view in run.capture(need_frames=False).views if exposures[view.name] < 1)
+    view = next(view for view in run.open_capture(need_frames=False).views if exposures[view.name] < 1)
     own, usual = run.render(view.camera), run.render(replace(view.camera, exposure=1.0))
     inside = usual.scene.max(-1) < 0.99  # what is clipped in the one is not in the other
     assert own.scene[inside] == pytest.approx(exposures[view.name] * usual.scene[inside], abs=1e-4)

@@ -18,7 +18,7 @@ from core.conventions.run_files import CHECKPOINT, FRAME_LIGHTS, PLATES
 from core.errors import Cancelled, CaptureError, RunError
 from core.fit import FitSettings, Run, fit, preset
 from core.fit.light_results import FlareShare, make_frame_lights, select_flaring, share_sentences
-from core.fit.settings import over_plates, override_settings
+from core.fit.settings import adapt_to_plates, override_settings
 from core.images.write import write_png
 from core.metrics.pictures import relative_l2
 from core.removal.jobs.fitted import remove_fitted_flare
@@ -65,7 +65,7 @@ def make_shot(folder: Path, *, second_lamp: bool = False, count: int = FRAMES) -
 
 
 def quick(iterations: int = 240) -> FitSettings:
-    settings = over_plates(preset("draft", iterations=iterations))
+    settings = adapt_to_plates(preset("draft", iterations=iterations))
     return override_settings(settings, {"flare.count": 60, "preview_every": 100})
 
 
@@ -87,11 +87,11 @@ def run(shot: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_the_held_out_frame_has_its_flare(run: Run) -> None:
-    capture = run.capture()
+    capture = run.open_capture()
     view = capture.view(HELD_OUT)
     layers = run.render(view.camera)
     fitted = sum(layers.flare_by_light.values())
-    frame, scene = capture.frame(view).linear(), capture.removed(view).linear()
+    frame, scene = capture.frame(view).linear(), capture.clean_frame(view).linear()
     error = relative_l2(np.asarray(fitted), frame - scene, (frame < 0.9).all(-1))
     assert error < 0.45
     np.testing.assert_allclose(layers.scene + fitted, frame, atol=0.06)
@@ -136,12 +136,12 @@ def test_a_capture_in_which_no_light_flares_is_reported() -> None:
 
 
 def test_the_plates_lack_the_flare(run: Run, tmp_path: Path) -> None:
-    capture = run.capture()
+    capture = run.open_capture()
     assert len(list((run.folder / PLATES).glob("*.png"))) == FRAMES
     remove_fitted_flare(run, capture, capture.views, tmp_path / "clean", Progress())
     before, after = [], []
     for view in capture.views:
-        exact, frame = capture.removed(view).linear(), capture.frame(view).linear()
+        exact, frame = capture.clean_frame(view).linear(), capture.frame(view).linear()
         clean = linear_from_srgb(_read(tmp_path / "clean" / view.name))
         before.append(np.mean((frame - exact) ** 2))
         after.append(np.mean((clean - exact) ** 2))
@@ -157,7 +157,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def test_the_layers_of_a_bake_add_up(run: Run, tmp_path: Path) -> None:
-    capture = run.capture(need_frames=False)
+    capture = run.open_capture(need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
     frames = number_views(cameras)[:2]
     bake(run, frames, cameras, tmp_path)
@@ -177,7 +177,7 @@ def test_a_stopped_fit_continues_as_if_it_had_not_stopped(shot: Path, tmp_path: 
 
 
 def test_plates_show_no_other_camera(run: Run) -> None:
-    camera = run.capture().views[0].camera
+    camera = run.open_capture().views[0].camera
     with pytest.raises(RunError, match="one plate per frame"):
         run.render(type(camera)(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
                                 camera.world_to_camera))

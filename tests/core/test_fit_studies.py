@@ -36,7 +36,7 @@ def test_a_scene_and_the_grid_of_the_frame_are_fitted_together(capture: Capture)
     scene, cells = _values(trainer.scene), _values(trainer.grids)
     assert trainer.step()["loss"] > 0
     assert _changed(scene, _values(trainer.scene))
-    number = trainer.views.index(trainer._view())
+    number = trainer.views.index(trainer._pick_view())
     assert _changed(cells, _values(trainer.grids)) == {f"cells.{number}"}
 
 

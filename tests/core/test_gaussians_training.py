@@ -203,7 +203,7 @@ def test_morton_order_keeps_neighbours_together() -> None:
 
 def of_scene(scene: SceneGaussians, extent: float = 1.0, iterations: int = 100) -> Optimisers:
     """Return the optimisers of a scene in a fit without a flare."""
-    return Optimisers(scene, None, FitSettings(iterations=iterations), extent, display_white=1.0)
+    return Optimisers(scene, flare=None, settings=FitSettings(iterations=iterations), extent=extent, display_white=1.0)
 
 
 def test_the_rate_decays_exponentially() -> None:

@@ -53,7 +53,7 @@ def test_clean_frames_of_turned_photographs_stand_as_their_frames(orientation: i
     clean_capture(capture, Remover(flare_everywhere, working_size=64), Progress())
     capture = Capture.open(capture.folder)
     for view in capture.views:
-        frame, clean = capture.frame(view), capture.removed(view)
+        frame, clean = capture.frame(view), capture.clean_frame(view)
         assert clean is not None and clean.size == frame.size
         ours, other = (np.corrcoef(frame.pixels.ravel(), pixels.ravel())[0, 1]
                        for pixels in (clean.pixels, clean.pixels[::-1, ::-1]))
@@ -86,10 +86,10 @@ def test_clean_frames_are_estimates_until_all_are_edited(tmp_path: Path, flare_e
     made = Capture.open(capture.folder)
     for view in made.views:
         assert not has_exact_clean_frames(made)
-        path = made.removed_path(view)
+        path = made.clean_frame_path(view)
         cv2.imwrite(str(path), cv2.imread(str(path)) // 2)
     assert has_exact_clean_frames(made)
-    shutil.copy(made.frame_path(made.views[0]), made.removed_path(made.views[0]))
+    shutil.copy(made.frame_path(made.views[0]), made.clean_frame_path(made.views[0]))
     assert has_exact_clean_frames(made)
     (capture.folder / "removed" / "remove.json").unlink()
     assert has_exact_clean_frames(made), "someone's own"
@@ -121,7 +121,7 @@ def test_two_fits_clean_one_capture_at_once(tmp_path: Path, flare_everywhere: Pa
         one.join()
     assert not failed and not (capture.folder / UNFINISHED_FOLDER).exists()
     assert len(list((capture.folder / "removed").glob("*.png"))) == 4
-    assert Capture.open(capture.folder).has_removed
+    assert Capture.open(capture.folder).has_clean_frames
 
 
 def test_a_stopped_cleaning_of_a_capture_resumes(tmp_path: Path, flare_everywhere: Path) -> None:
@@ -192,7 +192,7 @@ def test_a_second_fit_uses_what_the_first_has_cleaned(tmp_path: Path, flare_ever
 
     assert clean_capture(capture, remover, Meanwhile()) == capture.folder / "removed"
     assert not (capture.folder / UNFINISHED_FOLDER).exists()
-    assert Capture.open(capture.folder).has_removed
+    assert Capture.open(capture.folder).has_clean_frames
 
 
 def test_frames_with_one_clean_name_on_windows_are_refused(tmp_path: Path) -> None:

@@ -232,7 +232,7 @@ def test_flares_are_added_to_photographs(tmp_path: Path) -> None:
     for view, source in zip(made.views, capture.views, strict=True):
         np.testing.assert_allclose(view.camera.world_to_camera, source.camera.world_to_camera, atol=1e-9)
         assert view.camera.fx == pytest.approx(source.camera.fx * 0.75)
-        removed, flare = made.removed(view), made.truth_flare(view)
+        removed, flare = made.clean_frame(view), made.truth_flare(view)
         assert removed and flare and flare.pixels.max() > 0.5
         np.testing.assert_allclose(removed.display(), capture.frame(source, (48, 36)).display(), atol=0.51 / 255)
         both = srgb_from_linear(np.clip(removed.linear() + flare.pixels, 0, 1))
@@ -267,7 +267,7 @@ def sample() -> Capture:
 def test_the_sample_capture_is_complete_and_small(sample: Capture) -> None:
     assert len(sample.views) >= 60 and (sample.views[0].camera.width, sample.views[0].camera.height) == (480, 270)
     assert len(sample.points.xyz) >= 3000 and float(np.mean(sample.points.error)) < 0.6
-    assert sample.has_removed and sample.has_truth
+    assert sample.has_clean_frames and sample.has_truth
     assert sum(path.stat().st_size for path in SAMPLE.rglob("*") if path.is_file()) <= 25_000_000
 
 
@@ -284,7 +284,7 @@ def test_the_sample_capture_has_the_cameras_and_lights_of_its_script(sample: Cap
 
 def test_sample_frames_are_their_layers_seen_by_a_sensor(sample: Capture) -> None:
     for view in sample.views[2::17]:
-        frame, removed = sample.frame(view), sample.removed(view)
+        frame, removed = sample.frame(view), sample.clean_frame(view)
         scene, flare = sample.truth_scene(view), sample.truth_flare(view)
         assert removed and scene and flare and flare.pixels.min() >= 0
         both = srgb_from_linear(np.clip(scene.pixels + flare.pixels, 0, 1))

@@ -87,7 +87,7 @@ def test_making_lights_and_clean_frames_keeps_the_size_of_the_picture_cache(tmp_
                         lambda *_: (tmp_path / "c" / "lights.json").write_text('{"lights": []}'))
     monkeypatch.setattr("fit_flare.core.removal.inference.remover.Remover", lambda **_: None)
     monkeypatch.setattr("fit_flare.core.removal.jobs.capture.clean_capture", lambda *_: None)
-    for made in (lights.with_lights(capture, Progress()), remove.with_removed(capture, Progress())):
+    for made in (lights.with_lights(capture, Progress()), remove.with_clean_frames(capture, Progress())):
         assert made is not capture
         assert (made.folder, made.cache_bytes) == (capture.folder, 100_000)
 

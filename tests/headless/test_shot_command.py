@@ -21,7 +21,7 @@ def test_shot_makes_run_layers_and_clean_frames(tmp_path: Path) -> None:
     assert len(list(Path(result["layers"]).glob("layers.*.exr"))) == FRAMES
     assert len(list(Path(result["clean"]).glob("*.png"))) == FRAMES
     fitted = Run.open(result["run"])
-    assert fitted.capture().views[0].camera.fx == 90 and fitted.lights == ("lamp",)
+    assert fitted.open_capture().views[0].camera.fx == 90 and fitted.lights == ("lamp",)
     says = [event["text"] for event in events if event["type"] == "say"]
     assert any("Shares of the flare by light" in text for text in says)
     before = fitted.fingerprint

@@ -18,7 +18,7 @@ def has_exact_clean_frames(capture: Capture) -> bool:
     Files that `remove` made and nobody has edited since are estimates, all others in removed/ are exact. Without
     removed/, the exact layers of a rendered scene count.
     """
-    if not capture.has_removed:
+    if not capture.has_clean_frames:
         return capture.has_truth
     return not any(Manifest(capture.folder / REMOVED).unedited_frames(_frames_by_clean_name(capture)))
 
@@ -36,6 +36,6 @@ def check_clean_frames_current(capture: Capture) -> None:
 def _frames_by_clean_name(capture: Capture) -> dict[Path, Path]:
     """Return the frame of every clean frame, by the latter's name below removed/."""
     folder = (capture.folder / REMOVED).resolve()
-    frames = {capture.removed_path(view).resolve(): view for view in capture.views}
+    frames = {capture.clean_frame_path(view).resolve(): view for view in capture.views}
     return {path.relative_to(folder): capture.frame_path(view) for path, view in frames.items()
             if path.is_relative_to(folder)}

@@ -270,7 +270,8 @@ def measure_coloured_lights(folders: list[Path], lenses: Path | None = None, wei
 
 def fit_confidence(folders: list[Path], lenses: Path | None = None, weights: Path | None = None,
                    count: int = 600) -> None:
-    """Fit and score the weights of the confidence that a predicted flare is real."""
+    """Fit the weights of the confidence on training pictures and print them; then print, on held-out pictures, the
+    scores of the weights in use and of the fitted ones."""
     from core.removal.inference.confidence import BIAS, FEATURE_WEIGHTS, confidence_from_log_odds
     from core.removal.training.backgrounds import read_backgrounds
 
@@ -280,14 +281,15 @@ def fit_confidence(folders: list[Path], lenses: Path | None = None, weights: Pat
     print("FEATURE_WEIGHTS, BIAS =", ", ".join(f"{value:.3g}" for value in fitted))
     features, gains = _draw_features(remover, 1007, count // 2, _held_out_backgrounds(folders),
                                      _held_out_lenses(lenses))
-    flares = gains > 0
-    for name, weights_and_bias in (("in use", np.array([*FEATURE_WEIGHTS, BIAS])), ("fitted", fitted)):
-        log_odds = features @ weights_and_bias[:-1] + weights_and_bias[-1]
-        area = np.mean(log_odds[flares][:, None] > log_odds[~flares])
+    is_useful = gains > 0  # the prediction brings the picture closer to the truth
+    for name, coefficients in (("in use", np.array([*FEATURE_WEIGHTS, BIAS])), ("fitted", fitted)):
+        log_odds = features @ coefficients[:-1] + coefficients[-1]
+        auc = np.mean(log_odds[is_useful][:, None] > log_odds[~is_useful])
         applied = np.array([confidence_from_log_odds(value) for value in log_odds])
-        print(f"{name}: area under the curve {area:.3f}; applied of {flares.sum()} useful predictions "
-              f"{applied[flares].mean():.1%}, of {(~flares).sum()} harmful ones {applied[~flares].mean():.1%}; the "
-              f"useful ones gain {gains[flares].mean():.2f} dB, applied {(gains * applied)[flares].mean():.2f} dB")
+        print(f"{name}: area under the curve {auc:.3f}; applied of {is_useful.sum()} useful predictions "
+              f"{applied[is_useful].mean():.1%}, of {(~is_useful).sum()} harmful ones "
+              f"{applied[~is_useful].mean():.1%}; the useful ones gain {gains[is_useful].mean():.2f} dB, applied "
+              f"{(gains * applied)[is_useful].mean():.2f} dB")
 
 
 def _draw_features(remover: Remover, seed: int, count: int, backgrounds: Any, lenses: Any) -> tuple[Any, Any]:

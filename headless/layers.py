@@ -69,7 +69,7 @@ def report_layers(frames: Sequence[NumberedFrame], folder: Path, total: int, pro
     progress.say(f"Layers of {len(frames)} frame{'s' * (len(frames) != 1)} are in {folder}{total_note}.")
     tally = Tally("frame", "rendered", len(frames))
     tally.merge(skipped)
-    progress.say(tally.sentence())
+    progress.say(tally.summary())
     return {"layers": str(folder), "frames": len(frames), "frames_in_folder": total, **tally.as_result()}
 
 

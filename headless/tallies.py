@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 def report_capture(capture: Capture, progress: Progress) -> None:
-    """Report what the user should know of a capture before it is used."""
-    for sentence in capture.sentences:
-        progress.say(sentence)
+    """Report the warnings about a capture before it is used."""
+    for warning in capture.warnings:
+        progress.say(warning)
 
 
 def tally_capture(capture: Capture, verb: str = "used", used: int | None = None) -> Tally:
@@ -35,10 +35,10 @@ def tally_solve(report: Mapping[str, Any], source: Path) -> Tally:
     tally.use(report["registered"])
     tally.skip("no place in the model", *report["unregistered"])
     names = [path.name for path in pictures_in(source)] if source.is_dir() else []
-    for sentence in report["left_out"]:  # "PATH is damaged or truncated; export it again."
-        # Each sentence becomes the name of a file and a reason without the advice.
-        name = next((name for name in names if sentence.startswith(f"{source / name} ")), "")
-        problem = sentence.removeprefix(f"{source / name} ").partition(";")[0].partition(" (")[0].rstrip(".")
+    for message in report["left_out"]:  # "PATH is damaged or truncated; export it again."
+        # Each message becomes the name of a file and a reason without the advice.
+        name = next((name for name in names if message.startswith(f"{source / name} ")), "")
+        problem = message.removeprefix(f"{source / name} ").partition(";")[0].partition(" (")[0].rstrip(".")
         tally.skip(problem, name or source.name)
     if source.is_dir():
         tally.merge(unlisted_entries(source))
@@ -47,5 +47,5 @@ def tally_solve(report: Mapping[str, Any], source: Path) -> Tally:
 
 def report_tally(tally: Tally, progress: Progress) -> dict[str, Any]:
     """Report a tally, as the last line of a command; return it for the command's result."""
-    progress.say(tally.sentence())
+    progress.say(tally.summary())
     return {"tally": tally.as_result()}

@@ -183,11 +183,12 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
 
 def _open_pictures(options: TargetOptions, paths: list[Path], look: Look, sources: Mapping[str, str],
                    training: list[Floats] | None) -> Target:
-    """Return the target of pictures. sources: of --use. training: as of `open_target`. Raises SettingsError."""
+    """Return the target of pictures. sources: light of the flare by light of the target, from --use. training: as of
+    `open_target`. Raises SettingsError."""
     from ..core.colour import colour_space
     from ..core.lights.detection import Detector
     from ..core.lights.exposure import ExposureDetector
-    from ..core.transfer.highlights import NAME
+    from ..core.transfer.highlights import HIGHLIGHTS_LIGHT
     from ..core.transfer.query import training_views
     from ..core.transfer.target import picture_target
 
@@ -196,7 +197,7 @@ def _open_pictures(options: TargetOptions, paths: list[Path], look: Look, source
     if options.highlights is not None and options.light:
         raise SettingsError("--highlights takes the lights from the plates; leave --light out.")
     # The transfer moves this one light to the highlights of each plate; its pixel here has no meaning.
-    positions = {NAME: (0.5, 0.5)} if options.highlights is not None else _parse_lights(options.light)
+    positions = {HIGHLIGHTS_LIGHT: (0.5, 0.5)} if options.highlights is not None else _parse_lights(options.light)
     detector: Detector | None = None if positions else ExposureDetector()
     centre = _parse_point(options.centre) if options.centre else None
     space = None if options.plate_space == "auto" else colour_space(options.plate_space, options.ocio)
@@ -205,14 +206,15 @@ def _open_pictures(options: TargetOptions, paths: list[Path], look: Look, source
 
 
 def _open_shot(options: TargetOptions, path: Path, look: Look, sources: Mapping[str, str]) -> Target:
-    """Return the target of a shot file. sources: of --use. Raises SettingsError."""
+    """Return the target of a shot file. sources: see `_open_pictures`. Raises SettingsError."""
     from ..core.conventions.frame_numbers import NumberedFrame, select_task_frames
     from ..core.look.shot import Shot
     from ..core.transfer.target import shot_target
 
     shot = Shot.read(path)
-    numbers = [NumberedFrame("", number, "") for number in sorted({shot_frame.frame for shot_frame in shot.frames})]
-    selected = select_task_frames(numbers, options.frames, options.job_frames)
+    frames = [NumberedFrame(view="", number=number, file="")
+              for number in sorted({shot_frame.frame for shot_frame in shot.frames})]
+    selected = select_task_frames(frames, options.frames, options.job_frames)
     return shot_target(shot, look, sources, plates=options.plates, scene=options.scene,
                        required_frames={frame.number for frame in selected})
 

@@ -36,7 +36,7 @@ class CameraSolve:
     """Poses and points of a capture, before their pictures are looked at.
 
     root: folder that the frames' names start from. masks: files by the frames' names. training, held_out: names in the
-    solve's own lists, None without. sentences: what the user should know.
+    solve's own lists, None without. warnings: sentences for the user.
     """
 
     frames: list[PosedFrame]
@@ -45,7 +45,7 @@ class CameraSolve:
     masks: dict[str, Path] = field(default_factory=dict)
     training: set[str] | None = None
     held_out: set[str] | None = None
-    sentences: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 def read_solve_in_steps(folder: Path, *, required: bool = True) -> Steps[CameraSolve | None]:
@@ -56,9 +56,9 @@ def read_solve_in_steps(folder: Path, *, required: bool = True) -> Steps[CameraS
     models = find_models(folder)
     if not models and transforms_files(folder):
         read = read_transforms(folder)
-        solve = CameraSolve(read.frames, read.points, folder, read.masks, read.training, read.held_out, read.sentences)
+        solve = CameraSolve(read.frames, read.points, folder, read.masks, read.training, read.held_out, read.warnings)
     else:
-        model, sentence = choose_model(models or find_models(folder, LATER_MODEL_PLACES), folder)
+        model, choice_warning = choose_model(models or find_models(folder, LATER_MODEL_PLACES), folder)
         if model is None and not required:
             return None
         if model is None:
@@ -71,7 +71,7 @@ def read_solve_in_steps(folder: Path, *, required: bool = True) -> Steps[CameraS
         frames, points = yield from read_model_in_steps(model)
         root = frames_folder(folder, model)
         solve = CameraSolve(_with_relative_names(root, frames), points, root)
-        solve.sentences += [sentence] if sentence else []
+        solve.warnings += [choice_warning] if choice_warning else []
     solve.frames.sort(key=lambda frame: natural_key(frame.name))
     return solve
 
@@ -108,13 +108,13 @@ class MatchedFrames:
     """The picture of each posed frame, by the frame's name in the solve, and what has no counterpart.
 
     missing: names of poses without a picture; unposed: names of pictures without a pose, below the folder of the
-    frames. sentences: what the user should know.
+    frames. warnings: sentences for the user.
     """
 
     files: dict[str, Path]
     missing: list[str]
     unposed: list[str]
-    sentences: list[str]
+    warnings: list[str]
 
 
 def match_frames_in_steps(solve: CameraSolve) -> Steps[MatchedFrames]:
@@ -162,15 +162,15 @@ def _describe_matches(solve: CameraSolve, files: dict[str, Path], missing: list[
 
     files, missing, unposed: as of `MatchedFrames`. renamed: "file for name" of each frame of another name.
     """
-    sentences = []
+    warnings = []
     if files and (missing or unposed):
         text = f"{len(files)} of {len(files) + len(unposed)} frames in {solve.root} have a pose"
         text += f", not {list_names(unposed)}" if unposed else ""
         text += f"; {len(missing)} poses have no frame: {list_names(missing)}" if missing else ""
-        sentences.append(f"{text}. What has no counterpart is left out.")
+        warnings.append(f"{text}. What has no counterpart is left out.")
     if renamed:
-        sentences.append(f"{len(renamed)} frames have other names than in the camera solve: {list_names(renamed)}.")
-    return sentences
+        warnings.append(f"{len(renamed)} frames have other names than in the camera solve: {list_names(renamed)}.")
+    return warnings
 
 
 def list_names(names: list[str]) -> str:
@@ -179,13 +179,13 @@ def list_names(names: list[str]) -> str:
     return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
-def check_geometry(solve: CameraSolve) -> list[str]:
+def geometry_warnings(solve: CameraSolve) -> list[str]:
     """Return sentences for the user on points that no camera sees, and on impossible focal lengths."""
-    return [*_check_points(solve), *_check_lenses(solve)]
+    return [*_point_warnings(solve), *_focal_length_warnings(solve)]
 
 
-def _check_points(solve: CameraSolve) -> list[str]:
-    """Return a sentence if most sampled points are in no view, or behind the cameras."""
+def _point_warnings(solve: CameraSolve) -> list[str]:
+    """Return a warning if most sampled points are in no view, or behind the cameras; [] otherwise."""
     points = solve.points.xyz[::max(len(solve.points) // SAMPLED_POINTS, 1)].astype(np.float64)
     if not len(points):
         return []
@@ -208,8 +208,8 @@ def _check_points(solve: CameraSolve) -> list[str]:
             "(scale, axes, origin)."]
 
 
-def _check_lenses(solve: CameraSolve) -> list[str]:
-    """Return a sentence if a focal length gives a field of view that no lens has."""
+def _focal_length_warnings(solve: CameraSolve) -> list[str]:
+    """Return a warning if a focal length gives a field of view that no lens has; [] otherwise."""
     impossible = []
     for frame in solve.frames:
         lens = frame.lens

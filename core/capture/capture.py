@@ -35,7 +35,7 @@ from ..system.file_names import canonical_name, find_entry
 from ..system.files import read_json, safe_join
 from ..system.steps import FRAMES_PER_STEP, Steps, finish
 from .camera import Camera, Floats
-from .camera_solve import CameraSolve, check_geometry, match_frames_in_steps, read_solve_in_steps
+from .camera_solve import CameraSolve, geometry_warnings, match_frames_in_steps, read_solve_in_steps
 from .colmap import PointCloud, PosedFrame
 from .frame_files import mask_pictures, matching_pictures, view_name
 from .frame_sizes import checked_size, size_or_model_size
@@ -96,7 +96,7 @@ class Capture:
         self._paths = light_paths(self.lights, names)
         self._focal: float | None = None
         self._split_lists: tuple[set[str] | None, ...] = (None, None)
-        self.sentences: tuple[str, ...] = ()
+        self.warnings: tuple[str, ...] = ()
         """What the user should know of the capture before it is used."""
         self.left_out: dict[str, tuple[str, ...]] = {}
         """Names of frames that are not among the views, by reason."""
@@ -138,8 +138,8 @@ class Capture:
         matched = yield from match_frames_in_steps(solve)
         yield
         turned = [each for frame in solve.frames if (each := turned_frame(frame, matched.files.get(frame.name)))]
-        upright, sentences = (find_upright(turned, solve.points) if has_cameras
-                              else ({frame.posed.name for frame in turned}, []))  # the one camera is made upright
+        upright, orientation_warnings = (find_upright(turned, solve.points) if has_cameras
+                                         else ({frame.posed.name for frame in turned}, []))  # its camera is upright
         turned_by_name = {frame.posed.name: frame for frame in turned if frame.posed.name in upright}
         yield
         opened = yield from _open_views_in_steps(folder, solve, matched.files, upright, turned_by_name, need_frames)
@@ -157,8 +157,8 @@ class Capture:
         yield
         if need_frames:
             yield from capture._check_layer_sizes()
-            capture.sentences = (*solve.sentences, *matched.sentences, *sentences, *check_geometry(solve),
-                                 *capture.light_sentences)
+            capture.warnings = (*solve.warnings, *matched.warnings, *orientation_warnings, *geometry_warnings(solve),
+                                *capture.light_warnings)
             capture.left_out = {reason: tuple(each) for reason, each in (
                 ("no pose", matched.unposed), ("a pose without a frame", matched.missing)) if each}
         if (folder / "split.json").exists():
@@ -224,9 +224,9 @@ class Capture:
         return self._paths[light.name].state(view.name, view.camera, self.extent)
 
     @property
-    def light_sentences(self) -> list[str]:
-        """What the user should know of the lights' paths: frames that are interpolated or unknown."""
-        return [sentence for path in self._paths.values() for sentence in path.sentences()]
+    def light_warnings(self) -> list[str]:
+        """Sentences for the user on the lights' paths: frames that are interpolated or unknown."""
+        return [warning for path in self._paths.values() for warning in path.warnings()]
 
     # What was filmed.
 

@@ -87,7 +87,10 @@ def count_images(model: Path) -> int:
 
 
 def choose_model(models: Sequence[Path], folder: Path) -> tuple[Path | None, str]:
-    """Return the model with the most images, the first of equal ones, and a sentence where there are several."""
+    """Return the model with the most images, the first of equal ones, and a warning where there are several, else "".
+
+    None and "" for no models.
+    """
     if len(models) < 2:
         return (models[0] if models else None), ""
     counts = {model: count_images(model) for model in models}

@@ -258,16 +258,17 @@ class LightPath:
         times, values = zip(*self._brightness_keys, strict=True)
         return float(np.interp(self._times[name], times, values))
 
-    def sentences(self) -> list[str]:
-        """Return what the user should know of the path: interpolated and unknown frames."""
-        missing, result = self.missing(), []
+    def warnings(self) -> list[str]:
+        """Return sentences for the user on frames in which the place is interpolated, and on frames of lights.json that
+        the capture lacks."""
+        missing, warnings = self.missing(), []
         if missing:
-            result.append(f"The light {self.light.name!r} has no place in {len(missing)} of {len(self._times)} frames "
-                          f"({_list(missing)}); it is interpolated there.")
+            warnings.append(f"The light {self.light.name!r} has no place in {len(missing)} of {len(self._times)} "
+                            f"frames ({_list(missing)}); it is interpolated there.")
         if self.unknown:
-            result.append(f"lights.json has entries of the light {self.light.name!r} for {len(self.unknown)} frames "
-                          f"that are not in the capture ({_list(self.unknown)}); they are left out.")
-        return result
+            warnings.append(f"lights.json has entries of the light {self.light.name!r} for {len(self.unknown)} frames "
+                            f"that are not in the capture ({_list(self.unknown)}); they are left out.")
+        return warnings
 
 
 def light_paths(lights: Iterable[Light], names: Sequence[str]) -> dict[str, LightPath]:

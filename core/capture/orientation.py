@@ -79,17 +79,17 @@ def find_upright(frames: Sequence[TurnedFrame], points: PointCloud) -> tuple[set
             undecided.setdefault(frame.orientation, []).append(frame)
         elif fits_shown:
             upright.add(frame.posed.name)
-    sentences = [_describe(sorted(upright), "as shown, by the sizes of their cameras")] if upright else []
+    warnings = [_describe(sorted(upright), "as shown, by the sizes of their cameras")] if upright else []
     for orientation, group in sorted(undecided.items()):
         names = [frame.posed.name for frame in group]
         is_upright = _matches_upright(group, points)
         if is_upright is None:
-            sentences.append(_describe(names, f"as stored, though their Exif orientation is {orientation}: no coloured "
-                                              "points show which. If the fit comes out turned, remove that tag"))
+            warnings.append(_describe(names, f"as stored, though their Exif orientation is {orientation}: no coloured "
+                                             "points show which. If the fit comes out turned, remove that tag"))
         elif is_upright:
             upright.update(names)
-            sentences.append(_describe(names, "as shown, by the colours of the points"))
-    return upright, sentences
+            warnings.append(_describe(names, "as shown, by the colours of the points"))
+    return upright, warnings
 
 
 def _describe(names: Sequence[str], reading: str) -> str:

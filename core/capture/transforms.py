@@ -47,7 +47,7 @@ class Transforms:
     """Poses and points of a capture with transforms.json; the names are paths below its folder.
 
     masks: files of the frames' masks, by the frames' names. training, held_out: names in the file's lists of both, None
-    without a list. sentences: what the user should know.
+    without a list. warnings: sentences for the user.
     """
 
     frames: list[PosedFrame]
@@ -55,7 +55,7 @@ class Transforms:
     masks: dict[str, Path] = field(default_factory=dict)
     training: set[str] | None = None
     held_out: set[str] | None = None
-    sentences: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 def transforms_files(folder: Path) -> list[Path]:
@@ -265,17 +265,17 @@ def _read_points(path: Path, meta: dict[str, Any], result: Transforms) -> PointC
             raise CaptureError(f"{file} is missing, which {path} names as its points.")
         cloud = read_points(cloud_file)
         if len(cloud) and (cloud.rgb == GREY).all():
-            result.sentences.append(f"The points of {cloud_file} have no colours, so they start grey.")
+            result.warnings.append(f"The points of {cloud_file} have no colours, so they start grey.")
         return cloud
-    model, sentence = choose_model(find_models(folder, LATER_MODEL_PLACES), folder)
+    model, choice_warning = choose_model(find_models(folder, LATER_MODEL_PLACES), folder)
     if model is None:
         return PointCloud.empty()
     posed, points = read_model(model)
-    result.sentences += [sentence] if sentence else []
+    result.warnings += [choice_warning] if choice_warning else []
     to_world = _read_applied_transform(path, meta)
     from_cameras = _fit_similarity(posed, result.frames)
     if from_cameras is not None and not _move_alike(to_world, from_cameras, points.xyz):
-        result.sentences.append(f"The points of {model} are moved as their cameras are in {path.name}: "
+        result.warnings.append(f"The points of {model} are moved as their cameras are in {path.name}: "
                                 + ("applied_transform and applied_scale say otherwise." if "applied_transform" in meta
                                    else "it has no applied_transform."))
         to_world = from_cameras

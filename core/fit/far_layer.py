@@ -105,8 +105,8 @@ def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) ->
     return FarLayer(sphere, _make_far_points(sphere, patches, sampled, frames))
 
 
-def far_layer_sentences(scene: SceneGaussians) -> tuple[str, ...]:
-    """Return a sentence for the user on the far layer of a scene that a fit starts from; none without one."""
+def far_layer_messages(scene: SceneGaussians) -> tuple[str, ...]:
+    """Return a message to the user on the far layer of a scene that a fit starts from; () without one."""
     count = len(scene.far_rows())
     if not count:
         return ()

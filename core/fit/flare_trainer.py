@@ -28,7 +28,7 @@ from .light_results import (
     flare_shares,
     select_flaring,
     select_lights,
-    share_sentences,
+    share_messages,
     write_frame_lights,
 )
 from .optimisers import Optimisers
@@ -89,7 +89,7 @@ class FlareTrainer(abc.ABC):
 
     def finish_lights(self, folder: Path) -> Sequence[str]:
         """Normalise the lights' brightness, leave out lights that do not flare, and write the lights by frame, if they
-        change; return sentences for the user on their shares.
+        change; return messages to the user on their shares.
 
         In a fit over plates, the brightness is solved once more for all views first, held-out ones too.
         """
@@ -102,7 +102,7 @@ class FlareTrainer(abc.ABC):
         flaring = select_flaring(shares)
         self.flare = select_lights(self.flare, flaring)
         write_frame_lights(folder / FRAME_LIGHTS, self.capture, self.flare)
-        return share_sentences(shares, flaring)
+        return share_messages(shares, flaring)
 
     def _pick_view(self) -> View:
         """Return the view of this iteration: each view once per round, in a random order given by seed and round."""

@@ -45,7 +45,7 @@ class _Features(NamedTuple):
 
 
 def ensure_points(capture: Capture, settings: FitSettings, progress: Progress) -> tuple[Capture, tuple[str, ...]]:
-    """Return the capture with points, and a sentence where they had to be made. Raises Cancelled."""
+    """Return the capture with points, and a message to the user if they had to be made. Raises Cancelled."""
     if len(capture.points) or settings.scene.start or settings.uses_plates:
         return capture, ()
     xyz, rgb, observed = _triangulate_matches(capture, progress)

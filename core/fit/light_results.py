@@ -71,18 +71,18 @@ def select_flaring(shares: Mapping[str, FlareShare]) -> list[str]:
     return flaring or [max(shares, key=lambda name: shares[name])]
 
 
-def share_sentences(shares: Mapping[str, FlareShare], flaring: Sequence[str]) -> list[str]:
-    """Return sentences for the user about the lights' shares. flaring: the lights that the .flare has."""
+def share_messages(shares: Mapping[str, FlareShare], flaring: Sequence[str]) -> list[str]:
+    """Return messages to the user about the lights' shares. flaring: the lights that the .flare has."""
     if not any(share.is_visible for share in shares.values()):
         return [f"No light of the capture flares: the flare of each is below {MIN_PEAK:g} of white everywhere. The "
                 f"flare layers of this run are dark, and its .flare has {', '.join(flaring)} alone."]
     largest_first = sorted(shares, key=lambda name: -shares[name].share)
     listed = ", ".join(f"{name} {100 * shares[name].share:.1f} %" for name in largest_first)
-    sentences = [f"Shares of the flare by light: {listed}."]
+    messages = [f"Shares of the flare by light: {listed}."]
     if left_out := [name for name in shares if name not in flaring]:
-        sentences.append(f"Left out of the .flare, since they do not flare (less than {100 * MIN_SHARE:g} % of the "
-                         f"flare, or below {MIN_PEAK:g} of white everywhere): {', '.join(left_out)}.")
-    return sentences
+        messages.append(f"Left out of the .flare, since they do not flare (less than {100 * MIN_SHARE:g} % of the "
+                        f"flare, or below {MIN_PEAK:g} of white everywhere): {', '.join(left_out)}.")
+    return messages
 
 
 def select_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:

@@ -34,7 +34,7 @@ def scene_only_iterations(settings: SplitSettings, views: int, iterations: int) 
 
 def scene_loss(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
                settings: SplitSettings, progress: float) -> Tensor:
-    """Return the loss of a scene (height, width, 3), display values, beside that of the composite.
+    """Return the loss on the scene alone, (height, width, 3) display values; `trainer` adds it to the composite's loss.
 
     lights: (n, 3), world. discs: (height, width), the lights' clipped pixels, or None. progress: of the fit, 0..1; as
     it grows, brighter frames pull the scene up less, and the scene is held down more near the lights.

@@ -54,22 +54,22 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
             if run.finished:
                 progress.say(f"The fit in {folder} is finished already.")
             else:
-                capture, sentences = ensure_points(capture, run.settings, progress)
+                capture, point_messages = ensure_points(capture, run.settings, progress)
                 trainer = _make_trainer(capture, run.settings, run.exposures)
                 remove_partials_below(folder)
                 if (folder / CHECKPOINT).exists():
                     trainer.load_state(checkpoint.load(folder / CHECKPOINT))
                 else:
-                    _report((*sentences, *trainer.warnings), run, progress)
+                    _report((*point_messages, *trainer.warnings), run, progress)
                 _run_to_end(trainer, run, progress)
         return run
     settings, warnings = resolve_white(settings.validated(), capture)
-    capture, sentences = ensure_points(capture, settings, progress)
+    capture, point_messages = ensure_points(capture, settings, progress)
     # Made before anything is written: it may refuse the capture.
     trainer = _make_trainer(capture, settings, progress=progress)
     with folder_lock(folder):
         run = Run.create(folder, settings, capture.folder, trainer.exposures)
-        _report((*warnings, *sentences, *trainer.warnings), run, progress)
+        _report((*warnings, *point_messages, *trainer.warnings), run, progress)
         _run_to_end(trainer, run, progress)
     return run
 
@@ -143,11 +143,11 @@ def _finish(trainer: FlareTrainer, run: Run, progress: Progress) -> None:
 
     After a kill in between, a resumed fit repeats these steps and loses nothing.
     """
-    sentences = trainer.finish_lights(run.folder)
+    light_messages = trainer.finish_lights(run.folder)
     _write_previews(trainer, run)
     pixel_grid = PixelGrid.from_focal_lengths(trainer.frames.camera(view).focal_length for view in trainer.views)
     trainer.finish(run.folder, pixel_grid, progress)
-    _report(sentences, run, progress)
+    _report(light_messages, run, progress)
     if trainer.flare is not None:
         camera = trainer.views[0].camera
         lens = TrainedCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)

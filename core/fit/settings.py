@@ -265,9 +265,9 @@ class FitSettings:
             (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),
             (self.flare.form.is_consistent, "a form with arcs needs rings, and ellipses instead of solid Gaussians"),
         )
-        for is_met, sentence in checks:
+        for is_met, requirement in checks:
             if not is_met:
-                raise SettingsError(f"The settings cannot be used: {sentence}.")
+                raise SettingsError(f"The settings cannot be used: {requirement}.")
         return self
 
 

@@ -35,7 +35,7 @@ from ..gaussians.spherical_harmonics import MAX_DEGREE
 from ..system.progress import Progress
 from . import metering
 from .checkpoint import FitInputs, State
-from .far_layer import far_layer_sentences
+from .far_layer import far_layer_messages
 from .flare_trainer import FlareTrainer, load_parameters
 from .frames import Frames, Targets, masked, subsample
 from .initialise import has_frame_lights, initial_flare, initial_scene
@@ -94,7 +94,7 @@ class Trainer(FlareTrainer):
         # Models, made from the inputs.
         self._scene = initial_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else initial_flare(capture, self.views, self.frames, settings)
-        self.warnings = (*self.frames.warnings, *far_layer_sentences(self.scene),
+        self.warnings = (*self.frames.warnings, *far_layer_messages(self.scene),
                          *metering.exposure_warnings(self.exposures),
                          *footage_warnings(capture, settings, self.views, self.frames),
                          *(() if self.flare is None else moved_light_warnings(capture, self.flare)))

@@ -133,7 +133,7 @@ class LightFlare(nn.Module):
             means = means + rows["offsets"]
         scales, rotations = deformed("log_scales"), deformed("rotations")
         if form.solid:
-            covariances = placement.covariance_of_solid(means, scales, rotations)
+            covariances = placement.project_covariances(means, scales, rotations)
         else:
             covariances = placement.covariance_of_ellipse(scales, rotations)
         opacities, rings, arcs = deformed("opacity_logits").sigmoid()[:, 0], None, None

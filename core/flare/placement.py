@@ -41,8 +41,8 @@ def on_line(mu: Tensor, light: Tensor) -> Tensor:
     return mu * light
 
 
-def covariance_of_solid(means: Tensor, log_scales: Tensor, quaternions: Tensor) -> Tensor:
-    """Return covariances (n, 3) on the plane of 3D Gaussians in the camera frame at depth `PLANE_DEPTH`.
+def project_covariances(means: Tensor, log_scales: Tensor, quaternions: Tensor) -> Tensor:
+    """Return covariances (n, 3) xx, xy, yy on the plane of 3D Gaussians in the camera frame at depth PLANE_DEPTH.
 
     means (n, 2) on the plane, log_scales (n, 3) in world units, quaternions (n, 4) wxyz. The local affine approximation
     of the projection (Zwicker et al. 2002): J = [1 0 -x; 0 1 -y] / depth.

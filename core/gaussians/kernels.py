@@ -62,8 +62,8 @@ def is_available(name: str) -> bool:
 
 
 @cache
-def _warn_once(sentence: str) -> None:
-    log.warning(sentence)
+def _warn_once(message: str) -> None:
+    log.warning(message)
 
 
 class StepsInBackward(Protocol):

@@ -111,8 +111,8 @@ def with_description(encoded: bytes, exif: bytes, xmp: bytes) -> bytes:
     return encoded[:_HEADER_END] + chunks + encoded[_HEADER_END:]
 
 
-def dropped_parts(path: Path) -> str:
-    """Return a sentence on what a picture with changed pixels cannot keep of this file; "" where it keeps all."""
+def dropped_parts_warning(path: Path) -> str:
+    """Return a warning on what a picture with changed pixels cannot keep of this file; "" where it keeps all."""
     with open_regular(path) as stream:
         head = stream.read(_HEAD_BYTES)
         if head[4:8] == b"ftyp" and any(name in head for name in _HEIF_GAIN_MAPS):

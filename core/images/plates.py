@@ -32,7 +32,7 @@ from .formats.exif import upright_block
 from .formats.kinds import JPEG_SUFFIXES, SUFFIX_OF_KIND
 from .formats.kinds import SUFFIXES as SUFFIX_KINDS
 from .listing import SUFFIXES
-from .metadata import copy_metadata, dropped_parts, with_colour_chunks, with_description
+from .metadata import copy_metadata, dropped_parts_warning, with_colour_chunks, with_description
 from .oiio_writer import OIIO_FORMATS, needs_oiio_writer, write_by_oiio
 from .picture import Encoding
 from .read import read_stored_pixels, rgb_codes
@@ -176,13 +176,13 @@ class Plate:
         """Sentences for the user, "" for none: that the suffix is not that of the file's contents, and what is lost
         when a plate with changed codes is written."""
         suffix, kind = self.path.suffix.lower(), file_kind(self.path)
-        written, sentence = SUFFIX_KINDS.get(_format_suffix(self.path, self)), ""
+        written_kind, kind_warning = SUFFIX_KINDS.get(_format_suffix(self.path, self)), ""
         # Only where the clean plate keeps the file's name, and with it the suffix.
         if clean_name(self.path) == self.path and kind not in ("", SUFFIX_KINDS.get(suffix)):
-            sentence = f"{self.path} holds {kind.upper()} data, whatever its name; " + (
-                "so does the result of that name." if written == kind else
-                f"the result of that name holds {str(written).upper()} data.")
-        return " ".join(filter(None, (sentence, dropped_parts(self.path))))
+            kind_warning = f"{self.path} holds {kind.upper()} data, whatever its name; " + (
+                "so does the result of that name." if written_kind == kind else
+                f"the result of that name holds {str(written_kind).upper()} data.")
+        return " ".join(filter(None, (kind_warning, dropped_parts_warning(self.path))))
 
     @property
     def placement(self) -> dict[str, Any]:

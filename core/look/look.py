@@ -36,8 +36,8 @@ from .plane import (
     arcs_of_ellipse,
     colours,
     covariance_of_ellipse,
-    covariance_of_solid,
     opacity_gain,
+    project_covariances,
 )
 
 VERSION = 1
@@ -145,7 +145,7 @@ class LightLook:
         if form.static_offset:
             means = means + rows["offsets"]
         scales, rotations = rows["log_scales"] + offsets["log_scales"], rows["rotations"] + offsets["rotations"]
-        covariances = (covariance_of_solid(means, scales, rotations) if form.solid
+        covariances = (project_covariances(means, scales, rotations) if form.solid
                        else covariance_of_ellipse(scales, rotations))
         with np.errstate(over="ignore"):  # an exponential that overflows gives opacity 0
             opacities = 1 / (1 + np.exp(-(rows["opacity_logits"] + offsets["opacity_logits"])[:, 0]))

@@ -22,7 +22,7 @@ from ..conventions.splatting import C0, C1, C2, C3
 Floats = NDArray[np.float32]
 
 PLANE_DEPTH = 0.21
-"""Camera depth of solid Gaussians: just past 3DGS's near plane of 0.2 (paper, appendix)."""
+"""Camera depth of 3D Gaussians of a flare: just past 3DGS's near plane of 0.2 (paper, appendix)."""
 ARC_SOFTNESS = 0.1
 """Strength of an arc from which its opacity is that of its peak; see `opacity_gain`."""
 
@@ -81,9 +81,11 @@ class PlaneGaussians:
         return np.asarray(self.opacities * area * luminance, np.float32)
 
 
-def covariance_of_solid(means: Floats, log_scales: Floats, quaternions: Floats) -> Floats:
-    """Return (n, 3) covariances on the plane of 3D Gaussians at depth PLANE_DEPTH, projected to first order (Zwicker et
-    al. 2002). log_scales: (n, 3). quaternions: (n, 4) wxyz, of any length but zero."""
+def project_covariances(means: Floats, log_scales: Floats, quaternions: Floats) -> Floats:
+    """Return (n, 3) covariances xx, xy, yy on the plane of 3D Gaussians at depth PLANE_DEPTH, projected to first order
+    (Zwicker et al. 2002).
+
+    means: (n, 2) on the plane. log_scales: (n, 3), world units. quaternions: (n, 4) wxyz, of any length but zero."""
     q = quaternions / np.maximum(np.linalg.norm(quaternions, axis=-1, keepdims=True), 1e-12)
     w, x, y, z = q.T
     rotation = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Counts the files or frames that a command used and those that it left out, for the last line of the command.
 
-Readers and jobs fill a `Tally`; the command prints `Tally.sentence` last and puts `Tally.as_result` into its result.
+Readers and jobs fill a `Tally`; the command prints `Tally.summary` last and puts `Tally.as_result` into its result.
 """
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any
 from .file_names import natural_key
 
 MAX_NAMES = 3
-"""Number of names that the sentence spells out for each reason."""
+"""Number of names that the summary spells out for each reason."""
 MAX_REASONS = 4
-"""Number of reasons that the sentence spells out."""
+"""Number of reasons that the summary spells out."""
 MAX_RESULT_NAMES = 1000
 """Number of names in the result for other programs."""
 
@@ -52,8 +52,8 @@ class Tally:
         """Number of items that are left out."""
         return len({name for names in self.skipped.values() for name in names})
 
-    def sentence(self) -> str:
-        """Return the sentence for the user: the two counts, and the first names of each reason.
+    def summary(self) -> str:
+        """Return one sentence for the user: the two counts, and the first names of each reason.
 
         "14 frames used; 5 left out: 10.heic, 11.heic, 12.heic and 1 more (HEIC needs pillow-heif), cut.mov (a video)."
         """

@@ -10,7 +10,7 @@ from ..capture import Camera, LightExtent
 from ..lights.highlights import Highlights
 from ..look import PlacedLight
 
-NAME = "highlights"
+HIGHLIGHTS_LIGHT = "highlights"
 """Name of the light that stands for all highlights."""
 
 

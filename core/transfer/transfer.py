@@ -32,7 +32,7 @@ from ..flare.compositing import linear_layers as linear_layers
 from ..flare.visibility import VisibilitySettings, visibility_behind
 from ..gaussians import Splats
 from ..images.picture import Picture
-from ..images.window import crop_to_display_window, move_to_window
+from ..images.window import DataWindow, crop_to_display_window, move_to_window
 from ..lights.highlights import find_highlights
 from ..look import LightLook, LookEdits, PlacedLight, PlaneGaussians, ViewOfLight, read_look
 from ..look.placed_light import evaluate_placed
@@ -81,14 +81,15 @@ class Transfer:
 
     def __init__(self, flare: Path, target: Target, settings: TransferSettings | None = None,
                  training: Sequence[ArrayLike] | None = None, config: str | None = None) -> None:
-        """Read the look of `flare`. Raises FlareFileError."""
+        """Read the look of `flare`, and index the target's frames. Raises FlareFileError."""
         self.flare, self.target, self.settings, self.config = flare, target, settings or TransferSettings(), config
         self.look = read_look(flare)
         self.sources = {light.name: light for light in self.look.lights}
         self.training_views = queries.training_views(flare, self.look.lights, training)
         self._visibilities: dict[tuple[int, str], tuple[float, tuple[float, ...] | None]] = {}
-        self._fixed = self._fixed_views() if self.settings.query == "source" else {}
-        self._index = {frame.frame.view: index for index, frame in enumerate(target.frames)}
+        """Results of `_frame_visibility`, by index of the frame and name of the light."""
+        self._fixed_views_by_light = self._fixed_views() if self.settings.query == "source" else {}
+        self._index_by_view = {target_frame.frame.view: index for index, target_frame in enumerate(target.frames)}
 
     # ---- the interface of `core.bake` -------------------------------------------------------------
 
@@ -107,8 +108,9 @@ class Transfer:
         """Return a hash of a frame and of the neighbours that the visibility of its lights depends on."""
         radius = 2 * self.settings.smooth  # see `smooth_visibility`
         neighbours = self.target.frames[max(index - radius, 0):index + radius + 1]
-        fixed = [(name, view.camera.tolist(), view.light.tolist()) for name, view in self._fixed.items()]
-        key_text = "".join(frame.cache_key() for frame in neighbours) + repr(fixed)
+        fixed_views = [(name, view.camera.tolist(), view.light.tolist())
+                       for name, view in self._fixed_views_by_light.items()]
+        key_text = "".join(frame.cache_key() for frame in neighbours) + repr(fixed_views)
         if self.settings.fall_off is not None:
             key_text += repr([self._reference_distance(light) for light in self.target.frames[index].shot.lights])
         return hashlib.sha256(key_text.encode()).hexdigest()[:16]
@@ -142,7 +144,7 @@ class Transfer:
                 return queries.evaluate(
                     source, view, light.xyz, self.settings.query, self.training_views.get(light.source),
                     visibility=visibility, edits=edits, name=light.name, scale=self.settings.scale,
-                    fixed=self._fixed.get(light.name))
+                    fixed=self._fixed_views_by_light.get(light.name))
 
             placed = replace(light, visibility=self.visibility(index, light.name),
                              shares=self._shares(index, light.name),
@@ -202,8 +204,9 @@ class Transfer:
         return distances
 
     def _fixed_views(self) -> dict[str, ViewOfLight]:
-        """Return the view of each light for the query `source`, by name; without lights that are never in front."""
-        fixed = {}
+        """Return the training view of each light for the query `source`, by name (`query.fixed_view`); lights that are
+        never in front of the camera have none."""
+        view_by_light = {}
         for name in self.lights:
             placed = [(frame.shot.camera, light) for frame in self.target.frames for light in frame.shot.lights
                       if light.name == name]
@@ -213,8 +216,8 @@ class Transfer:
             source = placed[0][1].source
             view = queries.fixed_view(self.sources[source], views, distances, self.training_views.get(source))
             if view is not None:
-                fixed[name] = view
-        return fixed
+                view_by_light[name] = view
+        return view_by_light
 
     # ---- frames -----------------------------------------------------------------------------------
 
@@ -224,7 +227,7 @@ class Transfer:
     ) -> _FrameRenderer:
         """Return the renderer of a frame; with `out` it also writes the plate with its flare there, and reports to
         `progress` what that cannot keep."""
-        return _FrameRenderer(self, self._index[frame.view], space or colour_space("linear"), out, progress)
+        return _FrameRenderer(self, self._index_by_view[frame.view], space or colour_space("linear"), out, progress)
 
     def bake(self, out: Path | str, requested: Sequence[NumberedFrame] | None = None,
              settings: BakeSettings | None = None, progress: Progress | None = None, *,
@@ -343,23 +346,38 @@ class _FrameRenderer:
         return np.zeros((camera.height, camera.width, 3), np.float32), no_depth
 
     def finish(self, layers: FrameLayers, camera: Camera) -> FrameLayers:
-        """Return the layers with their window, with the alpha of the plate, and with the plate's own numbers if the
-        colour spaces are the same; write the plate with its flare."""
+        """Write the plate with its flare; return the layers in the window of the plate, with its alpha.
+
+        Layers without a plate of their size are returned unchanged.
+        """
         frame, plate = self._frame, self._plate
         if plate is None or frame.plate is None or frame.window is None or frame.window.size != camera.size:
             return layers
         stored_window = plate_window(frame.plate, frame.orientation)
-        path = frame.plate_with_flare_path(self._out) if self._out is not None else None
-        if path is not None:
-            plate.write(path, move_to_window(self._space.to_linear(layers.flare), frame.window, stored_window))
-            if plate.plate.warning:
-                self._progress.say(plate.plate.warning)
-        layers = replace(layers, window=frame.window)
+        self._write_plate(plate, layers, frame.window, stored_window)
+        return self._with_plate_window(plate, layers, frame.window, stored_window)
+
+    def _write_plate(self, plate: ColouredPlate, layers: FrameLayers, window: DataWindow,
+                     stored_window: DataWindow) -> None:
+        """Write the plate with its flare, if the renderer has a folder for it. window: of the layers. stored_window: of
+        the plate's file."""
+        path = self._frame.plate_with_flare_path(self._out) if self._out is not None else None
+        if path is None:
+            return
+        plate.write(path, move_to_window(self._space.to_linear(layers.flare), window, stored_window))
+        if plate.plate.warning:
+            self._progress.say(plate.plate.warning)
+
+    def _with_plate_window(self, plate: ColouredPlate, layers: FrameLayers, window: DataWindow,
+                           stored_window: DataWindow) -> FrameLayers:
+        """Return the layers with their window, with the plate's alpha, and with its values as scene where both have one
+        colour space. window, stored_window: as for `_write_plate`."""
+        layers = replace(layers, window=window)
         plate_matrix, matrix = plate.space.matrix, self._space.matrix  # None for a space that is not linear
         if plate_matrix is not None and matrix is not None and np.allclose(plate_matrix, matrix, atol=1e-9)\
                 and not plate.has_straight_alpha:
-            layers = replace(layers, scene=move_to_window(plate.values, stored_window, frame.window))
+            layers = replace(layers, scene=move_to_window(plate.values, stored_window, window))
         if plate.alpha is None:
             return layers
-        alpha = alpha_with_light(move_to_window(plate.alpha, stored_window, frame.window), layers.composite)
+        alpha = alpha_with_light(move_to_window(plate.alpha, stored_window, window), layers.composite)
         return replace(layers, alpha=alpha)

@@ -38,7 +38,7 @@ def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
     if not same_aspect((width, height), (render.resolution_x, render.resolution_y)):
         yield (f"The layers have {width} x {height} pixels and the scene renders {render.resolution_x} x "
                f"{render.resolution_y}, another aspect ratio, to which they are stretched; bake them again.")
-    baked = [NumberedFrame("", number, "") for number in layers.files]
+    baked = [NumberedFrame(view="", number=number, file="") for number in layers.files]
     if missing := missing_numbers(baked, f"{max(scene.frame_start, 0)}-{max(scene.frame_end, scene.frame_start, 0)}"):
         effect = "this version of Blender shows in magenta" if flare_node.MISSING_IS_MAGENTA else "are without flare"
         yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}, and there are no layers of {missing}, "

@@ -138,7 +138,7 @@ def _bake_shot(args: argparse.Namespace, progress: Progress, step: str,
             raise SettingsError(f"--{name} does not apply to a shot, which has its own cameras and lights; leave it "
                                 "out.")
     shot = Shot.read(args.run).resized(*layers.parse_size(args.size))
-    numbered = [NumberedFrame("", shot_frame.frame, "") for shot_frame in shot.frames]
+    numbered = [NumberedFrame(view="", number=shot_frame.frame, file="") for shot_frame in shot.frames]
     selected = frames.select_task(numbered, args, progress)
     if not selected:
         return layers.empty_result(args.out)

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.out.resolve() == args.layers.resolve():
         raise SettingsError(f"{args.out} holds the layers; choose another folder for the frames.")
     layers = LayerFolder.open(args.layers)
-    available = [NumberedFrame("", number, str(path)) for number, path in layers.files.items()]
+    available = [NumberedFrame(view="", number=number, file=str(path)) for number, path in layers.files.items()]
     selected = frames.select_task(available, args, progress)
     if not selected:
         return {"frames": str(args.out)}
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                             intensity=args.intensity, tint=args.tint)
     progress.say(f"The frames are in {result['frames']}; {result['blend']} opens in Blender.")
     tally = Tally("frame", "composed", len(selected))
-    progress.say(tally.sentence())
+    progress.say(tally.summary())
     return {**result, **tally.as_result()}
 
 
@@ -79,9 +79,9 @@ def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, number
     if not (window := layers.window()).is_frame:
         progress.say(f"The layers have overscan ({window.size[0]} x {window.size[1]} pixels for a frame of "
                      f"{window.frame[0]} x {window.frame[1]}), which Blender cannot show; its nodes cut it off.")
-    for sentence in (render_settings.set_plain_view(scene), setup.colour_space_warning(scene)):
-        if sentence:
-            progress.say(sentence)
+    for warning in (render_settings.set_plain_view(scene), setup.colour_space_warning(scene)):
+        if warning:
+            progress.say(warning)
     node.inputs["Intensity"].default_value = intensity
     node.inputs["Tint"].default_value = (*colour, 1.0)
     for name in _VARYING_METADATA:

@@ -112,8 +112,8 @@ def _follow_and_record(capture: Capture, progress: Progress, keep: bool = False)
     progress.say(f"{capture.folder} has no camera solve; its lights are followed from frame to frame.")
     findings = track_lights(capture, progress)
     report = write_tracks(capture, findings, keep=keep)
-    for sentence in findings.messages:
-        progress.say(sentence)
+    for message in findings.messages:
+        progress.say(message)
     progress.say(f"Look at {capture.folder / report['sheets'][0]}. You can edit {LIGHTS}; `lights --keep` keeps your "
                  "changes.")
     return report
@@ -150,8 +150,8 @@ def _find_and_record(capture: Capture, detector: Detector, progress: Progress,
     findings = find_lights(capture, detector, progress, settings, gaussians=gaussians)
     tracked = track_moving_lights(capture, findings.lights, progress) if follow else None
     report = write_findings(capture, findings, keep=keep, tracked=tracked)
-    for sentence in [*findings.messages, *(tracked.messages if tracked else [])]:
-        progress.say(sentence)
+    for message in [*findings.messages, *(tracked.messages if tracked else [])]:
+        progress.say(message)
     for light in report["lights"]:
         progress.say(_describe_light(light))
     if findings.doubtful:

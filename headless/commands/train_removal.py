@@ -94,8 +94,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             progress.say("There are too few clean pictures for a validation set; the log will have no validation "
                          "scores.")
         unusable = [*backgrounds.unusable, *(validation[0].unusable if validation else ())]
-        if sentence := describe_unusable(unusable):
-            progress.say(sentence)
+        if warning := describe_unusable(unusable):
+            progress.say(warning)
         user_flares = _read_user_flares(args.flares, recipe, progress) if args.flares else None
         if args.model == "diffusion":
             return _train_diffusion(args, recipe, backgrounds, train_lenses, user_flares, progress)

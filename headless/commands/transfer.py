@@ -112,8 +112,8 @@ def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, pr
     read_look(flare)
     scene = open_blend(options.to[0])
     all_numbers = range(scene.frame_start, scene.frame_end + 1)
-    selected = {frame.number for frame in select_task_frames([NumberedFrame("", number, "") for number in all_numbers],
-                                                             options.frames, options.job_frames)}
+    all_frames = [NumberedFrame(view="", number=number, file="") for number in all_numbers]
+    selected = {frame.number for frame in select_task_frames(all_frames, options.frames, options.job_frames)}
     # Neighbours too: visibility is smoothed over them (`smooth_visibility`), and a part of the frames must give the
     # result of the whole range.
     neighbour_offsets = range(-2 * options.smooth, 2 * options.smooth + 1)
@@ -164,8 +164,8 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     from ...core.transfer.target import resized
     from ...core.transfer.transfer import Transfer, TransferSettings
 
-    for sentence in target.warnings:
-        progress.say(sentence)
+    for warning in target.warnings:
+        progress.say(warning)
     target = resized(target, *layers.parse_size(args.size))
     plates = [target_frame for target_frame in target.frames if target_frame.plate is not None]
     if unwritten := sum(target_frame.plate_with_flare_path(args.out) is None for target_frame in plates):

@@ -60,7 +60,7 @@ def test_a_model_is_found_in_each_place(tmp_path: Path, place: str) -> None:
     for file in (tmp_path / MODEL).iterdir():
         file.rename(model / file.name)
     capture = Capture.open(folder)
-    assert len(capture.views) == 4 and len(capture.points) == 20 and not capture.sentences
+    assert len(capture.views) == 4 and len(capture.points) == 20 and not capture.warnings
     assert capture.frame(capture.views[3]).size == SIZE
 
 
@@ -88,7 +88,7 @@ def test_the_model_with_the_most_images_is_used(tmp_path: Path, places: tuple[st
             reconstruction.write_binary(str(folder / place))
     capture = Capture.open(folder)
     assert len(capture.views) == 4
-    [sentence] = capture.sentences
+    [sentence] = capture.warnings
     assert f"{places[1]} with 4 frames is used" in sentence and f"{places[0]} 2)" in sentence
 
 
@@ -118,13 +118,13 @@ def test_names_of_a_model_that_start_above_its_frames_are_resolved(start: str, s
     (folder / MODEL / "images.txt").write_text(text)
     capture = Capture.open(folder)
     assert [view.name for view in capture.views] == [f"{subfolder}000{number}.png" for number in range(4)]
-    assert not capture.sentences and not capture.left_out
+    assert not capture.warnings and not capture.left_out
 
 
 def test_points_without_colours_are_reported(tmp_path: Path) -> None:
     folder = make_transforms(tmp_path / "c", ply_file_path="p.ply")
     ply(folder / "p.ply", ("intensity",), "float", [0.5])
-    assert any("p.ply have no colours, so they start grey" in sentence for sentence in Capture.open(folder).sentences)
+    assert any("p.ply have no colours, so they start grey" in sentence for sentence in Capture.open(folder).warnings)
 
 
 def test_a_model_in_another_place_is_named(tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_frames_without_a_pose_are_counted_and_named(tmp_path: Path) -> None:
     (folder / "images" / "second").mkdir()
     cv2.imwrite(str(folder / "images" / "second" / "0000.png"), picture(0))
     capture = Capture.open(folder)
-    [sentence] = capture.sentences
+    [sentence] = capture.warnings
     assert "4 of 7 frames in" in sentence and "0004.png, 0005.png, second/0000.png" in sentence
     assert capture.left_out == {"no pose": ("0004.png", "0005.png", "second/0000.png")}
 
@@ -235,7 +235,7 @@ def test_poses_without_a_frame_are_counted_and_named(tmp_path: Path, kind: str) 
     (folder / "images" / "0001.png").unlink()
     capture = Capture.open(folder)
     assert len(capture.views) == 8
-    [sentence] = capture.sentences
+    [sentence] = capture.warnings
     assert "8 of 8 frames" in sentence and "1 poses have no frame" in sentence and "0001.png" in sentence
     [left_out] = capture.left_out.values()
     assert left_out[0].endswith("0001.png")
@@ -256,7 +256,7 @@ def test_a_frame_with_another_suffix_is_used_and_reported(tmp_path: Path, suffix
             cv2.imwrite(str(path.with_suffix(suffix)), cv2.imread(str(path)))
         path.unlink()
     capture = Capture.open(folder)
-    [sentence] = capture.sentences
+    [sentence] = capture.warnings
     assert "4 frames have other names" in sentence and f"0000{suffix} for 0000.png" in sentence
     assert capture.frame(capture.views[2]).size == SIZE
 
@@ -278,7 +278,7 @@ def test_a_name_has_one_form_for_frames_and_layers(tmp_path: Path, form: str) ->
     (folder / "split.json").write_text(json.dumps({"test": [composed]}))
     capture = Capture.open(folder)
     view = capture.view(composed)
-    assert view.name == composed and capture.has_clean_frames and not capture.sentences
+    assert view.name == composed and capture.has_clean_frames and not capture.warnings
     assert capture.split(None)[1] == (view,)
     np.testing.assert_array_equal(capture.frame(view).pixels, capture.clean_frame(view).pixels)  # type: ignore[union-attr]
 
@@ -329,8 +329,8 @@ def test_points_of_the_colmap_model_follow_the_poses(tmp_path: Path, kind: str) 
     expected = nerfstudio(tmp_path / "t", applied, scale, **declared)
     capture = Capture.open(tmp_path / "t")
     np.testing.assert_allclose(capture.points.xyz, expected, atol=1e-5)
-    assert bool(capture.sentences) == kind.startswith("undeclared")
-    assert all("as their cameras are" in sentence for sentence in capture.sentences)
+    assert bool(capture.warnings) == kind.startswith("undeclared")
+    assert all("as their cameras are" in sentence for sentence in capture.warnings)
 
 
 @pytest.mark.parametrize("scale", [0, -1, "x"])
@@ -507,9 +507,9 @@ def test_points_outside_all_views_are_reported(tmp_path: Path, change: str) -> N
         x, y, z = map(float, words[1:4])
         moved = {"behind": (x, y, z - 20), "far off": (x + 100, y, z), "axes": (z, x + 9, -y - 9)}[change]
         lines.append(" ".join([words[0], *map(str, moved), *words[4:]]))
-    assert not Capture.open(folder).sentences
+    assert not Capture.open(folder).warnings
     (folder / MODEL / "points3D.txt").write_text("\n".join(lines))
-    [sentence] = Capture.open(folder).sentences
+    [sentence] = Capture.open(folder).warnings
     assert "do not fit each other" in sentence
 
 
@@ -517,7 +517,7 @@ def test_points_outside_all_views_are_reported(tmp_path: Path, change: str) -> N
 def test_an_implausible_focal_length_is_reported(tmp_path: Path, focal: float, is_bad: bool) -> None:
     folder = make_transforms(tmp_path / "t", fl_x=focal, fl_y=focal)
     edit(folder, fl_x=focal, fl_y=focal)
-    assert any("focal length of 3 of 3 frames cannot be" in text for text in Capture.open(folder).sentences) == is_bad
+    assert any("focal length of 3 of 3 frames cannot be" in text for text in Capture.open(folder).warnings) == is_bad
 
 
 # Exif orientation.
@@ -552,7 +552,7 @@ def turned_capture(folder: Path, orientation: int, *, coloured: bool = True) -> 
 def test_photographs_that_were_solved_as_shown_are_turned(tmp_path: Path, orientation: int) -> None:
     folder = turned_capture(tmp_path / "c", orientation)
     capture = Capture.open(folder)
-    [sentence] = capture.sentences
+    [sentence] = capture.warnings
     assert "as shown, by the " + ("sizes" if orientation > 4 else "colours") in sentence
     view = capture.views[2]
     path = folder / "images" / "0002.jpg"
@@ -570,14 +570,14 @@ def test_photographs_that_were_solved_as_stored_stay(tmp_path: Path) -> None:
         raw = cv2.imencode(".jpg", pixels)[1].tobytes()
         path.write_bytes(raw[:2] + exif_segment("II", 3, 27) + raw[2:])
     capture = Capture.open(folder)
-    assert not any(view.upright for view in capture.views) and not capture.sentences
+    assert not any(view.upright for view in capture.views) and not capture.warnings
 
 
 def test_an_undecidable_orientation_is_reported(tmp_path: Path) -> None:
     folder = turned_capture(tmp_path / "c", 3)
     (folder / MODEL / "points3D.txt").unlink()
     capture = Capture.open(folder)
-    [sentence] = capture.sentences
+    [sentence] = capture.warnings
     assert "as stored, though their Exif orientation is 3" in sentence and not capture.views[0].upright
 
 

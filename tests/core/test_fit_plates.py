@@ -17,7 +17,7 @@ from core.conventions.frame_numbers import number_views
 from core.conventions.run_files import CHECKPOINT, FRAME_LIGHTS, PLATES
 from core.errors import Cancelled, CaptureError, RunError
 from core.fit import FitSettings, Run, fit, preset
-from core.fit.light_results import FlareShare, make_frame_lights, select_flaring, share_sentences
+from core.fit.light_results import FlareShare, make_frame_lights, select_flaring, share_messages
 from core.fit.settings import adapt_to_plates, override_settings
 from core.images.write import write_png
 from core.metrics.pictures import relative_l2
@@ -125,13 +125,13 @@ def test_a_doubtful_brightness_is_only_a_first_guess(tmp_path: Path) -> None:
 def test_lights_that_do_not_flare_are_left_out_and_named() -> None:
     shares = {"a": FlareShare(0.999, 0.5), "b": FlareShare(0.001, 0.5)}
     assert select_flaring(shares) == ["a"]
-    assert share_sentences(shares, ["a"])[1].endswith("everywhere): b.")
+    assert share_messages(shares, ["a"])[1].endswith("everywhere): b.")
 
 
 def test_a_capture_in_which_no_light_flares_is_reported() -> None:
     dark = {"a": FlareShare(0.9, 0.001), "b": FlareShare(0.1, 0.0)}
     assert select_flaring(dark) == ["a"]
-    (sentence,) = share_sentences(dark, ["a"])
+    (sentence,) = share_messages(dark, ["a"])
     assert "No light of the capture flares" in sentence and "has a alone" in sentence
 
 

@@ -114,7 +114,7 @@ def test_solid_gaussians_project_as_the_rasterizer_projects_them() -> None:
     quaternions = torch.randn(n, 4, generator=generator)
     opacities = torch.rand(n, generator=generator) * 0.5 + 0.2
     colours = torch.rand(n, 3, generator=generator)
-    flat = placement.PlaneGaussians(means, placement.covariance_of_solid(means, log_scales, quaternions),
+    flat = placement.PlaneGaussians(means, placement.project_covariances(means, log_scales, quaternions),
                                     opacities, colours)
     splats = splat_flare(flat, intrinsics, 40, 36, "over", kernels="torch")
     solid = torch.cat([means, torch.ones(n, 1)], 1) * PLANE_DEPTH

@@ -125,7 +125,7 @@ def test_plates_without_a_key_are_counted_and_named(tmp_path: Path) -> None:
     (tmp_path / "camera.nk").write_text(script())
     camera = read_nuke_camera(tmp_path / "camera.nk")
     tally = write_nuke_capture(camera, plates(tmp_path / "p", (1002, 1003, 1004)), tmp_path / "c", Progress())
-    assert tally.sentence() == "2 frames written; 1 left out: sh.1004.png (the camera has no key there)."
+    assert tally.summary() == "2 frames written; 1 left out: sh.1004.png (the camera has no key there)."
     with pytest.raises(CaptureError, match="the camera has the frames 1001 to 1003, and the plates 7 to 8"):
         write_nuke_capture(camera, plates(tmp_path / "q", (7, 8)), tmp_path / "d", Progress())
 

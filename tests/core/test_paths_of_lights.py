@@ -48,10 +48,10 @@ class TestPaths:
     def test_interpolated_frames_are_counted(self, tmp_path: Path) -> None:
         write(make_shot(tmp_path), {"name": "torch", "frames": {**XY, "0099.png": {"xy": [1, 1]}}})
         capture = Capture.open(tmp_path, need_cameras=False)
-        (missing, unknown) = capture.light_sentences
+        (missing, unknown) = capture.light_warnings
         assert "'torch' has no place in 2 of 5 frames (0002.png, 0005.png)" in missing
         assert "1 frames that are not in the capture (0099.png)" in unknown
-        assert {missing, unknown} <= set(capture.sentences)
+        assert {missing, unknown} <= set(capture.warnings)
 
     def test_a_place_on_the_picture_lies_on_its_ray(self, tmp_path: Path) -> None:
         write(make_capture(tmp_path, 4), {"name": "lamp", "xy": [-8.0, 30.0]})
@@ -76,7 +76,7 @@ class TestPaths:
         names = [view.name for view in Capture.open(folder).views]
         write(folder, {"name": "lamp", "xyz": [0, 0, 0.5], "frames": {names[1]: {"on": 0.25}}})
         capture = Capture.open(folder)
-        assert not capture.lights[0].moves and not capture.light_sentences
+        assert not capture.lights[0].moves and not capture.light_warnings
         assert [state.on for state in states(capture)] == [0.25] * 4
         assert not any(state.interpolated for state in states(capture))
 

@@ -13,7 +13,7 @@ from core.errors import FrameError
 from core.images.plates import Plate
 from core.removal.inference import optical_flow
 from core.removal.inference.confidence import FlareFeatures
-from core.removal.inference.neighbours import NEIGHBOUR_OFFSETS, ShotPredictor, natural_key
+from core.removal.inference.neighbours import NEIGHBOUR_OFFSETS, ShotPredictor, shot_sort_key
 from core.removal.inference.prediction import FlarePrediction, TtaPrediction, single_prediction
 from core.removal.inference.remover import Remover
 from core.removal.inference.temporal import (
@@ -184,9 +184,9 @@ def test_the_confidence_is_averaged_over_the_shot() -> None:
     assert filter_in_shot(doubtful, confident).confidence == 1
 
 
-def test_names_are_in_natural_order() -> None:
+def test_plates_of_a_shot_are_in_natural_order() -> None:
     names = ["a10.png", "a2.png", "b1.png", "a.png", "10a.png", "9b.png"]
-    assert [path.name for path in sorted(map(Path, names), key=natural_key)] == [
+    assert [path.name for path in sorted(map(Path, names), key=shot_sort_key)] == [
         "9b.png", "10a.png", "a2.png", "a10.png", "a.png", "b1.png"]
 
 

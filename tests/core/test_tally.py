@@ -14,10 +14,10 @@ from core.system.tally import MAX_NAMES, MAX_REASONS, Tally
 def test_a_complete_folder_leaves_nothing_out() -> None:
     tally = Tally("plate", "cleaned")
     tally.use(2)
-    assert tally.sentence() == "2 plates cleaned, none left out."
+    assert tally.summary() == "2 plates cleaned, none left out."
     tally = Tally()
     tally.use()
-    assert tally.sentence() == "1 frame used, none left out."
+    assert tally.summary() == "1 frame used, none left out."
 
 
 def test_names_are_listed_by_reason_in_natural_order() -> None:
@@ -25,7 +25,7 @@ def test_names_are_listed_by_reason_in_natural_order() -> None:
     tally.use(14)
     tally.skip("a video", "cut.mov")
     tally.skip("HEIC needs pillow-heif", "10.heic", "9.heic", "11.heic", "12.heic", "9.heic")
-    assert tally.sentence() == ("14 frames used; 5 left out: 9.heic, 10.heic, 11.heic and 1 more (HEIC needs "
+    assert tally.summary() == ("14 frames used; 5 left out: 9.heic, 10.heic, 11.heic and 1 more (HEIC needs "
                                 "pillow-heif), cut.mov (a video).")
     assert tally.as_result() == {"used": 14, "left_out": 5, "skipped": [
         {"name": "cut.mov", "reason": "a video"},
@@ -37,10 +37,10 @@ def test_a_long_list_of_reasons_is_cut() -> None:
     tally = Tally()
     for number in range(MAX_REASONS + 3):
         tally.skip(f"reason {number}", f"{number}.png")
-    assert tally.sentence().count("(") == MAX_REASONS
-    assert "7 left out" in tally.sentence() and tally.sentence().endswith("and 3 for other reasons.")
+    assert tally.summary().count("(") == MAX_REASONS
+    assert "7 left out" in tally.summary() and tally.summary().endswith("and 3 for other reasons.")
     tally.skip("reason 0", *(f"{n}.jpg" for n in range(9)))
-    assert f"and {10 - MAX_NAMES} more (reason 0)" in tally.sentence()
+    assert f"and {10 - MAX_NAMES} more (reason 0)" in tally.summary()
 
 
 def test_tallies_are_merged() -> None:

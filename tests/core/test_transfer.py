@@ -318,7 +318,7 @@ def test_dissimilarity_grows_with_position_and_distance() -> None:
 def test_source_queries_one_view_for_the_whole_shot(flare: Path, look: Look) -> None:
     views = cameras(5)
     transfer = Transfer(flare, shot_target(shot(flare, look, views), look, {}), TransferSettings(query="source"))
-    fixed = transfer._fixed["lamp"]
+    fixed = transfer._fixed_views_by_light["lamp"]
     assert any(np.allclose(fixed.camera, known, atol=1e-4) for known in transfer.training_views[name(look)].cameras)
     queried = [queries._weighted_queries(look.lights[0], ViewOfLight.of(view.world_to_camera, look.lights[0].xyz),
                                          look.lights[0].xyz, "source", None, 1.0, fixed) for view in views]

@@ -51,7 +51,7 @@ def test_a_solve_counts_frames_and_other_files(tmp_path: Path) -> None:
               "left_out": [f"{tmp_path / 'in a' / 'f 2.png'} is damaged or truncated (in its "
                            "header); export it again."]}
     tally = tally_solve(report, tmp_path / "in a")
-    assert tally.sentence() == ("8 frames placed; 4 left out: f9.png (no place in the model), f 2.png (is damaged or "
+    assert tally.summary() == ("8 frames placed; 4 left out: f9.png (no place in the model), f 2.png (is damaged or "
                                 "truncated), cut.mov (a video, which is read by its own name), second (a subfolder "
                                 "with 1 picture).")
 
@@ -86,4 +86,4 @@ def test_views_in_no_list_are_left_out(tmp_path: Path) -> None:
     capture = Capture.open(folder)
     train, held_out = capture.split(None)
     assert len(train) == 2 and len(held_out) == 1
-    assert tally_capture(capture, "searched").sentence() == "5 frames searched, none left out."
+    assert tally_capture(capture, "searched").summary() == "5 frames searched, none left out."

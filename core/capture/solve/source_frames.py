@@ -139,7 +139,7 @@ def read_record(work: Path) -> tuple[list[SourceFrame], list[str]] | None:
     data = read_json(work / RECORD_FILE, CaptureError)
     try:
         return ([parse_table(SourceFrame, frame) for frame in data["stills"]],
-                [parse_value(str, sentence) for sentence in data["left_out"]])
+                [parse_value(str, message) for message in data["left_out"]])
     except (KeyError, TypeError, ValueError) as problem:
         raise CaptureError(f"{work / RECORD_FILE} is damaged.") from problem
 
@@ -214,8 +214,8 @@ def _prepare_video(source: Path, work: Path, number: int, size: int,
         for frame in video:
             scores.append(sharpness(frame.grey()))
             progress.advance()
-        for sentence in video.problems:
-            progress.say(sentence)
+        for problem in video.problems:
+            progress.say(problem)
     if not scores:
         raise CaptureError(f"{source} holds no frame that can be decoded; convert it to MP4 (H.264).")
     chosen = set(choose_sharpest(scores, number))

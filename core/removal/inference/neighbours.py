@@ -7,14 +7,15 @@ their details are alike. It ends at a cut, and a folder of single photographs is
 """
 from __future__ import annotations
 
-import re
 from collections.abc import Container, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ...colour.srgb import Pixels
 from ...images.plates import Plate, is_plate_error, read_plate
+from ...system.file_names import natural_key
 from .optical_flow import compute_flow
 from .prediction import FlarePrediction
 from .remover import Remover
@@ -134,11 +135,6 @@ class ShotPredictor:
                        and not (source in before and target in before)}
 
 
-def natural_key(path: Path) -> list[tuple[int, str]]:
-    """Return a sort key that orders paths by the numbers in their names: a2 before a10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
-
-
-def shot_sort_key(path: Path) -> tuple[Path, list[tuple[int, str]]]:
+def shot_sort_key(path: Path) -> tuple[Path, Any]:
     """Return a sort key for plates of any folders: in this order `ShotPredictor` computes nothing twice."""
     return path.parent, natural_key(path)

@@ -190,13 +190,13 @@ def clean_plates(inputs: Sequence[Path], folder: Path, remover: Remover, progres
     tally = Tally("plate", "cleaned", written + kept_counts.total(), left_out_files(inputs, excluded))
     tally.skip("could not be cleaned", *failed_names)
     if failed:
-        progress.say(tally.sentence())
+        progress.say(tally.summary())
         raise FrameError(f"{len(failed)} of {len(plates) + len(failed_inputs)} plates could not be cleaned: "
                          f"{join_failures(failed)}")
     confidence = manifest.confidence(name for _, name in plates)
     _report_low_confidence(confidence, progress)
     progress.say(f"{written + kept_counts.total()} clean frames are in {folder}.")
-    progress.say(tally.sentence())
+    progress.say(tally.summary())
     return {"plates": str(folder), "made": written, "kept": kept_counts.total(), "confidence": confidence,
             **tally.as_result()}
 

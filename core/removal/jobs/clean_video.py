@@ -86,9 +86,9 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
         write_json(folder / RECORD, {"from": digest, "written": content_hash(finished), **replaced})
 
     progress.stage(f"write {target.name}", len(clean))
-    for sentence in rewrite_video(source, target, codec_name, changed_pixels, on_frame=progress.advance,
-                                  on_written=write_record):
-        progress.say(sentence)
+    for message in rewrite_video(source, target, codec_name, changed_pixels, on_frame=progress.advance,
+                                 on_written=write_record):
+        progress.say(message)
     progress.say(f"The clean video is {target}.")
     return True
 

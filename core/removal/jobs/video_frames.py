@@ -64,8 +64,8 @@ def extract_frames(video: Path, folder: Path, progress: Progress, space: str | N
     if manifest.get("content") != video_hash:
         raise SettingsError(f"{frames_folder} holds the frames of another video of that name; choose another folder "
                             "for the clean frames, or delete it.")
-    for sentence in problems:
-        progress.say(str(sentence))
+    for problem in problems:
+        progress.say(str(problem))
     return frames_folder
 
 

@@ -2,9 +2,9 @@
 """Follows lights through the frames of a shot: places on the picture, brightness and confidence by frame.
 
 `sources.py` finds candidates in each frame, `association.py` chains them. A chain is a light if its sources look like
-lamps in most frames and it is no ghost of another light. Between the frames that show a light its path is a cubic
-through places and velocities; beyond them it goes on at constant velocity until it is well out of the frame. Each
-interpolated place has an expected error, from the light's own acceleration, which becomes its confidence.
+lamps in most frames and it is no ghost of another light. Between the frames that show a light `path_interpolation.py`
+completes its path; beyond them it goes on at constant velocity until it is well out of the frame. Each interpolated
+place has an expected error, from the light's own acceleration, which becomes its confidence.
 
 Brightness is the height of the glow around the light's place in unclipped rings, with one profile for the whole shot:
 I[t, r] = on[t] G[r] + background[t], by alternating least squares.
@@ -23,6 +23,7 @@ from ..capture.camera import Floats
 from ..capture.lights import DOUBTFUL, LightKey
 from ..system.progress import Progress
 from .association import Chain, follow_sources
+from .path_interpolation import interpolate
 from .sources import CLIPPED, REFERENCE, Source, find_sources, measure_profile
 
 MIN_EVIDENCE = 0.3
@@ -280,20 +281,19 @@ def _fill_path(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple
     first, last = max(chain.frames[0] - MAX_BEYOND, 0), min(chain.frames[-1] + MAX_BEYOND, count - 1)
     frames, places, errors = [], [], []
     knots, points = np.array(uncut.frames), uncut.places
-    rates = _velocities(knots, points)
+    between = interpolate(knots, points, PLACE_ERROR)
     for frame in range(first, last + 1):
         index = int(np.searchsorted(knots, frame))  # of the first knot that is not before the frame
         if index < len(knots) and knots[index] == frame:
             place, error = points[index], _expected_error(uncut, index, acceleration)
         elif 0 < index < len(knots):  # between two knots; else before the first or after the last
-            low, high = index - 1, index
-            span = float(knots[high] - knots[low])
-            place = _hermite((frame - knots[low]) / span, span, points[low], rates[low], points[high], rates[high])
+            span = float(knots[index] - knots[index - 1])
+            place = between[frame]
             error = acceleration * span * span / 16  # half of what a straight line would miss in the middle
         else:
             end = -1 if index else 0
             step = float(frame - knots[end])
-            place, error = points[end] + step * rates[end], 0.5 * acceleration * step * step
+            place, error = points[end] + step * _velocity_at_end(knots, points, end), 0.5 * acceleration * step * step
         source = measured.get(frame)
         if source is not None and source.detection.is_cut:
             # The part within the frame bounds the place: more than three of its radii away, the path is wrong.
@@ -317,39 +317,21 @@ def _without_cut(chain: Chain) -> Chain:
     return Chain([frame for frame, _ in uncut], [source for _, source in uncut])
 
 
-def _velocities(frames: Floats, places: Floats) -> Floats:
-    """Return the velocity (n, 2), pixels per frame, at each place (n, 2), in the frames of these numbers (n,).
+def _velocity_at_end(frames: Floats, places: Floats, end: int) -> Floats:
+    """Return the velocity (2,), pixels per frame, at the first or last measured place.
 
-    It is that of the parabola through the place and its two neighbours in time, at either end the two nearest. Where
-    the three span more than MAX_PARABOLA_SPAN, it is that of the straight line to the neighbour nearer in time.
+    frames: (n,) numbers of the measured frames. places: (n, 2), pixels. end: 0 for the first, -1 for the last. It is
+    that of the parabola through the three places nearest to the end. Where they span more than MAX_PARABOLA_SPAN, it is
+    that of the straight line through the nearest two.
     """
+    nearest = slice(None, 3) if end == 0 else slice(-3, None)
+    if np.ptp(frames[nearest]) > MAX_PARABOLA_SPAN:
+        nearest = slice(None, 2) if end == 0 else slice(-2, None)
     if len(frames) < 2:
-        return np.zeros_like(places)
-    rates = []
-    for index in range(len(frames)):
-        start = min(max(index - 1, 0), max(len(frames) - 3, 0))
-        near = slice(start, min(start + 3, len(frames)))
-        times = (frames[near] - frames[index]).astype(np.float64)
-        degree = min(2, len(times) - 1)
-        if np.ptp(times) > MAX_PARABOLA_SPAN:  # neighbours across a gap say nothing of the velocity here
-            before, after = max(index - 1, 0), min(index + 1, len(frames) - 1)
-            sides = [pair for pair in ((before, index), (index, after)) if pair[0] != pair[1]]
-            low, high = min(sides, key=lambda pair: frames[pair[1]] - frames[pair[0]])
-            rates.append((places[high] - places[low]) / (frames[high] - frames[low]))
-            continue
-        rates.append(np.polyfit(times, places[near], degree)[-2])  # the linear term: the derivative at time 0
-    return np.array(rates)
-
-
-def _hermite(part: float, span: float, start: Floats, out: Floats, end: Floats, into: Floats) -> Floats:
-    """Return the place (2,) on the cubic between two places with given velocities.
-
-    part: 0..1, the part of the time between them that has passed. span: that time, frames. out, into: velocities (2,)
-    at `start` and at `end`, pixels per frame.
-    """
-    square, cube = part * part, part ** 3
-    return np.asarray((2 * cube - 3 * square + 1) * start + (cube - 2 * square + part) * span * out
-                      + (3 * square - 2 * cube) * end + (cube - square) * span * into)
+        return np.zeros(2)
+    times = (frames[nearest] - frames[end]).astype(np.float64)
+    linear_term = -2  # of the coefficients, highest first: the derivative at time 0
+    return np.asarray(np.polyfit(times, places[nearest], len(times) - 1)[linear_term])
 
 
 def _expected_error(chain: Chain, index: int, acceleration: float) -> float:

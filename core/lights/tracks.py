@@ -3,15 +3,16 @@
 
 `sources.py` finds candidates in each frame, `association.py` chains them. A chain is a light if its sources look like
 lamps in most frames and it is no ghost of another light. Between the frames that show a light `path_interpolation.py`
-completes its path; beyond them it goes on at constant velocity until it is well out of the frame. Each interpolated
-place has an expected error, from the light's own acceleration, which becomes its confidence.
+completes its path; beyond them it goes on at constant velocity until it is well out of the frame. A static light goes
+with the background instead (`background_motion.py`). Each such place has an expected error, which becomes its
+confidence.
 
 Brightness is the height of the glow around the light's place in unclipped rings, with one profile for the whole shot:
 I[t, r] = on[t] G[r] + background[t], by alternating least squares.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from ..capture.camera import Floats
 from ..capture.lights import DOUBTFUL, LightKey
 from ..system.progress import Progress
 from .association import Chain, follow_sources
+from .background_motion import BackgroundMotion, CarriedPlace
 from .path_interpolation import interpolate
 from .sources import CLIPPED, REFERENCE, Source, find_sources, measure_profile
 
@@ -114,9 +116,9 @@ def track_lights(capture: Capture, progress: Progress | None = None) -> TrackFin
     lamps = [chain for chain in lamps if chain not in ghosts]
     doubtful_chains = [chain for chain in long_chains if MIN_EVIDENCE > chain.evidence >= 0.5 * MIN_EVIDENCE]
     progress.stage("follow lights", len(lamps) + len(doubtful_chains))
-    tracked = []
+    tracked, motion = [], BackgroundMotion(capture)
     for chain in [*lamps, *doubtful_chains]:
-        tracked.append(_to_light(chain, capture, diagonal))
+        tracked.append(_to_light(chain, capture, diagonal, motion))
         progress.advance()
     lights, doubtful = tracked[:len(lamps)], tracked[len(lamps):]
     return TrackFindings(lights, doubtful, sources, _messages(lights, doubtful, len(ghosts), sources))
@@ -184,10 +186,10 @@ def _is_ghost(chain: Chain, lamps: Sequence[Chain], centre: Floats, diagonal: fl
     return False
 
 
-def _to_light(chain: Chain, capture: Capture, diagonal: float) -> TrackedLight:
+def _to_light(chain: Chain, capture: Capture, diagonal: float, motion: BackgroundMotion) -> TrackedLight:
     """Return the light of a chain with its keys in all frames that its path reaches."""
     size = np.array(capture.views[0].camera.size, np.float64)
-    frames, places, errors = _fill_path(chain, len(capture.views), size, diagonal)
+    frames, places, errors = _fill_path(chain, len(capture.views), size, diagonal, motion)
     source_by_frame = dict(zip(chain.frames, chain.sources, strict=True))
     is_inside = ((places > 0) & (places < size)).all(axis=1)
     profiles = []
@@ -269,11 +271,13 @@ def recover_sources(chains: Sequence[Chain], sources: Sequence[Sequence[Source]]
             chain.sources.insert(index, nearest.source)
 
 
-def _fill_path(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple[list[int], Floats, Floats]:
+def _fill_path(chain: Chain, count: int, size: Floats, diagonal: float,
+               motion: BackgroundMotion | None = None) -> tuple[list[int], Floats, Floats]:
     """Return the frames of a chain's path, places (n, 2) and expected errors (n,) in pixels.
 
-    count: number of frames of the shot. size (2,), diagonal: of the frames, pixels. Sources that the frame's edge cuts
-    count as missing where their path is known.
+    count: number of frames of the shot. size (2,), diagonal: of the frames, pixels. motion: carries a static light to
+    frames that do not show it; None follows its own motion alone. Sources that the frame's edge cuts count as missing
+    where their path is known.
     """
     uncut = _without_cut(chain)
     acceleration = chain.acceleration(diagonal)
@@ -282,10 +286,15 @@ def _fill_path(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple
     frames, places, errors = [], [], []
     knots, points = np.array(uncut.frames), uncut.places
     between = interpolate(knots, points, PLACE_ERROR)
+    carried: Mapping[int, CarriedPlace] = {}
+    if motion is not None:
+        carried = motion.carry(uncut.frames, points, sorted({*range(first, last + 1)} - {*uncut.frames}))
     for frame in range(first, last + 1):
         index = int(np.searchsorted(knots, frame))  # of the first knot that is not before the frame
         if index < len(knots) and knots[index] == frame:
             place, error = points[index], _expected_error(uncut, index, acceleration)
+        elif frame in carried:
+            place, error = carried[frame]
         elif 0 < index < len(knots):  # between two knots; else before the first or after the last
             span = float(knots[index] - knots[index - 1])
             place = between[frame]
@@ -295,7 +304,7 @@ def _fill_path(chain: Chain, count: int, size: Floats, diagonal: float) -> tuple
             step = float(frame - knots[end])
             place, error = points[end] + step * _velocity_at_end(knots, points, end), 0.5 * acceleration * step * step
         source = measured.get(frame)
-        if source is not None and source.detection.is_cut:
+        if source is not None and source.detection.is_cut and frame not in carried:
             # The part within the frame bounds the place: more than three of its radii away, the path is wrong.
             place = source.xy if np.linalg.norm(place - source.xy) > 3 * source.detection.radius else place
             error = max(error, 0.5 * source.detection.radius)

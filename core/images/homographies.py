@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Finds homographies between frames of a shot by matched features (SIFT, Lowe 2004; RANSAC, Fischler & Bolles 1981).
+
+A homography aligns two frames of a camera that stands or turns, and frames of what is far away. `core.lights` carries
+static lights by it, and `core.fit` aligns plates.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..colour.srgb import LUMINANCE
+
+Pixels = NDArray[np.float32]
+Matrix = NDArray[np.float64]
+
+FEATURES, MATCH_RATIO, MIN_INLIERS, MAX_ERROR_PX = 800, 0.8, 25, 1.5
+"""Features of a frame, ratio test, and what a homography between two frames needs; errors in pixels of the pictures."""
+STANDING_PX = 0.1
+"""Median motion of the matches, pixels, below which the camera stands."""
+
+
+@dataclass(frozen=True)
+class _Features:
+    """Points (n, 2), pixels, and their descriptors."""
+
+    points: NDArray[np.float32]
+    descriptors: Any
+
+
+@dataclass(frozen=True)
+class FrameMatch:
+    """A homography (3, 3) from one frame's pixels to another's, None where none fits, and its share of inliers, None
+    with too few matches."""
+
+    matrix: Matrix | None
+    inlier_share: float | None
+
+
+class HomographyMatcher:
+    """The homographies between frames; features and matches are computed once.
+
+    read: returns the picture of a frame by its name, display values (height, width, 3), all of one size.
+    min_inlier_share: share of the matches that a homography has to explain.
+    """
+
+    def __init__(self, read: Callable[[str], Pixels], min_inlier_share: float) -> None:
+        self._read, self._min_inlier_share = read, min_inlier_share
+        self._features: dict[str, _Features] = {}
+        self._matches: dict[tuple[str, str], FrameMatch] = {}
+
+    def match(self, source: str, target: str) -> FrameMatch:
+        """Return the match from a frame's pixels to another's; that of the reverse is its inverse."""
+        if (source, target) not in self._matches:
+            match = self._find_match(source, target)
+            self._matches[source, target] = match
+            inverse = None if match.matrix is None else np.linalg.inv(match.matrix)
+            self._matches[target, source] = FrameMatch(inverse, match.inlier_share)
+        return self._matches[source, target]
+
+    def _find_match(self, source: str, target: str) -> FrameMatch:
+        """Compute the homography from a frame's pixels to another's by matched features; the identity if the camera
+        stands."""
+        import cv2
+
+        first, second = self._described(source), self._described(target)
+        if min(len(first.points), len(second.points)) < MIN_INLIERS:
+            return FrameMatch(None, None)
+        matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, 2)
+        pairs = [(near.queryIdx, near.trainIdx) for near, *other in matches
+                 if other and near.distance < MATCH_RATIO * other[0].distance]
+        if len(pairs) < MIN_INLIERS:
+            return FrameMatch(None, None)
+        ends = first.points[[pair[0] for pair in pairs]], second.points[[pair[1] for pair in pairs]]
+        cv2.setRNGSeed(0)  # RANSAC gives the same result each time
+        matrix, inliers = cv2.findHomography(*ends, cv2.RANSAC, MAX_ERROR_PX)
+        share = 0.0 if matrix is None else float(inliers.mean())
+        if matrix is None or inliers.sum() < max(MIN_INLIERS, self._min_inlier_share * len(pairs)):
+            return FrameMatch(None, share)
+        motion = np.abs(ends[1] - ends[0])[inliers[:, 0] > 0]
+        stands = np.median(motion) < STANDING_PX
+        return FrameMatch(np.eye(3) if stands else np.asarray(matrix, np.float64), share)
+
+    def _described(self, name: str) -> _Features:
+        """Return the SIFT features of a frame."""
+        import cv2
+
+        if name not in self._features:
+            grey = np.clip(self._read(name) @ LUMINANCE * 255 + 0.5, 0, 255).astype(np.uint8)
+            keys, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(grey, np.array([]))
+            self._features[name] = _Features(np.array([key.pt for key in keys], np.float32).reshape(-1, 2), descriptors)
+        return self._features[name]
+
+
+def project(matrix: Matrix, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points (n, 2) under a homography (3, 3); NaN for points behind the camera of the target."""
+    mapped = np.column_stack([points, np.ones(len(points))]) @ matrix.T
+    depth = np.where(mapped[:, 2:] > 0, mapped[:, 2:], np.nan) * np.sign(matrix[2, 2])
+    return np.asarray(mapped[:, :2] / depth)

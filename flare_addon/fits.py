@@ -276,7 +276,7 @@ def start_light_search(scene: Any) -> Job:
         lights.write_to_capture(scene, capture)
     lights.remember_names(scene)
     return engine.run("lights", capture / "lights", ["lights", capture, "--keep",
-                                                        *plate_space.command_args(scene)])
+                                                     *plate_space.command_args(scene)])
 
 
 def start_cleaning(scene: Any) -> Job:

@@ -268,8 +268,8 @@ def start_job(kind: str, folder: Path, command: Sequence[str], environment: Mapp
         _lower_priority(process.pid)
         try:
             write_json(folder / RECORD, {"kind": kind, "host": HOST, "host_name": platform.node(), "pid": process.pid,
-                                          "started": time.time(), "args": [str(arg) for arg in args],
-                                          "log_from": log_offset})
+                                         "started": time.time(), "args": [str(arg) for arg in args],
+                                         "log_from": log_offset})
         except OSError:
             process.kill()  # it could not be found again
             raise

@@ -197,7 +197,7 @@ def _is_of_this_capture(look: Look, state: Any, objects: dict[str, Any], depsgra
     if not (root is not None or state.capture) or not shared:
         return False
     camera_span = max(float(np.linalg.norm(light.query_range.camera_high - light.query_range.camera_low))
-                 for light in shared)
+                      for light in shared)
     try:
         return all(
             np.linalg.norm(capture_position(objects[light.name], root, depsgraph) - light.xyz) < 0.05 * camera_span

@@ -62,7 +62,7 @@ class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
         folder = fits.capture_folder(context.scene)
         if folder is None:
             label_lines(layout, "Footage with a camera solve: a folder with images/ and sparse/0/ (COLMAP) or "
-                          "transforms.json. Flare from Footage needs only a clip.", "INFO")
+                        "transforms.json. Flare from Footage needs only a clip.", "INFO")
         elif not is_folder(folder):
             label_lines(layout, f"The capture {folder} does not exist any more: choose its present folder.", "ERROR")
         row = layout.row()

@@ -183,7 +183,7 @@ def _run_command(argv: Sequence[str], progress: Progress) -> int:
 def _memory_advice(arguments: argparse.Namespace) -> str:
     """Return the advice for a command that ran out of memory, from the options that it has."""
     advice = [text for option, text in (("size", "a smaller --size"), ("jobs", "fewer --jobs"),
-                                    ("processes", "fewer --processes")) if hasattr(arguments, option)]
+                                        ("processes", "fewer --processes")) if hasattr(arguments, option)]
     return f"use {', or '.join(advice)}" if advice else "close other programs, or use a machine with more memory"
 
 

@@ -47,7 +47,7 @@ def engine_command(path: str | None) -> list[str]:
     where none is found.
     """
     for source, place in (("--engine", path), ("FIT_FLARE_ENGINE", os.environ.get("FIT_FLARE_ENGINE")),
-                         ("the add-on's preferences", _engine_in_preferences())):
+                          ("the add-on's preferences", _engine_in_preferences())):
         if place:
             python = find_python(Path(place).expanduser())
             if python is None or not _has_torch(python):

@@ -276,7 +276,7 @@ def _read_points(path: Path, meta: dict[str, Any], result: Transforms) -> PointC
     from_cameras = _fit_similarity(posed, result.frames)
     if from_cameras is not None and not _move_alike(to_world, from_cameras, points.xyz):
         result.warnings.append(f"The points of {model} are moved as their cameras are in {path.name}: "
-                                + ("applied_transform and applied_scale say otherwise." if "applied_transform" in meta
+                               + ("applied_transform and applied_scale say otherwise." if "applied_transform" in meta
                                    else "it has no applied_transform."))
         to_world = from_cameras
     xyz = points.xyz.astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]

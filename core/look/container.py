@@ -22,7 +22,7 @@ Arrays = dict[str, NDArray[Any]]
 
 MAX_HEADER_BYTES = 100_000_000  # bytes, the format's own limit
 _DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "i1", "U8": "u1",
-          "BOOL": "?"}
+           "BOOL": "?"}
 
 
 def read_tensors(path: Path | str) -> tuple[Arrays, dict[str, str]]:

@@ -206,7 +206,7 @@ def _is_copy(target: Path, path: Path) -> bool:
 
 
 _UNSUPPORTED_DISTORTION = {"DIVISION": ("division_k1", "division_k2"), "NUKE": ("nuke_k1", "nuke_k2"),
-                     "BROWN": ("brown_k1", "brown_k2", "brown_k3", "brown_k4", "brown_p1", "brown_p2")}
+                           "BROWN": ("brown_k1", "brown_k2", "brown_k3", "brown_k4", "brown_p1", "brown_p2")}
 """The coefficients of the tracker's distortion models other than Polynomial."""
 
 

@@ -352,7 +352,7 @@ def remove_nodes(scene: Any) -> None:
     if picture_below is None and not state["tree"]:
         picture_below = _render_picture(tree)
     for fed_input in [link.to_socket for link in tree.links if link.from_node == node
-                and (link.from_socket.name == "Image" or link.to_node.bl_idname == _OUTPUT_TYPE)]:
+                      and (link.from_socket.name == "Image" or link.to_node.bl_idname == _OUTPUT_TYPE)]:
         if picture_below is not None:
             tree.links.new(picture_below, fed_input)
     drivers.disconnect_node(scene)

@@ -215,7 +215,7 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         light.empty_display_size = 0.02 * (position - eye).length
         if item is None:
             item = looks.add_flare(scene, light, state.lights[state.light].source if state.lights
-                                      else look.names[0])
+                                   else look.names[0])
         item.target = light
 
 

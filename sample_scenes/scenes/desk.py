@@ -124,7 +124,7 @@ def _add_things(rng: np.random.Generator) -> None:
                         (1e-3, 0.4)], (2.75, 1.35, 0),
                 s.picture_material("pot", p.marble(rng, 400, 800, p.STONE), 0.8))
     leaf = s.picture_material("leaf", p.gradient_map(p.noise(rng, 256, 256, 40, 4), ((28, 54, 30), (76, 116, 58),
-                                                                                (140, 160, 90))), 0.7)
+                                                                                     (140, 160, 90))), 0.7)
     for index in range(15):
         lean, azimuth = rng.uniform(20, 60), index * 137.5
         leaf_offset = 0.32 * np.sin(np.radians(lean))

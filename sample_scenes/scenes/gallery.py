@@ -57,7 +57,7 @@ def build_scene(scene: SceneDescription) -> None:
     s.add_box("partition left", (1.3, 0.14, 2.4), (0.15, 2.3, 0), panel[:1])
     s.add_box("partition right", (0.75, 0.14, 2.4), (1.42, 2.3, 0), panel[1:])
     for index, (x, y, width, height) in enumerate(((-1.7, 1.4, 0.6, 1.0), (-0.2, 0.2, 0.5, 0.75), (1.7, 0.6, 0.6, 0.9),
-                                               (-3.1, 0.4, 0.55, 1.1), (3.1, -0.2, 0.5, 0.8))):
+                                                   (-3.1, 0.4, 0.55, 1.1), (3.1, -0.2, 0.5, 0.8))):
         s.add_poster_box(f"plinth {index}", rng, (width, width, height), (x, y, 0), (p.STONE, p.SEA, p.PLUM)[index % 3],
                          rng.uniform(-20, 20))
     vase = [(1e-3, 0), (0.16, 0), (0.26, 0.25), (0.2, 0.5), (0.08, 0.66), (0.13, 0.8), (0.1, 0.8)]

@@ -53,7 +53,7 @@ def build_scene(scene: SceneDescription) -> None:
     for index in range(4):
         s.add_box(f"rail {index}", (1.6, 0.04, 0.06), (-1.7, 2.33, 0.3 + 0.42 * index), [wood], 8)
     for index, (x, y, turn, size) in enumerate(((-1.5, -0.3, 20, 0.7), (-0.9, -0.8, -12, 0.5), (1.6, 0.4, 8, 0.8),
-                                               (2.1, -0.5, 40, 0.55), (-2.6, 0.5, 5, 0.6), (1.7, 0.4, 30, 0.45))):
+                                                (2.1, -0.5, 40, 0.55), (-2.6, 0.5, 5, 0.6), (1.7, 0.4, 30, 0.45))):
         s.add_poster_box(f"crate {index}", rng, (size, size, size), (x, y, 0.8 if index == 5 else 0),
                          (p.WARM, p.SEA, p.MOSS, p.PLUM)[index % 4], turn)
     s.add_poster_box("plinth", rng, (0.8, 0.8, 1.0), (0.25, 0.5, 0), p.SEA, 15)

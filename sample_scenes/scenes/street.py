@@ -47,7 +47,7 @@ def build_scene(scene: SceneDescription) -> None:
                       [gable, front, gable, front, gable])
             y += length
     for index, (x, y, turn, size) in enumerate(((-2.6, -4.6, 20, 0.7), (-2.0, -4.9, -12, 0.5), (2.5, -2.4, 8, 0.8),
-                                               (2.9, -3.3, 40, 0.55), (-2.9, 0.4, 5, 0.9), (-2.4, -4.7, 3, 0.4))):
+                                                (2.9, -3.3, 40, 0.55), (-2.9, 0.4, 5, 0.9), (-2.4, -4.7, 3, 0.4))):
         s.add_poster_box(f"crate {index}", rng, (size, size, size), (x, y, 0.7 if index == 5 else 0),
                          (p.WARM, p.SEA, p.MOSS, p.PLUM)[index % 4], turn)
     # A column with a head upon it, which the sun passes behind.

@@ -60,7 +60,7 @@ def build_scene(scene: SceneDescription) -> None:
         bark = p.tiles(rng, 900, 600, (p.WARM, p.STONE, p.SEA)[index], 16, 8, (60, 50, 44), offset=True)
         s.add_lathe(f"column {index}", profile, to_world(x, y, 0), s.picture_material(f"column {index}", bark, 0.7))
     for index, (x, y, side, height) in enumerate(((-2.3, 0.4, 0.6, 0.8), (-0.3, 0.9, 0.7, 0.6), (1.9, 0.2, 0.5, 0.7),
-                                               (0.2, -1.4, 0.4, 0.35))):
+                                                  (0.2, -1.4, 0.4, 0.35))):
         s.add_poster_box(f"crate {index}", rng, (side, side, height), to_world(x, y, 0),
                          (p.WARM, p.SEA, p.MOSS, p.PLUM)[index], turn + rng.uniform(-25, 25))
     bust = s.picture_material("bust", p.marble(rng, 500, 500, p.STONE))

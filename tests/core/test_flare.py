@@ -43,7 +43,9 @@ def random_(seed: int) -> torch.Generator:
 def some_flare(form: FlareForm = PAPER, count: int = 40, lights: int = 1, seed: int = 0) -> FlareModel:
     """A flare whose network has been shaken, so that every deformation does something."""
     generator = random_(seed)
-    flares = [LightFlare(form, RANGE, count, generator) for _ in range(lights)]
+    with torch.random.fork_rng():  # the networks draw their weights from torch's global generator
+        torch.manual_seed(seed)
+        flares = [LightFlare(form, RANGE, count, generator) for _ in range(lights)]
     model = FlareModel([f"lamp {i}" for i in range(lights)],
                        torch.tensor([[0.3 * i - 0.2, -0.4, 1.0] for i in range(lights)]), flares)
     with torch.no_grad():

@@ -66,7 +66,7 @@ class SolveSettings:
         """Raise SettingsError for an invalid setting."""
         if self.lens not in MODELS or self.lens == "EQUIRECTANGULAR":
             raise SettingsError(f"{self.lens!r} is not a camera model to solve with; take one of "
-                               f"{', '.join(name for name in MODELS if name != 'EQUIRECTANGULAR')}.")
+                                f"{', '.join(name for name in MODELS if name != 'EQUIRECTANGULAR')}.")
         if self.matching not in (choices := get_args(Matching)):
             raise SettingsError(f"{self.matching!r} is not a way of matching; take one of {', '.join(choices)}.")
         if self.frames < 0 or self.output_size < 0:

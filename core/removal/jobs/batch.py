@@ -13,16 +13,18 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ...colour.srgb import Pixels
 from ...errors import DISK_FULL, FrameError, SettingsError, join_failures, os_error_message
 from ...images.exr import read_data_window
 from ...images.formats.exif import read_exif
 from ...images.listing import pictures_below, pictures_in, unlisted_entries
-from ...images.plates import clean_name, is_plate_error
+from ...images.plates import Plate, clean_name, is_plate_error
 from ...images.views import split_views, write_view_results
 from ...system.files import check_no_overwrite, real_path
 from ...system.progress import Progress
 from ...system.tally import Tally, list_first
 from ..inference.neighbours import ShotPredictor, shot_sort_key
+from ..inference.prediction import FlarePrediction
 from ..inference.remover import Remover
 from .clean_frames import CleanFrame, PreparedResults, write_clean_frames
 from .manifest import MANIFEST, Manifest, digest_inputs
@@ -122,6 +124,41 @@ def _check_creatable(folder: Path) -> None:
         raise SettingsError(f"{nearest} is not a folder, so {folder} cannot be written to; choose another folder.")
 
 
+class _PlateCleaner:
+    """Predicts and removes the flare of one plate after the other, for `write_clean_frames`.
+
+    mattes: where flares may be removed; None for everywhere. progress: receives the warnings about written plates.
+    """
+
+    def __init__(self, remover: Remover, predictor: ShotPredictor, mattes: Mattes | None, progress: Progress) -> None:
+        self._remover, self._predictor, self._mattes, self._progress = remover, predictor, mattes, progress
+
+    def digest(self, frame: CleanFrame) -> str:
+        """Hash the remover's settings and all files that the clean plate depends on."""
+        matte_files = [self._mattes.path(frame.name)] if self._mattes else []
+        return digest_inputs(self._remover.cache_key,
+                             [frame.source, *self._predictor.dependencies(frame.source), *matte_files])
+
+    def clean(self, frame: CleanFrame) -> PreparedResults:
+        """Predict a plate's flare, and prepare its results. With a matte, the flare has no confidence."""
+        plate, prediction = self._predictor.predict(frame.source)
+        matte = None
+        if self._mattes:
+            matte = self._mattes.read(frame.name, read_data_window(frame.source), read_exif(frame.source)[0])
+        return PreparedResults(lambda: self._write(frame, plate, prediction, matte),
+                               float(prediction.confidence) if matte is None else None)
+
+    def _write(self, frame: CleanFrame, plate: Plate, prediction: FlarePrediction, matte: Pixels | None) -> None:
+        """Write the clean plate, and its flare where the frame has a second result. matte: (height, width), 0..1."""
+        # The eyes of a stereo picture; the prediction is that of the first one.
+        (_, first_view), *other_views = split_views(plate)
+        view_results = [self._remover.remove(first_view, matte, prediction),
+                        *(self._remover.remove(view, matte) for _, view in other_views)]
+        write_view_results(frame.results, plate, view_results)
+        if plate.warning:
+            self._progress.say(plate.warning)
+
+
 def clean_plates(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
                  flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
                  only: Container[Path] | None = None, independent: bool = False,
@@ -150,30 +187,11 @@ def clean_plates(inputs: Sequence[Path], folder: Path, remover: Remover, progres
                        itertools.chain.from_iterable(results.values()))
     manifest = Manifest(folder)
     predictor = ShotPredictor(remover, [] if independent else collect_with_neighbours(inputs, excluded))
+    cleaner = _PlateCleaner(remover, predictor, mattes, progress)
     if only is not None:
         plates = [(path, name) for path, name in plates if name in only]
     progress.stage("remove", len(plates))
     failed, failed_names = list(failed_inputs), list[str]()
-
-    def digest(frame: CleanFrame) -> str:
-        matte = [mattes.path(frame.name)] if mattes else []
-        return digest_inputs(remover.cache_key, [frame.source, *predictor.dependencies(frame.source), *matte])
-
-    def clean(frame: CleanFrame) -> PreparedResults:
-        """Predict a plate's flare, and prepare its results."""
-        plate, prediction = predictor.predict(frame.source)
-        matte = mattes.read(frame.name, read_data_window(frame.source), read_exif(frame.source)[0]) if mattes else None
-
-        def write() -> None:
-            # The eyes of a stereo picture; the first one is predicted above.
-            (_, first_view), *other_views = split_views(plate)
-            view_results = [remover.remove(first_view, matte, prediction),
-                            *(remover.remove(view, matte) for _, view in other_views)]
-            write_view_results(frame.results, plate, view_results)
-            if plate.warning:
-                progress.say(plate.warning)
-
-        return PreparedResults(write, float(prediction.confidence) if matte is None else None)
 
     def leave_out(frame: CleanFrame, error: Exception) -> None:
         """Record a plate that cannot be cleaned; raise an error that concerns all plates."""
@@ -184,8 +202,9 @@ def clean_plates(inputs: Sequence[Path], folder: Path, remover: Remover, progres
 
     frames = (CleanFrame(name, path, results[name])
               for path, name in sorted(plates, key=lambda plate: shot_sort_key(plate[0])))
-    written, kept_counts = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
-                                              keep_finished=not overwrite, overwrite=overwrite, on_error=leave_out)
+    written, kept_counts = write_clean_frames(frames, manifest, progress, digest=cleaner.digest,
+                                              clean=cleaner.clean, keep_finished=not overwrite, overwrite=overwrite,
+                                              on_error=leave_out)
     manifest.report_kept(kept_counts, progress)
     tally = Tally("plate", "cleaned", written + kept_counts.total(), left_out_files(inputs, excluded))
     tally.skip("could not be cleaned", *failed_names)

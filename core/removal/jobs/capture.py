@@ -27,6 +27,32 @@ UNFINISHED_FOLDER = "removed.unfinished"
 """Holds the clean frames until all exist: an incomplete removed/ would be read as a complete one."""
 
 
+class _FrameCleaner:
+    """Predicts and removes the flare of one frame after the other, for `write_clean_frames`.
+
+    flared_names: clean files of the frames that are known to show a flare.
+    """
+
+    def __init__(self, remover: Remover, predictor: ShotPredictor, flared_names: set[Path]) -> None:
+        self._remover, self._predictor, self._flared_names = remover, predictor, flared_names
+
+    def digest(self, frame: CleanFrame) -> str:
+        """Hash the settings and all files that the clean frame depends on."""
+        cache_key = self._remover.cache_key
+        settings = f"{cache_key} flared" if frame.name in self._flared_names else cache_key
+        return digest_inputs(settings, [frame.source, *self._predictor.dependencies(frame.source)])
+
+    def clean(self, frame: CleanFrame) -> PreparedResults:
+        """Predict a frame's flare, and prepare its results."""
+        plate, prediction = self._predictor.predict(frame.source)
+        if frame.name in self._flared_names:
+            prediction = prediction._replace(confidence=np.float32(1))
+        (_, first_view), *other_views = split_views(plate)
+        return PreparedResults(lambda: write_view_results(frame.results, plate, [
+            self._remover.remove(first_view, prediction=prediction),
+            *(self._remover.remove(view) for _, view in other_views)]), float(prediction.confidence))
+
+
 def clean_capture(capture: Capture, remover: Remover, progress: Progress,
                   flared: Collection[str] = ()) -> Path:
     """Clean every frame into the capture's removed/ and return that folder; frames of an interrupted call are kept.
@@ -48,25 +74,10 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress,
     frames = [CleanFrame(names[view.name], capture.frame_path(view),
                          [safe_join(unfinished, str(names[view.name]), CaptureError)])
               for view in sorted(capture.views, key=lambda view: shot_sort_key(capture.frame_path(view)))]
-
-    flared_names = {names[name] for name in flared}
-
-    def digest(frame: CleanFrame) -> str:
-        settings = f"{remover.cache_key} flared" if frame.name in flared_names else remover.cache_key
-        return digest_inputs(settings, [frame.source, *predictor.dependencies(frame.source)])
-
-    def clean(frame: CleanFrame) -> PreparedResults:
-        plate, prediction = predictor.predict(frame.source)
-        if frame.name in flared_names:
-            prediction = prediction._replace(confidence=np.float32(1))
-        (_, first_view), *other_views = split_views(plate)
-        return PreparedResults(lambda: write_view_results(frame.results, plate, [
-            remover.remove(first_view, prediction=prediction), *(remover.remove(view) for _, view in other_views)]),
-            float(prediction.confidence))
-
+    cleaner = _FrameCleaner(remover, predictor, {names[name] for name in flared})
     try:
-        write_clean_frames(frames, Manifest(unfinished), progress, digest=digest, clean=clean, keep_finished=True,
-                           overwrite=True)
+        write_clean_frames(frames, Manifest(unfinished), progress, digest=cleaner.digest, clean=cleaner.clean,
+                           keep_finished=True, overwrite=True)
         # In this order: if another fit has just renamed the folder, `target` exists by the second test.
         if not all(frame.results[0].is_file() for frame in frames) and not target.exists():
             raise CaptureError(f"Another fit is cleaning the frames of {capture.folder} with other settings; wait "

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -55,42 +56,49 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
     """
     folder = frames_folder(target)
     extracted = {path.stem: path for path in pictures_in(folder / f"{source.name}.frames")}
-    clean = {stem: folder / path.name for stem, path in extracted.items()}
-    if missing := sum(not path.is_file() for path in clean.values()):
-        progress.say(f"{missing} of {len(clean)} frames are not clean yet; {target} is written when all are.")
+    clean_files = [folder / path.name for path in extracted.values()]
+    if missing := sum(not path.is_file() for path in clean_files):
+        progress.say(f"{missing} of {len(clean_files)} frames are not clean yet; {target} is written when all are.")
         return False
     with Video(source) as video:
         codec_name = choose_codec(target, video, codec)
-    digest = digest_inputs(codec_name, [source, *clean.values()])
+    digest = digest_inputs(codec_name, [source, *clean_files])
     record = _read_record(folder / RECORD)
     if target.exists() and not overwrite and _is_up_to_date(target, record, digest):
         progress.say(f"{target} is up to date; --overwrite makes it again.")
         return True
-
-    def changed_pixels(frame: VideoFrame) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Return a frame's pixels as extracted and as cleaned; None where they are the same."""
-        stem = f"{source.stem}.{frame.number + 1:06d}"
-        if stem not in extracted:
-            raise FrameError(f"{folder / stem} is missing among the frames of {source}; delete {folder} and clean it "
-                             "again.")
-        before, after = read_picture(extracted[stem]), read_picture(clean[stem])
-        return None if np.array_equal(before.pixels, after.pixels) else (before.pixels, after.pixels)
-
-    def write_record(finished: Path) -> None:
-        """Record the finished video and the one that it replaces.
-
-        It is called before the video has its name: a process that is killed between the two must leave neither of them
-        looking like someone's work.
-        """
-        replaced = {"replaced": content_hash(target)} if target.exists() else {}
-        write_json(folder / RECORD, {"from": digest, "written": content_hash(finished), **replaced})
-
-    progress.stage(f"write {target.name}", len(clean))
-    for message in rewrite_video(source, target, codec_name, changed_pixels, on_frame=progress.advance,
-                                 on_written=write_record):
+    progress.stage(f"write {target.name}", len(clean_files))
+    for message in rewrite_video(source, target, codec_name, partial(_changed_pixels, source, folder, extracted),
+                                 on_frame=progress.advance,
+                                 on_written=partial(_write_record, folder / RECORD, digest, target)):
         progress.say(message)
     progress.say(f"The clean video is {target}.")
     return True
+
+
+def _changed_pixels(source: Path, folder: Path, extracted: Mapping[str, Path],
+                    frame: VideoFrame) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Return the pixels of a frame of the video `source` as extracted and as cleaned; None where they are the same.
+
+    folder: of the clean frames. extracted: the extracted frames by the stem of their names. Raises FrameError for a
+    frame that is not among them.
+    """
+    stem = f"{source.stem}.{frame.number + 1:06d}"
+    if stem not in extracted:
+        raise FrameError(f"{folder / stem} is missing among the frames of {source}; delete {folder} and clean it "
+                         "again.")
+    before, after = read_picture(extracted[stem]), read_picture(folder / extracted[stem].name)
+    return None if np.array_equal(before.pixels, after.pixels) else (before.pixels, after.pixels)
+
+
+def _write_record(path: Path, digest: str, target: Path, finished: Path) -> None:
+    """Record the finished video and the one that it replaces. digest: of what it was made from.
+
+    It is called before the video has its name `target`: a process that is killed between the two must leave neither of
+    them looking like someone's work.
+    """
+    replaced = {"replaced": content_hash(target)} if target.exists() else {}
+    write_json(path, {"from": digest, "written": content_hash(finished), **replaced})
 
 
 def _is_up_to_date(target: Path, record: Mapping[str, object], digest: str) -> bool:

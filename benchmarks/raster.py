@@ -253,7 +253,7 @@ def iteration_section(kernel_sets: list[str], thread_counts: list[int], rounds: 
 
 STAGES = {
     "projection": ("project",),
-    "tiles and depth order": ("list_sorted", "scatter"),
+    "tiles and depth order": ("list_sorted", "scatter_entries"),
     "raster, forward": ("raster",),
     "raster, backward": ("raster_backward",),
     "projection, backward, and Adam": ("project_backward", "_step_all"),

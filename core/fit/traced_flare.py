@@ -31,7 +31,7 @@ from ..flare.file import FlareFile
 from ..flare.model import FlareModel, LightFlare, ViewOfLight, plane_scale
 from ..look import TrainedCamera, store_elements
 from ..optics.flare import LensSetup, build_optics, render_flare
-from ..optics.ghosts import draw_ghosts, limited
+from ..optics.ghosts import draw_ghosts, limit_brightness
 from ..optics.lenses import find_lens
 from ..system.files import atomic_path
 from ..system.processes import available_cores
@@ -155,7 +155,7 @@ def setup_with_ghost_gain(settings: TracedFlareSettings) -> LensSetup:
     for _ in range(GAIN_STEPS):  # what the limit takes, the rest has to make up for
         if gain * pictures.max() <= settings.ghosts.limit:
             break
-        gain *= settings.ghosts.level / _root_mean_square(limited(gain * pictures, settings.ghosts.limit))
+        gain *= settings.ghosts.level / _root_mean_square(limit_brightness(gain * pictures, settings.ghosts.limit))
     return replace(setup, ghosts=replace(setup.ghosts, gain=gain))
 
 

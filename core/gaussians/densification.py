@@ -121,26 +121,28 @@ class Classic:
         large ones too (gsplat: _grow_gs and _prune_gs)."""
         settings, scene = self.settings, self.scene
         size = scene.scales.amax(-1) / scene.units(self.extent)
-        removed = scene.opacities < settings.faint
+        is_removed = scene.opacities < settings.faint
         if prune_large:
-            removed |= size > settings.large * self.extent
+            is_removed |= size > settings.large * self.extent
         mean_gradient = self.gradients / self.views.clamp(min=1)
-        grown = (mean_gradient > settings.gradient) & ~removed
+        is_grown = (mean_gradient > settings.gradient) & ~is_removed
         if settings.cap is not None:
-            free = max(0, settings.cap - int((~removed).sum()))
-            if int(grown.sum()) > free:  # a clone and a split each add one Gaussian
-                highest = torch.argsort(mean_gradient.masked_fill(~grown, -1), descending=True, stable=True)[:free]
-                grown = torch.zeros_like(grown).index_fill_(0, highest, True)
-        split = grown & (size > settings.small * self.extent)
-        clones = {name: p.detach()[grown & ~split] for name, p in scene.named_parameters()}
-        halves = self._split(split)
-        self.optimiser.keep_rows(torch.nonzero(~removed & ~split)[:, 0])
+            free_rows = max(0, settings.cap - int((~is_removed).sum()))
+            if int(is_grown.sum()) > free_rows:  # a clone and a split each add one Gaussian
+                candidates = mean_gradient.masked_fill(~is_grown, -1)
+                highest = torch.argsort(candidates, descending=True, stable=True)[:free_rows]
+                is_grown = torch.zeros_like(is_grown).index_fill_(0, highest, True)
+        is_split = is_grown & (size > settings.small * self.extent)
+        clones = {name: p.detach()[is_grown & ~is_split] for name, p in scene.named_parameters()}
+        halves = self._split(is_split)
+        self.optimiser.keep_rows(torch.nonzero(~is_removed & ~is_split)[:, 0])
         self.optimiser.append_rows(clones)
         self.optimiser.append_rows(halves)
 
-    def _split(self, split: Tensor) -> dict[str, Tensor]:
-        """Return two Gaussians for each one to split: smaller, at positions sampled from it."""
-        halves = {name: p.detach()[split].repeat_interleave(2, 0) for name, p in self.scene.named_parameters()}
+    def _split(self, is_split: Tensor) -> dict[str, Tensor]:
+        """Return two Gaussians for each one to split, by name of the parameter: smaller, at positions sampled from
+        it."""
+        halves = {name: p.detach()[is_split].repeat_interleave(2, 0) for name, p in self.scene.named_parameters()}
         noise = _randn(halves["means"].shape, self.generator, halves["means"])
         offsets = rotation_matrices(halves["quaternions"]) @ (noise * halves["log_scales"].exp())[..., None]
         halves["means"] = halves["means"] + offsets[..., 0]
@@ -221,9 +223,9 @@ class Mcmc:
 
     def _relocate(self) -> None:
         """Move dead Gaussians, whose opacity is at most `faint`, to others drawn by opacity."""
-        dead = self.scene.opacities <= self.settings.faint
-        targets = torch.nonzero(dead)[:, 0]
-        alive = torch.nonzero(~dead)[:, 0]
+        is_dead = self.scene.opacities <= self.settings.faint
+        targets = torch.nonzero(is_dead)[:, 0]
+        alive = torch.nonzero(~is_dead)[:, 0]
         if len(targets) == 0 or len(alive) == 0:
             return
         sources = alive[self._sample_rows(self.scene.opacities[alive], len(targets))]
@@ -235,10 +237,10 @@ class Mcmc:
     def _add_copies(self) -> None:
         """Add Gaussians as copies of others drawn by opacity, up to `growth` and `cap`."""
         n = len(self.scene)
-        added = min(self.settings.cap, int(n * self.settings.growth)) - n
-        if added <= 0:
+        num_added = min(self.settings.cap, int(n * self.settings.growth)) - n
+        if num_added <= 0:
             return
-        sources = self._sample_rows(self.scene.opacities, added)
+        sources = self._sample_rows(self.scene.opacities, num_added)
         self._split_opacity(sources)
         for name in dict(self.scene.named_parameters()):
             self.optimiser.reset_moments(name, sources)

@@ -38,12 +38,12 @@ class FarSphere:
 
     def contains(self, means: Tensor) -> Tensor:
         """Return (n,) which Gaussians at `means` (n, 3) are far."""
-        away = means.detach() - torch.tensor(self.centre, dtype=means.dtype, device=means.device)
-        return away.square().sum(-1) > self.min_distance**2
+        offsets = means.detach() - torch.tensor(self.centre, dtype=means.dtype, device=means.device)
+        return offsets.square().sum(-1) > self.min_distance**2
 
     def move(self, means: Tensor, steps: Tensor) -> Tensor:
         """Return means (m, 3) on the sphere, moved along it by steps (m, 3), world units."""
         centre = torch.tensor(self.centre, dtype=means.dtype, device=means.device)
-        away = means + steps - centre
+        offsets = means + steps - centre
         # The clamp bounds the factor, for a step that leads close to the centre.
-        return centre + away * (self.radius / away.norm(dim=-1, keepdim=True).clamp(min=self.min_distance))
+        return centre + offsets * (self.radius / offsets.norm(dim=-1, keepdim=True).clamp(min=self.min_distance))

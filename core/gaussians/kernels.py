@@ -48,7 +48,8 @@ class KernelSet(Protocol):
 
 
 @cache
-def _load(name: str) -> KernelSet | ImportError:
+def _load_kernel_set(name: str) -> KernelSet | ImportError:
+    """Return the kernel set of this name, or the error of its import."""
     try:
         module = importlib.import_module(MODULES[name], __package__)
     except ImportError as error:
@@ -58,7 +59,7 @@ def _load(name: str) -> KernelSet | ImportError:
 
 def is_available(name: str) -> bool:
     """Return whether this kernel set can be imported."""
-    return not isinstance(_load(name), ImportError)
+    return not isinstance(_load_kernel_set(name), ImportError)
 
 
 @cache
@@ -95,7 +96,7 @@ def fused_kernels(like: Tensor) -> FusedKernels | None:
     which have a torch version too."""
     if not like.is_cpu or like.dtype != torch.float32:
         return None
-    kernels = _load("cpu")
+    kernels = _load_kernel_set("cpu")
     return None if isinstance(kernels, ImportError) else cast(FusedKernels, kernels)
 
 
@@ -105,12 +106,12 @@ def select_kernels(name: str, like: Tensor) -> KernelSet:
     Raises SettingsError for an unknown name, EngineError for a kernel set that is not installed.
     """
     if name == "auto":
-        name = _fastest(like)
+        name = _fastest_kernel_set(like)
     if name not in MODULES:
         raise SettingsError(
             f"Gaussians are rasterized by the kernels {', '.join(MODULES)} or auto, not {name!r}; choose one of those."
         )
-    kernels = _load(name)
+    kernels = _load_kernel_set(name)
     if isinstance(kernels, ImportError):
         raise EngineError(
             f"The {name} kernels cannot be used here ({kernels}); choose auto to do without them."
@@ -118,12 +119,12 @@ def select_kernels(name: str, like: Tensor) -> KernelSet:
     return kernels
 
 
-def _fastest(like: Tensor) -> str:
+def _fastest_kernel_set(like: Tensor) -> str:
     """Return the name of the fastest kernel set that can be used for such tensors."""
     preferred = {"cuda": "cuda", "cpu": "cpu"}.get(like.device.type, "tiles")
     if like.dtype != torch.float32:
         return "tiles"  # the faster ones compute in float32 alone
-    kernels = _load(preferred)
+    kernels = _load_kernel_set(preferred)
     if isinstance(kernels, ImportError):
         _warn_once(f"The {preferred} kernels cannot be used here ({kernels}); slower torch ones take their place.")
         return "tiles"

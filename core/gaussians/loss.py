@@ -30,7 +30,7 @@ def l1_ssim(image: Tensor, target: Tensor, lam: float, *, kernels: Literal["auto
     image, target: (h, w, 3), 0..1. Differentiable by the image; the target is a constant.
     lam: weight of L1 (the paper: 0.9; 3DGS: 0.8). Raises SettingsError for different sizes.
     """
-    _check(image, target)
+    _check_shapes(image, target)
     cpu = fused_kernels(image) if kernels == "auto" else None
     if cpu is not None:
         return cpu.l1_ssim(image, target, lam)
@@ -40,7 +40,7 @@ def l1_ssim(image: Tensor, target: Tensor, lam: float, *, kernels: Literal["auto
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Return the mean structural similarity of two (h, w, 3) pictures, a scalar, 1 for equal pictures."""
-    _check(image, target)
+    _check_shapes(image, target)
     a, b = image.permute(2, 0, 1), target.permute(2, 0, 1)
     mu_a, mu_b, aa, bb, ab = _blur(torch.cat([a, b, a * a, b * b, a * b])).split(3)
     variances = aa - mu_a * mu_a + bb - mu_b * mu_b
@@ -63,7 +63,7 @@ def _blur(planes: Tensor) -> Tensor:
     return torch.nn.functional.conv2d(planes, weights.view(1, 1, -1, 1), padding=(WINDOW // 2, 0))[:, 0]
 
 
-def _check(image: Tensor, target: Tensor) -> None:
+def _check_shapes(image: Tensor, target: Tensor) -> None:
     if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
         raise SettingsError(
             f"Picture and target must both be (h, w, 3), not {tuple(image.shape)} and {tuple(target.shape)}."

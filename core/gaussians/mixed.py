@@ -72,11 +72,12 @@ def splat_mixed(
         border = 0 if factor == 1 else 1  # so that interpolation has neighbours on all sides
         # In reduced pixels lengths are divided by the factor, so b, px^-1, is multiplied by it; m has no unit.
         layer = kernels.splat(
-            _rows(centres, index) / factor + border, _rows(covariances, index) / factor**2,
-            _rows(opacities, index), _rows(colours, index),
+            _select_rows(centres, index) / factor + border, _select_rows(covariances, index) / factor**2,
+            _select_rows(opacities, index), _select_rows(colours, index),
             -(-width // factor) + 2 * border, -(-height // factor) + 2 * border,
-            rings=None if rings is None else _rows(rings, index),
-            arcs=None if arcs is None else _rows(arcs, index) * arcs.new_tensor([factor, factor, 1]), blend=blend,
+            rings=None if rings is None else _select_rows(rings, index),
+            arcs=None if arcs is None else _select_rows(arcs, index) * arcs.new_tensor([factor, factor, 1]),
+            blend=blend,
         )  # fmt: skip
         if factor > 1:
             layer = upsample_layer(layer, factor, width, height)
@@ -88,7 +89,7 @@ def splat_mixed(
     return picture
 
 
-def _rows(tensor: Tensor, index: Tensor) -> Tensor:
+def _select_rows(tensor: Tensor, index: Tensor) -> Tensor:
     """Return tensor[index] for ascending indices; the tensor itself if they are all of its rows."""
     return tensor if len(index) == len(tensor) else tensor[index]
 

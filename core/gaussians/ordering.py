@@ -55,12 +55,13 @@ def nearest_distances(points: Tensor, neighbours: int = 3) -> Tensor:
     highs = torch.stack([block.amax(0) for block in blocks])
     half_width = BLOCK + 2 * k
     for block_number, (start, block) in enumerate(zip(starts, blocks, strict=True)):
-        around = points[order[max(0, start - half_width) : start + half_width]]  # at least k + 1 points
-        bound = _other_distances(block, around, k)[:, -1].amax()  # no k-th neighbour of this block's points is farther
+        candidates = points[order[max(0, start - half_width) : start + half_width]]  # at least k + 1 points
+        # No k-th neighbour of this block's points is farther.
+        bound = _other_distances(block, candidates, k)[:, -1].amax()
         # Along each axis, between this block's box and all boxes; 0 where they overlap.
         gaps = (lows - highs[block_number]).clamp(min=0) + (lows[block_number] - highs).clamp(min=0)
-        near = torch.nonzero(torch.linalg.vector_norm(gaps, dim=-1) <= bound)[:, 0].tolist()
-        distances = _other_distances(block, torch.cat([blocks[other] for other in near]), k)
+        near_blocks = torch.nonzero(torch.linalg.vector_norm(gaps, dim=-1) <= bound)[:, 0].tolist()
+        distances = _other_distances(block, torch.cat([blocks[number] for number in near_blocks]), k)
         result[order[start : start + BLOCK]] = distances
     return result
 

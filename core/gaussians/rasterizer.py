@@ -48,7 +48,7 @@ def rasterization(
     Differentiable by every tensor. Raises SettingsError for shapes and values that do not fit,
     EngineError for kernels that are not installed.
     """
-    n = _count(means, 3, "means")
+    n = _check_rows(means, 3, "means")
     _check_shape(quats, (n, 4), "quats")
     _check_shape(scales, (n, 3), "scales")
     _check_shape(opacities, (n,), "opacities")
@@ -91,7 +91,7 @@ def splat(
     Differentiable by every tensor. Raises SettingsError for shapes and values that do not fit,
     EngineError for kernels that are not installed.
     """
-    n = _count(centres, 2, "centres")
+    n = _check_rows(centres, 2, "centres")
     _check_shape(covariances, (n, 3), "covariances")
     _check_shape(opacities, (n,), "opacities")
     _check_shape(colours, (n, 3), "colours")
@@ -117,7 +117,8 @@ def splat(
     )
 
 
-def _count(tensor: Tensor, width: int, name: str) -> int:
+def _check_rows(tensor: Tensor, width: int, name: str) -> int:
+    """Return n of a tensor that must be (n, width). Raises SettingsError for another shape."""
     if tensor.ndim != 2 or tensor.shape[1] != width:
         raise SettingsError(f"{name} has the shape {tuple(tensor.shape)}, but must be (n, {width}).")
     return tensor.shape[0]

@@ -120,10 +120,10 @@ def rasterize_scene(
         return torch.cat([weights.T @ values, weights.sum(0)[:, None]], -1)
 
     def median(pixels: Tensor) -> Tensor:
-        alpha, before = alphas_over(profiles(pixels, centres, covariances, None, None), opacities)
+        alpha, transmittance = alphas_over(profiles(pixels, centres, covariances, None, None), opacities)
         # Gaussians behind which at least half the light passes; the next one is the median, or the appended 0.
-        passed = (before * (1 - alpha) >= 0.5).sum(0)
-        return torch.cat([depths, depths.new_zeros(1)])[passed]
+        num_in_front = (transmittance * (1 - alpha) >= 0.5).sum(0)
+        return torch.cat([depths, depths.new_zeros(1)])[num_in_front]
 
     pixels = pixel_centres(width, height, means)
     with torch.no_grad():

@@ -29,29 +29,31 @@ MIN_TRANSMITTANCE = TRANSMITTANCE_MIN * (1 - OPACITY_MAX) / 2
 """A lower bound on the transmittance behind any entry that contributes."""
 
 
-def _pixels(like: Tensor) -> Tensor:
+def _tile_pixels(like: Tensor) -> Tensor:
     """Return (TILE², 3) pixel centres relative to the middle of a tile, and ones: x, y, 1."""
     along = torch.arange(TILE, dtype=like.dtype, device=like.device) + 0.5 - TILE / 2
     grid = torch.cartesian_prod(along, along).flip(-1)
     return torch.cat([grid, torch.ones_like(grid[:, :1])], -1)
 
 
-def _groups(lists: TileLists, filler: int) -> Iterator[tuple[Tensor, Tensor]]:
+def _tile_groups(lists: TileLists, filler: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield groups of tiles that are processed together, longest lists first: (b,) tile numbers and (b, longest)
     entries, padded with `filler`, the row of an invisible Gaussian. Tiles without entries are omitted."""
     lengths = lists.starts.diff()
     order = torch.argsort(lengths, descending=True, stable=True)
-    busy = int((lengths > 0).sum())
-    for first in range(0, busy, TILES_PER_GROUP):
-        tiles = order[first : min(first + TILES_PER_GROUP, busy)]
+    num_nonempty = int((lengths > 0).sum())
+    for first in range(0, num_nonempty, TILES_PER_GROUP):
+        tiles = order[first : min(first + TILES_PER_GROUP, num_nonempty)]
         place = torch.arange(int(lengths[tiles[0]]), device=tiles.device)
-        inside = place < lengths[tiles, None]  # beyond the end of a list: index 0, to be replaced
-        entries = lists.entries[(lists.starts[tiles, None] + place) * inside]
-        yield tiles, torch.where(inside, entries, filler)
+        is_entry = place < lengths[tiles, None]  # beyond the end of a list: index 0, to be replaced
+        entries = lists.entries[(lists.starts[tiles, None] + place) * is_entry]
+        yield tiles, torch.where(is_entry, entries, filler)
 
 
 class _Chunk:
-    """A chunk of k entries of b tiles, evaluated at all pixels; tensors are (b, pixels, k) unless stated otherwise."""
+    """A chunk of k entries of b tiles, evaluated at all pixels; tensors are (b, pixels, k) unless stated otherwise.
+
+    u, v: whitened offsets; g: profiles; of rings r, the distance, w, and t = (r - r0) / w; of arcs a_u and a_v."""
 
     def __init__(self, gaussians: WhitenedGaussians, index: Tensor, origins: Tensor, pixels: Tensor) -> None:
         """index (b, k): rows of `gaussians`; origins (b, 2): middles of the tiles, px; pixels: see `_pixels`."""
@@ -85,22 +87,22 @@ class _Chunk:
     def backward(self, h: Tensor) -> list[Tensor]:
         """Return the gradients, (b, k) each, from h = dL/dlog g (b, pixels, k): five of the places, then those of ring
         and arc."""
-        extras = []
+        d_shapes = []
         scaled = h  # -2 dL/dq
         if self.gaussians.rings is not None:
             dr = h * self.t / self.w  # dL/dr0
-            extras += [dr.sum(1), (dr * self.t).sum(1)]
+            d_shapes += [dr.sum(1), (dr * self.t).sum(1)]
             scaled = dr / self.r
         scaled_u, scaled_v = scaled * self.u, scaled * self.v  # -dL/du, -dL/dv
         if self.gaussians.arcs is not None:
-            extras += [(h * self.u).sum(1), (h * self.v).sum(1), -h.sum(1)]
+            d_shapes += [(h * self.u).sum(1), (h * self.v).sum(1), -h.sum(1)]
             scaled_u, scaled_v = scaled_u - h * self.a_u, scaled_v - h * self.a_v
         # Sums over the pixels, times x, y, 1.
         sx_u, _, s_u = (self.pixels.T @ scaled_u).unbind(1)
         sx_v, sy_v, s_v = (self.pixels.T @ scaled_v).unbind(1)
         d_cx, d_cy = self.w_xx * s_u + self.w_yx * s_v, self.w_yy * s_v
         d_whitening = [self.cx * s_u - sx_u, self.cx * s_v - sx_v, self.cy * s_v - sy_v]
-        return [d_cx, d_cy, *d_whitening, *extras]
+        return [d_cx, d_cy, *d_whitening, *d_shapes]
 
 
 def _tile_centres(tiles: Tensor, columns: int) -> Tensor:
@@ -125,22 +127,22 @@ class _DrawTiles(torch.autograd.Function):
         ctx.lists, ctx.blend = lists, blend
         gaussians = _append_empty(WhitenedGaussians(*parts))  # type: ignore[arg-type]
         n, channels = len(gaussians.values) - 1, gaussians.values.shape[1] - 1
-        pixels = _pixels(gaussians.values)
+        pixels = _tile_pixels(gaussians.values)
         picture = gaussians.values.new_zeros(lists.columns * lists.rows, TILE * TILE, channels)
         median_rows = torch.full(picture.shape[:2], -1, dtype=torch.int64, device=picture.device)
-        for tiles, entries in _groups(lists, n):
+        for tiles, entries in _tile_groups(lists, n):
             total = torch.zeros_like(picture[tiles])
-            before = torch.ones_like(total[..., :1])
+            t_before = torch.ones_like(total[..., :1])
             for index in entries.split(ENTRIES_PER_CHUNK, 1):
                 chunk = _Chunk(gaussians, index, _tile_centres(tiles, lists.columns), pixels)
-                weights, after = _blend_weights(chunk, blend, before)
+                weights, t_after = _blend_weights(chunk, blend, t_before)
                 total.baddbmm_(weights, chunk.values)
                 if blend == "add":
                     continue
                 if median:
-                    median_rows[tiles] = torch.maximum(median_rows[tiles], _median_rows(before, after, index))
-                before = after[..., -1:]
-                if float(before.max()) < TRANSMITTANCE_MIN:
+                    median_rows[tiles] = torch.maximum(median_rows[tiles], _median_rows(t_before, t_after, index))
+                t_before = t_after[..., -1:]
+                if float(t_before.max()) < TRANSMITTANCE_MIN:
                     break
             picture[tiles] = total
         ctx.save_for_backward(picture, *parts)
@@ -153,56 +155,56 @@ class _DrawTiles(torch.autograd.Function):
         picture, *parts = ctx.saved_tensors
         lists: TileLists = ctx.lists
         gaussians = _append_empty(WhitenedGaussians(*parts))
-        # Widths of values, places, rings and arcs in the rows of `sums`.
-        columns = [0 if part is None else part.shape[1] for part in (gaussians.values, *gaussians[:1], *gaussians[2:])]
-        sums = gaussians.values.new_zeros(len(gaussians.values), sum(columns))
-        pixels = _pixels(gaussians.values)
-        for tiles, entries in _groups(lists, len(gaussians.values) - 1):
+        # Of values, places, rings and arcs in the rows of `sums`.
+        widths = [0 if part is None else part.shape[1] for part in (gaussians.values, *gaussians[:1], *gaussians[2:])]
+        sums = gaussians.values.new_zeros(len(gaussians.values), sum(widths))
+        pixels = _tile_pixels(gaussians.values)
+        for tiles, entries in _tile_groups(lists, len(gaussians.values) - 1):
             upstream = gradient[tiles]
             remaining = (upstream * picture[tiles]).sum(-1, keepdim=True)  # of the sum, behind the entry
-            before = torch.ones_like(remaining)
+            t_before = torch.ones_like(remaining)
             for index in entries.split(ENTRIES_PER_CHUNK, 1):
                 chunk = _Chunk(gaussians, index, _tile_centres(tiles, lists.columns), pixels)
-                weights, after = _blend_weights(chunk, ctx.blend, before)
+                weights, t_after = _blend_weights(chunk, ctx.blend, t_before)
                 h = upstream @ chunk.values.transpose(1, 2)
                 h *= weights
                 if ctx.blend == "over":
-                    behind = remaining - h.cumsum(-1)
+                    remaining_behind = remaining - h.cumsum(-1)
                     # weights / after: alpha / (1 - alpha), or 0 if the entry did not count
-                    h.addcmul_(weights / after.clamp(min=MIN_TRANSMITTANCE), behind, value=-1)
-                    remaining, before = behind[..., -1:], after[..., -1:]
+                    h.addcmul_(weights / t_after.clamp(min=MIN_TRANSMITTANCE), remaining_behind, value=-1)
+                    remaining, t_before = remaining_behind[..., -1:], t_after[..., -1:]
                 d_peaks = h.sum(1) / chunk.peaks[:, 0].clamp(min=ALPHA_MIN)
                 d_values = weights.transpose(1, 2) @ upstream
                 gradients = torch.stack([d_peaks, *d_values.unbind(-1), *chunk.backward(h)], -1)
                 sums.index_add_(0, index.flatten(), gradients.flatten(0, 1))
-                if ctx.blend == "over" and float(before.max()) < TRANSMITTANCE_MIN:
+                if ctx.blend == "over" and float(t_before.max()) < TRANSMITTANCE_MIN:
                     break
-        values, places, rings, arcs = sums[:-1].split(columns, 1)
+        values, places, rings, arcs = sums[:-1].split(widths, 1)
         return (
             None, None, None, places.to(gaussians.places.dtype), values,
             None if gaussians.rings is None else rings, None if gaussians.arcs is None else arcs,
         )  # fmt: skip
 
 
-def _blend_weights(chunk: _Chunk, blend: Blend, before: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weights (b, pixels, k) of the entries and the transmittances behind them; before (b, pixels, 1): the
+def _blend_weights(chunk: _Chunk, blend: Blend, t_before: Tensor) -> tuple[Tensor, Tensor]:
+    """Return weights (b, pixels, k) of the entries and the transmittances behind them; t_before (b, pixels, 1): the
     transmittance in front of the chunk, which "add" returns unchanged."""
     if blend == "add":
-        return threshold(chunk.g, PROFILE_MIN, 0.0), before
+        return threshold(chunk.g, PROFILE_MIN, 0.0), t_before
     alpha = threshold(chunk.peaks * chunk.g, ALPHA_MIN, 0.0)
-    after = torch.cumprod(1 - alpha, -1).mul_(before)
-    reaching = torch.cat([before, after[..., :-1]], -1)
-    return alpha.mul_(threshold(reaching, TRANSMITTANCE_MIN, 0.0)), after
+    t_after = torch.cumprod(1 - alpha, -1).mul_(t_before)
+    t_in_front = torch.cat([t_before, t_after[..., :-1]], -1)
+    return alpha.mul_(threshold(t_in_front, TRANSMITTANCE_MIN, 0.0)), t_after
 
 
-def _median_rows(transmittance: Tensor, next_transmittance: Tensor, index: Tensor) -> Tensor:
+def _median_rows(t_before: Tensor, t_after: Tensor, index: Tensor) -> Tensor:
     """Return (b, pixels) the row at which the transmittance falls below 1/2, -1 if at none of `index` (b, k).
 
-    transmittance (b, pixels, 1): in front of the chunk; next_transmittance (b, pixels, k): behind each entry."""
-    limit = torch.full_like(transmittance, -0.5)
+    t_before (b, pixels, 1): transmittance in front of the chunk; t_after (b, pixels, k): behind each entry."""
+    limit = torch.full_like(t_before, -0.5)
     # Negated, since searchsorted needs ascending order.
-    place = torch.searchsorted(next_transmittance.neg(), limit, right=True)[..., 0]
-    crosses = (place < index.shape[1]) & (transmittance[..., 0] >= 0.5)
+    place = torch.searchsorted(t_after.neg(), limit, right=True)[..., 0]
+    crosses = (place < index.shape[1]) & (t_before[..., 0] >= 0.5)
     return torch.where(crosses, index.gather(1, place.clamp(max=index.shape[1] - 1)), -1)
 
 

@@ -213,9 +213,9 @@ def _as_warp_array(tensor: Tensor) -> Any:
     return wp.from_torch(tensor.detach(), dtype=kind, requires_grad=False)
 
 
-def _launch(kernel: Any, lists: TileLists, blend: Blend, parts: Any, more: list[Any]) -> None:
+def _launch(kernel: Any, lists: TileLists, blend: Blend, parts: Any, other_arrays: list[Any]) -> None:
     """Launch a kernel with one thread for each pixel of each tile. parts: the fields of `WhitenedGaussians`; absent
-    rings and arcs are passed as zeros. more: Warp arrays behind the common ones, the outputs among them."""
+    rings and arcs are passed as zeros. other_arrays: Warp arrays behind the common ones, the outputs among them."""
     places, values, rings, arcs = parts
     shapes = values.new_zeros(len(values), SHAPES)
     if rings is not None:
@@ -227,7 +227,7 @@ def _launch(kernel: Any, lists: TileLists, blend: Blend, parts: Any, more: list[
         _as_warp_array(lists.entries.int()), _as_warp_array(lists.starts.int()), lists.columns,
         _as_warp_array(places.float().contiguous()), _as_warp_array(values[:, 0].contiguous()),
         _as_warp_array(values[:, 1:].contiguous()), _as_warp_array(shapes), rings is not None, arcs is not None,
-        blend == "add", *more,
+        blend == "add", *other_arrays,
     ]  # fmt: skip
     stream = wp.stream_from_torch(values.device) if device.is_cuda else None
     wp.launch(

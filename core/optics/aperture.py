@@ -14,6 +14,9 @@ EDGE_STEPS = 1440
 MIN_FACING = 0.05
 """Cosine of 87 degrees: the largest angle between a direction and the normal of a blade that bounds it."""
 
+ABSORPTION = 0.9
+"""Share of the light that a speck of dust or a scratch takes."""
+
 
 @dataclass(frozen=True)
 class Aperture:
@@ -50,7 +53,7 @@ def edge_radius(aperture: Aperture, sectors: int) -> Array:
 def transmission(aperture: Aperture, size: int, fill: float) -> Array:
     """Return the stop as a picture (size, size), 0..1, its radius `fill` of half the side.
 
-    Dust and scratches on the glass let a tenth of the light through."""
+    Dust and scratches on the glass absorb ABSORPTION of the light."""
     axis = (np.arange(size) + 0.5) / size * 2 - 1
     x, y = np.meshgrid(axis / fill, axis / fill)
     radius, angle = np.hypot(x, y), np.arctan2(y, x)
@@ -62,11 +65,11 @@ def transmission(aperture: Aperture, size: int, fill: float) -> Array:
     for _ in range(aperture.dust):
         offset, azimuth, speck_radius = np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi), rng.uniform(0.004, 0.02)
         distance = np.hypot(x - offset * np.cos(azimuth), y - offset * np.sin(azimuth))
-        mask *= 1 - 0.9 * np.clip((speck_radius - distance) * fill * size / 2 + 0.5, 0, 1)
+        mask *= 1 - ABSORPTION * np.clip((speck_radius - distance) * fill * size / 2 + 0.5, 0, 1)
     for _ in range(aperture.scratches):
         rotation, offset, width = rng.uniform(0, np.pi), rng.uniform(-0.9, 0.9), rng.uniform(0.002, 0.006)
         centre, half_length = rng.uniform(-0.6, 0.6), rng.uniform(0.1, 0.8)
         along, across = x * np.cos(rotation) + y * np.sin(rotation), y * np.cos(rotation) - x * np.sin(rotation)
         distance = np.maximum(np.abs(across - offset) - width, np.abs(along - centre) - half_length)
-        mask *= 1 - 0.9 * np.clip(0.5 - distance * fill * size / 2, 0, 1)
+        mask *= 1 - ABSORPTION * np.clip(0.5 - distance * fill * size / 2, 0, 1)
     return mask

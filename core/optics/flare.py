@@ -87,7 +87,7 @@ def build_optics(setup: LensSetup) -> tuple[Optics, list[tuple[int, int]]]:
     aperture = Aperture(float(lens.semi_aperture[lens.stop]) * setup.stop_down, setup.blades, setup.turn, setup.curved,
                         setup.uneven, setup.dust, setup.seed, setup.scratches)
     optics = Optics(lens, coatings(lens, setup.coating), aperture)
-    return optics, optics.pairs(setup.ghosts.count)
+    return optics, optics.brightest_pairs(setup.ghosts.count)
 
 
 def render_flare(setup: LensSetup, camera: Camera, light: Sequence[float] | NDArray[np.float64], *,

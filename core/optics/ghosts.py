@@ -28,6 +28,16 @@ REFERENCE_WAVELENGTH = 0.55
 """Micrometres."""
 COARSE_RAYS = 25
 """Rays along each side of the coarse grid that finds the bundle of rays which passes the lens."""
+BUNDLE_MARGIN = 1.05
+"""Distance from the axis, relative to rims and stop, up to which a coarse ray counts as one of the bundle."""
+COARSE_EXTENT = 1.15
+"""Half the side of the coarse grid, relative to the first surface's rim."""
+PAIR_RAYS = 21
+"""Rays along each side of the grid by which pairs of reflections are compared."""
+MIN_SPREAD = 0.02
+"""Added to the extent of a ghost on the sensor when pairs are compared, relative to the focal length."""
+EDGE_SECTORS = 720
+"""Sectors of the stop's edge: half a degree each."""
 MAX_SUPERSAMPLED_WIDTH = 1300
 """Width in pixels above which ghosts are not supersampled."""
 MAX_DENSITY = 40.0
@@ -71,14 +81,14 @@ class Optics:
         """z of the sensor, focused at infinity."""
         return float(self.lens.vertices[-1] + self.lens.back_focus())
 
-    def pairs(self, count: int, fill: float = 0.12) -> list[tuple[int, int]]:
+    def brightest_pairs(self, count: int, fill: float = 0.12) -> list[tuple[int, int]]:
         """Return the `count` pairs (first, second) of surfaces whose ghosts have the most light by area on the sensor.
 
         fill: tan of the field angle of the light for which they are compared."""
         surfaces = _trace_arguments(self, REFERENCE_WAVELENGTH)
         optical = [index for index in range(len(self.coating)) if index != self.lens.stop]
         scored = []
-        axis = np.linspace(-1, 1, 21) * self.lens.semi_aperture[0]
+        axis = np.linspace(-1, 1, PAIR_RAYS) * self.lens.semi_aperture[0]
         for position, first in enumerate(optical):
             for second in optical[position + 1:]:
                 rays, arrived = trace_grid(axis, axis, fill, first, second, *surfaces)
@@ -87,7 +97,7 @@ class Optics:
                 if passes.sum() < 2:
                     continue
                 # A focused ghost has no area; the added length keeps it from passing all others.
-                spread = np.ptp(rays[passes][:, :2], axis=0).max() + 0.02 * self.lens.focal_length()
+                spread = np.ptp(rays[passes][:, :2], axis=0).max() + MIN_SPREAD * self.lens.focal_length()
                 scored.append((rays[passes][:, WEIGHT].sum() / spread**2, first, second))
         return [(first, second) for _, first, second in sorted(scored, reverse=True)[:count]]
 
@@ -121,9 +131,9 @@ def _non_negative_span(start: float, slope: float, left: float, right: float) ->
 
 
 @compile_cached
-def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: Array, stop_x: Array,
-               stop_y: Array, radius: float, edges: Array, rim: float, colour: Array,
-               picture: NDArray[np.float32]) -> None:
+def _draw_cells(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: Array, stop_x: Array,
+                stop_y: Array, radius: float, edges: Array, rim: float, colour: Array,
+                picture: NDArray[np.float32]) -> None:
     """Add the cells of a traced grid to `picture`, each as two triangles.
 
     rays: (rows, columns, FIELDS). arrived: which of them reach the sensor. px, py: where, in pixels. light: their
@@ -137,9 +147,9 @@ def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, li
     sectors = edges.shape[0]
     for row in range(rows - 1):
         for column in range(columns - 1):
-            for half in range(2):
+            for triangle in range(2):
                 r0, c0 = row, column
-                if half == 0:
+                if triangle == 0:
                     r1, c1, r2, c2 = row, column + 1, row + 1, column + 1
                 else:
                     r1, c1, r2, c2 = row + 1, column + 1, row + 1, column
@@ -227,7 +237,7 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
     slope = math.hypot(*light)
     azimuth = math.atan2(light[1], light[0])
     cosine, sine = math.cos(azimuth), math.sin(azimuth)
-    edges = edge_radius(optics.aperture, 720)
+    edges = edge_radius(optics.aperture, EDGE_SECTORS)
     bands = responses(settings.bands)
     surfaces = _trace_arguments(optics, REFERENCE_WAVELENGTH)
     grids = {pair: _find_bundle(optics, slope, pair, surfaces, settings.grid) for pair in pairs}
@@ -241,20 +251,21 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
             x, y = -rays[..., SENSOR_X] / length, -rays[..., SENSOR_X + 1] / length
             cell = (grid[0][1] - grid[0][0]) * (grid[1][1] - grid[1][0]) / (math.pi * length**2)
             # The root is the cosine of the field angle, at which the beam enters.
-            dense = _density(x, y, cell) * rays[..., WEIGHT] / math.sqrt(1 + slope**2)
+            density = _density(x, y, cell) * rays[..., WEIGHT] / math.sqrt(1 + slope**2)
             px = supersample * (centre[0] + focal[0] * (cosine * x - sine * y))
             py = supersample * (centre[1] + focal[1] * (sine * x + cosine * y))
-            sx, sy = rays[..., STOP_X::2], rays[..., STOP_X + 1::2]
-            _rasterise(rays, arrived, px, py, dense, cosine * sx - sine * sy, sine * sx + cosine * sy,
-                       optics.aperture.radius, edges, settings.rim, bands[band], picture)
+            stop_x, stop_y = rays[..., STOP_X::2], rays[..., STOP_X + 1::2]
+            _draw_cells(rays, arrived, px, py, density, cosine * stop_x - sine * stop_y,
+                        sine * stop_x + cosine * stop_y, optics.aperture.radius, edges, settings.rim, bands[band],
+                        picture)
     # OpenCV needs a blur above 0.
-    soft = cv2.GaussianBlur(picture, (0, 0), max(settings.size * focal[0] * supersample, 0.3))
-    small = cv2.resize(soft, (width, height), interpolation=cv2.INTER_AREA)
-    return limited((small * np.float32(settings.gain)).astype(np.float32), settings.limit)
+    blurred = cv2.GaussianBlur(picture, (0, 0), max(settings.size * focal[0] * supersample, 0.3))
+    light_map = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_AREA)
+    return limit_brightness((light_map * np.float32(settings.gain)).astype(np.float32), settings.limit)
 
 
-def limited(light: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
-    """Return light (..., 3), dimmed in the same hue where a channel exceeds `limit`."""
+def limit_brightness(light: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
+    """Return light (..., 3), dimmed in the same hue where a channel exceeds `limit`; the same array if none does."""
     brightest = light.max(-1, keepdims=True)
     if not (brightest > np.float32(limit)).any():
         return light
@@ -275,14 +286,14 @@ def _find_bundle(optics: Optics, slope: float, pair: tuple[int, int], surfaces: 
     The bundle's bounds are those of the rays of a coarse grid that pass, or nearly do, and one cell more.
     slope: tan of the field angle. surfaces: see `_trace_arguments`. grid: rays along each side."""
     # Oblique rays may meet the plane of the first vertex outside the rim of the first surface.
-    extent = 1.15 * optics.lens.semi_aperture[0]
+    extent = COARSE_EXTENT * optics.lens.semi_aperture[0]
     axis = np.linspace(-extent, extent, COARSE_RAYS)
     rays, arrived = trace_grid(axis, axis, slope, *pair, *surfaces)
     radius = np.hypot(rays[..., STOP_X::2], rays[..., STOP_X + 1::2]).max(axis=-1)
-    passes = arrived & (rays[..., STRAY] < 1.05) & (radius < 1.05 * optics.aperture.radius)
+    passes = arrived & (rays[..., STRAY] < BUNDLE_MARGIN) & (radius < BUNDLE_MARGIN * optics.aperture.radius)
     if not passes.any():
         return None
-    step = axis[1] - axis[0]
+    spacing = axis[1] - axis[0]
     rows, columns = np.flatnonzero(passes.any(axis=1)), np.flatnonzero(passes.any(axis=0))
-    return (np.linspace(axis[columns[0]] - step, axis[columns[-1]] + step, grid),
-            np.linspace(axis[rows[0]] - step, axis[rows[-1]] + step, grid))
+    return (np.linspace(axis[columns[0]] - spacing, axis[columns[-1]] + spacing, grid),
+            np.linspace(axis[rows[0]] - spacing, axis[rows[-1]] + spacing, grid))

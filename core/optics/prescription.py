@@ -213,8 +213,8 @@ def read_prescription(path: Path | str) -> Prescription:
     return parse_prescription(text, path.stem, str(path))
 
 
-def parse_prescription(text: str, name: str, where: str = "The lens") -> Prescription:
-    """Parse the text format of the module's head; `where` begins the message of a SettingsError."""
+def parse_prescription(text: str, name: str, source: str = "The lens") -> Prescription:
+    """Parse the text format of the module's head. Raises SettingsError, with a message that begins with `source`."""
     surfaces: list[list[float]] = []
     stop = -1
     for number, line in enumerate(text.splitlines(), 1):
@@ -229,13 +229,13 @@ def parse_prescription(text: str, name: str, where: str = "The lens") -> Prescri
         except ValueError:
             surface = []
         if len(surface) < 5 or not all(map(math.isfinite, surface)) or surface[INDEX] < 0.9 or surface[DIAMETER] <= 0:
-            raise SettingsError(f"{where}, line {number}, is not a surface; give radius, thickness, index, Abbe "
+            raise SettingsError(f"{source}, line {number}, is not a surface; give radius, thickness, index, Abbe "
                                 "number, clear diameter.")
         surfaces.append(surface)
     if len(surfaces) < 3:
-        raise SettingsError(f"{where} is not a lens; it needs two surfaces at least and a line that starts with stop.")
+        raise SettingsError(f"{source} is not a lens; it needs two surfaces at least and a line that starts with stop.")
     if stop < 0:
-        raise SettingsError(f"{where} has no line that starts with stop, like converters, attachments and mirror "
+        raise SettingsError(f"{source} has no line that starts with stop, like converters, attachments and mirror "
                             "lenses; add the aperture stop, or choose another lens.")
     radius, thickness, index, abbe, diameter = np.array(surfaces).T
     curvature = np.divide(1.0, radius, out=np.zeros_like(radius), where=radius != 0)

@@ -145,8 +145,8 @@ def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) 
 
 
 def draw_streak(settings: Streak, light: tuple[float, float], x: Pixels, y: Pixels) -> Pixels:
-    """Return a streak through the light, and its fainter mirror image, (height, width, 3); coordinates as in
-    `draw_ring`."""
+    """Return a streak through the light, and its fainter mirror image, at image coordinates (x, y), (height, width, 3).
+    x, y and light: tan from the principal point."""
     cosine, sine = math.cos(math.radians(settings.turn)), math.sin(math.radians(settings.turn))
     total = np.zeros(x.shape, np.float32)
     for position_factor, streak_gain in ((1.0, 1.0), (MIRROR_POSITION, settings.mirror)):

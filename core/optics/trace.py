@@ -43,15 +43,15 @@ def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating:
         return 1.0
     c2 = math.sqrt(1.0 - s2 * s2)
     if coating <= 0.0:
-        rs = (n0 * cosine - n2 * c2) / (n0 * cosine + n2 * c2)
-        rp = (n2 * cosine - n0 * c2) / (n2 * cosine + n0 * c2)
-        return 0.5 * (rs * rs + rp * rp)
+        r_s = (n0 * cosine - n2 * c2) / (n0 * cosine + n2 * c2)
+        r_p = (n2 * cosine - n0 * c2) / (n2 * cosine + n0 * c2)
+        return 0.5 * (r_s * r_s + r_p * r_p)
     n1 = max(math.sqrt(n0 * n2), COATING_INDEX)
     s1 = sine * n0 / n1
     if s1 >= 1.0:
         return 1.0
     c1 = math.sqrt(1.0 - s1 * s1)
-    wave = math.cos(math.pi * coating / wavelength * c1)  # the layer is coating / (4 n1) thick
+    phase_cosine = math.cos(math.pi * coating / wavelength * c1)  # the layer is coating / (4 n1) thick
     total = 0.0
     for polarisation in range(2):
         if polarisation == 0:
@@ -60,8 +60,9 @@ def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating:
         else:
             r01 = (n1 * cosine - n0 * c1) / (n1 * cosine + n0 * c1)
             r12 = (n2 * c1 - n1 * c2) / (n2 * c1 + n1 * c2)
-        both = r01 * r12
-        total += (r01 * r01 + r12 * r12 + 2.0 * both * wave) / (1.0 + both * both + 2.0 * both * wave)
+        product = r01 * r12
+        numerator = r01 * r01 + r12 * r12 + 2.0 * product * phase_cosine
+        total += numerator / (1.0 + product * product + 2.0 * product * phase_cosine)
     return max(0.5 * total, 0.0)  # where the two waves cancel, rounding may fall below zero
 
 
@@ -75,71 +76,71 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
     `Prescription`; stop: index of the stop; sensor: its z. Returns False where the ray misses a surface or is reflected
     totally. `out` (FIELDS,) receives the result.
     """
-    length = math.sqrt(1.0 + slope * slope)
-    dx, dy, dz = -slope / length, 0.0, 1.0 / length
+    slope_norm = math.sqrt(1.0 + slope * slope)
+    dx, dy, dz = -slope / slope_norm, 0.0, 1.0 / slope_norm
     px, py, pz = x, y, 0.0
     count = curvature.shape[0]
-    stray, weight, passages = 0.0, 1.0, 0
-    at, step, turns = 0, 1, 0
-    while at < count:
-        c, z0 = curvature[at], vertices[at]
+    max_stray, weight, passages = 0.0, 1.0, 0
+    surface, direction, reflections = 0, 1, 0
+    while surface < count:
+        c, z0 = curvature[surface], vertices[surface]
         # Meet the sphere (or plane, c = 0): a t^2 - 2 b t + k = 0, the root nearest to the vertex.
         oz = pz - z0
         a = c
         b = dz - c * (px * dx + py * dy + oz * dz)
         k = c * (px * px + py * py + oz * oz) - 2.0 * oz
-        inside = b * b - a * k
-        if inside < 0.0:
+        discriminant = b * b - a * k
+        if discriminant < 0.0:
             return False
-        root = math.sqrt(inside)
+        root = math.sqrt(discriminant)
         distance = k / (b + math.copysign(root, b))
         px += distance * dx
         py += distance * dy
         pz += distance * dz
         radius = math.sqrt(px * px + py * py)
-        if at == stop:
+        if surface == stop:
             if passages < 3:
                 out[STOP_X + 2 * passages] = px
                 out[STOP_Y + 2 * passages] = py
                 passages += 1
-            at += step
+            surface += direction
             continue
-        stray = max(stray, radius / semi_aperture[at])
-        before = index[at - 1] if at > 0 else 1.0
-        after = index[at]
-        n0, n2 = (before, after) if step > 0 else (after, before)
+        max_stray = max(max_stray, radius / semi_aperture[surface])
+        index_before = index[surface - 1] if surface > 0 else 1.0
+        index_after = index[surface]
+        n0, n2 = (index_before, index_after) if direction > 0 else (index_after, index_before)
         # The normal, turned along the ray.
         nx, ny, nz = -c * px, -c * py, 1.0 - c * (pz - z0)
         cosine = nx * dx + ny * dy + nz * dz
         if cosine < 0.0:
             nx, ny, nz, cosine = -nx, -ny, -nz, -cosine
         cosine = min(cosine, 1.0)
-        share = reflectance(cosine, n0, n2, wavelength, coating[at])
-        if (turns == 0 and at == second) or (turns == 1 and at == first):
-            weight *= share
+        reflected = reflectance(cosine, n0, n2, wavelength, coating[surface])
+        if (reflections == 0 and surface == second) or (reflections == 1 and surface == first):
+            weight *= reflected
             dx -= 2.0 * cosine * nx
             dy -= 2.0 * cosine * ny
             dz -= 2.0 * cosine * nz
-            step = -step
-            turns += 1
+            direction = -direction
+            reflections += 1
         else:
-            if share >= 1.0:
+            if reflected >= 1.0:
                 return False
-            weight *= 1.0 - share
+            weight *= 1.0 - reflected
             ratio = n0 / n2
-            bend = math.sqrt(1.0 - ratio * ratio * (1.0 - cosine * cosine)) - ratio * cosine
-            dx = ratio * dx + bend * nx
-            dy = ratio * dy + bend * ny
-            dz = ratio * dz + bend * nz
-        at += step
+            normal_factor = math.sqrt(1.0 - ratio * ratio * (1.0 - cosine * cosine)) - ratio * cosine
+            dx = ratio * dx + normal_factor * nx
+            dy = ratio * dy + normal_factor * ny
+            dz = ratio * dz + normal_factor * nz
+        surface += direction
     distance = (sensor - pz) / dz
     out[SENSOR_X] = px + distance * dx
     out[SENSOR_Y] = py + distance * dy
-    out[STRAY] = stray
+    out[STRAY] = max_stray
     out[WEIGHT] = weight
-    for later in range(passages, 3):
-        out[STOP_X + 2 * later] = out[STOP_X]
-        out[STOP_Y + 2 * later] = out[STOP_Y]
+    for passage in range(passages, 3):
+        out[STOP_X + 2 * passage] = out[STOP_X]
+        out[STOP_Y + 2 * passage] = out[STOP_Y]
     return True
 
 

@@ -14,7 +14,7 @@ from core.fit.traced_flare import make_flare
 from core.fit.traced_settings import REFERENCE_REACH, TracedFlareSettings
 from core.look import ViewOfLight, draw, read_look
 from core.optics.flare import build_optics
-from core.optics.ghosts import draw_ghosts, limited
+from core.optics.ghosts import draw_ghosts, limit_brightness
 from core.optics.lenses import find_lens, lens_names
 from core.optics.prescription import parse_prescription
 from core.optics.starburst import starburst_texture
@@ -102,8 +102,8 @@ def test_ghosts_in_focus_have_a_limit_and_the_same_level() -> None:
     setup = traced_flare.setup_with_ghost_gain(TracedFlareSettings().override({**values, "ghosts.limit": 0.2}))
     assert setup.ghosts.gain > 1.02 * free.ghosts.gain
     light = np.array([[[0.1, 0.4, 0.2]], [[0.1, 0.1, 0.2]]], np.float32)
-    np.testing.assert_allclose(limited(light, 0.2), [[[0.05, 0.2, 0.1]], [[0.1, 0.1, 0.2]]], rtol=1e-6)
-    assert limited(light, 0.4) is light
+    np.testing.assert_allclose(limit_brightness(light, 0.2), [[[0.05, 0.2, 0.1]], [[0.1, 0.1, 0.2]]], rtol=1e-6)
+    assert limit_brightness(light, 0.4) is light
 
 
 def test_tangents_scale_with_the_frame() -> None:

@@ -47,11 +47,11 @@ def _release(reference: weakref.ref[Array]) -> None:
     _free_blocks.move_to_end(size)
     _free_bytes += size
     while _free_bytes > MAX_FREE_BYTES:
-        oldest, blocks = next(iter(_free_blocks.items()))
+        oldest_size, blocks = next(iter(_free_blocks.items()))
         blocks.pop()
-        _free_bytes -= oldest
+        _free_bytes -= oldest_size
         if not blocks:
-            del _free_blocks[oldest]
+            del _free_blocks[oldest_size]
 
 
 def _capacity(size: int) -> int:
@@ -61,9 +61,10 @@ def _capacity(size: int) -> int:
 
 
 def _allocate_aligned(size: int) -> Array:
+    """Return uninitialised bytes of this size that start at a cache line."""
     array = np.empty(size + CACHE_LINE, np.uint8)
-    first = -array.__array_interface__["data"][0] % CACHE_LINE
-    return array[first : first + size]
+    padding = -array.__array_interface__["data"][0] % CACHE_LINE
+    return array[padding : padding + size]
 
 
 def _take_block(capacity: int) -> Array:
@@ -96,11 +97,11 @@ def empty(count: int, dtype: npt.DTypeLike = np.float32) -> Array:
 
 def empty_many(*requests: tuple[int, type[np.generic]]) -> list[Array]:
     """Return several flat, uninitialised arrays of (count, type) in one block: one reference is cheaper than many."""
-    sizes = [-(-count * np.dtype(kind).itemsize // CACHE_LINE) * CACHE_LINE for count, kind in requests]
-    block, arrays, first = empty(sum(sizes), np.uint8), [], 0
-    for (count, kind), size in zip(requests, sizes, strict=True):
-        arrays.append(block[first : first + size].view(kind)[:count])
-        first += size
+    sizes = [-(-count * np.dtype(dtype).itemsize // CACHE_LINE) * CACHE_LINE for count, dtype in requests]
+    block, arrays, offset = empty(sum(sizes), np.uint8), [], 0
+    for (count, dtype), size in zip(requests, sizes, strict=True):
+        arrays.append(block[offset : offset + size].view(dtype)[:count])
+        offset += size
     return arrays
 
 

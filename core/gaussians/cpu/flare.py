@@ -74,7 +74,7 @@ from .layout import (
     Y,
 )
 from .projection import MARGIN, RUN_LOG2_RANGE, RUN_MAX
-from .raster_backward import EDGE, SCRATCH, V_BLUE, V_GREEN, V_RED, load_tile, moments, row_gradient
+from .raster_backward import PADDED_ROW, SCRATCH, V_BLUE, V_GREEN, V_RED, init_tile_backward, moments, row_gradient
 from .raster_backward import ROW as ROW_BACKWARD
 from .raster_backward import STATE as STATE_BACKWARD
 from .raster_forward import (
@@ -86,14 +86,14 @@ from .raster_forward import (
     ROW,
     blend_row,
     falloff,
+    init_tile,
     is_finished,
     is_needle,
     needle_offsets,
     next_entry,
-    ratio,
+    row_ratio,
     run_length,
     start_run,
-    start_tile,
     write_tile,
 )
 from .vector import (
@@ -114,8 +114,8 @@ from .vector import (
     where,
 )
 
-# Offsets in a shape: ring and arc of a Gaussian. SHARPNESS: s above; CUTOFF: the largest -log2 G that is drawn; ARC_U,
-# ARC_Y, ARC_NORM: b_x, b_s and m, over ln 2.
+# Offsets in a shape: ring and arc of a Gaussian, and what is derived from them. SHARPNESS: s above; CUTOFF: the largest
+# -log2 G that is drawn; ARC_U, ARC_Y, ARC_NORM: b_x, b_s and m, over ln 2.
 R0, SHARPNESS, WIDTH, CUTOFF, ARC_U, ARC_Y, ARC_NORM = range(7)
 SHAPE = 8
 
@@ -133,8 +133,8 @@ RADIUS2_MIN = np.float32(1e-12)
 def _cutoff_log2(opacity, add):
     """Return log2 of the peak over the smallest value that is drawn, opacity / ALPHA_MIN or 1 / PROFILE_MIN; negative
     if even the peak is below it."""
-    share = 4096.0 if add else opacity * 255.0
-    return math.log(share) / math.log(2.0) if share >= 1.0 else -1.0
+    peak_ratio = 4096.0 if add else opacity * 255.0
+    return math.log(peak_ratio) / math.log(2.0) if peak_ratio >= 1.0 else -1.0
 
 
 @inlined
@@ -142,41 +142,42 @@ def _arc_strength(arcs, i, xx, xy, yy):
     """Return beta, see `arc_strengths` of `..rendering`; 0 without arcs."""
     if arcs.size == 0:
         return 0.0
-    x, y = np.float64(arcs[3 * i]), np.float64(arcs[3 * i + 1])
-    return math.sqrt(max(xx * x * x + 2.0 * xy * x * y + yy * y * y, 0.0))
+    b_x, b_y = np.float64(arcs[3 * i]), np.float64(arcs[3 * i + 1])
+    return math.sqrt(max(xx * b_x * b_x + 2.0 * xy * b_x * b_y + yy * b_y * b_y, 0.0))
 
 
 @inlined
-def _tiles(centre, half, size, shift):
-    """Return the number of tiles that centre - half .. centre + half touches along one axis of `size` pixels; a tile
-    has 2^shift."""
-    return (int(min(centre + half, size - 1.0)) >> shift) - (int(max(centre - half, 0.0)) >> shift) + 1
+def _tiles_along(centre, half_extent, size, tile_shift):
+    """Return the number of tiles of 2^tile_shift pixels that centre - half_extent .. centre + half_extent touches along
+    an axis of `size` pixels."""
+    first_tile = int(max(centre - half_extent, 0.0)) >> tile_shift
+    return (int(min(centre + half_extent, size - 1.0)) >> tile_shift) - first_tile + 1
 
 
 @kernel
 def prepare_records(
     centres, covariances, opacities, colours, rings, arcs, width, height, add,
-    records, shapes, keys, bounds, firsts, chunk_bounds,
+    records, shapes, keys, max_tiles, first_slots, chunk_max_tiles,
 ):  # fmt: skip
     """Write record, shape, key and an upper bound on the number of tiles of each Gaussian; in float64, for needles.
 
-    The key is the Gaussian's index, so that the given order is kept; firsts, chunk_bounds: see `binning`. rings (n 2),
-    arcs (n 3): flat, empty if there are none. With the blend "add" the opacity is multiplied into the colour, and the
-    record's is 1.
-    """
+    centres, covariances, opacities, colours, rings (n 2) and arcs (n 3): the arguments of `splat`, flat; rings and arcs
+    are empty if there are none. keys: the index of a Gaussian, so that the given order is kept, or CULLED_KEY.
+    max_tiles, first_slots, chunk_max_tiles: see `tiles.bin_gaussians`. With the blend "add" the opacity is multiplied
+    into the colour, and the record's is 1."""
     half = -0.5 / math.log(2.0)  # h of `projection`
     for i in range(opacities.size):
-        at = i * RECORD
+        record = i * RECORD
         xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
         yy = np.float64(covariances[3 * i + 2])
         determinant = xx * yy - xy * xy
         opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), rendering.OPACITY_MAX)
-        r0, w = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
+        r0, ring_width = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
         cutoff = _cutoff_log2(opacity, add)
         # Mahalanobis; see `normalise_arcs` and `extent` of `..rendering`.
         plain_reach = math.sqrt(2.0 * math.log(2.0) * max(cutoff, 0.0))
-        reach = r0 + w * w * _arc_strength(arcs, i, xx, xy, yy) + abs(w) * plain_reach
-        keys[i], bounds[i] = CULLED_KEY, 0
+        reach = r0 + ring_width * ring_width * _arc_strength(arcs, i, xx, xy, yy) + abs(ring_width) * plain_reach
+        keys[i], max_tiles[i] = CULLED_KEY, 0
         if not (determinant > 0 and xx > 0 and cutoff >= 0 and reach >= 0):
             continue
         x, y, k = np.float64(centres[2 * i]), np.float64(centres[2 * i + 1]), -xy / yy
@@ -187,139 +188,150 @@ def prepare_records(
             continue
         gain = opacity if add else 1.0
         bend = major * k * k + minor
-        records[at + X], records[at + Y] = x, y
-        records[at + A], records[at + K], records[at + D] = major, k, minor
-        records[at + K_REST] = k - np.float64(records[at + K])
-        records[at + OPACITY] = 1.0 if add else opacity
-        records[at + STEP] = math.expm1(2.0 * bend * math.log(2.0))
-        records[at + RUN] = min(math.sqrt(RUN_LOG2_RANGE / -bend), np.float64(RUN_MAX))
-        records[at + RED], records[at + GREEN] = gain * colours[3 * i], gain * colours[3 * i + 1]
-        records[at + BLUE], records[at + DEPTH] = gain * colours[3 * i + 2], 0.0
-        records[at + REACH] = half * reach * reach - MARGIN
-        records[at + HALF_X], records[at + HALF_Y] = half_x, half_y
-        _write_shape(shapes, i, r0, w, cutoff, k, arcs)
+        records[record + X], records[record + Y] = x, y
+        records[record + A], records[record + K], records[record + D] = major, k, minor
+        records[record + K_REST] = k - np.float64(records[record + K])
+        records[record + OPACITY] = 1.0 if add else opacity
+        records[record + STEP] = math.expm1(2.0 * bend * math.log(2.0))
+        records[record + RUN] = min(math.sqrt(RUN_LOG2_RANGE / -bend), np.float64(RUN_MAX))
+        records[record + RED], records[record + GREEN] = gain * colours[3 * i], gain * colours[3 * i + 1]
+        records[record + BLUE], records[record + DEPTH] = gain * colours[3 * i + 2], 0.0
+        records[record + REACH] = half * reach * reach - MARGIN
+        records[record + HALF_X], records[record + HALF_Y] = half_x, half_y
+        _write_shape(shapes, i, r0, ring_width, cutoff, k, arcs)
         # Half a pixel wider than `binning` lists, so that rounding cannot make the bound too low.
-        columns = _tiles(x, half_x + 0.5, width, TILE_SHIFT_X)
-        keys[i], bounds[i] = i, columns * _tiles(y, half_y + 0.5, height, TILE_SHIFT_Y)
-    for chunk in range(chunk_bounds.size):
-        end = min(chunk * CHUNK + CHUNK, bounds.size)
-        chunk_bounds[chunk] = exclusive_sum(bounds, chunk * CHUNK, end, firsts)
+        columns = _tiles_along(x, half_x + 0.5, width, TILE_SHIFT_X)
+        keys[i], max_tiles[i] = i, columns * _tiles_along(y, half_y + 0.5, height, TILE_SHIFT_Y)
+    for chunk in range(chunk_max_tiles.size):
+        end = min(chunk * CHUNK + CHUNK, max_tiles.size)
+        chunk_max_tiles[chunk] = exclusive_sum(max_tiles, chunk * CHUNK, end, first_slots)
 
 
 @inlined
-def _write_shape(shapes, i, r0, w, cutoff, k, arcs):
-    """Write the shape of ring or arc i: radius, width, cutoff (log2), and the arc in the units of the record."""
-    at = i * SHAPE
-    shapes[at + R0], shapes[at + WIDTH] = r0, w
-    shapes[at + SHARPNESS] = 0.5 / (math.log(2.0) * w * w)
-    shapes[at + CUTOFF] = cutoff + MARGIN
+def _write_shape(shapes, i, r0, ring_width, cutoff, k, arcs):
+    """Write the shape of Gaussian i: radius and width of its ring, cutoff (log2), and its arc in the units of the
+    record.
+
+    k: of the record; arcs (n 3): flat, empty if there are none."""
+    shape = i * SHAPE
+    shapes[shape + R0], shapes[shape + WIDTH] = r0, ring_width
+    shapes[shape + SHARPNESS] = 0.5 / (math.log(2.0) * ring_width * ring_width)
+    shapes[shape + CUTOFF] = cutoff + MARGIN
     if arcs.size > 0:
-        x, y, m = np.float64(arcs[3 * i]), np.float64(arcs[3 * i + 1]), np.float64(arcs[3 * i + 2])
-        shapes[at + ARC_U], shapes[at + ARC_Y] = x / math.log(2.0), (y - k * x) / math.log(2.0)
-        shapes[at + ARC_NORM] = m / math.log(2.0)
+        b_x, b_y, m = np.float64(arcs[3 * i]), np.float64(arcs[3 * i + 1]), np.float64(arcs[3 * i + 2])
+        shapes[shape + ARC_U], shapes[shape + ARC_Y] = b_x / math.log(2.0), (b_y - k * b_x) / math.log(2.0)
+        shapes[shape + ARC_NORM] = m / math.log(2.0)
 
 
 # --- profiles --------------------------------------------------------------------------------------------
 
 
 @inlined
-def _row_start(records, at, left, y):
+def _row_start(records, record, left, y):
     """Return u at column `left` and d_y in the pixel row y, and k, the step of u from row to row; all float64."""
-    dy = y + 0.5 - np.float64(load_scalar(records, at + Y))
-    k = np.float64(load_scalar(records, at + K)) + np.float64(load_scalar(records, at + K_REST))
-    return left + 0.5 - np.float64(load_scalar(records, at + X)) + k * dy, dy, k
+    dy = y + 0.5 - np.float64(load_scalar(records, record + Y))
+    k = np.float64(load_scalar(records, record + K)) + np.float64(load_scalar(records, record + K_REST))
+    return left + 0.5 - np.float64(load_scalar(records, record + X)) + k * dy, dy, k
 
 
 @inlined
-def _distance(records, at, u, dy):
+def _distance(records, record, u, dy):
     """Return the Mahalanobis distance r."""
-    power = fma(u * load_scalar(records, at + A), u, load_scalar(records, at + D) * dy * dy)
+    power = fma(u * load_scalar(records, record + A), u, load_scalar(records, record + D) * dy * dy)
     return sqrt(maximum(power * -TWO_LN2, RADIUS2_MIN))
 
 
 @inlined
-def _negative_log2_profile(shapes, shape, z, u, dy, arcs):
-    """Return -log2 G. shape: offset in shapes; z = r - r0; arcs: whether there are arcs."""
+def _negative_log2_profile(shapes, shape, radial_offset, u, dy, arcs):
+    """Return -log2 G. shape: index of the Gaussian's first number in `shapes`; radial_offset = r - r0; arcs: whether
+    there are arcs."""
     if not arcs:
-        return z * z * load_scalar(shapes, shape + SHARPNESS)
+        return radial_offset * radial_offset * load_scalar(shapes, shape + SHARPNESS)
     level = load_scalar(shapes, shape + ARC_NORM) - load_scalar(shapes, shape + ARC_Y) * dy
-    return fma(z * z, load_scalar(shapes, shape + SHARPNESS), level - u * load_scalar(shapes, shape + ARC_U))
+    arc_term = level - u * load_scalar(shapes, shape + ARC_U)
+    return fma(radial_offset * radial_offset, load_scalar(shapes, shape + SHARPNESS), arc_term)
 
 
 # --- forward ---------------------------------------------------------------------------------------------
 
 
 @inlined
-def _add_row(state, at, e, records, record):
-    """Add one row of a Gaussian to the sums of a tile. at: offset of the row in the state; e: the profile."""
+def _add_row(state, state_row, e, records, record):
+    """Add one row of a Gaussian to the sums of a tile. state_row: index of the row's first number in the state; e:
+    profile."""
     e = where(e >= PROFILE_MIN, e, ZERO)
-    store(state, at + RED_PLANE, fma(e, load_scalar(records, record + RED), load(state, at + RED_PLANE)))
-    store(state, at + GREEN_PLANE, fma(e, load_scalar(records, record + GREEN), load(state, at + GREEN_PLANE)))
-    store(state, at + BLUE_PLANE, fma(e, load_scalar(records, record + BLUE), load(state, at + BLUE_PLANE)))
+    store(state, state_row + RED_PLANE, fma(e, load_scalar(records, record + RED), load(state, state_row + RED_PLANE)))
+    green, blue = load(state, state_row + GREEN_PLANE), load(state, state_row + BLUE_PLANE)
+    store(state, state_row + GREEN_PLANE, fma(e, load_scalar(records, record + GREEN), green))
+    store(state, state_row + BLUE_PLANE, fma(e, load_scalar(records, record + BLUE), blue))
 
 
 @inlined
-def _add_plain(state, records, at, left, top, first, end, start):
-    """Add a plain Gaussian to rows first .. end, by the recurrence unless it is a needle (see `raster_forward`). The
-    opacity in its record is 1."""
-    step, one = load_scalar(records, at + STEP), opaque(1)
-    needle, run = is_needle(records, at, end - first), run_length(records, at)
-    e, r, _ = start
-    row, stop = first, first if needle else min(first + run, end)
+def _add_plain(state, records, record, left, top, first_row, end_row, run_start):
+    """Add a plain Gaussian to rows first_row .. end_row - 1, by the recurrence unless it is a needle (see
+    `raster_forward`). The opacity in its record is 1."""
+    step, opaque_one = load_scalar(records, record + STEP), opaque(1)
+    is_narrow, run = is_needle(records, record, end_row - first_row), run_length(records, record)
+    e, r, _ = run_start
+    row, run_end = first_row, first_row if is_narrow else min(first_row + run, end_row)
     while True:
-        while row < stop:
-            _add_row(state, row * ROW, e, records, at)
+        while row < run_end:
+            _add_row(state, row * ROW, e, records, record)
             e = e * r
             r = fma(r, step, r)
-            row += one
-        if row >= end:
+            row += opaque_one
+        if row >= end_row:
             break
-        u, dy = needle_offsets(records, at, left, top + row)
-        e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
-        stop = row + 1 if needle else min(row + run, end)
+        u, dy = needle_offsets(records, record, left, top + row)
+        e, r = falloff(records, record, u, dy), row_ratio(records, record, u, dy)
+        run_end = row + 1 if is_narrow else min(row + run, end_row)
 
 
 @inlined
-def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs, add):
-    """Draw a ring or arc in rows first .. end; rows that it does not reach cost little."""
-    start, y, k = _row_start(records, at, left, top + first)  # start: u of lane 0; y: d_y
+def _draw_shaped(state, records, record, shapes, shape, left, top, first_row, end_row, arcs, add):
+    """Draw a ring or arc in rows first_row .. end_row - 1; rows that it does not reach cost little.
+
+    shape: index of its first number in `shapes`; arcs: whether there are arcs; add: the blend is "add", else "over"."""
+    lane0_u, row_dy, k = _row_start(records, record, left, top + first_row)
     r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
-    row, one = first, opaque(1)
-    while row < end:
-        dy, u = np.float32(y), lane_index() + np.float32(start)
-        power = _negative_log2_profile(shapes, shape, _distance(records, at, u, dy) - r0, u, dy, arcs)
+    row, opaque_one = first_row, opaque(1)
+    while row < end_row:
+        dy, u = np.float32(row_dy), lane_index() + np.float32(lane0_u)
+        power = _negative_log2_profile(shapes, shape, _distance(records, record, u, dy) - r0, u, dy, arcs)
         if any_of(power <= cutoff):
             e = exp2(-power)
             if add:
-                _add_row(state, row * ROW, e, records, at)
+                _add_row(state, row * ROW, e, records, record)
             else:
-                blend_row(state, row * ROW, e * load_scalar(records, at + OPACITY), records, at, False)
-        row += one
-        start += k
-        y += 1.0
+                blend_row(state, row * ROW, e * load_scalar(records, record + OPACITY), records, record, False)
+        row += opaque_one
+        lane0_u += k
+        row_dy += 1.0
 
 
 @inlined
-def _draw_plain(entries, begin, end, records, left, top, state):
-    """Draw all entries of a tile: plain Gaussians, blend "add"."""
+def _draw_plain_tile(entries, begin, end, records, left, top, state):
+    """Draw entries begin .. end - 1 of a tile: plain Gaussians, blend "add"."""
     if begin == end:
         return
     upcoming = next_entry(entries, begin, end, records, left, top)
-    for e in range(begin, end):
-        at, first, last, start = upcoming
-        upcoming = next_entry(entries, e + 1, end, records, left, top)
-        _add_plain(state, records, at, left, top, first, last, start)
+    for index in range(begin, end):
+        record, first_row, end_row, run_start = upcoming
+        upcoming = next_entry(entries, index + 1, end, records, left, top)
+        _add_plain(state, records, record, left, top, first_row, end_row, run_start)
 
 
 @inlined
-def _draw_tile(entries, begin, end, records, shapes, left, top, state, arcs, add):
-    """Draw the entries of a tile, rings or arcs, until all pixels are finished; return the end of the drawn ones."""
-    for e in range(begin, end):
-        if not add and (e - begin) & (CHECK_INTERVAL - 1) == CHECK_INTERVAL - 1 and is_finished(state):
-            return e
-        i = load_scalar(entries, e * ENTRY + GAUSSIAN)
-        first, last = load_scalar(entries, e * ENTRY + FIRST_ROW), load_scalar(entries, e * ENTRY + END_ROW)
-        _draw_shaped(state, records, i * RECORD, shapes, i * SHAPE, left, top, first, last, arcs, add)
+def _draw_shaped_tile(entries, begin, end, records, shapes, left, top, state, arcs, add):
+    """Draw entries begin .. end - 1 of a tile, rings or arcs, until all pixels are finished; return the end of the
+    drawn ones."""
+    for index in range(begin, end):
+        if not add and (index - begin) & (CHECK_INTERVAL - 1) == CHECK_INTERVAL - 1 and is_finished(state):
+            return index
+        i = load_scalar(entries, index * ENTRY + GAUSSIAN)
+        first_row = load_scalar(entries, index * ENTRY + FIRST_ROW)
+        end_row = load_scalar(entries, index * ENTRY + END_ROW)
+        _draw_shaped(state, records, i * RECORD, shapes, i * SHAPE, left, top, first_row, end_row, arcs, add)
     return end
 
 
@@ -330,7 +342,8 @@ def raster(
 ):  # fmt: skip
     """Write colour (h w 3) and alpha (h w), flat; ends (tiles,): the end of each tile's drawn entries.
 
-    shaped: there are rings or arcs, else plain Gaussians, which this kernel draws with the blend "add" only."""
+    shaped: there are rings or arcs, else plain Gaussians, which this kernel draws with the blend "add" only; arcs:
+    there are arcs; add: the blend is "add", else "over". The other arguments: `raster_forward.raster`."""
     no_depth = np.bool_(False)
     while True:
         tile = atomic_increment(counter)
@@ -338,13 +351,13 @@ def raster(
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         begin, end = starts[tile], starts[tile + 1]
-        start_tile(state, ROW, left, top, width, height)
+        init_tile(state, ROW, left, top, width, height)
         if not shaped:
-            _draw_plain(entries, begin, end, records, left, top, state)
+            _draw_plain_tile(entries, begin, end, records, left, top, state)
         elif add:  # two loops for LLVM to specialise
-            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, arcs, add)
+            end = _draw_shaped_tile(entries, begin, end, records, shapes, left, top, state, arcs, add)
         else:
-            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, arcs, add)
+            end = _draw_shaped_tile(entries, begin, end, records, shapes, left, top, state, arcs, add)
         ends[tile] = end
         # alphas stand for the depths, which are not written
         write_tile(image, alphas, alphas, alphas, state, left, top, width, height, background, no_depth)
@@ -354,21 +367,23 @@ def raster(
 
 
 @inlined
-def _add_gradient(state, at, e, records, record):
-    """Return g and w of one row for the blend "add", where Gaussians are independent: w = G, g = w v . colour."""
+def _add_gradient(state, state_row, e, records, record):
+    """Return g and w of one row for the blend "add", where Gaussians are independent: w = G, g = w v . colour.
+
+    state_row: index of the row's first number in the state."""
     w = where(e >= PROFILE_MIN, e, ZERO)
-    vc = load(state, at + V_RED) * load_scalar(records, record + RED)
-    vc = fma(load(state, at + V_GREEN), load_scalar(records, record + GREEN), vc)
-    return w * fma(load(state, at + V_BLUE), load_scalar(records, record + BLUE), vc), w
+    vc = load(state, state_row + V_RED) * load_scalar(records, record + RED)
+    vc = fma(load(state, state_row + V_GREEN), load_scalar(records, record + GREEN), vc)
+    return w * fma(load(state, state_row + V_BLUE), load_scalar(records, record + BLUE), vc), w
 
 
 @inlined
-def _add_colours(state, at, w, colours):
+def _add_colours(state, state_row, w, colours):
     """Add w v to the sums for red, green and blue."""
     return (
-        fma(w, load(state, at + V_RED), colours[0]),
-        fma(w, load(state, at + V_GREEN), colours[1]),
-        fma(w, load(state, at + V_BLUE), colours[2]),
+        fma(w, load(state, state_row + V_RED), colours[0]),
+        fma(w, load(state, state_row + V_GREEN), colours[1]),
+        fma(w, load(state, state_row + V_BLUE), colours[2]),
     )
 
 
@@ -380,116 +395,120 @@ def _add_moments(sums, h, u, dy):
 
 
 @inlined
-def _needle_backward(state, records, at, left, top, first, end):
+def _needle_backward(state, records, record, left, top, first_row, end_row):
     """Return the gradient row of a plain Gaussian with the blend "add" that is too narrow for the recurrence over rows,
     so that each row has its own exponential: sums of g by the five moments of `_add_moments`, a zero, then R, G, B."""
     zero = splat(ZERO)
     sums, colours = (zero, zero, zero, zero, zero), (zero, zero, zero)
-    row, one = first, opaque(1)
-    while row < end:
-        u, dy = needle_offsets(records, at, left, top + row)
-        g, w = _add_gradient(state, row * ROW_BACKWARD, falloff(records, at, u, dy), records, at)
+    row, opaque_one = first_row, opaque(1)
+    while row < end_row:
+        u, dy = needle_offsets(records, record, left, top + row)
+        g, w = _add_gradient(state, row * ROW_BACKWARD, falloff(records, record, u, dy), records, record)
         colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
         sums = _add_moments(sums, g, u, dy)
-        row += one
+        row += opaque_one
     return reduce_add_each((sums[0], sums[1], sums[2], sums[3], sums[4], zero, colours[0], colours[1], colours[2]))
 
 
 @inlined
-def _plain_backward(state, records, at, left, top, first, end, start):
+def _plain_backward(state, records, record, left, top, first_row, end_row, run_start):
     """Return the gradient row of `_needle_backward` by the recurrence and three sums per lane (`raster_backward`)."""
-    step, one, run = load_scalar(records, at + STEP), opaque(1), run_length(records, at)
+    step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)
     zero = splat(ZERO)
     m0, m1, m2, colours = zero, zero, zero, (zero, zero, zero)
-    e, r, dy = start
-    row, stop = first, min(first + run, end)
+    e, r, dy = run_start
+    row, run_end = first_row, min(first_row + run, end_row)
     while True:
-        while row < stop:
-            g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, at)
+        while row < run_end:
+            g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, record)
             colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
             gy = g * dy
             m0, m1, m2 = m0 + g, m1 + gy, fma(gy, dy, m2)
             dy += ONE
             e = e * r
             r = fma(r, step, r)
-            row += one
-        if row >= end:
+            row += opaque_one
+        if row >= end_row:
             break
-        e, r, dy = start_run(records, at, left, top + row)
-        stop = min(row + run, end)
-    mu, my, muu, muy, myy = moments(records, at, left, m0, m1, m2)
+        e, r, dy = start_run(records, record, left, top + row)
+        run_end = min(row + run, end_row)
+    mu, my, muu, muy, myy = moments(records, record, left, m0, m1, m2)
     return reduce_add_each((mu, my, muu, muy, myy, zero, colours[0], colours[1], colours[2]))
 
 
 @inlined
-def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, arcs, add):
+def _shaped_backward(state, records, record, shapes, shape, left, top, first_row, end_row, arcs, add):
     """Return the gradient row of a ring or arc: moments of h (see the module head), sums of g and of colours, the
-    gradients of r0 and w, and sums of g u and g d_y for b."""
-    start, y, k = _row_start(records, at, left, top + first)  # start: u of lane 0; y: d_y
+    gradients of r0 and w, and sums of g u and g d_y for b. Arguments as in `_draw_shaped`."""
+    lane0_u, row_dy, k = _row_start(records, record, left, top + first_row)
     r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
     zero = splat(ZERO)
-    sums, colours, mass = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
+    sums, colours, g_sum = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
     d_r0, d_w, arc_u, arc_y = zero, zero, zero, zero
-    row, one = first, opaque(1)
-    while row < end:
-        dy, u = np.float32(y), lane_index() + np.float32(start)
-        r = _distance(records, at, u, dy)
+    row, opaque_one = first_row, opaque(1)
+    while row < end_row:
+        dy, u = np.float32(row_dy), lane_index() + np.float32(lane0_u)
+        r = _distance(records, record, u, dy)
         z = r - r0
         power = _negative_log2_profile(shapes, shape, z, u, dy, arcs)
         if any_of(power <= cutoff):
             e = exp2(-power)
             if add:
-                g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, at)
+                g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, record)
             else:
-                e = e * load_scalar(records, at + OPACITY)
-                g, w = row_gradient(state, row * ROW_BACKWARD, e, records, at, False)
+                e = e * load_scalar(records, record + OPACITY)
+                g, w = row_gradient(state, row * ROW_BACKWARD, e, records, record, False)
             colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
-            mass = mass + g
+            g_sum = g_sum + g
             gz = g * z
             d_r0, d_w = d_r0 + gz, fma(gz, z, d_w)
             sums = _add_moments(sums, where(r > RADIUS_MIN, gz / r, ZERO), u, dy)
             if arcs:
                 arc_u, arc_y = fma(g, u, arc_u), fma(g, dy, arc_y)
-        row += one
-        start += k
-        y += 1.0
-    slope = load_scalar(shapes, shape + SHARPNESS) * TWO_LN2  # 1 / w²
+        row += opaque_one
+        lane0_u += k
+        row_dy += 1.0
+    inverse_w2 = load_scalar(shapes, shape + SHARPNESS) * TWO_LN2
     return reduce_add_each((
-        sums[0] * slope, sums[1] * slope, sums[2] * slope, sums[3] * slope, sums[4] * slope, mass,
-        colours[0], colours[1], colours[2], d_r0 * slope, d_w * (slope / load_scalar(shapes, shape + WIDTH)),
+        sums[0] * inverse_w2, sums[1] * inverse_w2, sums[2] * inverse_w2, sums[3] * inverse_w2, sums[4] * inverse_w2,
+        g_sum,
+        colours[0], colours[1], colours[2], d_r0 * inverse_w2, d_w * (inverse_w2 / load_scalar(shapes, shape + WIDTH)),
         arc_u, arc_y,
     ))  # fmt: skip
 
 
 @inlined
-def _tile_backward_plain(entries, begin, end, records, left, top, state, gradients):
-    """Write the gradient rows of a tile's entries: plain Gaussians, blend "add"."""
+def _plain_tile_backward(entries, begin, end, records, left, top, state, gradients):
+    """Write the gradient rows of a tile's entries begin .. end - 1: plain Gaussians, blend "add"."""
     if begin == end:
         return
     upcoming = next_entry(entries, begin, end, records, left, top)
-    for e in range(begin, end):
-        at, first, last, start = upcoming
-        upcoming = next_entry(entries, e + 1, end, records, left, top)
-        prefetch(gradients, load_scalar(entries, min(e + PREFETCH_DISTANCE, end - 1) * ENTRY + SLOT) * RECORD)
-        if is_needle(records, at, last - first):
-            row = _needle_backward(state, records, at, left, top, first, last)
+    for index in range(begin, end):
+        record, first_row, end_row, run_start = upcoming
+        upcoming = next_entry(entries, index + 1, end, records, left, top)
+        prefetch(gradients, load_scalar(entries, min(index + PREFETCH_DISTANCE, end - 1) * ENTRY + SLOT) * RECORD)
+        if is_needle(records, record, end_row - first_row):
+            gradient_row = _needle_backward(state, records, record, left, top, first_row, end_row)
         else:
-            row = _plain_backward(state, records, at, left, top, first, last, start)
-        store(gradients, load_scalar(entries, e * ENTRY + SLOT) * RECORD, row)
+            gradient_row = _plain_backward(state, records, record, left, top, first_row, end_row, run_start)
+        store(gradients, load_scalar(entries, index * ENTRY + SLOT) * RECORD, gradient_row)
 
 
 @inlined
-def _tile_backward(entries, begin, used, end, records, shapes, left, top, state, arcs, add, gradients):
-    """Write the gradient rows of a tile's entries begin .. end, rings or arcs; zeros from `used` on, which were not
-    drawn."""
-    for e in range(begin, used):
-        prefetch(gradients, load_scalar(entries, min(e + PREFETCH_DISTANCE, end - 1) * ENTRY + SLOT) * RECORD)
-        i = load_scalar(entries, e * ENTRY + GAUSSIAN)
-        first, last = load_scalar(entries, e * ENTRY + FIRST_ROW), load_scalar(entries, e * ENTRY + END_ROW)
-        row = _shaped_backward(state, records, i * RECORD, shapes, i * SHAPE, left, top, first, last, arcs, add)
-        store(gradients, load_scalar(entries, e * ENTRY + SLOT) * RECORD, row)
-    for e in range(used, end):
-        store(gradients, load_scalar(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
+def _shaped_tile_backward(entries, begin, drawn_end, end, records, shapes, left, top, state, arcs, add, gradients):
+    """Write the gradient rows of a tile's entries begin .. end - 1, rings or arcs; zeros from drawn_end on, which were
+    not drawn."""
+    for index in range(begin, drawn_end):
+        prefetch(gradients, load_scalar(entries, min(index + PREFETCH_DISTANCE, end - 1) * ENTRY + SLOT) * RECORD)
+        i = load_scalar(entries, index * ENTRY + GAUSSIAN)
+        first_row = load_scalar(entries, index * ENTRY + FIRST_ROW)
+        end_row = load_scalar(entries, index * ENTRY + END_ROW)
+        gradient_row = _shaped_backward(
+            state, records, i * RECORD, shapes, i * SHAPE, left, top, first_row, end_row, arcs, add
+        )
+        store(gradients, load_scalar(entries, index * ENTRY + SLOT) * RECORD, gradient_row)
+    for index in range(drawn_end, end):
+        store(gradients, load_scalar(entries, index * ENTRY + SLOT) * RECORD, splat(ZERO))
 
 
 @kernel
@@ -497,47 +516,53 @@ def raster_backward(
     counter, scratch, entries, starts, ends, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
     image, alphas, d_image, d_alphas, gradients,
 ):  # fmt: skip
-    """Write the gradient row of each slot, RECORD numbers, to `gradients`. shaped, arcs, add: see `raster`."""
-    state, edge = scratch[:STATE_BACKWARD], scratch[STATE_BACKWARD:SCRATCH].reshape(6, EDGE)
+    """Write the gradient row of each slot, RECORD numbers, to `gradients`. d_alphas may be empty.
+
+    shaped, arcs, add: see `raster`; the other arguments: `raster_backward.raster_backward`."""
+    state, padded = scratch[:STATE_BACKWARD], scratch[STATE_BACKWARD:SCRATCH].reshape(6, PADDED_ROW)
     no_depth = np.bool_(False)
     while True:
         tile = atomic_increment(counter)
         if tile >= ends.size:
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
-        a, b, c = starts[tile], ends[tile], starts[tile + 1]  # begin, end of the drawn entries, end
-        load_tile(  # alphas and d_alphas stand for the depths, which are not read
+        begin, drawn_end, end = starts[tile], ends[tile], starts[tile + 1]
+        init_tile_backward(  # alphas and d_alphas stand for the depths, which are not read
             state, left, top, width, height, background, image, alphas, alphas, d_image, d_alphas, d_alphas,
-            no_depth, edge,
+            no_depth, padded,
         )  # fmt: skip
         if not shaped:
-            _tile_backward_plain(entries, a, c, records, left, top, state, gradients)
+            _plain_tile_backward(entries, begin, end, records, left, top, state, gradients)
         elif add:  # two loops for LLVM to specialise
-            _tile_backward(entries, a, b, c, records, shapes, left, top, state, arcs, add, gradients)
+            _shaped_tile_backward(
+                entries, begin, drawn_end, end, records, shapes, left, top, state, arcs, add, gradients
+            )
         else:
-            _tile_backward(entries, a, b, c, records, shapes, left, top, state, arcs, add, gradients)
+            _shaped_tile_backward(
+                entries, begin, drawn_end, end, records, shapes, left, top, state, arcs, add, gradients
+            )
 
 
 @inlined
-def _add_rows(gradients, first, count, row):
-    """Write the sum of `count` gradient rows to `row`."""
+def _write_row_sum(gradients, first_slot, count, row):
+    """Write the sum of `count` gradient rows, from first_slot on, to `row` (16,)."""
     total = splat(ZERO)
-    for slot in range(first, first + count):
+    for slot in range(first_slot, first_slot + count):
         total = total + load(gradients, slot * RECORD)
     store(row, 0, total)
 
 
 @kernel
 def sum_gradients(
-    row, covariances, opacities, colours, arcs, gradients, firsts, counts, add,
+    row, covariances, opacities, colours, arcs, gradients, first_slots, counts, add,
     d_centres, d_covariances, d_opacities, d_colours, d_rings, d_arcs,
 ):  # fmt: skip
     """Write the gradients of the inputs from the gradient rows; see `projection` for the moments.
 
-    firsts, counts: first slot and number of slots of each Gaussian. d_rings, d_arcs may be empty. row: workspace of 16.
-    """
+    row: workspace of 16; gradients: the rows, by slot; first_slots, counts: first slot and number of slots of each
+    Gaussian; add: the blend is "add". d_rings, d_arcs may be empty."""
     for i in range(opacities.size):
-        _add_rows(gradients, firsts[i], counts[i], row)
+        _write_row_sum(gradients, first_slots[i], counts[i], row)
         xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
         yy = np.float64(covariances[3 * i + 2])
         determinant = xx * yy - xy * xy
@@ -551,17 +576,17 @@ def sum_gradients(
         d_covariances[3 * i] = 0.5 * alpha * uu
         d_covariances[3 * i + 1] = alpha * (k * uu + uy)
         d_covariances[3 * i + 2] = 0.5 * (alpha * k * k * uu + 2.0 * alpha * k * uy + dd)
-        light = (row[G_RED], row[G_GREEN], row[G_BLUE])
+        colour_sums = (row[G_RED], row[G_GREEN], row[G_BLUE])
         if add:
             d_opacities[i] = ZERO
             for c in range(3):
-                d_opacities[i] += light[c] * colours[3 * i + c]
-                d_colours[3 * i + c] = light[c] * opacities[i]
+                d_opacities[i] += colour_sums[c] * colours[3 * i + c]
+                d_colours[3 * i + c] = colour_sums[c] * opacities[i]
         else:
             is_unclamped = ALPHA_MIN <= opacities[i] <= OPACITY_MAX
             d_opacities[i] = row[G] / opacities[i] if is_unclamped else ZERO
             for c in range(3):
-                d_colours[3 * i + c] = light[c]
+                d_colours[3 * i + c] = colour_sums[c]
         if d_rings.size > 0:
             d_rings[2 * i], d_rings[2 * i + 1] = row[G_R0], row[G_WIDTH]
         if d_arcs.size > 0:

@@ -34,93 +34,100 @@ ZERO = np.float32(0)
 
 
 @inlined
-def _interpolate_rows(plane, length, near, far, share, row):
-    """Write (1 - share) plane[near] + share plane[far] to `row`; rows have at least 16 numbers."""
-    for block in range(0, length, LANES):
-        at = min(block, length - LANES)
-        here = load(plane, near * length + at)
-        store(row, at, fma(load(plane, far * length + at) - here, share, here))
+def _interpolate_rows(plane, row_length, nearest, other, other_weight, out):
+    """Write (1 - other_weight) plane[nearest] + other_weight plane[other] to the row `out`; rows have at least 16
+    numbers."""
+    for block in range(0, row_length, LANES):
+        column = min(block, row_length - LANES)
+        nearest_row = load(plane, nearest * row_length + column)
+        store(out, column, fma(load(plane, other * row_length + column) - nearest_row, other_weight, nearest_row))
 
 
 @inlined
-def _upsample_row(row, channels, factor, width, out, at):
+def _upsample_row(row, channels, factor, width, out, out_start):
     """Upsample the pixels of an interpolated row, which has a border of one pixel, to `width` pixels of `out`, from the
-    flat index `at` on."""
-    for i in range(width):
-        cell, j = i // factor + 1, i % factor
-        share = (j + 0.5) / factor - 0.5
-        other = cell - 1 if share < 0 else cell + 1
-        weight = np.float32(abs(share))
-        for c in range(channels):
-            here = load_scalar(row, cell * channels + c)
-            out[at + i * channels + c] = here + weight * (load_scalar(row, other * channels + c) - here)
+    flat index out_start on."""
+    for x in range(width):
+        nearest, position = x // factor + 1, x % factor
+        offset = (position + 0.5) / factor - 0.5
+        other = nearest - 1 if offset < 0 else nearest + 1
+        other_weight = np.float32(abs(offset))
+        for channel in range(channels):
+            nearest_value = load_scalar(row, nearest * channels + channel)
+            other_value = load_scalar(row, other * channels + channel)
+            out[out_start + x * channels + channel] = nearest_value + other_weight * (other_value - nearest_value)
 
 
 @kernel
 def upsample_kernel(counter, row, colour, t, small_width, factor, width, height, out_colour, out_t):
-    """Upsample colour (h, w, 3) and t (h, w), which have a border of one pixel, to (height, width)."""
+    """Upsample colour (h, w, 3) and t (h, w), which have a border of one pixel, to (height, width), all flat.
+
+    counter: of the next row; row: scratch; small_width: w; factor: of the size."""
     while True:
         y = atomic_increment(counter)
         if y >= height:
             break
-        near, j = y // factor + 1, y % factor
-        share = (j + 0.5) / factor - 0.5
-        far = near - 1 if share < 0 else near + 1
-        weight = np.float32(abs(share))
-        _interpolate_rows(colour, 3 * small_width, near, far, weight, row)
+        nearest, position = y // factor + 1, y % factor
+        offset = (position + 0.5) / factor - 0.5
+        other = nearest - 1 if offset < 0 else nearest + 1
+        other_weight = np.float32(abs(offset))
+        _interpolate_rows(colour, 3 * small_width, nearest, other, other_weight, row)
         _upsample_row(row, 3, factor, width, out_colour, 3 * y * width)
-        _interpolate_rows(t, small_width, near, far, weight, row)
+        _interpolate_rows(t, small_width, nearest, other, other_weight, row)
         _upsample_row(row, 1, factor, width, out_t, y * width)
 
 
 @inlined
-def _gather_rows(plane, length, r, factor, height, row, pad):
-    """Write the tent-weighted sum of the rows of a plane about small row r to row[pad : pad + length]; length, height:
-    of the plane."""
-    start = (r - 1) * factor - factor // 2
-    first, last = max(start, 0), min(start + 2 * factor, height)
-    for block in range(0, length, LANES):
-        at = min(block, length - LANES)
+def _gather_rows(plane, row_length, small_row, factor, height, row, padding):
+    """Write the tent-weighted sum of the rows of a plane about small_row to row[padding : padding + row_length].
+
+    row_length, height: of the plane."""
+    start = (small_row - 1) * factor - factor // 2
+    first_row, end_row = max(start, 0), min(start + 2 * factor, height)
+    for block in range(0, row_length, LANES):
+        column = min(block, row_length - LANES)
         total = splat(ZERO)
-        for y in range(first, last):
+        for y in range(first_row, end_row):
             weight = (min(y - start, start + 2 * factor - 1 - y) + 0.5) / factor
-            total = fma(load(plane, y * length + at), np.float32(weight), total)
-        store(row, pad + at, total)
+            total = fma(load(plane, y * row_length + column), np.float32(weight), total)
+        store(row, padding + column, total)
 
 
 @inlined
-def _gather_pixels(row, pad, channels, factor, small_width, out, at):
-    """Write the tent-weighted sums along a row of `_gather_rows` to `small_width` pixels of `out`, from index `at` on.
-    """
+def _gather_pixels(row, padding, channels, factor, small_width, out, out_start):
+    """Write the tent-weighted sums along a row of `_gather_rows` to small_width pixels of `out`, from index out_start
+    on."""
     for x in range(small_width):
-        first = pad + ((x - 1) * factor - factor // 2) * channels
-        for c in range(channels):
+        start = padding + ((x - 1) * factor - factor // 2) * channels
+        for channel in range(channels):
             total = ZERO
             for k in range(factor):
                 weight = np.float32((k + 0.5) / factor)
-                far = load_scalar(row, first + (2 * factor - 1 - k) * channels + c)
-                total += weight * (load_scalar(row, first + k * channels + c) + far)
-            out[at + x * channels + c] = total
+                mirrored_value = load_scalar(row, start + (2 * factor - 1 - k) * channels + channel)
+                total += weight * (load_scalar(row, start + k * channels + channel) + mirrored_value)
+            out[out_start + x * channels + channel] = total
 
 
 @kernel
 def upsample_backward_kernel(
     counter, row, d_colour, d_t, small_width, small_height, factor, width, height, out_colour, out_t
 ):  # fmt: skip
-    """Write the gradients of the small picture, border included; d_t may be empty."""
-    pad = 3 * PADDING
+    """Write the gradients of the small picture, border included, from those of the large one; d_t may be empty.
+
+    counter: of the next small row; row: scratch."""
+    padding = 3 * PADDING
     row[:] = ZERO
     while True:
-        r = atomic_increment(counter)
-        if r >= small_height:
+        small_row = atomic_increment(counter)
+        if small_row >= small_height:
             break
-        _gather_rows(d_colour, 3 * width, r, factor, height, row, pad)
-        row[pad + 3 * width :] = ZERO
-        _gather_pixels(row, pad, 3, factor, small_width, out_colour, 3 * r * small_width)
+        _gather_rows(d_colour, 3 * width, small_row, factor, height, row, padding)
+        row[padding + 3 * width :] = ZERO
+        _gather_pixels(row, padding, 3, factor, small_width, out_colour, 3 * small_row * small_width)
         if d_t.size > 0:
-            _gather_rows(d_t, width, r, factor, height, row, pad)
-            row[pad + width : pad + width + 3 * PADDING] = ZERO
-            _gather_pixels(row, pad, 1, factor, small_width, out_t, r * small_width)
+            _gather_rows(d_t, width, small_row, factor, height, row, padding)
+            row[padding + width : padding + width + 3 * PADDING] = ZERO
+            _gather_pixels(row, padding, 1, factor, small_width, out_t, small_row * small_width)
 
 
 @kernel
@@ -132,11 +139,11 @@ def composite_kernel(counter, colour, t, behind, out):
         if start >= n:
             break
         for block in range(start, min(start + PIXELS_PER_TASK, n), LANES):
-            at = min(block, n - LANES)
-            shares = interleave((load(t, at), load(t, at), load(t, at)))
-            for part in range(3):
-                i = 3 * at + part * LANES
-                store(out, i, fma(load(behind, i), shares[part], load(colour, i)))
+            pixel = min(block, n - LANES)
+            t_by_channel = interleave((load(t, pixel), load(t, pixel), load(t, pixel)))
+            for vector_index in range(3):
+                index = 3 * pixel + vector_index * LANES
+                store(out, index, fma(load(behind, index), t_by_channel[vector_index], load(colour, index)))
 
 
 @kernel
@@ -148,13 +155,14 @@ def composite_backward_kernel(counter, gradient, t, behind, d_t, d_behind):
         if start >= n:
             break
         for block in range(start, min(start + PIXELS_PER_TASK, n), LANES):
-            at = min(block, n - LANES)
-            i = 3 * at
-            v = deinterleave((load(gradient, i), load(gradient, i + LANES), load(gradient, i + 2 * LANES)))
-            b = deinterleave((load(behind, i), load(behind, i + LANES), load(behind, i + 2 * LANES)))
-            share = load(t, at)
-            store(d_t, at, fma(v[0], b[0], fma(v[1], b[1], v[2] * b[2])))
-            store_rows(d_behind, i, LANES, interleave((v[0] * share, v[1] * share, v[2] * share)))
+            pixel = min(block, n - LANES)
+            index = 3 * pixel
+            v = deinterleave((load(gradient, index), load(gradient, index + LANES), load(gradient, index + 2 * LANES)))
+            b = deinterleave((load(behind, index), load(behind, index + LANES), load(behind, index + 2 * LANES)))
+            transmittance = load(t, pixel)
+            store(d_t, pixel, fma(v[0], b[0], fma(v[1], b[1], v[2] * b[2])))
+            products = (v[0] * transmittance, v[1] * transmittance, v[2] * transmittance)
+            store_rows(d_behind, index, LANES, interleave(products))
 
 
 class _Upsample(torch.autograd.Function):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Layout of the arrays that kernels pass on to each other: records, gradient rows and entries of tiles.
 
-The arrays are flat. In all kernels `at` is the index of the first number of a record, row or entry, and a field is read
-at `at` + its constant here.
+The arrays are flat. `record` is the index of a record's first number in `records`, and a field is read at `record` +
+its constant here; likewise for rows and entries.
 """
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ CHUNK = 1024
 G_U, G_Y, G_UU, G_UY, G_YY, G, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
 G_R0, G_WIDTH, G_ARC_U, G_ARC_Y = range(9, 13)
 
-# An entry of a tile, int32: which Gaussian, first row and end row within the tile, slot of its row of gradients.
+# An entry of a tile, int32: which Gaussian, first row within the tile and the row after the last, slot of its row of
+# gradients.
 GAUSSIAN, FIRST_ROW, END_ROW, SLOT, ENTRY = 0, 1, 2, 3, 4
 
 OPACITY_MAX, ALPHA_MIN = np.float32(rendering.OPACITY_MAX), np.float32(rendering.ALPHA_MIN)

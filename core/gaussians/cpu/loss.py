@@ -22,7 +22,7 @@ where two parts meet are computed for both.
 from __future__ import annotations
 
 import weakref
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -64,24 +64,25 @@ ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 
 
 @inlined
-def _apply_window(v):
-    """Return the window's weighted sum of 11 vectors."""
-    s = v[5] * W0
-    s = fma(v[4] + v[6], W1, s)
-    s = fma(v[3] + v[7], W2, s)
-    s = fma(v[2] + v[8], W3, s)
-    s = fma(v[1] + v[9], W4, s)
-    return fma(v[0] + v[10], W5, s)
+def _apply_window(rows):
+    """Return the window's weighted sum of 11 vectors, a tuple."""
+    total = rows[5] * W0
+    total = fma(rows[4] + rows[6], W1, total)
+    total = fma(rows[3] + rows[7], W2, total)
+    total = fma(rows[2] + rows[8], W3, total)
+    total = fma(rows[1] + rows[9], W4, total)
+    return fma(rows[0] + rows[10], W5, total)
 
 
 @inlined
-def _window_along_row(row, at):
-    """Return the window's weighted sums along a row of scratch, for 16 numbers from `at` on, without the padding.
+def _window_along_row(row, column):
+    """Return the window's weighted sums along a padded row of scratch, at 16 numbers of the picture's row from `column`
+    on.
 
     Neighbours in x are 3 numbers apart: -15, -12 ... 15. They are shuffled out of three vectors: unaligned loads take
     twice the time, since nearly all of them cross a cache line."""
-    at += PAD
-    a, b, c = load(row, at - LANES), load(row, at), load(row, at + LANES)
+    column += PAD
+    a, b, c = load(row, column - LANES), load(row, column), load(row, column + LANES)
     return _apply_window((
         align_lanes(a, b, 1), align_lanes(a, b, 4), align_lanes(a, b, 7), align_lanes(a, b, 10),
         align_lanes(a, b, 13), b, align_lanes(b, c, 3),
@@ -90,71 +91,77 @@ def _window_along_row(row, at):
 
 
 @inlined
-def _store_band(v, rows, at):
-    """Apply the window down 16 columns of a band and write them to scratch from `at` on.
+def _window_down_band(vectors, rows, column):
+    """Apply the window down 16 columns of a band, and write them to rows of scratch from `column` on.
 
-    v: the band's 6 rows and 5 more on both sides."""
-    store(rows[0], PAD + at, _apply_window(v[:11]))
-    store(rows[1], PAD + at, _apply_window(v[1:12]))
-    store(rows[2], PAD + at, _apply_window(v[2:13]))
-    store(rows[3], PAD + at, _apply_window(v[3:14]))
-    store(rows[4], PAD + at, _apply_window(v[4:15]))
-    store(rows[5], PAD + at, _apply_window(v[5:]))
-
-
-@inlined
-def _is_interior(band, height):
-    """Return whether the windows of a band lie within the picture; band: its first row."""
-    return HALO <= band <= height - BAND - HALO
+    vectors: of the band's 6 rows, and of 5 more on both sides."""
+    store(rows[0], PAD + column, _apply_window(vectors[:11]))
+    store(rows[1], PAD + column, _apply_window(vectors[1:12]))
+    store(rows[2], PAD + column, _apply_window(vectors[2:13]))
+    store(rows[3], PAD + column, _apply_window(vectors[3:14]))
+    store(rows[4], PAD + column, _apply_window(vectors[4:15]))
+    store(rows[5], PAD + column, _apply_window(vectors[5:]))
 
 
 @inlined
-def _column_moments(x, y, row, at, length, height):
-    """Return E[x], E[xx] and E[xy] down the columns, at 16 numbers of a row from `at` on; length: numbers of a row."""
-    m, xx, xy = splat(ZERO), splat(ZERO), splat(ZERO)
+def _is_interior(first_row, height):
+    """Return whether the windows of a band, which starts at first_row, lie within the picture."""
+    return HALO <= first_row <= height - BAND - HALO
+
+
+@inlined
+def _column_moments(x, y, row, column, row_length, height):
+    """Return E[x], E[xx] and E[xy] down the columns, at 16 numbers of a row from `column` on; row_length: numbers of a
+    row."""
+    mean, xx, xy = splat(ZERO), splat(ZERO), splat(ZERO)
     for k in range(max(-HALO, -row), min(HALO + 1, height - row)):
-        a = load(x, (row + k) * length + at)
-        w = a * WEIGHTS[k + HALO]
-        m, xx, xy = m + w, fma(w, a, xx), fma(w, load(y, (row + k) * length + at), xy)
-    return m, xx, xy
+        value = load(x, (row + k) * row_length + column)
+        weighted = value * WEIGHTS[k + HALO]
+        y_value = load(y, (row + k) * row_length + column)
+        mean, xx, xy = mean + weighted, fma(weighted, value, xx), fma(weighted, y_value, xy)
+    return mean, xx, xy
 
 
 @inlined
-def _columns_of_moments(x, y, band, end, length, height, rows):
-    """Write the column moments of rows band .. end of the picture to scratch; loads the rows of all windows once."""
-    for block in range(0, length, LANES):
-        at = min(block, length - LANES)
-        if _is_interior(band, height):
-            top = (band - HALO) * length + at
-            a, b = load_rows(x, top, length), load_rows(y, top, length)
-            _store_band(a, rows[0], at)
-            _store_band(multiply_each(a, a), rows[1], at)
-            _store_band(multiply_each(a, b), rows[2], at)
+def _moments_down_columns(x, y, first_row, end_row, row_length, height, rows):
+    """Write the column moments of rows first_row .. end_row - 1 of the picture to `rows` of scratch (3, BAND, padded);
+    loads the rows of all windows once."""
+    for block in range(0, row_length, LANES):
+        column = min(block, row_length - LANES)
+        if _is_interior(first_row, height):
+            top = (first_row - HALO) * row_length + column
+            x_rows, y_rows = load_rows(x, top, row_length), load_rows(y, top, row_length)
+            _window_down_band(x_rows, rows[0], column)
+            _window_down_band(multiply_each(x_rows, x_rows), rows[1], column)
+            _window_down_band(multiply_each(x_rows, y_rows), rows[2], column)
         else:
-            for row in range(band, end):
-                m, xx, xy = _column_moments(x, y, row, at, length, height)
-                store(rows[0, row - band], PAD + at, m)
-                store(rows[1, row - band], PAD + at, xx)
-                store(rows[2, row - band], PAD + at, xy)
+            for row in range(first_row, end_row):
+                mean, xx, xy = _column_moments(x, y, row, column, row_length, height)
+                store(rows[0, row - first_row], PAD + column, mean)
+                store(rows[1, row - first_row], PAD + column, xx)
+                store(rows[2, row - first_row], PAD + column, xy)
         for row in range(LANES, LANES + BAND):  # the rows that the next band needs in addition
-            prefetch(x, (band - HALO + row) * length + at)
-            prefetch(y, (band - HALO + row) * length + at)
+            prefetch(x, (first_row - HALO + row) * row_length + column)
+            prefetch(y, (first_row - HALO + row) * row_length + column)
 
 
 @inlined
-def _columns_of_maps(before, here, after, length, rows):
-    """Apply the window down the columns of each of three maps (3, BAND, length), for the band `here`, with the maps of
-    the bands before and after it."""
+def _maps_down_columns(maps_above, maps_here, maps_below, row_length, rows):
+    """Apply the window down the columns of each of three maps (3, BAND, row_length), for the band of maps_here, and
+    write them to `rows` of scratch."""
     for i in range(3):
-        a, b, c = before[i], here[i], after[i]
-        for block in range(0, length, LANES):
-            at = min(block, length - LANES)
-            v = (
-                load(a[1], at), load(a[2], at), load(a[3], at), load(a[4], at), load(a[5], at),
-                load(b[0], at), load(b[1], at), load(b[2], at), load(b[3], at), load(b[4], at), load(b[5], at),
-                load(c[0], at), load(c[1], at), load(c[2], at), load(c[3], at), load(c[4], at),
+        above, here, below = maps_above[i], maps_here[i], maps_below[i]
+        for block in range(0, row_length, LANES):
+            column = min(block, row_length - LANES)
+            vectors = (
+                load(above[1], column), load(above[2], column), load(above[3], column), load(above[4], column),
+                load(above[5], column),
+                load(here[0], column), load(here[1], column), load(here[2], column), load(here[3], column),
+                load(here[4], column), load(here[5], column),
+                load(below[0], column), load(below[1], column), load(below[2], column), load(below[3], column),
+                load(below[4], column),
             )  # fmt: skip
-            _store_band(v, rows[i], at)
+            _window_down_band(vectors, rows[i], column)
 
 
 @inlined
@@ -163,119 +170,134 @@ def _ssim_derivatives(mu, xx, xy, mu_y, s_y):
     cross, squares = mu * mu_y, fma(mu, mu, mu_y * mu_y)
     a1, a2 = fma(cross, TWO, splat(C1)), fma(xy - cross, TWO, splat(C2))
     b1, b2 = squares + C1, xx - mu * mu + s_y + C2
-    inverse = ONE / (b1 * b2)
-    similarity = a1 * a2 * inverse
-    share = similarity * (b1 * inverse)  # S / B2
-    by_mu = TWO * (mu_y * (a2 - a1) * inverse + mu * (share - similarity * (b2 * inverse)))
-    return similarity, by_mu, -share, TWO * a1 * inverse
+    inverse_b1_b2 = ONE / (b1 * b2)
+    similarity = a1 * a2 * inverse_b1_b2
+    s_over_b2 = similarity * (b1 * inverse_b1_b2)  # S / B2
+    by_mu = TWO * (mu_y * (a2 - a1) * inverse_b1_b2 + mu * (s_over_b2 - similarity * (b2 * inverse_b1_b2)))
+    return similarity, by_mu, -s_over_b2, TWO * a1 * inverse_b1_b2
 
 
 @inlined
-def _compute_maps(x, y, mu_y, s_y, band, length, height, rows, maps, sums):
-    """Write the maps of S by mu, E[xx], E[xy] of a band, (3, BAND, length), zeros below the picture, and the row sums
-    (h, 2) of |x - y| and S. band: its first row. length: numbers in a row, 3 w. rows: scratch."""
-    end = min(band + BAND, height)
-    _columns_of_moments(x, y, band, end, length, height, rows)
-    if end < band + BAND:
+def _compute_maps(x, y, mu_y, s_y, first_row, row_length, height, rows, maps, sums):
+    """Write the maps of S by mu, E[xx], E[xy] of a band, (3, BAND, row_length), zeros below the picture, and the row
+    sums (h, 2) of |x - y| and S.
+
+    x, y: image and target, flat; mu_y, s_y: moments of the target; row_length: numbers in a row, 3 w; rows: scratch."""
+    end_row = min(first_row + BAND, height)
+    _moments_down_columns(x, y, first_row, end_row, row_length, height, rows)
+    if end_row < first_row + BAND:
         maps[:, :, :] = ZERO
-    for row in range(band, end):
-        place = row - band
-        l1, similar = splat(ZERO), splat(ZERO)
-        for block in range(0, length, LANES):
-            at = min(block, length - LANES)
-            is_new = lane_index() >= np.float32(block - at)  # the last block overlaps the one before
-            i = row * length + at
-            prefetch(mu_y, i + length)
-            prefetch(s_y, i + length)
-            mu, xx = _window_along_row(rows[0, place], at), _window_along_row(rows[1, place], at)
-            xy = _window_along_row(rows[2, place], at)
-            s, by_mu, by_xx, by_xy = _ssim_derivatives(mu, xx, xy, load(mu_y, i), load(s_y, i))
-            store(maps[0, place], at, by_mu)
-            store(maps[1, place], at, by_xx)
-            store(maps[2, place], at, by_xy)
-            similar = similar + where(is_new, s, ZERO)
+    for row in range(first_row, end_row):
+        band_row = row - first_row
+        l1, ssim = splat(ZERO), splat(ZERO)
+        for block in range(0, row_length, LANES):
+            column = min(block, row_length - LANES)
+            is_new = lane_index() >= np.float32(block - column)  # the last block overlaps the one before
+            i = row * row_length + column
+            prefetch(mu_y, i + row_length)
+            prefetch(s_y, i + row_length)
+            mu, xx = _window_along_row(rows[0, band_row], column), _window_along_row(rows[1, band_row], column)
+            xy = _window_along_row(rows[2, band_row], column)
+            similarity, by_mu, by_xx, by_xy = _ssim_derivatives(mu, xx, xy, load(mu_y, i), load(s_y, i))
+            store(maps[0, band_row], column, by_mu)
+            store(maps[1, band_row], column, by_xx)
+            store(maps[2, band_row], column, by_xy)
+            ssim = ssim + where(is_new, similarity, ZERO)
             l1 = l1 + where(is_new, absolute(load(x, i) - load(y, i)), ZERO)
-        sums[row, 0], sums[row, 1] = reduce_add(l1), reduce_add(similar)
+        sums[row, 0], sums[row, 1] = reduce_add(l1), reduce_add(ssim)
 
 
 @inlined
-def _gradient(x, y, before, here, after, band, length, height, by_l1, by_similarity, rows, out):
-    """Write by_l1 sign(x - y) + by_similarity dS/dx of a band, from its maps `here` and those of its neighbours."""
-    _columns_of_maps(before, here, after, length, rows)
-    for row in range(band, min(band + BAND, height)):
-        place = row - band
-        for block in range(0, length, LANES):
-            at = min(block, length - LANES)
-            i = row * length + at
-            prefetch(out, i + length)
+def _write_gradient(
+    x, y, maps_above, maps_here, maps_below, first_row, row_length, height, by_l1, by_similarity, rows, out
+):  # fmt: skip
+    """Write by_l1 sign(x - y) + by_similarity dS/dx of a band to `out`, from its maps and those of its neighbours.
+
+    x, y, out: flat; rows: scratch; row_length: numbers in a row."""
+    _maps_down_columns(maps_above, maps_here, maps_below, row_length, rows)
+    for row in range(first_row, min(first_row + BAND, height)):
+        band_row = row - first_row
+        for block in range(0, row_length, LANES):
+            column = min(block, row_length - LANES)
+            i = row * row_length + column
+            prefetch(out, i + row_length)
             vx, vy = load(x, i), load(y, i)
-            g = fma(vx * TWO, _window_along_row(rows[1, place], at), _window_along_row(rows[0, place], at))
-            g = fma(vy, _window_along_row(rows[2, place], at), g) * by_similarity
+            by_mu = _window_along_row(rows[0, band_row], column)
+            gradient = fma(vx * TWO, _window_along_row(rows[1, band_row], column), by_mu)
+            gradient = fma(vy, _window_along_row(rows[2, band_row], column), gradient) * by_similarity
             sign = where(vx > vy, splat(by_l1), where(vx < vy, splat(-by_l1), ZERO))
-            store(out, i, g + sign)
+            store(out, i, gradient + sign)
 
 
 @kernel
-def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, parts, done, sums, value, out):
+def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, parts, parts_done, sums, value, out):
     """Write the loss to value (1,) and its gradient by x to `out`, unless `out` is empty.
 
-    lam: weight of L1; parts: number of parts of the picture, each the work of a thread; done (1,): 0, counts finished
-    parts; sums (h, 2): workspace."""
-    length = STEP * width
-    maps = scratch[: 9 * BAND * length].reshape(3, 3, BAND, length)
-    rows = scratch[9 * BAND * length :][: 3 * BAND * (length + 2 * PAD)].reshape(3, BAND, length + 2 * PAD)
+    counter: of the next part; x, y: image and target, flat; mu_y, s_y: from `target_moments_kernel`; lam: weight of L1;
+    parts: number of parts of the picture, each the work of a thread; parts_done (1,): 0, counts finished parts; sums
+    (h, 2): workspace."""
+    row_length = STEP * width
+    maps = scratch[: 9 * BAND * row_length].reshape(3, 3, BAND, row_length)
+    rows = scratch[9 * BAND * row_length :][: 3 * BAND * (row_length + 2 * PAD)].reshape(3, BAND, row_length + 2 * PAD)
     rows[:, :, :] = ZERO
-    bands, size = -(-height // BAND), np.float32(x.size)
-    by_l1, by_similarity = lam / size, (lam - ONE) / size
+    bands, num_values = -(-height // BAND), np.float32(x.size)
+    by_l1, by_similarity = lam / num_values, (lam - ONE) / num_values
     while True:
         part = atomic_increment(counter)
         if part >= parts:
             break
-        first, end = bands * part // parts, bands * (part + 1) // parts
+        first_band, end_band = bands * part // parts, bands * (part + 1) // parts
         halo_bands = 1 if out.size > 0 else 0  # the gradient needs the maps of the bands beside
-        for number in range(first - halo_bands, end + halo_bands):
-            here = maps[(number + 3) % 3]  # a ring of three bands; number may be -1
-            if 0 <= number < bands:
-                _compute_maps(x, y, mu_y, s_y, number * BAND, length, height, rows, here, sums)
+        for band in range(first_band - halo_bands, end_band + halo_bands):
+            maps_below = maps[(band + 3) % 3]  # a ring of three bands; band may be -1
+            if 0 <= band < bands:
+                _compute_maps(x, y, mu_y, s_y, band * BAND, row_length, height, rows, maps_below, sums)
             else:
-                here[:, :, :] = ZERO
-            if halo_bands > 0 and number > first:
-                before, middle = maps[(number + 1) % 3], maps[(number + 2) % 3]
-                _gradient(
-                    x, y, before, middle, here, (number - 1) * BAND, length, height, by_l1, by_similarity, rows, out
+                maps_below[:, :, :] = ZERO
+            if halo_bands > 0 and band > first_band:
+                maps_above, maps_here = maps[(band + 1) % 3], maps[(band + 2) % 3]
+                _write_gradient(
+                    x, y, maps_above, maps_here, maps_below, (band - 1) * BAND, row_length, height, by_l1,
+                    by_similarity, rows, out
                 )
-        if atomic_add(done, 0, 1) == parts - 1:  # whoever finishes last adds up the rows, always in the same order
+        if atomic_add(parts_done, 0, 1) == parts - 1:  # the last to finish adds up the rows, always in the same order
             l1, similarity = 0.0, 0.0
             for row in range(height):
                 l1 += sums[row, 0]
                 similarity += sums[row, 1]
-            value[0] = lam * l1 / size + (1 - lam) * (1 - similarity / size)
+            value[0] = lam * l1 / num_values + (1 - lam) * (1 - similarity / num_values)
 
 
 @kernel
 def target_moments_kernel(counter, scratch, y, width, height, mu_y, s_y):
-    """Write the window means mu_y and variances s_y of the target y, all flat."""
-    length = STEP * width
-    rows = scratch[: 2 * (length + 2 * PAD)].reshape(2, length + 2 * PAD)
+    """Write the window means mu_y and variances s_y of the target y, all flat. counter: of the next row."""
+    row_length = STEP * width
+    rows = scratch[: 2 * (row_length + 2 * PAD)].reshape(2, row_length + 2 * PAD)
     rows[:, :] = ZERO
     while True:
         row = atomic_increment(counter)
         if row >= height:
             break
-        for block in range(0, length, LANES):
-            at = min(block, length - LANES)
-            m, yy, _ = _column_moments(y, y, row, at, length, height)
-            store(rows[0], PAD + at, m)
-            store(rows[1], PAD + at, yy)
-        for block in range(0, length, LANES):
-            at = min(block, length - LANES)
-            mu = _window_along_row(rows[0], at)
-            store(mu_y, row * length + at, mu)
-            store(s_y, row * length + at, _window_along_row(rows[1], at) - mu * mu)
+        for block in range(0, row_length, LANES):
+            column = min(block, row_length - LANES)
+            mean, yy, _ = _column_moments(y, y, row, column, row_length, height)
+            store(rows[0], PAD + column, mean)
+            store(rows[1], PAD + column, yy)
+        for block in range(0, row_length, LANES):
+            column = min(block, row_length - LANES)
+            mu = _window_along_row(rows[0], column)
+            store(mu_y, row * row_length + column, mu)
+            store(s_y, row * row_length + column, _window_along_row(rows[1], column) - mu * mu)
 
 
 def _scratch_size(width: int) -> int:
     return 3 * BAND * (STEP * width + 2 * PAD) + 9 * BAND * STEP * width
+
+
+class _CacheEntry(NamedTuple):
+    target: weakref.ref[Tensor]
+    version: int
+    moments: Array
 
 
 class _TargetMoments:
@@ -284,25 +306,26 @@ class _TargetMoments:
     MAX_BYTES = 256 << 20
 
     def __init__(self) -> None:
-        # By id of the tensor: a reference to it, its version, and the moments; the latest used is last.
-        self._entries: dict[int, tuple[weakref.ref[Tensor], int, Array]] = {}
+        # By id of the tensor; the latest used is last.
+        self._entries: dict[int, _CacheEntry] = {}
 
     def __call__(self, target: Tensor) -> Array:
         """Return mu_y and s_y (2, values) of a target, from the cache while the tensor is unchanged."""
         key = id(target)
         entry = self._entries.pop(key, None)
-        if entry is not None and entry[0]() is target and entry[1] == target._version:
+        if entry is not None and entry.target() is target and entry.version == target._version:
             self._entries[key] = entry  # the latest is last
-            return entry[2]
+            return entry.moments
         height, width, _ = target.shape
         moments = np.empty((2, target.numel()), np.float32)
         parallel(target_moments_kernel, flat(target), width, height, *moments, scratch=_scratch_size(width))
-        self._entries[key] = weakref.ref(target, lambda _: self._entries.pop(key, None)), target._version, moments
+        reference = weakref.ref(target, lambda _: self._entries.pop(key, None))
+        self._entries[key] = _CacheEntry(reference, target._version, moments)
         free_bytes = self.MAX_BYTES
-        for name, (_, _, array) in reversed(list(self._entries.items())):
-            free_bytes -= array.nbytes
-            if free_bytes < 0 and name != key:
-                self._entries.pop(name, None)
+        for target_id, entry in reversed(list(self._entries.items())):
+            free_bytes -= entry.moments.nbytes
+            if free_bytes < 0 and target_id != key:
+                self._entries.pop(target_id, None)
         return moments
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -36,14 +36,17 @@ def unpack_constants(constants):
 
 
 @inlined
-def step_lanes(parameter, first, second, at, gradient, rate, constants):
-    """Step 16 numbers at a flat index."""
-    beta1, new1, beta2, new2, scale, root, epsilon = constants
-    m = fma(load(first, at), beta1, gradient * new1)
-    v = fma(load(second, at), beta2, gradient * gradient * new2)
-    store(first, at, m)
-    store(second, at, v)
-    store(parameter, at, load(parameter, at) - rate * scale * m / fma(sqrt(v), root, epsilon))
+def step_lanes(parameter, first, second, index, gradient, rate, constants):
+    """Step the 16 numbers from flat index `index` on, with their moments.
+
+    gradient, rate: a vector each; constants: the tuple of `unpack_constants`."""
+    beta1, one_minus_beta1, beta2, one_minus_beta2, correction1, correction2, epsilon = constants
+    new_first = fma(load(first, index), beta1, gradient * one_minus_beta1)
+    new_second = fma(load(second, index), beta2, gradient * gradient * one_minus_beta2)
+    store(first, index, new_first)
+    store(second, index, new_second)
+    denominator = fma(sqrt(new_second), correction2, epsilon)
+    store(parameter, index, load(parameter, index) - rate * correction1 * new_first / denominator)
 
 
 @inlined
@@ -54,24 +57,26 @@ def step_array(parameter, gradient, first, second, rates, constants):
     `unpack_constants`.
     """
     n, period = parameter.size, rates.size
-    place, vector_end = 0, n - n % LANES
+    rate_index, vector_end = 0, n - n % LANES
     for i in range(0, vector_end, LANES):
-        step_lanes(parameter, first, second, i, load(gradient, i), load(rates, place), constants)
-        place += LANES
-        if place == period:
-            place = 0
-    beta1, new1, beta2, new2, scale, root, epsilon = constants
+        step_lanes(parameter, first, second, i, load(gradient, i), load(rates, rate_index), constants)
+        rate_index += LANES
+        if rate_index == period:
+            rate_index = 0
+    beta1, one_minus_beta1, beta2, one_minus_beta2, correction1, correction2, epsilon = constants
     for i in range(vector_end, n):
         g = gradient[i]
-        first[i] = first[i] * beta1 + g * new1
-        second[i] = second[i] * beta2 + g * g * new2
-        parameter[i] -= rates[i % period] * scale * first[i] / (math.sqrt(second[i]) * root + epsilon)
+        first[i] = first[i] * beta1 + g * one_minus_beta1
+        second[i] = second[i] * beta2 + g * g * one_minus_beta2
+        parameter[i] -= rates[i % period] * correction1 * first[i] / (math.sqrt(second[i]) * correction2 + epsilon)
 
 
 @kernel
 def adam_kernel(counter, parameter, gradient, first, second, rates, task_size, constants):
-    """Step a parameter on all threads; arrays are flat. rates: see `step_array`; task_size: a multiple of their
-    size."""
+    """Step a parameter on all threads; arrays are flat.
+
+    counter: of the next task; rates: see `step_array`; task_size: numbers of a task, a multiple of their size;
+    constants: an array, see `unpack_constants`."""
     while True:
         start = atomic_increment(counter) * task_size
         end = min(start + task_size, parameter.size)
@@ -81,6 +86,19 @@ def adam_kernel(counter, parameter, gradient, first, second, rates, task_size, c
             parameter[start:end], gradient[start:end], first[start:end], second[start:end], rates,
             unpack_constants(constants),
         )  # fmt: skip
+
+
+class _KernelArguments(NamedTuple):
+    """Arguments of `adam_kernel`, in its order."""
+
+    counter: Array
+    parameter: Array
+    gradient: Array
+    first: Array
+    second: Array
+    rates: Array
+    task_size: int
+    constants: Array
 
 
 class AdamStep(NamedTuple):
@@ -98,15 +116,15 @@ class AdamStep(NamedTuple):
 def adam_steps(steps: Sequence[AdamStep], *, beta1: float, beta2: float, epsilon: float) -> None:
     """Make all steps in one parallel call: a thread that finds no more work on one parameter takes the next."""
     calls = [_kernel_arguments(step, beta1, beta2, epsilon) for step in steps]
-    tasks = sum(-(-call[1].size // call[6]) for call in calls)  # parameter and task_size of `adam_kernel`
+    tasks = sum(-(-call.parameter.size // call.task_size) for call in calls)
     parallel(_step_all, calls, limit=tasks if adam_kernel.overloads else 1)  # compiled by one thread
 
 
-def _step_all(counter: Array, calls: Sequence[tuple[Any, ...]]) -> None:
+def _step_all(counter: Array, calls: Sequence[_KernelArguments]) -> None:
     """Step all parameters on this thread together with the others. The first call counts by the counter of `parallel`,
     for which idle threads watch; each other call has its own."""
     for number, call in enumerate(calls):
-        adam_kernel(call[0] if number else counter, *call[1:])
+        adam_kernel(*(call if number else call._replace(counter=counter)))
 
 
 def repeat_rates(rate: float | Tensor) -> Array:
@@ -129,11 +147,12 @@ def adam_constants(step: int, beta1: float, beta2: float, epsilon: float) -> tup
     return beta1, 1 - beta1, beta2, 1 - beta2, *unbiased, epsilon
 
 
-def _kernel_arguments(step: AdamStep, beta1: float, beta2: float, epsilon: float) -> tuple[Any, ...]:
-    """Return the arguments of `adam_kernel`, with a new counter."""
+def _kernel_arguments(step: AdamStep, beta1: float, beta2: float, epsilon: float) -> _KernelArguments:
+    """Return the arguments of `adam_kernel` for a step, with a new counter."""
     assert step.gradient is not None
     rates = repeat_rates(step.rate)
     task_size = -(-MIN_TASK_SIZE // rates.size) * rates.size
-    arrays = (flat(t) for t in (step.parameter, step.gradient, step.first, step.second))
+    parameter, gradient, first, second = (flat(t) for t in (step.parameter, step.gradient, step.first, step.second))
     constants = np.array(adam_constants(step.step, beta1, beta2, epsilon), np.float32)
-    return np.zeros(1, np.int64), *arrays, rates, task_size, constants
+    counter = np.zeros(1, np.int64)
+    return _KernelArguments(counter, parameter, gradient, first, second, rates, task_size, constants)

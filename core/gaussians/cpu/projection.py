@@ -18,8 +18,8 @@ the number of rows over which e falls from its peak to 2^-40.
 With `raw`, scales are logarithms and opacities logits, the form in which they are optimised.
 
 In the backward pass the rasterizer provides moments of g = dL / d ln alpha over the pixels: sums of g, g u, g d_y,
-g u², g u d_y, g d_y². They give the gradients of centre, covariance and opacity (`_from_moments`). The gradients of
-colour and depth are sums themselves.
+g u², g u d_y, g d_y². They give the gradients of centre, covariance and opacity (`_gradients_from_moments`). The
+gradients of colour and depth are sums themselves.
 """
 from __future__ import annotations
 
@@ -108,6 +108,8 @@ MARGIN = np.float32(1e-4)
 """Added to the reach, in powers of two, so that rounding loses no pixel at the rim, where alpha is tested again."""
 NORM2_MIN = np.float32(1e-16)
 """Smallest squared length of a quaternion: the square of `..projection.QUATERNION_MIN`."""
+MAX_INVERSE_NORM = np.float32(1e8)
+"""Inverse length of the shortest quaternion that is normalised, the inverse root of NORM2_MIN."""
 TINY = np.float32(1e-24)
 """Smallest squared distance from the camera; its inverse root is finite."""
 MAX_DETERMINANT, INFINITY = np.float32(1e30), np.float32(np.inf)
@@ -198,7 +200,7 @@ def _to_camera(camera, mean):
 
 
 @inlined
-def _rotate(camera, rows):
+def _rotate_to_camera(camera, rows):
     """Return the rows of R Q."""
     q0, q1, q2 = rows
     return (
@@ -209,8 +211,8 @@ def _rotate(camera, rows):
 
 
 @inlined
-def _rotate_back(camera, rows):
-    """Return the rows of R^T G."""
+def _rotate_to_world(camera, rows):
+    """Return the rows of R^T G, the gradient of Q from G, that of R Q."""
     g0, g1, g2 = rows
     return (
         _add_scaled(_add_scaled(_scale(camera[0], g0), camera[3], g1), camera[6], g2),
@@ -220,7 +222,7 @@ def _rotate_back(camera, rows):
 
 
 @inlined
-def _multiply(a, s):
+def _multiply_elements(a, s):
     return a[0] * s[0], a[1] * s[1], a[2] * s[2]
 
 
@@ -229,8 +231,8 @@ def _image_axes(camera, v, scales, slopes, inverse_z):
     """Return the rows a and b of T, and the clamped slopes u_x, u_y at which J is taken; v: rows of V."""
     ux = minimum(maximum(slopes[0], camera[LOW_X]), camera[HIGH_X])
     uy = minimum(maximum(slopes[1], camera[LOW_Y]), camera[HIGH_Y])
-    a = _scale(inverse_z * camera[FX], _multiply(_add_scaled(v[0], -ux, v[2]), scales))
-    b = _scale(inverse_z * camera[FY], _multiply(_add_scaled(v[1], -uy, v[2]), scales))
+    a = _scale(inverse_z * camera[FX], _multiply_elements(_add_scaled(v[0], -ux, v[2]), scales))
+    b = _scale(inverse_z * camera[FY], _multiply_elements(_add_scaled(v[1], -uy, v[2]), scales))
     return a, b, ux, uy
 
 
@@ -285,35 +287,37 @@ def _load_opacities(opacities, first, raw):
 
 
 @inlined
-def _tiles_bound(x, y, half_x, half_y, visible, width, height):
-    """Return the number of tiles that the box around each Gaussian touches; 0 where `visible` is false."""
+def _tiles_bound(x, y, half_x, half_y, is_visible, width, height):
+    """Return the number of tiles that the box around each Gaussian touches; 0 where `is_visible` is false."""
     right, bottom = np.float32(width - 1), np.float32(height - 1)
-    x0 = to_ints(minimum(maximum(x - half_x, ZERO), right)) >> TILE_SHIFT_X
-    x1 = to_ints(minimum(maximum(x + half_x, ZERO), right)) >> TILE_SHIFT_X
-    y0 = to_ints(minimum(maximum(y - half_y, ZERO), bottom)) >> TILE_SHIFT_Y
-    y1 = to_ints(minimum(maximum(y + half_y, ZERO), bottom)) >> TILE_SHIFT_Y
-    return where(visible, (x1 - x0 + 1) * (y1 - y0 + 1), 0)
+    first_column = to_ints(minimum(maximum(x - half_x, ZERO), right)) >> TILE_SHIFT_X
+    last_column = to_ints(minimum(maximum(x + half_x, ZERO), right)) >> TILE_SHIFT_X
+    first_row = to_ints(minimum(maximum(y - half_y, ZERO), bottom)) >> TILE_SHIFT_Y
+    last_row = to_ints(minimum(maximum(y + half_y, ZERO), bottom)) >> TILE_SHIFT_Y
+    return where(is_visible, (last_column - first_column + 1) * (last_row - first_row + 1), 0)
 
 
 @inlined
 def _project_block(
     means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, transposed, basis,
-    records, centres, radii, depths, bounds, tiles, tile_rows, slopes_out,
+    records, centres, radii, depths, max_tiles, small_tiles, small_rows, colour_slopes,
 ):  # fmt: skip
-    """Project the 16 Gaussians from `first` on. slopes_out: slopes of this block, see `project`; transposed, basis:
-    workspaces."""
+    """Project the 16 Gaussians from `first` on.
+
+    colour_slopes: of this block, see `project`; transposed, basis: workspaces of TRANSPOSED and SQUARE numbers; all
+    other arguments as in `project`."""
     mean = _load3(means, first)
     px, py, pz = _to_camera(camera, mean)
-    in_front = pz > camera[NEAR]
+    is_in_front = pz > camera[NEAR]
     zero = splat(ZERO)
-    inverse_z = ONE / where(in_front, pz, ONE)
+    inverse_z = ONE / where(is_in_front, pz, ONE)
     slopes = (px * inverse_z, py * inverse_z)
-    x = where(in_front, fma(slopes[0], camera[FX], splat(camera[CX])), ZERO)
-    y = where(in_front, fma(slopes[1], camera[FY], splat(camera[CY])), ZERO)
+    x = where(is_in_front, fma(slopes[0], camera[FX], splat(camera[CX])), ZERO)
+    y = where(is_in_front, fma(slopes[1], camera[FY], splat(camera[CY])), ZERO)
     _store2(centres, first, x, y)
 
     (qw, qx, qy, qz), _ = _normalise(_load4(quats, first))
-    v = _rotate(camera, _rotation(qw, qx, qy, qz))
+    v = _rotate_to_camera(camera, _rotation(qw, qx, qy, qz))
     a, b, _, _ = _image_axes(camera, v, _load_scales(scales, first, raw), slopes, inverse_z)
     xx, xy, yy, determinant = _covariance(a, b, camera[DILATION])
 
@@ -321,36 +325,38 @@ def _project_block(
     reach = log2(maximum(opacity, ALPHA_MIN) * ALPHA_MIN_INVERSE)  # half the squared radius, over ln 2
     radius2 = reach * TWO_LN2
     half_x, half_y = sqrt(radius2 * xx), sqrt(radius2 * yy)
-    solid = in_front & (determinant > ZERO) & (determinant < MAX_DETERMINANT) & (opacity >= ALPHA_MIN)
-    inside = (x + half_x > ZERO) & (x - half_x < np.float32(width))
-    inside = inside & (y + half_y > ZERO) & (y - half_y < np.float32(height))
-    visible = solid & inside & (yy > ZERO)
+    is_drawable = is_in_front & (determinant > ZERO) & (determinant < MAX_DETERMINANT) & (opacity >= ALPHA_MIN)
+    is_in_frame = (x + half_x > ZERO) & (x - half_x < np.float32(width))
+    is_in_frame = is_in_frame & (y + half_y > ZERO) & (y - half_y < np.float32(height))
+    is_visible = is_drawable & is_in_frame & (yy > ZERO)
     half_difference = (xx - yy) * HALF
-    largest = (xx + yy) * HALF + sqrt(fma(half_difference, half_difference, xy * xy))
-    store(radii, first, where(visible & (radius2 > ZERO), sqrt(largest) * np.float32(3), ZERO))
+    largest_variance = (xx + yy) * HALF + sqrt(fma(half_difference, half_difference, xy * xy))
+    store(radii, first, where(is_visible & (radius2 > ZERO), sqrt(largest_variance) * np.float32(3), ZERO))
 
-    store(depths, first, where(visible, pz, INFINITY))
-    inverse_y = ONE / where(visible, yy, ONE)
+    store(depths, first, where(is_visible, pz, INFINITY))
+    inverse_y = ONE / where(is_visible, yy, ONE)
     k = -xy * inverse_y
-    major = yy * H / where(visible, determinant, ONE)
+    major = yy * H / where(is_visible, determinant, ONE)
     minor = inverse_y * H
     bend = fma(major * k, k, minor)
     # Half a pixel wider than `binning` lists, so that rounding cannot make the bound too low.
-    store(bounds, first, _tiles_bound(x, y, half_x + HALF, half_y + HALF, visible, width, height))
-    tile, tile_row = small_footprints(x, y, half_x, half_y, major, k, minor, -(reach + MARGIN), visible, width, height)
-    store(tiles, first, tile)
-    store(tile_rows, first, tile_row)
+    store(max_tiles, first, _tiles_bound(x, y, half_x + HALF, half_y + HALF, is_visible, width, height))
+    first_tile, packed_rows = small_footprints(
+        x, y, half_x, half_y, major, k, minor, -(reach + MARGIN), is_visible, width, height
+    )
+    store(small_tiles, first, first_tile)
+    store(small_rows, first, packed_rows)
 
     red, green, blue = zero, zero, zero
-    if any_of(visible):
+    if any_of(is_visible):
         harmonics.gather(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), transposed)
         direction, inverse = _direction(mean, camera)
         red, green, blue = harmonics.colours(transposed, degree, direction[0], direction[1], direction[2], basis)
-        if slopes_out.size > 0:
-            _colour_slopes(transposed, degree, direction, inverse, slopes_out)
-    elif slopes_out.size > 0:
+        if colour_slopes.size > 0:
+            _colour_slopes(transposed, degree, direction, inverse, colour_slopes)
+    elif colour_slopes.size > 0:
         for i in range(SLOPES):
-            store(slopes_out, i * LANES, zero)
+            store(colour_slopes, i * LANES, zero)
     rows = transpose((
         x, y, major, k, minor, opacity, exp2m1(bend * TWO), minimum(sqrt(RUN_LOG2_RANGE / -bend), RUN_MAX),
         maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
@@ -366,27 +372,35 @@ def _store2(array, first, x, y):
 
 
 @inlined
-def _colour_slopes(transposed, degree, direction, inverse_distance, out):
+def _colour_slopes(transposed, degree, direction, inverse_distance, colour_slopes):
     """Write the gradient of each colour by the mean: the slope's component tangential to the sphere of directions, over
-    the distance."""
+    the distance. transposed: coefficients from `spherical_harmonics.gather`."""
     for channel in range(3):
-        g = harmonics.slope(transposed, degree, direction[0], direction[1], direction[2], channel)
+        g = harmonics.colour_slope(transposed, degree, direction[0], direction[1], direction[2], channel)
         g = _scale(inverse_distance, _add_scaled(g, -_dot(g, direction), direction))
-        store_rows(out, 3 * channel * LANES, LANES, g)
+        store_rows(colour_slopes, 3 * channel * LANES, LANES, g)
 
 
 @kernel
 def project(
     counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height,
-    records, centres, radii, depths, bounds, tiles, tile_rows, firsts, chunk_bounds, d_centres, slopes,
+    records, centres, radii, depths, max_tiles, small_tiles, small_rows, first_slots, chunk_max_tiles, d_centres,
+    colour_slopes,
 ):  # fmt: skip
-    """Write for each of n >= 16 Gaussians its record, centre, radius, depth (infinite for a culled one), an upper bound
-    on the number of its tiles, and the tiles of small ones (`small_footprints`).
+    """Project n >= 16 Gaussians; see `projection` of the package for means, quats, scales, opacities.
 
-    sh_width: numbers of a row of sh; degree: of the harmonics that are used.
-    firsts, chunk_bounds: sums of the bounds within and over chunks (`binning`). d_centres: set to zero.
-    slopes: gradients of the colours by the means, 9 vectors per block of 16; empty without gradients.
-    raw: scales are logarithms and opacities logits."""
+    sh, sh_width        coefficients, flat, and the numbers of a Gaussian's row of them
+    degree              of the harmonics that are used
+    raw                 scales are logarithms and opacities logits
+    camera              from `pack_camera`
+    records, centres    results, see `layout`; (n, 2) px
+    radii, depths       results: 3 sigma, px; infinite depth for a culled Gaussian
+    max_tiles           result: upper bounds on the numbers of tiles
+    small_tiles, small_rows        results of `small_footprints`: first tiles, and packed rows
+    first_slots, chunk_max_tiles   results: exclusive sums of max_tiles within chunks, and their sums by chunk
+    d_centres           set to zero
+    colour_slopes       result: gradients of the colours by the means, SLOPES vectors per block of 16; empty without
+                        gradients"""
     n = opacities.size
     transposed, basis = scratch[:TRANSPOSED], scratch[TRANSPOSED : TRANSPOSED + SQUARE]
     while True:
@@ -398,53 +412,56 @@ def project(
             first = min(block, n - LANES)  # the last block overlaps the one before and writes the same again
             _project_block(
                 means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, transposed,
-                basis, records, centres, radii, depths, bounds, tiles, tile_rows, slopes[block * SLOPES :],
+                basis, records, centres, radii, depths, max_tiles, small_tiles, small_rows,
+                colour_slopes[block * SLOPES :],
             )  # fmt: skip
-        chunk_bounds[chunk] = exclusive_sum(bounds, start, end, firsts)
+        chunk_max_tiles[chunk] = exclusive_sum(max_tiles, start, end, first_slots)
         d_centres[2 * start : 2 * end] = ZERO
 
 
 @inlined
-def _from_moments(fields, xy, yy, determinant):
+def _gradients_from_moments(fields, xy, yy, determinant):
     """Return the gradients of the centre and of the covariance xx, xy (which stands for both places), yy.
 
-    With e = covariance^-1 d: dL/dcentre = sum g e, dL/dcovariance = sum g e e^T / 2. In terms of u and d_y,
-    e = (alpha u, alpha k u + d_y / yy) where alpha = yy / det.
-    """
+    fields: the summed gradient rows, one vector per field. With e = covariance^-1 d: dL/dcentre = sum g e,
+    dL/dcovariance = sum g e e^T / 2. In terms of u and d_y, e = (alpha u, alpha k u + d_y / yy) where alpha = yy /
+    det."""
     inverse_y = ONE / yy
     k = -xy * inverse_y
     alpha = yy / determinant
-    ak = alpha * k
-    x = alpha * fields[G_U]
-    y = fma(ak, fields[G_U], inverse_y * fields[G_Y])
+    alpha_k = alpha * k
+    d_x = alpha * fields[G_U]
+    d_y = fma(alpha_k, fields[G_U], inverse_y * fields[G_Y])
     uu, uy, dd = alpha * fields[G_UU], inverse_y * fields[G_UY], inverse_y * inverse_y * fields[G_YY]
     d_xx = alpha * uu * HALF
-    d_xy = fma(ak, uu, alpha * uy)
-    d_yy = fma(ak * k, uu, fma(ak * TWO, uy, dd)) * HALF
-    return x, y, d_xx, d_xy, d_yy
+    d_xy = fma(alpha_k, uu, alpha * uy)
+    d_yy = fma(alpha_k * k, uu, fma(alpha_k * TWO, uy, dd)) * HALF
+    return d_x, d_y, d_xx, d_xy, d_yy
 
 
 @inlined
 def _sum_rows(gradients, first_slot, count):
     """Return the sum of the gradient rows of one Gaussian."""
-    row, at, end, step = splat(ZERO), first_slot * RECORD, (first_slot + count) * RECORD, opaque(RECORD)
-    while at < end:
-        row = row + load(gradients, at)
-        at += step
+    row, index, end, opaque_record = splat(ZERO), first_slot * RECORD, (first_slot + count) * RECORD, opaque(RECORD)
+    while index < end:
+        row = row + load(gradients, index)
+        index += opaque_record
     return row
 
 
 @inlined
-def _gather_gradients(gradients, slots, counts, first, rows):
-    """Return the summed gradient rows of the 16 Gaussians from `first` on, one vector per field; rows: workspace."""
+def _gather_gradients(gradients, first_slots, counts, first, rows):
+    """Return the summed gradient rows of the 16 Gaussians from `first` on, one vector per field; first_slots, counts:
+    slots of each Gaussian; rows: workspace."""
     for i in range(LANES):
-        store(rows, i * LANES, _sum_rows(gradients, load_scalar(slots, first + i), load_scalar(counts, first + i)))
+        first_slot, count = load_scalar(first_slots, first + i), load_scalar(counts, first + i)
+        store(rows, i * LANES, _sum_rows(gradients, first_slot, count))
     return transpose(load_rows(rows, 0, LANES))
 
 
 @inlined
-def _add_to(sums, place, value, mask):
-    store(sums, place * LANES, load(sums, place * LANES) + where(mask, value, ZERO))
+def _add_to(sums, sum_index, value, is_new):
+    store(sums, sum_index * LANES, load(sums, sum_index * LANES) + where(is_new, value, ZERO))
 
 
 @inlined
@@ -467,8 +484,10 @@ def _add_camera_gradients(sums, is_new, mean, q, dv, dp, offset, intrinsics):
 
 
 @inlined
-def _offset_gradient(d_colour, slopes):
-    """Return the gradient of the offset from the camera to the means through the colours; slopes: see `project`."""
+def _offset_gradient(d_colour, colour_slopes):
+    """Return the gradient of the offset from the camera to the means through the colours; colour_slopes: see
+    `project`."""
+    slopes = colour_slopes
     result = _scale(d_colour[0], (load(slopes, 0), load(slopes, 16), load(slopes, 32)))
     result = _add_scaled(result, d_colour[1], (load(slopes, 48), load(slopes, 64), load(slopes, 80)))
     return _add_scaled(result, d_colour[2], (load(slopes, 96), load(slopes, 112), load(slopes, 128)))
@@ -477,33 +496,34 @@ def _offset_gradient(d_colour, slopes):
 @inlined
 def _project_block_backward(
     means, quats, scales, opacities, sh_width, degree, raw, camera, records, colour_slopes, first, is_new, fields,
-    transposed, rows, d_means, d_quats, d_scales, d_opacities, d_sh, row, cached, d_centres, sums, with_camera,
+    transposed, rows, d_means, d_quats, d_scales, d_opacities, d_sh, target_row, keep_cached, d_centres, sums,
+    with_camera,
 ):  # fmt: skip
-    """Write the gradients of the 16 Gaussians from `first` on to rows from `row` on.
+    """Write the gradients of the 16 Gaussians from `first` on to rows from target_row on.
 
-    fields: the summed gradient rows, one vector per field; colour_slopes: see `project`; cached: keep the gradients of
-    sh in the cache, since they are read soon; is_new, sums: for the camera, see `_add_camera_gradients`;
-    transposed, rows: workspaces."""
+    fields: the summed gradient rows, one vector per field; colour_slopes: of this block, see `project`; keep_cached:
+    keep the gradients of sh in the cache, since they are read soon; is_new, sums: for the camera, see
+    `_add_camera_gradients`; transposed, rows: workspaces."""
     mean, scale = _load3(means, first), _load_scales(scales, first, raw)
     px, py, pz = _to_camera(camera, mean)
-    in_front = pz > camera[NEAR]
-    inverse_z = ONE / where(in_front, pz, ONE)
+    is_in_front = pz > camera[NEAR]
+    inverse_z = ONE / where(is_in_front, pz, ONE)
     slopes = (px * inverse_z, py * inverse_z)
     (qw, qx, qy, qz), inverse_norm = _normalise(_load4(quats, first))
     q = _rotation(qw, qx, qy, qz)
-    v = _rotate(camera, q)
+    v = _rotate_to_camera(camera, q)
     a, b, ux, uy = _image_axes(camera, v, scale, slopes, inverse_z)
     _, xy, yy, determinant = _covariance(a, b, camera[DILATION])
-    usable = in_front & (determinant > ZERO) & (determinant < MAX_DETERMINANT) & (yy > ZERO)
-    yy, determinant = where(usable, yy, ONE), where(usable, determinant, ONE)
-    dx, dy, d_xx, d_xy, d_yy = _from_moments(fields, xy, yy, determinant)
+    is_drawable = is_in_front & (determinant > ZERO) & (determinant < MAX_DETERMINANT) & (yy > ZERO)
+    yy, determinant = where(is_drawable, yy, ONE), where(is_drawable, determinant, ONE)
+    dx, dy, d_xx, d_xy, d_yy = _gradients_from_moments(fields, xy, yy, determinant)
     _store2(d_centres, first, dx, dy)
 
     opacity = _load_opacities(opacities, first, raw)
     is_unclamped = (opacity <= OPACITY_MAX) & (opacity >= ALPHA_MIN)
     # G is the gradient by ln opacity; by the logit it is 1 - opacity times as large
     d_opacity = fields[G] * (ONE - opacity) if raw else fields[G] / where(is_unclamped, opacity, ONE)
-    store(d_opacities, row, where(is_unclamped, d_opacity, ZERO))
+    store(d_opacities, target_row, where(is_unclamped, d_opacity, ZERO))
 
     # covariance -> a, b -> V, scales, slopes, depth; na, nb, n2: gradients of V_0 S, V_1 S, V_2 S
     da = _add_scaled(_scale(d_xx * TWO, a), d_xy, b)
@@ -511,21 +531,21 @@ def _project_block_backward(
     a_da, b_db = _dot(a, da), _dot(b, db)
     na, nb = _scale(inverse_z * camera[FX], da), _scale(inverse_z * camera[FY], db)
     n2 = _add_scaled(_scale(-ux, na), -uy, nb)
-    v2s = _multiply(v[2], scale)
+    v2s = _multiply_elements(v[2], scale)
     d_ux, d_uy = -_dot(na, v2s), -_dot(nb, v2s)
     d_scale = (
         fma(na[0], v[0][0], fma(nb[0], v[1][0], n2[0] * v[2][0])),
         fma(na[1], v[0][1], fma(nb[1], v[1][1], n2[1] * v[2][1])),
         fma(na[2], v[0][2], fma(nb[2], v[1][2], n2[2] * v[2][2])),
     )
-    _store3(d_scales, row, _multiply(d_scale, scale) if raw else d_scale)
-    dv = (_multiply(na, scale), _multiply(nb, scale), _multiply(n2, scale))
-    gw, gx, gy, gz = _rotation_backward(qw, qx, qy, qz, _rotate_back(camera, dv))
-    along = fma(gw, qw, _dot((gx, gy, gz), (qx, qy, qz)))
-    along = where(inverse_norm < np.float32(1e8), along, ZERO)  # shorter quaternions were scaled by a constant
-    _store4(d_quats, row, (
-        (gw - qw * along) * inverse_norm, (gx - qx * along) * inverse_norm,
-        (gy - qy * along) * inverse_norm, (gz - qz * along) * inverse_norm,
+    _store3(d_scales, target_row, _multiply_elements(d_scale, scale) if raw else d_scale)
+    dv = (_multiply_elements(na, scale), _multiply_elements(nb, scale), _multiply_elements(n2, scale))
+    gw, gx, gy, gz = _rotation_backward(qw, qx, qy, qz, _rotate_to_world(camera, dv))
+    radial = fma(gw, qw, _dot((gx, gy, gz), (qx, qy, qz)))
+    radial = where(inverse_norm < MAX_INVERSE_NORM, radial, ZERO)  # shorter quaternions were scaled by a constant
+    _store4(d_quats, target_row, (
+        (gw - qw * radial) * inverse_norm, (gx - qx * radial) * inverse_norm,
+        (gy - qy * radial) * inverse_norm, (gz - qz * radial) * inverse_norm,
     ))  # fmt: skip
 
     inside_x = (slopes[0] >= camera[LOW_X]) & (slopes[0] <= camera[HIGH_X])
@@ -544,14 +564,14 @@ def _project_block_backward(
     )
     direction, _ = _direction(mean, camera)
     harmonics.coefficients_backward(degree, direction[0], direction[1], direction[2], d_colour, rows, transposed)
-    harmonics.scatter(transposed, row, sh_width, d_sh, cached)
+    harmonics.scatter(transposed, target_row, sh_width, d_sh, keep_cached)
     offset = _offset_gradient(d_colour, colour_slopes)
     d_mean = (
         fma(dp[0], camera[0], fma(dp[1], camera[3], fma(dp[2], camera[6], offset[0]))),
         fma(dp[0], camera[1], fma(dp[1], camera[4], fma(dp[2], camera[7], offset[1]))),
         fma(dp[0], camera[2], fma(dp[1], camera[5], fma(dp[2], camera[8], offset[2]))),
     )
-    _store3(d_means, row, d_mean)
+    _store3(d_means, target_row, d_mean)
     if with_camera:
         intrinsics = (fma(dx, slopes[0], a_da / camera[FX]), fma(dy, slopes[1], b_db / camera[FY]), dx, dy)
         _add_camera_gradients(sums, is_new, mean, q, dv, dp, offset, intrinsics)
@@ -559,27 +579,28 @@ def _project_block_backward(
 
 @kernel
 def project_backward(
-    counter, scratch, parameters, sh_width, degree, raw, camera, records, slopes, gradients, slots, counts,
-    d_parameters, d_centres, d_camera, with_camera, first_moments, second_moments, rates, constants,
+    counter, scratch, parameters, sh_width, degree, raw, camera, records, colour_slopes, gradients, first_slots,
+    counts, d_parameters, d_centres, d_camera, with_camera, first_moments, second_moments, rates, constants,
 ):  # fmt: skip
     """Write the gradients of all inputs from the rasterizer's gradient rows.
 
     parameters: means, quats, scales, opacities, and sh if they are stepped; d_parameters: the gradients of all five. If
-    these are empty, the parameters are stepped by their gradients instead (`stepping.StepArrays`), chunk by chunk.
-    gradients: one row for each pair of Gaussian and tile; Gaussian i has counts[i] rows from slots[i] on.
-    d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if with_camera.
-    """
+    these are empty, the parameters are stepped by their gradients instead, chunk by chunk; first_moments,
+    second_moments, rates, constants: see `stepping.StepArrays`.
+    gradients: one row for each pair of Gaussian and tile; Gaussian i has counts[i] rows from first_slots[i] on.
+    colour_slopes: from `project`; d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if with_camera."""
     means, quats, scales, opacities, _ = parameters
     n = opacities.size
     transposed, rows = scratch[:TRANSPOSED], scratch[TRANSPOSED : TRANSPOSED + SQUARE]
     sums = scratch[TRANSPOSED + SQUARE : SCRATCH]
-    stepping = d_parameters[0].size == 0
+    steps_parameters = d_parameters[0].size == 0
     targets = d_parameters
-    if stepping:
-        rest, size = scratch[SCRATCH:], CHUNK_CAPACITY
+    if steps_parameters:
+        chunk_scratch, capacity = scratch[SCRATCH:], CHUNK_CAPACITY
         targets = (
-            rest[: 3 * size], rest[3 * size : 7 * size], rest[7 * size : 10 * size], rest[10 * size : 11 * size],
-            rest[11 * size :],
+            chunk_scratch[: 3 * capacity], chunk_scratch[3 * capacity : 7 * capacity],
+            chunk_scratch[7 * capacity : 10 * capacity], chunk_scratch[10 * capacity : 11 * capacity],
+            chunk_scratch[11 * capacity :],
         )  # fmt: skip
     d_means, d_quats, d_scales, d_opacities, d_sh = targets
     chunks = max(1, n // CHUNK + np.int64(n % CHUNK >= LANES))  # a remainder below 16 joins the last chunk
@@ -593,20 +614,21 @@ def project_backward(
                 store(sums, i, splat(ZERO))
         for block in range(start, end, LANES):
             first = min(block, end - LANES)  # the last block overlaps the one before
-            fields = _gather_gradients(gradients, slots, counts, first, rows)
+            fields = _gather_gradients(gradients, first_slots, counts, first, rows)
             is_new = lane_index() >= np.float32(block - first)
             _project_block_backward(
-                means, quats, scales, opacities, sh_width, degree, raw, camera, records, slopes[block * SLOPES :],
-                first, is_new, fields, transposed, rows, d_means, d_quats, d_scales, d_opacities, d_sh,
-                first - start if stepping else first, stepping, d_centres, sums, with_camera,
+                means, quats, scales, opacities, sh_width, degree, raw, camera, records,
+                colour_slopes[block * SLOPES :], first, is_new, fields, transposed, rows, d_means, d_quats, d_scales,
+                d_opacities, d_sh,
+                first - start if steps_parameters else first, steps_parameters, d_centres, sums, with_camera,
             )  # fmt: skip
-        if stepping:
+        if steps_parameters:
             for i in range(len(parameters)):
                 width = parameters[i].size // n
-                low, high = start * width, end * width
+                start_number, end_number = start * width, end * width
                 step_array(
-                    parameters[i][low:high], targets[i], first_moments[i][low:high], second_moments[i][low:high],
-                    rates[i], unpack_constants(constants[i]),
+                    parameters[i][start_number:end_number], targets[i], first_moments[i][start_number:end_number],
+                    second_moments[i][start_number:end_number], rates[i], unpack_constants(constants[i]),
                 )  # fmt: skip
         if with_camera:
             for i in range(CAMERA_SUMS):

@@ -47,12 +47,12 @@ from .raster_forward import (
     PREFETCH_DISTANCE,
     T_PLANE,
     falloff,
+    init_tile,
     is_needle,
     needle_offsets,
     next_entry,
     run_length,
     start_run,
-    start_tile,
 )
 from .vector import (
     atomic_increment,
@@ -73,200 +73,210 @@ from .vector import (
 S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH, MEAN_DEPTH = (i * TILE_WIDTH for i in range(1, 8))
 ROW = 9 * TILE_WIDTH  # an odd number of cache lines, so that rows fall into all sets of the cache
 STATE = ROW * TILE_HEIGHT
-EDGE = 3 * TILE_WIDTH
-SCRATCH = STATE + 6 * EDGE
+PADDED_ROW = 3 * TILE_WIDTH
+SCRATCH = STATE + 6 * PADDED_ROW
 
 
 @inlined
-def _load_gradients(
+def _init_row(
     state, row, pixel, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
 ):  # fmt: skip
-    """Write one row of pixel gradients, and S before the first Gaussian, for 16 pixels from the flat index `pixel` on.
+    """Write one row of a tile's state before its first Gaussian: S and the gradients of the pixels.
 
-    The background counts as an opposite gradient of alpha. Depth adds nothing to S, since the sum of
+    row: of the tile; pixel: flat index of its first pixel. image (h w 3), alphas and depths (h w): the pictures, each
+    with its gradient. The background counts as an opposite gradient of alpha. Depth adds nothing to S, since the sum of
     w (depth - mean depth) is 0."""
-    at = row * ROW
-    at_colour = 3 * pixel
-    colour = deinterleave((load(image, at_colour), load(image, at_colour + 16), load(image, at_colour + 32)))
-    v = deinterleave((load(d_image, at_colour), load(d_image, at_colour + 16), load(d_image, at_colour + 32)))
+    state_row = row * ROW
+    colour_index = 3 * pixel
+    colour = deinterleave((load(image, colour_index), load(image, colour_index + 16), load(image, colour_index + 32)))
+    v = deinterleave((load(d_image, colour_index), load(d_image, colour_index + 16), load(d_image, colour_index + 32)))
     alpha = load(alphas, pixel)
-    t = ONE - alpha
+    transmittance = ONE - alpha
     behind = fma(v[0], background[0], fma(v[1], background[1], v[2] * background[2]))
     v_alpha = (load(d_alphas, pixel) if d_alphas.size > 0 else splat(ZERO)) - behind
-    s = fma(v[0], colour[0], fma(v[1], colour[1], v[2] * colour[2])) - t * behind
+    s_before = fma(v[0], colour[0], fma(v[1], colour[1], v[2] * colour[2])) - transmittance * behind
     if with_depth:
-        store(state, at + V_DEPTH, load(d_depths, pixel) / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN))
-        store(state, at + MEAN_DEPTH, load(depths, pixel))
-    store(state, at + S_PLANE, fma(v_alpha, alpha, s))
-    store(state, at + V_RED, v[0])
-    store(state, at + V_GREEN, v[1])
-    store(state, at + V_BLUE, v[2])
-    store(state, at + V_ALPHA, v_alpha)
+        weight = where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN)
+        store(state, state_row + V_DEPTH, load(d_depths, pixel) / weight)
+        store(state, state_row + MEAN_DEPTH, load(depths, pixel))
+    store(state, state_row + S_PLANE, fma(v_alpha, alpha, s_before))
+    store(state, state_row + V_RED, v[0])
+    store(state, state_row + V_GREEN, v[1])
+    store(state, state_row + V_BLUE, v[2])
+    store(state, state_row + V_ALPHA, v_alpha)
 
 
 @inlined
-def row_gradient(state, at, e, records, record, with_depth):
-    """Return g and w (see the module head) of one row of a Gaussian, and update T and S.
+def row_gradient(state, state_row, e, records, record, with_depth):
+    """Return g and w (see the module head) of one row of a Gaussian, and update T and S of that row in the state.
 
-    at: offset of the row in the state; e: opacity times profile."""
-    t, s = load(state, at + T_PLANE), load(state, at + S_PLANE)
-    counts = (e >= ALPHA_MIN) & (t >= T_MIN)
-    w = where(counts, t * e, ZERO)
-    vc = fma(load(state, at + V_RED), load_scalar(records, record + RED), load(state, at + V_ALPHA))
-    vc = fma(load(state, at + V_GREEN), load_scalar(records, record + GREEN), vc)
-    vc = fma(load(state, at + V_BLUE), load_scalar(records, record + BLUE), vc)
+    state_row: index of the row's first number in the state; e: opacity times profile."""
+    t, s = load(state, state_row + T_PLANE), load(state, state_row + S_PLANE)
+    is_drawn = (e >= ALPHA_MIN) & (t >= T_MIN)
+    w = where(is_drawn, t * e, ZERO)
+    vc = fma(load(state, state_row + V_RED), load_scalar(records, record + RED), load(state, state_row + V_ALPHA))
+    vc = fma(load(state, state_row + V_GREEN), load_scalar(records, record + GREEN), vc)
+    vc = fma(load(state, state_row + V_BLUE), load_scalar(records, record + BLUE), vc)
     if with_depth:
-        vc = fma(load(state, at + V_DEPTH), load_scalar(records, record + DEPTH) - load(state, at + MEAN_DEPTH), vc)
+        depth = load_scalar(records, record + DEPTH)
+        vc = fma(load(state, state_row + V_DEPTH), depth - load(state, state_row + MEAN_DEPTH), vc)
     wvc = w * vc
     s = s - wvc
-    store(state, at + S_PLANE, s)
-    store(state, at + T_PLANE, t - w)
-    return wvc - s * where(counts, e / (ONE - e), ZERO), w
+    store(state, state_row + S_PLANE, s)
+    store(state, state_row + T_PLANE, t - w)
+    return wvc - s * where(is_drawn, e / (ONE - e), ZERO), w
 
 
 @inlined
-def _add_colours(state, at, w, sums, with_depth):
-    """Add w v to the sums for red, green, blue and depth."""
-    d_red = fma(w, load(state, at + V_RED), sums[0])
-    d_green = fma(w, load(state, at + V_GREEN), sums[1])
-    d_blue = fma(w, load(state, at + V_BLUE), sums[2])
-    d_depth = fma(w, load(state, at + V_DEPTH), sums[3]) if with_depth else sums[3]
+def _add_colours(state, state_row, w, sums, with_depth):
+    """Return the sums for red, green, blue and depth with w v added; state_row: as in `row_gradient`."""
+    d_red = fma(w, load(state, state_row + V_RED), sums[0])
+    d_green = fma(w, load(state, state_row + V_GREEN), sums[1])
+    d_blue = fma(w, load(state, state_row + V_BLUE), sums[2])
+    d_depth = fma(w, load(state, state_row + V_DEPTH), sums[3]) if with_depth else sums[3]
     return d_red, d_green, d_blue, d_depth
 
 
 @inlined
-def _needle_sums(state, records, at, left, top, first, end, with_depth):
-    """Return sums of g u, g d_y, g u², g u d_y, g d_y², g and colours, with an exponential for each row."""
+def _needle_sums(state, records, record, left, top, first_row, end_row, with_depth):
+    """Return sums of g u, g d_y, g u², g u d_y, g d_y², g, and a tuple of those for red, green, blue and depth, by
+    lane, with an exponential for each row."""
     zero = splat(ZERO)
     m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
     colours = (zero, zero, zero, zero)
-    row, one = first, opaque(1)
-    while row < end:
-        u, dy = needle_offsets(records, at, left, top + row)
-        e = falloff(records, at, u, dy) * load_scalar(records, at + OPACITY)
-        g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
+    row, opaque_one = first_row, opaque(1)
+    while row < end_row:
+        u, dy = needle_offsets(records, record, left, top + row)
+        e = falloff(records, record, u, dy) * load_scalar(records, record + OPACITY)
+        g, w = row_gradient(state, row * ROW, e, records, record, with_depth)
         colours = _add_colours(state, row * ROW, w, colours, with_depth)
         gu, gy = g * u, g * dy
         m, mu, my = m + g, mu + gu, my + gy
         muu, muy, myy = fma(gu, u, muu), fma(gu, dy, muy), fma(gy, dy, myy)
-        row += one
+        row += opaque_one
     return mu, my, muu, muy, myy, m, colours
 
 
 @inlined
-def moments(records, at, left, m0, m1, m2):
+def moments(records, record, left, m0, m1, m2):
     """Return sums of g times u, d_y, u², u d_y, d_y² in each lane, from m_i = sum g d_y^i. With u = d_x + k d_y,
 
     sum g u = d_x m0 + k m1,   sum g u d_y = d_x m1 + k m2,   sum g u² = d_x (d_x m0 + 2 k m1) + k² m2
     """
-    k = load_scalar(records, at + K)
-    dx = lane_index() + (np.float32(left) + HALF - load_scalar(records, at + X))
+    k = load_scalar(records, record + K)
+    dx = lane_index() + (np.float32(left) + HALF - load_scalar(records, record + X))
     mu = fma(dx, m0, m1 * k)
     return mu, m1, fma(dx, fma(m1, k, mu), m2 * (k * k)), fma(dx, m1, m2 * k), m2
 
 
 @inlined
-def _recurrence_sums(state, records, at, left, top, first, end, start, with_depth):
+def _recurrence_sums(state, records, record, left, top, first_row, end_row, run_start, with_depth):
     """Return the sums of `_needle_sums` by the recurrence and three running sums per lane: of g over the rows, of the
     values of the first sum, and of those of the second. A row j rows above the end counts 1, j and j (j + 1) / 2 times
     in them."""
-    step, one, run = load_scalar(records, at + STEP), opaque(1), run_length(records, at)
+    step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)
     zero = splat(ZERO)
     m0, m1, m2 = zero, zero, zero
     colours = (zero, zero, zero, zero)
-    e, r, top_dy = start
-    row, stop = first, min(first + run, end)
+    e, r, first_dy = run_start
+    row, run_end = first_row, min(first_row + run, end_row)
     while True:
-        while row < stop:
-            g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
+        while row < run_end:
+            g, w = row_gradient(state, row * ROW, e, records, record, with_depth)
             colours = _add_colours(state, row * ROW, w, colours, with_depth)
             m0 = m0 + g
             m1 = m1 + m0
             m2 = m2 + m1
             e = e * r
             r = fma(r, step, r)
-            row += one
-        if row >= end:
+            row += opaque_one
+        if row >= end_row:
             break
-        e, r, _ = start_run(records, at, left, top + row)
-        stop = min(row + run, end)
-    # below: d_y of the row below the last; j rows above it d_y = below - j, and j² = 2 (j (j + 1) / 2) - j
-    below = top_dy + np.float32(end - first)
-    m2 = m0 * (below * below) - m1 * (below * TWO + ONE) + m2 * TWO
-    m1 = m0 * below - m1
-    mu, my, muu, muy, myy = moments(records, at, left, m0, m1, m2)
+        e, r, _ = start_run(records, record, left, top + row)
+        run_end = min(row + run, end_row)
+    # end_dy: d_y of end_row; j rows above it d_y = end_dy - j, and j² = 2 (j (j + 1) / 2) - j
+    end_dy = first_dy + np.float32(end_row - first_row)
+    m2 = m0 * (end_dy * end_dy) - m1 * (end_dy * TWO + ONE) + m2 * TWO
+    m1 = m0 * end_dy - m1
+    mu, my, muu, muy, myy = moments(records, record, left, m0, m1, m2)
     return mu, my, muu, muy, myy, m0, colours
 
 
 @inlined
-def _gradient_row(state, records, at, left, top, first, end, start, with_depth):
+def _gradient_row(state, records, record, left, top, first_row, end_row, run_start, with_depth):
     """Return the gradient row (see `layout`) of one Gaussian in one tile."""
-    if is_needle(records, at, end - first):
-        mu, my, muu, muy, myy, m, colours = _needle_sums(state, records, at, left, top, first, end, with_depth)
+    if is_needle(records, record, end_row - first_row):
+        mu, my, muu, muy, myy, m, colours = _needle_sums(
+            state, records, record, left, top, first_row, end_row, with_depth
+        )
     else:
         mu, my, muu, muy, myy, m, colours = _recurrence_sums(
-            state, records, at, left, top, first, end, start, with_depth
+            state, records, record, left, top, first_row, end_row, run_start, with_depth
         )
     return reduce_add_each((mu, my, muu, muy, myy, m, colours[0], colours[1], colours[2], colours[3]))
 
 
 @inlined
-def _edge_row(edge, pixel, count, image, alphas, depths, d_image, d_alphas, d_depths, with_depth):
-    """Copy the `count` pixels of a tile row that lie inside the picture to `edge` (6, EDGE), zeros beyond.
+def _pad_row(padded, pixel, count, image, alphas, depths, d_image, d_alphas, d_depths, with_depth):
+    """Copy the `count` pixels of a tile row that lie inside the picture to `padded` (6, PADDED_ROW), zeros beyond.
 
-    pixel: flat index of the first. Rows of edge: image, its gradient, then alpha and depth, each with its gradient."""
-    edge[:, :] = ZERO
-    lane, one = 0, opaque(1)
-    while lane < 3 * count:
-        edge[0, lane], edge[1, lane] = image[3 * pixel + lane], d_image[3 * pixel + lane]
-        lane += one
-    lane = 0
-    while lane < count:
-        edge[2, lane] = alphas[pixel + lane]
+    pixel: flat index of the first. Rows of `padded`: image, its gradient, then alpha and depth, each with its
+    gradient."""
+    padded[:, :] = ZERO
+    i, opaque_one = 0, opaque(1)
+    while i < 3 * count:
+        padded[0, i], padded[1, i] = image[3 * pixel + i], d_image[3 * pixel + i]
+        i += opaque_one
+    i = 0
+    while i < count:
+        padded[2, i] = alphas[pixel + i]
         if d_alphas.size > 0:
-            edge[3, lane] = d_alphas[pixel + lane]
+            padded[3, i] = d_alphas[pixel + i]
         if with_depth:
-            edge[4, lane], edge[5, lane] = depths[pixel + lane], d_depths[pixel + lane]
-        lane += one
+            padded[4, i], padded[5, i] = depths[pixel + i], d_depths[pixel + i]
+        i += opaque_one
 
 
 @inlined
-def load_tile(
-    state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth, edge
+def init_tile_backward(
+    state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth, padded
 ):  # fmt: skip
-    """Write the state of a tile before its first Gaussian; edge: workspace for tiles that the picture's edge cuts."""
-    start_tile(state, ROW, left, top, width, height)
-    row, one = 0, opaque(1)
+    """Write the state of a tile before its first Gaussian; pictures and gradients: see `_init_row`.
+
+    padded: workspace (6, PADDED_ROW) for tiles that reach beyond the right edge of the picture."""
+    init_tile(state, ROW, left, top, width, height)
+    row, opaque_one = 0, opaque(1)
     while row < min(TILE_HEIGHT, height - top):
         pixel = (top + row) * width + left
         if left + TILE_WIDTH <= width:
-            _load_gradients(
+            _init_row(
                 state, row, pixel, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
             )
         else:
-            _edge_row(
-                edge, pixel, width - left, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
+            _pad_row(
+                padded, pixel, width - left, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
             )
-            _load_gradients(  # pixel * 0: `edge` begins at index 0; a constant would be compiled as another version
-                state, row, pixel * 0, background, edge[0], edge[2], edge[4], edge[1], edge[3], edge[5], with_depth
+            _init_row(  # pixel * 0: `padded` begins at index 0; a constant would be compiled as another version
+                state, row, pixel * 0, background, padded[0], padded[2], padded[4], padded[1], padded[3], padded[5],
+                with_depth,
             )
-        row += one
+        row += opaque_one
 
 
 @inlined
-def _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth):
-    """Write the gradient rows of a tile's entries begin .. end; zeros from `used` on, which were not drawn."""
-    if begin < used:
+def _tile_backward(entries, begin, drawn_end, end, records, left, top, state, gradients, with_depth):
+    """Write the gradient rows of a tile's entries begin .. end - 1; zeros from drawn_end on, which were not drawn."""
+    if begin < drawn_end:
         upcoming = next_entry(entries, begin, end, records, left, top)
-        for e in range(begin, used):
-            at, first, last, start = upcoming
-            upcoming = next_entry(entries, e + 1, end, records, left, top)
-            far = min(e + PREFETCH_DISTANCE, end - 1)
-            prefetch_to_write(gradients, load_scalar(entries, far * ENTRY + SLOT) * RECORD)
-            row = _gradient_row(state, records, at, left, top, first, last, start, with_depth)
-            store(gradients, load_scalar(entries, e * ENTRY + SLOT) * RECORD, row)
-    for e in range(used, end):
-        store(gradients, load_scalar(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
+        for index in range(begin, drawn_end):
+            record, first_row, end_row, run_start = upcoming
+            upcoming = next_entry(entries, index + 1, end, records, left, top)
+            upcoming_index = min(index + PREFETCH_DISTANCE, end - 1)
+            prefetch_to_write(gradients, load_scalar(entries, upcoming_index * ENTRY + SLOT) * RECORD)
+            gradient_row = _gradient_row(state, records, record, left, top, first_row, end_row, run_start, with_depth)
+            store(gradients, load_scalar(entries, index * ENTRY + SLOT) * RECORD, gradient_row)
+    for index in range(drawn_end, end):
+        store(gradients, load_scalar(entries, index * ENTRY + SLOT) * RECORD, splat(ZERO))
 
 
 @kernel
@@ -274,22 +284,23 @@ def raster_backward(
     counter, scratch, entries, starts, ends, records, background, width, height, tiles_x, image, alphas, depths,
     d_image, d_alphas, d_depths, gradients,
 ):  # fmt: skip
-    """Write the gradient row of each slot, RECORD numbers, to `gradients`. d_alphas and d_depths may be empty.
+    """Write the gradient row of each slot, RECORD numbers, to `gradients`; d_alphas and d_depths may be empty.
 
-    starts, ends: see `raster`; scratch: workspace of SCRATCH numbers."""
-    state, edge = scratch[:STATE], scratch[STATE:SCRATCH].reshape(6, EDGE)
+    counter: of the next tile; scratch: workspace of SCRATCH numbers; d_image (h w 3), d_alphas, d_depths (h w):
+    gradients of the pictures; all else as `raster` of `raster_forward` had it or wrote it."""
+    state, padded = scratch[:STATE], scratch[STATE:SCRATCH].reshape(6, PADDED_ROW)
     with_depth = d_depths.size > 0
     while True:
         tile = atomic_increment(counter)
         if tile >= ends.size:
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
-        begin, used, end = starts[tile], ends[tile], starts[tile + 1]
-        load_tile(
+        begin, drawn_end, end = starts[tile], ends[tile], starts[tile + 1]
+        init_tile_backward(
             state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths,
-            with_depth, edge,
+            with_depth, padded,
         )  # fmt: skip
         if with_depth:  # two loops for LLVM to specialise
-            _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth)
+            _tile_backward(entries, begin, drawn_end, end, records, left, top, state, gradients, with_depth)
         else:
-            _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth)
+            _tile_backward(entries, begin, drawn_end, end, records, left, top, state, gradients, with_depth)

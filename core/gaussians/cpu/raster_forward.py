@@ -11,9 +11,13 @@ r = 2^(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(2 (A k² + D)) - 1, which 
 The recurrence restarts after `run` rows, over which e changes by 40 powers of two, so that neither underflow nor
 rounding spoils it. Where runs would be too short (needles), e is computed for each row.
 
-Arguments of the functions here and in `raster_backward` and `flare`: records, at (or record): the records, and the
-offset of the Gaussian's; left, top: first pixel column and row of the tile; first, end: the rows of the tile from
-`first` to before `end`; state: the tile's workspace; start: e, r and d_y in row `first`, from `start_run`.
+Arguments of the functions here and in `raster_backward` and `flare`:
+
+    records, record      the records, and the index of the Gaussian's first number in them
+    left, top            first pixel column and row of the tile
+    first_row, end_row   rows of the tile that the Gaussian covers: its first, and the one after its last
+    state                the tile's workspace, ROW numbers for each of its rows
+    run_start            e, r and d_y in the first row, from `start_run`
 """
 from __future__ import annotations
 
@@ -82,197 +86,209 @@ STATE = ROW * TILE_HEIGHT
 
 
 @inlined
-def offsets(records, at, left, y):
+def offsets(records, record, left, y):
     """Return u at the 16 pixels from column `left` on of the pixel row y, and d_y."""
-    dy = np.float32(y) + HALF - load_scalar(records, at + Y)
-    dx = lane_index() + (np.float32(left) + HALF - load_scalar(records, at + X))
-    return dx + load_scalar(records, at + K) * dy, dy
+    dy = np.float32(y) + HALF - load_scalar(records, record + Y)
+    dx = lane_index() + (np.float32(left) + HALF - load_scalar(records, record + X))
+    return dx + load_scalar(records, record + K) * dy, dy
 
 
 @inlined
-def needle_offsets(records, at, left, y):
+def needle_offsets(records, record, left, y):
     """Return the same u and d_y, computed in float64 for needles, where u is a small sum of large numbers."""
-    dy = y + 0.5 - np.float64(load_scalar(records, at + Y))
-    k = np.float64(load_scalar(records, at + K)) + np.float64(load_scalar(records, at + K_REST))
-    u = left + 0.5 - np.float64(load_scalar(records, at + X)) + k * dy
+    dy = y + 0.5 - np.float64(load_scalar(records, record + Y))
+    k = np.float64(load_scalar(records, record + K)) + np.float64(load_scalar(records, record + K_REST))
+    u = left + 0.5 - np.float64(load_scalar(records, record + X)) + k * dy
     return lane_index() + np.float32(u), np.float32(dy)
 
 
 @inlined
-def falloff(records, at, u, dy):
+def falloff(records, record, u, dy):
     """Return 2^(A u² + D d_y²), flushed to 0 below 2^-126."""
-    power = fma(u * load_scalar(records, at + A), u, load_scalar(records, at + D) * dy * dy)
+    power = fma(u * load_scalar(records, record + A), u, load_scalar(records, record + D) * dy * dy)
     return where(power > POWER_MIN, exp2_unclamped(power), ZERO)
 
 
 @inlined
-def ratio(records, at, u, dy):
+def row_ratio(records, record, u, dy):
     """Return r, the factor of e from this row to the next; `exp2` clamps it only where rows are zero anyway."""
-    k, slope = load_scalar(records, at + K), load_scalar(records, at + A) * load_scalar(records, at + K)
-    constant = slope * k + load_scalar(records, at + D) * (TWO * dy + ONE)
+    k, slope = load_scalar(records, record + K), load_scalar(records, record + A) * load_scalar(records, record + K)
+    constant = slope * k + load_scalar(records, record + D) * (TWO * dy + ONE)
     return exp2(fma(u, TWO * slope, constant))
 
 
 @inlined
-def run_length(records, at):
+def run_length(records, record):
     """Return the number of rows of a run."""
-    return int(load_scalar(records, at + RUN))
+    return int(load_scalar(records, record + RUN))
 
 
 @inlined
-def is_needle(records, at, rows):
+def is_needle(records, record, rows):
     """Return whether successive rows differ too much for the recurrence; never if all `rows` fit in one run."""
-    run = run_length(records, at)
+    run = run_length(records, record)
     return run < rows and run < MIN_RUN
 
 
 @inlined
-def start_tile(state, row_length, left, top, width, height):
-    """Set transmittance to 1 inside the picture and to 0 outside, so that no work is done there; all else to 0.
+def init_tile(state, row_stride, left, top, width, height):
+    """Set the transmittance of a tile's state to 1 inside the picture and to 0 outside, so that no work is done there;
+    all else to 0.
 
-    row_length: numbers of a row of the state."""
-    at, line = 0, opaque(TILE_WIDTH)
-    while at < row_length * TILE_HEIGHT:
-        store(state, at, splat(ZERO))
-        at += line
+    row_stride: numbers of a row of the state, ROW here or that of `raster_backward`."""
+    index, vector_stride = 0, opaque(TILE_WIDTH)
+    while index < row_stride * TILE_HEIGHT:
+        store(state, index, splat(ZERO))
+        index += vector_stride
     x = lane_index() + np.float32(left)
-    inside = where(x < np.float32(width), splat(ONE), ZERO)
-    row, one = 0, opaque(1)
+    transmittance_in_frame = where(x < np.float32(width), splat(ONE), ZERO)
+    row, opaque_one = 0, opaque(1)
     while row < TILE_HEIGHT:
-        store(state, T_PLANE + row * row_length, inside if top + row < height else splat(ZERO))
-        row += one
+        store(state, T_PLANE + row * row_stride, transmittance_in_frame if top + row < height else splat(ZERO))
+        row += opaque_one
 
 
 @inlined
 def is_finished(state):
-    """Return whether the transmittance of all pixels is below the threshold."""
-    highest = load(state, T_PLANE)
+    """Return whether the transmittance of all pixels of a tile is below the threshold."""
+    max_transmittance = load(state, T_PLANE)
     for row in range(1, TILE_HEIGHT):
-        t = load(state, T_PLANE + row * ROW)
-        highest = where(t > highest, t, highest)
-    return not any_of(highest >= T_MIN)
+        transmittance = load(state, T_PLANE + row * ROW)
+        max_transmittance = where(transmittance > max_transmittance, transmittance, max_transmittance)
+    return not any_of(max_transmittance >= T_MIN)
 
 
 @inlined
-def blend_row(state, at, e, records, record, with_depth):
-    """Blend one row of a Gaussian. at: offset of the row in the state; e: opacity times profile."""
-    t = load(state, at + T_PLANE)
+def blend_row(state, state_row, e, records, record, with_depth):
+    """Blend one row of a Gaussian into the state of a tile, and depth too if `with_depth`.
+
+    state_row: index of the row's first number in the state; e: opacity times profile."""
+    t = load(state, state_row + T_PLANE)
     alpha = where((e >= ALPHA_MIN) & (t >= T_MIN), e, ZERO)
     w = t * alpha
-    after = t - w
-    store(state, at + T_PLANE, after)
-    store(state, at + RED_PLANE, fma(w, load_scalar(records, record + RED), load(state, at + RED_PLANE)))
-    store(state, at + GREEN_PLANE, fma(w, load_scalar(records, record + GREEN), load(state, at + GREEN_PLANE)))
-    store(state, at + BLUE_PLANE, fma(w, load_scalar(records, record + BLUE), load(state, at + BLUE_PLANE)))
+    t_behind = t - w
+    store(state, state_row + T_PLANE, t_behind)
+    store(state, state_row + RED_PLANE, fma(w, load_scalar(records, record + RED), load(state, state_row + RED_PLANE)))
+    green, blue = load(state, state_row + GREEN_PLANE), load(state, state_row + BLUE_PLANE)
+    store(state, state_row + GREEN_PLANE, fma(w, load_scalar(records, record + GREEN), green))
+    store(state, state_row + BLUE_PLANE, fma(w, load_scalar(records, record + BLUE), blue))
     if with_depth:
         depth = load_scalar(records, record + DEPTH)
-        store(state, at + DEPTH_PLANE, fma(w, depth, load(state, at + DEPTH_PLANE)))
-        passes = (t >= HALF) & (after < HALF)
-        store(state, at + MEDIAN_PLANE, where(passes, depth, load(state, at + MEDIAN_PLANE)))
+        store(state, state_row + DEPTH_PLANE, fma(w, depth, load(state, state_row + DEPTH_PLANE)))
+        crosses_half = (t >= HALF) & (t_behind < HALF)
+        store(state, state_row + MEDIAN_PLANE, where(crosses_half, depth, load(state, state_row + MEDIAN_PLANE)))
 
 
 @inlined
-def start_run(records, at, left, y):
+def start_run(records, record, left, y):
     """Return e and r (see the module head) in the pixel row y, and d_y."""
-    u, dy = offsets(records, at, left, y)
-    return falloff(records, at, u, dy) * load_scalar(records, at + OPACITY), ratio(records, at, u, dy), dy
+    u, dy = offsets(records, record, left, y)
+    e = falloff(records, record, u, dy) * load_scalar(records, record + OPACITY)
+    return e, row_ratio(records, record, u, dy), dy
 
 
 @inlined
-def next_entry(entries, e, end, records, left, top):
-    """Return offset of the record, first row, end row and start of entry number e; of the last entry if e lies beyond.
+def next_entry(entries, index, end, records, left, top):
+    """Return the entry's record, first row, end row and run_start (see the module head) for the entry of this index, or
+    for the last one if there are no more.
 
-    Called before the previous entry is drawn, to hide the latency of the exponentials."""
-    at_entry = min(e, end - 1) * ENTRY
-    prefetch(records, load_scalar(entries, min(e + PREFETCH_DISTANCE, end - 1) * ENTRY + GAUSSIAN) * RECORD)
-    at = load_scalar(entries, at_entry + GAUSSIAN) * RECORD
-    first = load_scalar(entries, at_entry + FIRST_ROW)
-    return at, first, load_scalar(entries, at_entry + END_ROW), start_run(records, at, left, top + first)
-
-
-@inlined
-def _blend_needle(state, records, at, left, top, first, end, with_depth):
-    """Blend a Gaussian into rows first .. end of the tile, with an exponential for each row."""
-    row, one = first, opaque(1)
-    while row < end:
-        u, dy = needle_offsets(records, at, left, top + row)
-        e = falloff(records, at, u, dy) * load_scalar(records, at + OPACITY)
-        blend_row(state, row * ROW, e, records, at, with_depth)
-        row += one
+    end: of the tile's entries. Called before the previous entry is drawn, to hide the latency of the exponentials."""
+    entry = min(index, end - 1) * ENTRY
+    prefetch(records, load_scalar(entries, min(index + PREFETCH_DISTANCE, end - 1) * ENTRY + GAUSSIAN) * RECORD)
+    record = load_scalar(entries, entry + GAUSSIAN) * RECORD
+    first_row = load_scalar(entries, entry + FIRST_ROW)
+    return record, first_row, load_scalar(entries, entry + END_ROW), start_run(records, record, left, top + first_row)
 
 
 @inlined
-def _blend(state, records, at, left, top, first, end, start, with_depth):
-    """Blend a Gaussian into rows first .. end of the tile by the recurrence."""
-    step, one, run = load_scalar(records, at + STEP), opaque(1), run_length(records, at)
-    e, r, _ = start
-    row, stop = first, min(first + run, end)
+def _blend_needle(state, records, record, left, top, first_row, end_row, with_depth):
+    """Blend a Gaussian into rows first_row .. end_row - 1 of the tile, with an exponential for each row."""
+    row, opaque_one = first_row, opaque(1)
+    while row < end_row:
+        u, dy = needle_offsets(records, record, left, top + row)
+        e = falloff(records, record, u, dy) * load_scalar(records, record + OPACITY)
+        blend_row(state, row * ROW, e, records, record, with_depth)
+        row += opaque_one
+
+
+@inlined
+def _blend(state, records, record, left, top, first_row, end_row, run_start, with_depth):
+    """Blend a Gaussian into rows first_row .. end_row - 1 of the tile by the recurrence."""
+    step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)
+    e, r, _ = run_start
+    row, run_end = first_row, min(first_row + run, end_row)
     while True:
-        while row < stop:
-            blend_row(state, row * ROW, e, records, at, with_depth)
+        while row < run_end:
+            blend_row(state, row * ROW, e, records, record, with_depth)
             e = e * r
             r = fma(r, step, r)
-            row += one
-        if row >= end:
+            row += opaque_one
+        if row >= end_row:
             break
-        e, r, _ = start_run(records, at, left, top + row)
-        stop = min(row + run, end)
+        e, r, _ = start_run(records, record, left, top + row)
+        run_end = min(row + run, end_row)
 
 
 @inlined
-def _copy(source, at, target, to, count):
-    """Copy the first `count` of a vector's 16 numbers: all if count is larger, none if it is negative."""
+def _copy_pixels(source, source_index, target, target_index, count):
+    """Copy the first `count` of 16 numbers, from an index of the source to an index of the target: all if count is
+    larger, none if it is negative."""
     if count >= TILE_WIDTH:
-        store(target, to, load(source, at))
+        store(target, target_index, load(source, source_index))
         return
-    lane, one = 0, opaque(1)
+    lane, opaque_one = 0, opaque(1)
     while lane < count:
-        target[to + lane] = source[at + lane]
-        lane += one
+        target[target_index + lane] = source[source_index + lane]
+        lane += opaque_one
 
 
 @inlined
 def write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth):
-    """Write the finished tile, over the background, to the flat pictures; overwrites the state."""
+    """Write the finished tile, over the background (3,), to the flat pictures; overwrites the state.
+
+    depths, medians: not written unless `with_depth`."""
     visible_columns = width - left
-    row, one = 0, opaque(1)
+    row, opaque_one = 0, opaque(1)
     while row < min(TILE_HEIGHT, height - top):
-        at, pixel = row * ROW, (top + row) * width + left
-        t = load(state, at + T_PLANE)
+        state_row, pixel = row * ROW, (top + row) * width + left
+        t = load(state, state_row + T_PLANE)
         alpha = ONE - t
-        red = fma(t, load_scalar(background, 0), load(state, at + RED_PLANE))
-        green = fma(t, load_scalar(background, 1), load(state, at + GREEN_PLANE))
-        blue = fma(t, load_scalar(background, 2), load(state, at + BLUE_PLANE))
-        store(state, at + T_PLANE, alpha)
-        store_rows(state, at + RED_PLANE, TILE_WIDTH, interleave((red, green, blue)))
-        _copy(state, at + T_PLANE, alphas, pixel, visible_columns)
-        third = 0  # offset of the first, second or third vector of interleaved colours
-        while third < 3 * TILE_WIDTH:
-            _copy(state, at + RED_PLANE + third, image, 3 * pixel + third, 3 * visible_columns - third)
-            third += one * TILE_WIDTH
+        red = fma(t, load_scalar(background, 0), load(state, state_row + RED_PLANE))
+        green = fma(t, load_scalar(background, 1), load(state, state_row + GREEN_PLANE))
+        blue = fma(t, load_scalar(background, 2), load(state, state_row + BLUE_PLANE))
+        store(state, state_row + T_PLANE, alpha)
+        store_rows(state, state_row + RED_PLANE, TILE_WIDTH, interleave((red, green, blue)))
+        _copy_pixels(state, state_row + T_PLANE, alphas, pixel, visible_columns)
+        vector_offset = 0  # of the first, second or third vector of interleaved colours
+        while vector_offset < 3 * TILE_WIDTH:
+            _copy_pixels(
+                state, state_row + RED_PLANE + vector_offset, image, 3 * pixel + vector_offset,
+                3 * visible_columns - vector_offset,
+            )  # fmt: skip
+            vector_offset += opaque_one * TILE_WIDTH
         if with_depth:
-            depth = load(state, at + DEPTH_PLANE) / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN)
-            store(state, at + DEPTH_PLANE, depth)
-            _copy(state, at + DEPTH_PLANE, depths, pixel, visible_columns)
-            _copy(state, at + MEDIAN_PLANE, medians, pixel, visible_columns)
-        row += one
+            depth = load(state, state_row + DEPTH_PLANE) / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN)
+            store(state, state_row + DEPTH_PLANE, depth)
+            _copy_pixels(state, state_row + DEPTH_PLANE, depths, pixel, visible_columns)
+            _copy_pixels(state, state_row + MEDIAN_PLANE, medians, pixel, visible_columns)
+        row += opaque_one
 
 
 @inlined
 def _raster_tile(entries, begin, end, records, left, top, state, with_depth):
-    """Draw entries begin .. end of a tile until all pixels are finished; return the end of the drawn entries."""
+    """Draw entries begin .. end - 1 of a tile until all pixels are finished; return the end of the drawn entries."""
     if begin == end:
         return end
     upcoming = next_entry(entries, begin, end, records, left, top)
-    for e in range(begin, end):
-        if (e - begin) & (CHECK_INTERVAL - 1) == CHECK_INTERVAL - 1 and is_finished(state):
-            return e
-        at, first, last, start = upcoming
-        upcoming = next_entry(entries, e + 1, end, records, left, top)
-        if is_needle(records, at, last - first):
-            _blend_needle(state, records, at, left, top, first, last, with_depth)
+    for index in range(begin, end):
+        if (index - begin) & (CHECK_INTERVAL - 1) == CHECK_INTERVAL - 1 and is_finished(state):
+            return index
+        record, first_row, end_row, run_start = upcoming
+        upcoming = next_entry(entries, index + 1, end, records, left, top)
+        if is_needle(records, record, end_row - first_row):
+            _blend_needle(state, records, record, left, top, first_row, end_row, with_depth)
         else:
-            _blend(state, records, at, left, top, first, last, start, with_depth)
+            _blend(state, records, record, left, top, first_row, end_row, run_start, with_depth)
     return end
 
 
@@ -282,9 +298,9 @@ def raster(
 ):  # fmt: skip
     """Write colour (h w 3) and alpha (h w), flat; mean and median depth too unless `depths` is empty.
 
-    state: workspace of STATE numbers; starts (tiles + 1,): number of each tile's first entry; ends (tiles,): the end of
-    each tile's drawn entries, written for the backward pass.
-    """
+    counter: of the next tile; state: workspace of STATE numbers; entries, records: see `layout`; starts (tiles + 1,):
+    number of each tile's first entry; background (3,); tiles_x: tiles in a row of them; ends (tiles,): the end of each
+    tile's drawn entries, written for the backward pass."""
     with_depth = depths.size > 0
     while True:
         tile = atomic_increment(counter)
@@ -292,7 +308,7 @@ def raster(
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         begin, end = starts[tile], starts[tile + 1]
-        start_tile(state, ROW, left, top, width, height)
+        init_tile(state, ROW, left, top, width, height)
         if with_depth:  # two loops for LLVM to specialise
             ends[tile] = _raster_tile(entries, begin, end, records, left, top, state, with_depth)
         else:

@@ -37,49 +37,53 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
-        world_to_camera: Tensor, intrinsics: Tensor, background: Tensor, frame: _RasterOptions,
+        world_to_camera: Tensor, intrinsics: Tensor, background: Tensor, options: _RasterOptions,
         centre_gradients: Tensor,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
         """Return colour, alpha, mean depth and median depth, the last two None without depth.
 
-        Puts centres and radii into frame.projected, and zeros into centre_gradients (n, 2). `slopes` are written for
-        the backward pass alone."""
-        n, w, h = len(means), frame.width, frame.height
+        Puts centres and radii into options.projected, and zeros into centre_gradients (n, 2). colour_slopes are written
+        for the backward pass alone."""
+        n, w, h = len(means), options.width, options.height
         camera = np.empty(projection.CAMERA, np.float32)
         projection.pack_camera(
-            flat(world_to_camera), flat(intrinsics), w, h, frame.near, frame.dilation, camera
+            flat(world_to_camera), flat(intrinsics), w, h, options.near, options.dilation, camera
         )
-        records, depths_of, bounds, firsts, tiles, tile_rows = buffers.empty_many(
+        records, gaussian_depths, max_tiles, first_slots, small_tiles, small_rows = buffers.empty_many(
             (n * layout.RECORD, np.float32), (n, np.float32), *[(n, np.int32)] * 4
         )
         centres, centres_flat = buffers.tensor_and_array(n, 2)
         radii, radii_flat = buffers.tensor_and_array(n)
         inputs = [flat(t) for t in (means, quats, scales, opacities)]
         blocks = -(-n // LANES) if any(ctx.needs_input_grad) else 0
-        slopes = buffers.empty(blocks * LANES * projection.SLOPES)
-        chunk_bounds = np.zeros(-(-n // layout.CHUNK), np.int64)
+        colour_slopes = buffers.empty(blocks * LANES * projection.SLOPES)
+        chunk_max_tiles = np.zeros(-(-n // layout.CHUNK), np.int64)
         parallel(
             projection.project, *inputs, flat(sh), sh.shape[1] * 3,
-            frame.sh_degree, frame.raw, camera, w, h, records, centres_flat, radii_flat, depths_of, bounds, tiles,
-            tile_rows, firsts, chunk_bounds, flat(centre_gradients), slopes, scratch=projection.SCRATCH,
+            options.sh_degree, options.raw, camera, w, h, records, centres_flat, radii_flat, gaussian_depths,
+            max_tiles, small_tiles, small_rows, first_slots, chunk_max_tiles, flat(centre_gradients), colour_slopes,
+            scratch=projection.SCRATCH,
         )  # fmt: skip
-        bins = bin_gaussians(records, depths_of.view(np.uint32), tiles, tile_rows, bounds, firsts, chunk_bounds, frame)
+        keys = gaussian_depths.view(np.uint32)  # the bits of a positive number sort as the number
+        bins = bin_gaussians(
+            records, keys, small_tiles, small_rows, max_tiles, first_slots, chunk_max_tiles, options
+        )
 
         image, image_flat = buffers.tensor_and_array(h, w, 3)
         alpha, alpha_flat = buffers.tensor_and_array(h, w)
         (depth, depth_flat), (median, median_flat) = (
-            buffers.tensor_and_array(h, w) if frame.depth else (None, EMPTY) for _ in range(2)
+            buffers.tensor_and_array(h, w) if options.depth else (None, EMPTY) for _ in range(2)
         )
-        ends, behind = np.empty(frame.tiles, np.int64), flat(background)
+        ends, background_flat = np.empty(options.tiles, np.int64), flat(background)
         parallel(
-            raster_forward.raster, bins.entries, bins.starts, records, behind, w, h, frame.tiles_x,
+            raster_forward.raster, bins.entries, bins.starts, records, background_flat, w, h, options.tiles_x,
             image_flat, alpha_flat, depth_flat, median_flat, ends, scratch=raster_forward.STATE,
         )  # fmt: skip
         ctx.save_for_backward(means, quats, scales, opacities, sh, image, alpha, depth)
-        ctx.frame, ctx.bins, ctx.centre_gradients, ctx.first = frame, bins, centre_gradients, True
-        ctx.arrays = records, camera, slopes, ends, behind, inputs, (image_flat, alpha_flat, depth_flat)
+        ctx.options, ctx.bins, ctx.centre_gradients, ctx.is_first_backward = options, bins, centre_gradients, True
+        ctx.arrays = records, camera, colour_slopes, ends, background_flat, inputs, (image_flat, alpha_flat, depth_flat)
         ctx.set_materialize_grads(False)
-        frame.projected.extend((centres, radii))
+        options.projected.extend((centres, radii))
         if median is not None:
             ctx.mark_non_differentiable(median)
         return image, alpha, depth, median
@@ -88,16 +92,16 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None, *_: Any) -> Any:
         """Return the gradients of all inputs, or step the parameters by them if steps are pending (`stepping`)."""
         means, quats, scales, opacities, sh, _, alpha, _ = ctx.saved_tensors  # raises if they were changed in place
-        frame, bins = ctx.frame, ctx.bins
-        records, camera, slopes, ends, behind, inputs, pictures = ctx.arrays
-        n, w, h = len(means), frame.width, frame.height
+        options, bins = ctx.options, ctx.bins
+        records, camera, colour_slopes, ends, background_flat, inputs, pictures = ctx.arrays
+        n, w, h = len(means), options.width, options.height
         v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
         v_alpha = EMPTY if d_alpha is None else flat(d_alpha)
         v_depth = EMPTY if d_depth is None else flat(d_depth)
         rows = buffers.empty(bins.slots * layout.RECORD)
         parallel(
-            raster_backward.raster_backward, bins.entries, bins.starts, ends, records, behind, w, h, frame.tiles_x,
-            *pictures, v_image, v_alpha, v_depth, rows, scratch=raster_backward.SCRATCH,
+            raster_backward.raster_backward, bins.entries, bins.starts, ends, records, background_flat, w, h,
+            options.tiles_x, *pictures, v_image, v_alpha, v_depth, rows, scratch=raster_backward.SCRATCH,
         )  # fmt: skip
         parameters = (means, quats, scales, opacities, sh)
         steps = stepping.claim_steps(parameters)
@@ -106,17 +110,17 @@ class _Rasterize(torch.autograd.Function):
         else:
             gradients, gradients_flat = (None,) * len(parameters), (EMPTY,) * len(parameters)
         # the first backward writes centre_gradients directly; a second one adds to them
-        first, ctx.first = ctx.first, False
-        d_centres = flat(ctx.centre_gradients) if first else buffers.empty(2 * n)
+        is_first, ctx.is_first_backward = ctx.is_first_backward, False
+        d_centres = flat(ctx.centre_gradients) if is_first else buffers.empty(2 * n)
         with_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         sums = np.zeros((-(-n // layout.CHUNK) if with_camera else 0, projection.CAMERA_SUMS), np.float32)
         parallel(
-            projection.project_backward, (*inputs, flat(sh) if steps else EMPTY), sh.shape[1] * 3, frame.sh_degree,
-            frame.raw, camera, records, slopes, rows, bins.firsts, bins.counts, gradients_flat, d_centres, sums,
-            with_camera, *(steps or stepping.NO_STEPS),
+            projection.project_backward, (*inputs, flat(sh) if steps else EMPTY), sh.shape[1] * 3, options.sh_degree,
+            options.raw, camera, records, colour_slopes, rows, bins.first_slots, bins.counts, gradients_flat,
+            d_centres, sums, with_camera, *(steps or stepping.NO_STEPS),
             scratch=projection.STEP_SCRATCH if steps else projection.SCRATCH,
         )  # fmt: skip
-        if not first:
+        if not is_first:
             flat(ctx.centre_gradients)[:] += d_centres
         d_world_to_camera, d_intrinsics = _camera_gradients(sums, camera) if with_camera else (None, None)
         d_background = None
@@ -157,13 +161,13 @@ def rasterize_scene(
     if background is None:
         background = _BLACK
     centre_gradients, _ = buffers.tensor_and_array(len(inputs[0]), 2)
-    frame = _RasterOptions(width, height, sh_degree, near, dilation, depth, raw)
+    options = _RasterOptions(width, height, sh_degree, near, dilation, depth, raw)
     image, alpha, depths, median = _Rasterize.apply(
-        *inputs, _to_float32(world_to_camera), _to_float32(intrinsics), background, frame, centre_gradients
+        *inputs, _to_float32(world_to_camera), _to_float32(intrinsics), background, options, centre_gradients
     )
     if not depth:
         depths, median = _NO_DEPTH, _NO_DEPTH
-    per_gaussian = (*frame.projected, centre_gradients)
+    per_gaussian = (*options.projected, centre_gradients)
     if n < LANES:
         per_gaussian = tuple(t[:n] for t in per_gaussian)
     return Rendering(image, alpha, depths, median, *per_gaussian)

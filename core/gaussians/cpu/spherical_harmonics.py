@@ -29,11 +29,11 @@ ZERO, HALF, TWO, THREE, FOUR, EIGHT = (np.float32(number) for number in (0, 0.5,
 
 
 @inlined
-def gather(sh, first, width, used, transposed):
+def gather(sh, first, width, used_width, transposed):
     """Transpose the first `used` of the `width` numbers of 16 Gaussians, from row `first` of sh (n, width) on."""
-    one = opaque(1)
+    opaque_one = opaque(1)
     column = 0
-    while column < used:
+    while column < used_width:
         if column + LANES <= width:
             rows = load_rows(sh, first * width + column, width)
             store_rows(transposed, column * LANES, LANES, transpose(rows))
@@ -42,19 +42,20 @@ def gather(sh, first, width, used, transposed):
             i = 0
             while i < LANES:
                 transposed[column * LANES + i] = sh[(first + i) * width + column]
-                i += one
-            column += one
+                i += opaque_one
+            column += opaque_one
 
 
 @inlined
-def scatter(transposed, first, width, sh, cached):
-    """Invert `gather`: write all `width` numbers of 16 Gaussians to sh, past the caches unless `cached`."""
-    one = opaque(1)
+def scatter(transposed, first, width, sh, keep_cached):
+    """Invert `gather`: write all `width` numbers of 16 Gaussians to sh (n, width), from row `first` on; past the caches
+    unless keep_cached."""
+    opaque_one = opaque(1)
     column = 0
     while column < width:
         if column + LANES <= width:
             rows = load_rows(transposed, column * LANES, LANES)
-            if width == ROWS and not cached:  # rows of 48 numbers begin at cache lines, as `stream_rows` requires
+            if width == ROWS and not keep_cached:  # rows of 48 numbers begin at cache lines, as `stream_rows` requires
                 stream_rows(sh, first * width + column, width, transpose(rows))
             else:
                 store_rows(sh, first * width + column, width, transpose(rows))
@@ -63,60 +64,64 @@ def scatter(transposed, first, width, sh, cached):
             i = 0
             while i < LANES:
                 sh[(first + i) * width + column] = transposed[column * LANES + i]
-                i += one
-            column += one
+                i += opaque_one
+            column += opaque_one
 
 
 @inlined
-def _basis(degree, x, y, z, b):
-    """Write the basis functions up to this degree, one vector each."""
-    store(b, 0, splat(C0))
+def _write_basis(degree, x, y, z, basis):
+    """Write the basis functions up to this degree at unit directions, one vector each, to `basis`."""
+    store(basis, 0, splat(C0))
     if degree >= 1:
-        store_rows(b, LANES, LANES, (y * -C1, z * C1, x * -C1))
+        store_rows(basis, LANES, LANES, (y * -C1, z * C1, x * -C1))
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        store_rows(b, 4 * LANES, LANES, (
+        store_rows(basis, 4 * LANES, LANES, (
             x * y * C20, y * z * -C20, (zz * TWO - xx - yy) * C21, x * z * -C20, (xx - yy) * C22
         ))  # fmt: skip
         if degree >= 3:
-            four = zz * FOUR - xx - yy
-            store_rows(b, 9 * LANES, LANES, (
-                y * (xx * THREE - yy) * -C30, x * y * z * C31, y * four * -C32,
+            four_zz_less_xx_yy = zz * FOUR - xx - yy
+            store_rows(basis, 9 * LANES, LANES, (
+                y * (xx * THREE - yy) * -C30, x * y * z * C31, y * four_zz_less_xx_yy * -C32,
                 z * (zz * TWO - xx * THREE - yy * THREE) * C33,
-                x * four * -C32, z * (xx - yy) * C34, x * (xx - yy * THREE) * -C30,
+                x * four_zz_less_xx_yy * -C32, z * (xx - yy) * C34, x * (xx - yy * THREE) * -C30,
             ))  # fmt: skip
 
 
 @inlined
-def colours(transposed, degree, x, y, z, b):
-    """Return the colours (r, g, b), not yet clamped at 0, along unit directions. b: workspace of 16 vectors."""
-    _basis(degree, x, y, z, b)
+def colours(transposed, degree, x, y, z, basis):
+    """Return the colours (r, g, b), not yet clamped at 0, along unit directions; transposed: coefficients from
+    `gather`; basis: workspace of 16 vectors."""
+    _write_basis(degree, x, y, z, basis)
     red, green, blue = splat(HALF), splat(HALF), splat(HALF)
     for k in range((degree + 1) * (degree + 1)):
-        value, at = load(b, k * LANES), 3 * k * LANES
-        red = fma(value, load(transposed, at), red)
-        green = fma(value, load(transposed, at + LANES), green)
-        blue = fma(value, load(transposed, at + 2 * LANES), blue)
+        basis_value, index = load(basis, k * LANES), 3 * k * LANES
+        red = fma(basis_value, load(transposed, index), red)
+        green = fma(basis_value, load(transposed, index + LANES), green)
+        blue = fma(basis_value, load(transposed, index + 2 * LANES), blue)
     return red, green, blue
 
 
 @inlined
-def coefficients_backward(degree, x, y, z, v, b, transposed):
-    """Write the transposed gradients of the coefficients from those of the colours, v; zeros above the degree.
+def coefficients_backward(degree, x, y, z, d_colours, basis, transposed):
+    """Write the gradients of the coefficients, transposed as by `gather`, from those of the colours; zeros above the
+    degree.
 
-    b: workspace of 16 vectors."""
-    _basis(degree, x, y, z, b)
-    used = (degree + 1) * (degree + 1)
-    for k in range(used):
-        value = load(b, k * LANES)
-        store_rows(transposed, 3 * k * LANES, LANES, (value * v[0], value * v[1], value * v[2]))
-    for row in range(3 * used, ROWS):
+    basis: workspace of 16 vectors."""
+    _write_basis(degree, x, y, z, basis)
+    num_coefficients = (degree + 1) * (degree + 1)
+    for k in range(num_coefficients):
+        basis_value = load(basis, k * LANES)
+        by_channel = (basis_value * d_colours[0], basis_value * d_colours[1], basis_value * d_colours[2])
+        store_rows(transposed, 3 * k * LANES, LANES, by_channel)
+    for row in range(3 * num_coefficients, ROWS):
         store(transposed, row * LANES, splat(ZERO))
 
 
 @inlined
-def slope(transposed, degree, x, y, z, channel):
-    """Return the gradient of a colour by the direction, sum_k sh_k grad b_k, not yet projected on the sphere."""
+def colour_slope(transposed, degree, x, y, z, channel):
+    """Return the gradient of a channel's colour by the direction, sum_k sh_k grad b_k, not yet projected on the sphere;
+    transposed: coefficients from `gather`."""
     rows, stride = transposed[channel * LANES :], 3 * LANES  # coefficient k is at row k * stride
     zero = splat(ZERO)
     dx, dy, dz = zero, zero, zero

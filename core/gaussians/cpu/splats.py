@@ -27,23 +27,27 @@ class _Splat(torch.autograd.Function):
 
         Rings, arcs and the blend "add" have kernels of their own; other Gaussians use the scene's."""
         n, h, w = len(centres), grid.height, grid.width
-        shaped = rings is not None or arcs is not None
+        has_shapes = rings is not None or arcs is not None
         inputs = [flat(t) for t in (centres, covariances, opacities, colours)]
         shape_inputs = [EMPTY if t is None else flat(t) for t in (rings, arcs)]
         records, shapes = buffers.empty(n * layout.RECORD), buffers.empty(n * flare.SHAPE)
-        keys, bounds, firsts = (buffers.empty(n, kind) for kind in (np.uint32, np.int32, np.int32))
-        chunk_bounds = np.empty(-(-n // layout.CHUNK), np.int64)
-        flare.prepare_records(*inputs, *shape_inputs, w, h, add, records, shapes, keys, bounds, firsts, chunk_bounds)
-        large = np.full(n, -1, np.int32)  # no small footprints: most flare Gaussians are large
-        bins = bin_gaussians(records, keys, large, large, bounds, firsts, chunk_bounds, grid)
+        keys, max_tiles, first_slots = (buffers.empty(n, kind) for kind in (np.uint32, np.int32, np.int32))
+        chunk_max_tiles = np.empty(-(-n // layout.CHUNK), np.int64)
+        flare.prepare_records(
+            *inputs, *shape_inputs, w, h, add, records, shapes, keys, max_tiles, first_slots, chunk_max_tiles
+        )
+        no_small_tiles = np.full(n, -1, np.int32)  # no small footprints: most flare Gaussians are large
+        bins = bin_gaussians(
+            records, keys, no_small_tiles, no_small_tiles, max_tiles, first_slots, chunk_max_tiles, grid
+        )
 
         image, image_flat = buffers.tensor_and_array(h, w, 3)
         alpha, alpha_flat = buffers.tensor_and_array(h, w)
         ends = np.empty(grid.tiles, np.int64)
         tiles = (bins.entries, bins.starts, records)
-        if shaped or add:
+        if has_shapes or add:
             parallel(
-                flare.raster, *tiles, shapes, BLACK, w, h, grid.tiles_x, shaped, arcs is not None, add,
+                flare.raster, *tiles, shapes, BLACK, w, h, grid.tiles_x, has_shapes, arcs is not None, add,
                 image_flat, alpha_flat, ends, scratch=raster_forward.STATE,
             )  # fmt: skip
         else:
@@ -68,10 +72,10 @@ class _Splat(torch.autograd.Function):
         rows = buffers.empty(bins.slots * layout.RECORD)
         tiles = (bins.entries, bins.starts, ends, records)
         pictures = (flat(image), flat(alpha))
-        shaped = rings is not None or arcs is not None
-        if shaped or add:
+        has_shapes = rings is not None or arcs is not None
+        if has_shapes or add:
             parallel(
-                flare.raster_backward, *tiles, shapes, BLACK, w, h, grid.tiles_x, shaped, arcs is not None, add,
+                flare.raster_backward, *tiles, shapes, BLACK, w, h, grid.tiles_x, has_shapes, arcs is not None, add,
                 *pictures, v_image, v_alpha, rows, scratch=raster_backward.SCRATCH,
             )  # fmt: skip
         else:
@@ -82,7 +86,7 @@ class _Splat(torch.autograd.Function):
         gradients = [None if t is None else torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs]
         flare.sum_gradients(
             np.empty(layout.RECORD, np.float32), flat(covariances), flat(opacities), flat(colours),
-            EMPTY if arcs is None else flat(arcs), rows, bins.firsts, bins.counts, add,
+            EMPTY if arcs is None else flat(arcs), rows, bins.first_slots, bins.counts, add,
             *(EMPTY if t is None else flat(t) for t in gradients),
         )  # fmt: skip
         return (*gradients, None, None)

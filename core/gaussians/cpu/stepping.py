@@ -36,22 +36,28 @@ NO_STEPS = StepArrays(
 """Arguments of a backward pass that writes the gradients and makes no steps."""
 
 
+class _NamedStep(NamedTuple):
+    name: str
+    step: AdamStep
+
+
 class StepsInBackward:
     """Steps that a backward pass may make instead of writing the gradients; claimed: names of the parameters whose
     steps were made."""
 
     def __init__(self, steps: Mapping[str, AdamStep], beta1: float, beta2: float, epsilon: float) -> None:
-        self._steps = {id(step.parameter): (name, step) for name, step in steps.items()}
+        self._steps = {id(step.parameter): _NamedStep(name, step) for name, step in steps.items()}
         self._options = (beta1, beta2, epsilon)
         self.claimed: set[str] = set()
 
     def claim(self, parameters: Sequence[Tensor]) -> StepArrays | None:
-        """Return the steps of these parameters, which the caller has to make; None unless all are pending."""
+        """Return the steps of these parameters, which the caller then has to make, and note them in `claimed`; None
+        unless all are pending."""
         pending = [self._steps.get(id(parameter)) for parameter in parameters]
-        if any(entry is None or entry[0] in self.claimed for entry in pending):
+        if any(named_step is None or named_step.name in self.claimed for named_step in pending):
             return None
-        self.claimed.update(entry[0] for entry in pending if entry is not None)
-        steps = [entry[1] for entry in pending if entry is not None]
+        self.claimed.update(named_step.name for named_step in pending if named_step is not None)
+        steps = [named_step.step for named_step in pending if named_step is not None]
         return StepArrays(
             tuple(flat(step.first) for step in steps), tuple(flat(step.second) for step in steps),
             tuple(repeat_rates(step.rate) for step in steps),
@@ -66,7 +72,9 @@ _pending: list[StepsInBackward] = []
 def steps_in_backward(
     steps: Mapping[str, AdamStep], *, beta1: float, beta2: float, epsilon: float
 ) -> Iterator[StepsInBackward]:
-    """Within the context, a backward pass that computes all gradients of a scene may make the steps."""
+    """Offer steps: within the context, a backward pass that computes all gradients of a scene may make them.
+
+    steps: by name of the parameter. Yields the offer, whose `claimed` names the steps that were made."""
     offer = StepsInBackward(steps, beta1, beta2, epsilon)
     _pending.append(offer)
     try:

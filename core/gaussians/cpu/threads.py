@@ -43,6 +43,7 @@ class _Scratch(threading.local):
 
 _scratch = _Scratch()
 _Call = tuple[Callable[..., Any], int, tuple[Any, ...]]
+"""Function, size of its workspace (0 for none), and arguments: those of `_run_call`."""
 
 
 class _Worker:
@@ -65,8 +66,8 @@ class _Worker:
         self._number = number
         with self._state:
             self._call = call
-            asleep, self._is_asleep = self._is_asleep, False
-        if asleep:
+            was_asleep, self._is_asleep = self._is_asleep, False
+        if was_asleep:
             self._wakeup.release()
 
     def wait(self) -> BaseException | None:
@@ -77,19 +78,19 @@ class _Worker:
         return error
 
     def _run(self) -> None:
-        """Make one call after the other; between them spin for a moment, then sleep."""
+        """Make one call after the other, for ever; between them spin for a moment, then sleep."""
         torch.set_flush_denormal(True)  # a register of the thread
         while True:
             number = self._number
             finish_and_spin(self._done, number, self._counters[(number + 1) % 2], MAX_SPINS)
             with self._state:
-                asleep = self._is_asleep = self._call is None
-            if asleep:
+                is_asleep = self._is_asleep = self._call is None
+            if is_asleep:
                 self._wakeup.acquire()
             assert self._call is not None
             call, self._call = self._call, None
             try:
-                _call(*call)
+                _run_call(*call)
             except BaseException as error:
                 self._error = error
             del call  # frees its arrays before the thread waits
@@ -103,20 +104,23 @@ class _ThreadPool:
         self._number = 0
         self._counters = np.zeros((2, buffers.CACHE_LINE // 8), np.int64)
 
-    def call(self, function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...], count: int) -> None:
-        """Call function(counter, [workspace,] *arguments) on the caller's thread and on count - 1 workers, and wait.
+    def call(
+        self, function: Callable[..., Any], scratch_size: int, arguments: tuple[Any, ...], thread_count: int
+    ) -> None:
+        """Call function(counter, [workspace,] *arguments) on the caller's thread and on thread_count - 1 workers, and
+        wait; raise the first error.
 
-        scratch: see `parallel`."""
-        while len(self._workers) < count - 1:
+        scratch_size: see `parallel`."""
+        while len(self._workers) < thread_count - 1:
             self._workers.append(_Worker(self._counters))
         self._number += 1
         self._counters[(self._number + 1) % 2] = 0  # workers read it once they have finished this call
-        call = (function, scratch, (self._counters[self._number % 2], *arguments))
-        workers = self._workers[: count - 1]
+        call = (function, scratch_size, (self._counters[self._number % 2], *arguments))
+        workers = self._workers[: thread_count - 1]
         for worker in workers:
             worker.start(self._number, call)
         try:
-            _call(*call)
+            _run_call(*call)
         finally:
             errors = [worker.wait() for worker in workers]
         for error in errors:
@@ -128,9 +132,9 @@ _idle_pools: list[_ThreadPool] = []
 """Pools that no call uses at the moment; each of several callers at a time takes one."""
 
 
-def _call(function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...]) -> None:
-    counter, *others = arguments
-    function(counter, *([_scratch(scratch)] if scratch else []), *others)
+def _run_call(function: Callable[..., Any], scratch_size: int, arguments: tuple[Any, ...]) -> None:
+    counter, *kernel_arguments = arguments
+    function(counter, *([_scratch(scratch_size)] if scratch_size else []), *kernel_arguments)
 
 
 def parallel(function: Callable[..., Any], *arguments: Any, scratch: int = 0, limit: int | None = None) -> None:
@@ -139,14 +143,14 @@ def parallel(function: Callable[..., Any], *arguments: Any, scratch: int = 0, li
     counter: an int64 array shared by all threads, whose first element starts at 0. scratch: number of float32 values of
     workspace for each thread, passed after the counter unless 0. Raises the first error of any thread.
     """
-    count = torch.get_num_threads() if limit is None else max(1, min(limit, torch.get_num_threads()))
+    thread_count = torch.get_num_threads() if limit is None else max(1, min(limit, torch.get_num_threads()))
     if not getattr(function, "overloads", True):  # compile here, not on all threads at once
-        count = 1
+        thread_count = 1
     try:
         pool = _idle_pools.pop()
     except IndexError:
         pool = _ThreadPool()
     try:
-        pool.call(function, scratch, arguments, count)
+        pool.call(function, scratch, arguments, thread_count)
     finally:
         _idle_pools.append(pool)

@@ -37,16 +37,16 @@ class TileGrid:
 class Bins:
     """Entries by tile, and the slots of each Gaussian; see `binning`.
 
-    entries   flat, `layout.ENTRY` numbers each, tile by tile
-    starts    (tiles + 1,) number of the first entry of each tile
-    firsts    (n,) first slot of each Gaussian
-    counts    (n,) number of its slots
-    slots     number of all slots, including unused ones
+    entries      flat, `layout.ENTRY` numbers each, tile by tile
+    starts       (tiles + 1,) number of the first entry of each tile
+    first_slots  (n,) first slot of each Gaussian
+    counts       (n,) number of its slots
+    slots        number of all slots, including unused ones
     """
 
     entries: Array
     starts: Array
-    firsts: Array
+    first_slots: Array
     counts: Array
     slots: int
 
@@ -57,29 +57,34 @@ def flat(tensor: Tensor) -> Array:
 
 
 def bin_gaussians(
-    records: Array, keys: Array, tiles: Array, rows: Array, bounds: Array, firsts: Array, chunk_bounds: Array,
-    grid: TileGrid,
+    records: Array, keys: Array, small_tiles: Array, small_rows: Array, max_tiles: Array, first_slots: Array,
+    chunk_max_tiles: Array, grid: TileGrid,
 ) -> Bins:  # fmt: skip
-    """Sort n records into tiles, by key; for the arguments see `binning.list_sorted`, which replaces bounds by counts
-    and firsts by first slots.
+    """Sort n Gaussians into tiles, lowest key first; overwrites max_tiles and first_slots, which the result contains.
 
-    chunk_bounds: sums of the bounds over chunks."""
+    records                  flat, see `layout`
+    keys                     (n,) uint32; `binning.CULLED_KEY` for a Gaussian that is not drawn
+    small_tiles, small_rows  (n,) results of `binning.small_footprints`; -1 for larger Gaussians
+    max_tiles                (n,) upper bounds on the numbers of tiles
+    first_slots              (n,) exclusive sums of max_tiles within chunks of `layout.CHUNK` Gaussians
+    chunk_max_tiles          (chunks,) sums of max_tiles by chunk"""
     n, parts = len(keys), min(torch.get_num_threads(), MAX_PARTS)  # each part scans all keys
-    starts_of_chunks, cuts = np.empty(len(chunk_bounds), np.int64), np.empty(parts + 1, np.int64)
-    capacity = binning.plan_parts(
-        keys, bounds, chunk_bounds, max(1, -(-n // SAMPLE_SIZE)), np.empty(binning.HISTOGRAM_BINS, np.int64),
-        starts_of_chunks, cuts,
+    chunk_starts, cuts = np.empty(len(chunk_max_tiles), np.int64), np.empty(parts + 1, np.int64)
+    num_slots = binning.plan_parts(
+        keys, max_tiles, chunk_max_tiles, max(1, -(-n // SAMPLE_SIZE)), np.empty(binning.HISTOGRAM_BINS, np.int64),
+        chunk_starts, cuts,
     )  # fmt: skip
     # Each part needs one place more than it lists: it may write an entry that it does not count.
-    tile_list = buffers.empty((capacity + parts) * binning.LIST_ENTRY, np.int32)
+    tile_list = buffers.empty((num_slots + parts) * binning.LIST_ENTRY, np.int32)
     spans, tile_counts = np.empty((parts, 2), np.int64), np.empty((parts, grid.tiles), np.int32)
     parallel(
-        binning.list_sorted, records, keys, tiles, rows, bounds, firsts, starts_of_chunks, cuts, grid.width,
-        grid.height, grid.tiles_x, np.zeros(2, np.int64), np.empty((parts, binning.DIGITS, 1 << 11), np.int32),
-        buffers.empty(2 * (n + parts), np.int64).reshape(2, -1), tile_list, spans, tile_counts,
+        binning.list_sorted, records, keys, small_tiles, small_rows, max_tiles, first_slots, chunk_starts, cuts,
+        grid.width, grid.height, grid.tiles_x, np.zeros(2, np.int64),
+        np.empty((parts, binning.DIGITS, 1 << 11), np.int32), buffers.empty(2 * (n + parts), np.int64).reshape(2, -1),
+        tile_list, spans, tile_counts,
     )  # fmt: skip
     starts = np.empty(grid.tiles + 1, np.int64)
     binning.scan_tile_counts(tile_counts, starts)
     entries = buffers.empty(int(starts[-1]) * layout.ENTRY, np.int32)
-    parallel(binning.scatter, tile_list, spans, tile_counts, entries)
-    return Bins(entries, starts, firsts, bounds, capacity)
+    parallel(binning.scatter_entries, tile_list, spans, tile_counts, entries)
+    return Bins(entries, starts, first_slots, max_tiles, num_slots)

@@ -116,10 +116,12 @@ def rasterize_scene(
     gradients = record_gradient(centres, index, len(means))
 
     def shade(pixels: Tensor) -> Tensor:
+        """Return red, green, blue, depth and alpha (p, 5) at p pixels."""
         weights = weights_over(profiles(pixels, centres, covariances, None, None), opacities)
         return torch.cat([weights.T @ values, weights.sum(0)[:, None]], -1)
 
     def median(pixels: Tensor) -> Tensor:
+        """Return (p,) median depths at p pixels."""
         alpha, transmittance = alphas_over(profiles(pixels, centres, covariances, None, None), opacities)
         # Gaussians behind which at least half the light passes; the next one is the median, or the appended 0.
         num_in_front = (transmittance * (1 - alpha) >= 0.5).sum(0)
@@ -157,6 +159,7 @@ def splat(
     weigh = weights_over if blend == "over" else weights_add
 
     def shade(pixels: Tensor) -> Tensor:
+        """Return red, green, blue and alpha (p, 4) at p pixels."""
         weights = weigh(profiles(pixels, centres, covariances, rings, arcs), opacities)
         return torch.cat([weights.T @ colours, weights.sum(0)[:, None]], -1)
 

@@ -83,24 +83,25 @@ def whiten_arcs(arcs: Tensor, whitening: Tensor) -> Tensor:
 
 
 def _tile_span(
-    centres: Tensor, half: Tensor, radii: Tensor, columns: int, rows: int, size: int
+    centres: Tensor, half_size: Tensor, radii: Tensor, columns: int, rows: int, tile_size: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the first tile x, y (n, 2) of boxes of half size `half` (n, 2), px, and their size in tiles (n, 2)."""
+    """Return the first tile x, y (n, 2) of boxes of a half size (n, 2), px, and their size in tiles (n, 2)."""
     # Bounded before the conversion, since large floats overflow int64.
-    low = ((centres - half) / size).floor().clamp(min=-1, max=2**30).long().clamp(min=0)
-    high = ((centres + half) / size).floor().clamp(min=-1, max=2**30).long()
+    low = ((centres - half_size) / tile_size).floor().clamp(min=-1, max=2**30).long().clamp(min=0)
+    high = ((centres + half_size) / tile_size).floor().clamp(min=-1, max=2**30).long()
     high = torch.minimum(high, torch.tensor([columns - 1, rows - 1], device=centres.device))
     return low, (high - low + 1).clamp(min=0) * (radii > 0)[:, None]
 
 
 @torch.no_grad()
 def bin_tiles(
-    centres: Tensor, whitening: Tensor, half: Tensor, radii: Tensor, width: int, height: int, size: int
+    centres: Tensor, whitening: Tensor, half_size: Tensor, radii: Tensor, width: int, height: int, tile_size: int
 ) -> TileLists:
-    """Return the lists of tiles that ellipses of Mahalanobis radius `radii` (n,) touch; half (n, 2): half size of their
-    bounding boxes, px."""
-    columns, rows = -(-width // size), -(-height // size)
-    low, span = _tile_span(centres, half, radii, columns, rows, size)
+    """Return the lists of tiles that ellipses of Mahalanobis radius `radii` (n,) touch.
+
+    half_size (n, 2): of their bounding boxes, px; tile_size: px."""
+    columns, rows = -(-width // tile_size), -(-height // tile_size)
+    low, span = _tile_span(centres, half_size, radii, columns, rows, tile_size)
     counts = span.prod(-1)
 
     # One entry for each tile of each box, numbered row by row within its box; then drop those that the ellipse inside
@@ -109,20 +110,22 @@ def bin_tiles(
     tile_number = torch.arange(len(entries), device=centres.device) - (counts.cumsum(0) - counts)[entries]
     box_columns = span[entries, 0]
     x, y = low[entries, 0] + tile_number % box_columns, low[entries, 1] + tile_number // box_columns
-    distances = _min_squared_distance(centres[entries], whitening[entries], torch.stack([x, y], -1) * size, size)
+    distances = _min_squared_distance(
+        centres[entries], whitening[entries], torch.stack([x, y], -1) * tile_size, tile_size
+    )
     is_touched = distances <= (radii * (1 + REACH_MARGIN) + REACH_MARGIN)[entries] ** 2
     tiles, entries = (y * columns + x)[is_touched], entries[is_touched]
 
     order = torch.argsort(tiles, stable=True)
     starts = torch.searchsorted(tiles[order], torch.arange(columns * rows + 1, device=centres.device))
-    return TileLists(entries[order], starts, columns, rows, size)
+    return TileLists(entries[order], starts, columns, rows, tile_size)
 
 
-def _min_squared_distance(centres: Tensor, whitening: Tensor, corners: Tensor, size: int) -> Tensor:
+def _min_squared_distance(centres: Tensor, whitening: Tensor, corners: Tensor, tile_size: int) -> Tensor:
     """Return (m,) the smallest squared Mahalanobis distance from centres (m, 2) to tiles with these upper left corners
-    (m, 2): 0 if the centre is inside, else attained on one of the two edges that face it. size: of a tile, px."""
+    (m, 2): 0 if the centre is inside, else attained on one of the two edges that face it."""
     low = corners - centres
-    high = low + size
+    high = low + tile_size
     # The tile's point nearest to the centre, from the centre: its coordinates are those of the lines of the two edges.
     nearest_x, nearest_y = torch.zeros_like(low).clamp(low, high).unbind(-1)
     w_xx, w_yx, w_yy = whitening.unbind(-1)
@@ -138,25 +141,25 @@ def _min_squared_distance(centres: Tensor, whitening: Tensor, corners: Tensor, s
 
 
 def draw_tiles(
-    draw: DrawTiles, size: int, gaussians: WhitenedGaussians, radii: Tensor, half: Tensor, width: int, height: int,
-    *, blend: Blend, median: bool = False,
+    draw: DrawTiles, tile_size: int, gaussians: WhitenedGaussians, radii: Tensor, half_size: Tensor, width: int,
+    height: int, *, blend: Blend, median: bool = False,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return (height, width, c) weighted sums of the values, and (height, width) rows, see `DrawTiles`.
 
-    radii (n,): Mahalanobis distance up to which each Gaussian is drawn; half (n, 2): half size of its bounding box, px;
-    size: of a tile, px."""
+    radii (n,): Mahalanobis distance up to which each Gaussian is drawn; half_size (n, 2): of its bounding box, px;
+    tile_size: px."""
     centres = gaussians.places.detach()[:, :2]
-    columns, rows = -(-width // size), -(-height // size)
-    entries = int(_tile_span(centres, half, radii, columns, rows, size)[1].prod(-1).sum())
+    columns, rows = -(-width // tile_size), -(-height // tile_size)
+    entries = int(_tile_span(centres, half_size, radii, columns, rows, tile_size)[1].prod(-1).sum())
     if entries > MAX_ENTRIES and rows > 1:  # too many at a time: the upper half of the picture, then the lower
-        middle = rows // 2 * size  # px, at a tile's edge
+        middle = rows // 2 * tile_size  # px, at a tile's edge
         shifted = gaussians._replace(places=gaussians.places - gaussians.places.new_tensor([0, middle, 0, 0, 0]))
         halves = [
-            draw_tiles(draw, size, part, radii, half, width, part_height, blend=blend, median=median)
+            draw_tiles(draw, tile_size, part, radii, half_size, width, part_height, blend=blend, median=median)
             for part, part_height in ((gaussians, middle), (shifted, height - middle))
         ]
         return torch.cat([picture for picture, _ in halves]), torch.cat([median_rows for _, median_rows in halves])
-    lists = bin_tiles(centres, gaussians.places.detach()[:, 2:], half, radii, width, height, size)
+    lists = bin_tiles(centres, gaussians.places.detach()[:, 2:], half_size, radii, width, height, tile_size)
     picture, median_rows = (_assemble(part, lists)[:height, :width] for part in draw(lists, blend, median, gaussians))
     return picture, median_rows
 
@@ -173,12 +176,12 @@ def _to_double(tensor: Tensor) -> Tensor:
 
 
 def rasterize_scene(
-    draw: DrawTiles, size: int,
+    draw: DrawTiles, tile_size: int,
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
-    """Render as `rasterization` of the package does. draw: draws the tiles; size: of a tile, px."""
+    """Render as `rasterization` of the package does. draw: draws the tiles; tile_size: px."""
     scales, opacities = activate(scales, opacities, raw)
     dtype = means.dtype
     projected = project(
@@ -206,8 +209,8 @@ def rasterize_scene(
         None,
     )
     reach = reach[order]
-    half = half_sizes(covariances.detach(), reach)
-    picture, rows = draw_tiles(draw, size, gaussians, reach, half, width, height, blend="over", median=depth)
+    half_size = half_sizes(covariances.detach(), reach)
+    picture, rows = draw_tiles(draw, tile_size, gaussians, reach, half_size, width, height, blend="over", median=depth)
     alpha = picture[..., 4]
     colour = picture[..., :3]
     if background is not None:
@@ -221,11 +224,11 @@ def rasterize_scene(
 
 
 def splat(
-    draw: DrawTiles, size: int,
+    draw: DrawTiles, tile_size: int,
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
     *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """Rasterize as `splat` of the package does at full resolution. draw: draws the tiles; size: of a tile, px."""
+    """Rasterize as `splat` of the package does at full resolution. draw: draws the tiles; tile_size: px."""
     centres, covariances = _to_double(centres), _to_double(covariances)
     index = torch.nonzero(determinants(covariances) > 0)[:, 0]  # a degenerate ellipse covers nothing
     centres, covariances, opacities, colours = (
@@ -244,7 +247,7 @@ def splat(
     if arcs is not None:
         arcs = whiten_arcs(arcs, whitening_factors).to(values.dtype)
     gaussians = WhitenedGaussians(torch.cat([centres, whitening_factors], -1), values, rings, arcs)
-    half = half_sizes(covariances.detach(), reach)
-    picture, _ = draw_tiles(draw, size, gaussians, reach, half, width, height, blend=blend)
+    half_size = half_sizes(covariances.detach(), reach)
+    picture, _ = draw_tiles(draw, tile_size, gaussians, reach, half_size, width, height, blend=blend)
     alpha = picture[..., 3]
     return Splats(picture[..., :3], 1 - alpha if blend == "over" else torch.ones_like(alpha))

@@ -81,25 +81,25 @@ class Optics:
         """z of the sensor, focused at infinity."""
         return float(self.lens.vertices[-1] + self.lens.back_focus())
 
-    def brightest_pairs(self, count: int, fill: float = 0.12) -> list[tuple[int, int]]:
+    def brightest_pairs(self, count: int, slope: float = 0.12) -> list[tuple[int, int]]:
         """Return the `count` pairs (first, second) of surfaces whose ghosts have the most light by area on the sensor.
 
-        fill: tan of the field angle of the light for which they are compared."""
+        slope: tan of the field angle of the light for which they are compared."""
         surfaces = _trace_arguments(self, REFERENCE_WAVELENGTH)
-        optical = [index for index in range(len(self.coating)) if index != self.lens.stop]
-        scored = []
+        reflecting = [index for index in range(len(self.coating)) if index != self.lens.stop]
+        scored_pairs = []
         axis = np.linspace(-1, 1, PAIR_RAYS) * self.lens.semi_aperture[0]
-        for position, first in enumerate(optical):
-            for second in optical[position + 1:]:
-                rays, arrived = trace_grid(axis, axis, fill, first, second, *surfaces)
+        for i, first in enumerate(reflecting):
+            for second in reflecting[i + 1:]:
+                rays, arrived = trace_grid(axis, axis, slope, first, second, *surfaces)
                 radius = np.hypot(rays[..., STOP_X::2], rays[..., STOP_X + 1::2]).max(axis=-1)
                 passes = arrived & (rays[..., STRAY] < 1) & (radius < self.aperture.radius)
                 if passes.sum() < 2:
                     continue
                 # A focused ghost has no area; the added length keeps it from passing all others.
                 spread = np.ptp(rays[passes][:, :2], axis=0).max() + MIN_SPREAD * self.lens.focal_length()
-                scored.append((rays[passes][:, WEIGHT].sum() / spread**2, first, second))
-        return [(first, second) for _, first, second in sorted(scored, reverse=True)[:count]]
+                scored_pairs.append((rays[passes][:, WEIGHT].sum() / spread**2, first, second))
+        return [(first, second) for _, first, second in sorted(scored_pairs, reverse=True)[:count]]
 
 
 def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.0) -> Array:
@@ -108,14 +108,14 @@ def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.
     The wavelengths of `design` take turns over the surfaces between glass and air; all other surfaces get `cemented`,
     0 for none.
     """
-    values = np.full(len(lens.index), cemented)
+    coating = np.full(len(lens.index), cemented)
     previous, design_index = 1.0, 0
     for index, glass in enumerate(lens.index):
         if index != lens.stop and (previous == 1.0) != (glass == 1.0):
-            values[index] = design[design_index % len(design)]
+            coating[index] = design[design_index % len(design)]
             design_index += 1
         previous = glass
-    return values
+    return coating
 
 
 @compile_cached
@@ -233,7 +233,7 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
     supersample = max(1, min(settings.supersample, MAX_SUPERSAMPLED_WIDTH // width))
     picture = np.zeros((height * supersample, width * supersample, 3), np.float32)
     lens = optics.lens
-    length = lens.focal_length()
+    focal_length = lens.focal_length()
     slope = math.hypot(*light)
     azimuth = math.atan2(light[1], light[0])
     cosine, sine = math.cos(azimuth), math.sin(azimuth)
@@ -248,10 +248,10 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
                 continue
             rays, arrived = trace_grid(*grid, slope, *pair, *surfaces)
             # The sensor's picture is upside down; set it upright and turn it to the light's azimuth.
-            x, y = -rays[..., SENSOR_X] / length, -rays[..., SENSOR_X + 1] / length
-            cell = (grid[0][1] - grid[0][0]) * (grid[1][1] - grid[1][0]) / (math.pi * length**2)
+            x, y = -rays[..., SENSOR_X] / focal_length, -rays[..., SENSOR_X + 1] / focal_length
+            cell_area = (grid[0][1] - grid[0][0]) * (grid[1][1] - grid[1][0]) / (math.pi * focal_length**2)
             # The root is the cosine of the field angle, at which the beam enters.
-            density = _density(x, y, cell) * rays[..., WEIGHT] / math.sqrt(1 + slope**2)
+            density = _density(x, y, cell_area) * rays[..., WEIGHT] / math.sqrt(1 + slope**2)
             px = supersample * (centre[0] + focal[0] * (cosine * x - sine * y))
             py = supersample * (centre[1] + focal[1] * (sine * x + cosine * y))
             stop_x, stop_y = rays[..., STOP_X::2], rays[..., STOP_X + 1::2]
@@ -260,8 +260,8 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
                         picture)
     # OpenCV needs a blur above 0.
     blurred = cv2.GaussianBlur(picture, (0, 0), max(settings.size * focal[0] * supersample, 0.3))
-    light_map = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_AREA)
-    return limit_brightness((light_map * np.float32(settings.gain)).astype(np.float32), settings.limit)
+    reduced = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_AREA)
+    return limit_brightness((reduced * np.float32(settings.gain)).astype(np.float32), settings.limit)
 
 
 def limit_brightness(light: NDArray[np.float32], limit: float) -> NDArray[np.float32]:

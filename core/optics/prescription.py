@@ -38,6 +38,8 @@ LINE_F, LINE_D, LINE_C = 0.4861, 0.5876, 0.6563
 CHANNEL_WAVELENGTHS = (0.61, 0.54, 0.46)
 """Of the red, green and blue channel, micrometres."""
 MAGNESIUM_FLUORIDE_INDEX = 1.38
+MAX_AIR_INDEX = 1.01
+"""Refractive index above which a medium is glass; a surface between two glasses is cemented."""
 HALF_DIAGONAL = 21.6
 """Half the diagonal of the 24 x 36 mm frame, mm: the unit of the canvas."""
 
@@ -133,10 +135,10 @@ def trace_ghost_pairs(lens: Prescription) -> list[GhostPath]:
     focus = lens.back_focus()
     indices_by_channel = [lens.indices(wavelength) for wavelength in CHANNEL_WAVELENGTHS]
     # The stop, and surfaces between equal indices, reflect nothing.
-    refracting = [k for k in range(len(lens.index)) if abs(lens.index[k] - _index_before(lens.index, k)) > 1e-3]
+    reflecting = [k for k in range(len(lens.index)) if abs(lens.index[k] - _index_before(lens.index, k)) > 1e-3]
     paths = []
-    for i in refracting:
-        for j in refracting:
+    for i in reflecting:
+        for j in reflecting:
             if j > i:
                 systems = [_trace_path(lens, index, i, j, focus) for index in indices_by_channel]
                 contrast = np.array([[_index_before(index, i), index[i], _index_before(index, j), index[j]]
@@ -194,7 +196,7 @@ def reflectance(n0: Array, n2: Array, wavelengths: Array, coating: float) -> Arr
     glass; cemented surfaces have none.
     """
     bare: Array = np.square((n0 - n2) / (n0 + n2))
-    if coating <= 0 or min(float(np.min(n0)), float(np.min(n2))) > 1.01:
+    if coating <= 0 or min(float(np.min(n0)), float(np.min(n2))) > MAX_AIR_INDEX:
         return bare
     n1 = MAGNESIUM_FLUORIDE_INDEX
     r01, r12 = (n0 - n1) / (n0 + n1), (n1 - n2) / (n1 + n2)

@@ -115,14 +115,15 @@ def _pixel_rows(y, low, high, height):
 
 
 @inlined
-def _ellipse_rows(half_x, square, bend, lean, x):
+def _ellipse_rows(half_x, root_squared, root_falloff, shear, x):
     """Return the smallest and largest y, from the centre, of the ellipse at the horizontal offset x, which is clamped
     to its extent.
 
-    square = t / C, bend = A D / C², lean = -A k / C; see the module head."""
+    They are shear x ± sqrt(root_squared - root_falloff x²): root_squared = t / C, root_falloff = A D / C²,
+    shear = -A k / C, see the module head."""
     x = _min(_max(x, -half_x), half_x)
-    root, middle = math.sqrt(_max(square - bend * x * x, ZERO)), lean * x
-    return middle - root, middle + root
+    root, centre_y = math.sqrt(_max(root_squared - root_falloff * x * x, ZERO)), shear * x
+    return centre_y - root, centre_y + root
 
 
 @inlined
@@ -140,13 +141,13 @@ def small_footprints(x, y, half_x, half_y, major, k, minor, reach, is_visible, w
     extra_rows = (bottom_row >> TILE_SHIFT_Y) - tile_row
     # tip: X of the ellipse's smallest y; its largest y lies at -tip
     tip, inverse = k * half_y, ONE / fma(major * k, k, minor)
-    square, bend, lean = reach * inverse, major * inverse * (minor * inverse), -major * k * inverse
+    root_squared, root_falloff, shear = reach * inverse, major * inverse * (minor * inverse), -major * k * inverse
     left_edge = to_floats(tile_column << TILE_SHIFT_X) - x
     middle_edge = left_edge + np.float32(TILE_WIDTH)
     right_edge = middle_edge + np.float32(TILE_WIDTH)
-    low0, high0 = _ellipse_row_vectors(half_x, square, bend, lean, left_edge)
-    low1, high1 = _ellipse_row_vectors(half_x, square, bend, lean, middle_edge)
-    low2, high2 = _ellipse_row_vectors(half_x, square, bend, lean, right_edge)
+    low0, high0 = _ellipse_row_vectors(half_x, root_squared, root_falloff, shear, left_edge)
+    low1, high1 = _ellipse_row_vectors(half_x, root_squared, root_falloff, shear, middle_edge)
+    low2, high2 = _ellipse_row_vectors(half_x, root_squared, root_falloff, shear, right_edge)
     is_one_column = extra_columns < 1
     low = where(is_one_column | ((left_edge <= tip) & (tip <= middle_edge)), -half_y, minimum(low0, low1))
     high = where(is_one_column | ((left_edge <= -tip) & (-tip <= middle_edge)), half_y, maximum(high0, high1))
@@ -170,11 +171,11 @@ def _pixel_row_vectors(y, low, high, height):
 
 
 @inlined
-def _ellipse_row_vectors(half_x, square, bend, lean, x):
+def _ellipse_row_vectors(half_x, root_squared, root_falloff, shear, x):
     """Return the same as `_ellipse_rows`, of vectors."""
     x = minimum(maximum(x, -half_x), half_x)
-    root, middle = sqrt(maximum(fma(-bend * x, x, square), ZERO)), lean * x
-    return middle - root, middle + root
+    root, centre_y = sqrt(maximum(fma(-root_falloff * x, x, root_squared), ZERO)), shear * x
+    return centre_y - root, centre_y + root
 
 
 @inlined
@@ -245,13 +246,13 @@ def _list_gaussian(records, i, width, height, tiles_x, slot_offset, tile_list, p
     minor = load_scalar(records, record + D)
     tip = k * half_y  # X of the ellipse's smallest y; its largest y lies at -tip
     inverse, opaque_one = ONE / (major * k * k + minor), opaque(1)
-    square, lean = load_scalar(records, record + REACH) * inverse, -major * k * inverse
-    bend = major * inverse * (minor * inverse)
+    root_squared, shear = load_scalar(records, record + REACH) * inverse, -major * k * inverse
+    root_falloff = major * inverse * (minor * inverse)
     left = np.float32(column << TILE_SHIFT_X) - x
-    low0, high0 = _ellipse_rows(half_x, square, bend, lean, left)
+    low0, high0 = _ellipse_rows(half_x, root_squared, root_falloff, shear, left)
     while column <= last_column:
         right = left + np.float32(TILE_WIDTH)
-        low1, high1 = _ellipse_rows(half_x, square, bend, lean, right)
+        low1, high1 = _ellipse_rows(half_x, root_squared, root_falloff, shear, right)
         low = -half_y if left <= tip <= right else _max(_min(low0, low1), -half_y)
         high = half_y if left <= -tip <= right else _min(_max(high0, high1), half_y)
         top_row, bottom_row = _pixel_rows(y, low, high, height)

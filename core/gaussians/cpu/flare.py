@@ -165,7 +165,7 @@ def prepare_records(
     are empty if there are none. keys: the index of a Gaussian, so that the given order is kept, or CULLED_KEY.
     max_tiles, first_slots, chunk_max_tiles: see `tiles.bin_gaussians`. With the blend "add" the opacity is multiplied
     into the colour, and the record's is 1."""
-    half = -0.5 / math.log(2.0)  # h of `projection`
+    h = -0.5 / math.log(2.0)  # as in `projection`
     for i in range(opacities.size):
         record = i * RECORD
         xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
@@ -181,22 +181,22 @@ def prepare_records(
         if not (determinant > 0 and xx > 0 and cutoff >= 0 and reach >= 0):
             continue
         x, y, k = np.float64(centres[2 * i]), np.float64(centres[2 * i + 1]), -xy / yy
-        major, minor = half * yy / determinant, half / yy
+        major, minor = h * yy / determinant, h / yy
         half_x, half_y = reach * math.sqrt(xx), reach * math.sqrt(yy)
         # Negated so that a NaN centre is culled: it would be listed in tiles that do not exist.
         if not (x + half_x > 0 and y + half_y > 0 and x - half_x < width and y - half_y < height):
             continue
-        gain = opacity if add else 1.0
-        bend = major * k * k + minor
+        colour_gain = opacity if add else 1.0
+        curvature = major * k * k + minor
         records[record + X], records[record + Y] = x, y
         records[record + A], records[record + K], records[record + D] = major, k, minor
         records[record + K_REST] = k - np.float64(records[record + K])
         records[record + OPACITY] = 1.0 if add else opacity
-        records[record + STEP] = math.expm1(2.0 * bend * math.log(2.0))
-        records[record + RUN] = min(math.sqrt(RUN_LOG2_RANGE / -bend), np.float64(RUN_MAX))
-        records[record + RED], records[record + GREEN] = gain * colours[3 * i], gain * colours[3 * i + 1]
-        records[record + BLUE], records[record + DEPTH] = gain * colours[3 * i + 2], 0.0
-        records[record + REACH] = half * reach * reach - MARGIN
+        records[record + STEP] = math.expm1(2.0 * curvature * math.log(2.0))
+        records[record + RUN] = min(math.sqrt(RUN_LOG2_RANGE / -curvature), np.float64(RUN_MAX))
+        records[record + RED], records[record + GREEN] = colour_gain * colours[3 * i], colour_gain * colours[3 * i + 1]
+        records[record + BLUE], records[record + DEPTH] = colour_gain * colours[3 * i + 2], 0.0
+        records[record + REACH] = h * reach * reach - MARGIN
         records[record + HALF_X], records[record + HALF_Y] = half_x, half_y
         _write_shape(shapes, i, r0, ring_width, cutoff, k, arcs)
         # Half a pixel wider than `binning` lists, so that rounding cannot make the bound too low.

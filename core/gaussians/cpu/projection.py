@@ -338,7 +338,7 @@ def _project_block(
     k = -xy * inverse_y
     major = yy * H / where(is_visible, determinant, ONE)
     minor = inverse_y * H
-    bend = fma(major * k, k, minor)
+    curvature = fma(major * k, k, minor)
     # Half a pixel wider than `binning` lists, so that rounding cannot make the bound too low.
     store(max_tiles, first, _tiles_bound(x, y, half_x + HALF, half_y + HALF, is_visible, width, height))
     first_tile, packed_rows = small_footprints(
@@ -358,7 +358,7 @@ def _project_block(
         for i in range(SLOPES):
             store(colour_slopes, i * LANES, zero)
     rows = transpose((
-        x, y, major, k, minor, opacity, exp2m1(bend * TWO), minimum(sqrt(RUN_LOG2_RANGE / -bend), RUN_MAX),
+        x, y, major, k, minor, opacity, exp2m1(curvature * TWO), minimum(sqrt(RUN_LOG2_RANGE / -curvature), RUN_MAX),
         maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
         -(reach + MARGIN), half_x, half_y, zero,
     ))  # fmt: skip

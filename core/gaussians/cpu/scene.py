@@ -98,7 +98,7 @@ class _Rasterize(torch.autograd.Function):
         v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
         v_alpha = EMPTY if d_alpha is None else flat(d_alpha)
         v_depth = EMPTY if d_depth is None else flat(d_depth)
-        rows = buffers.empty(bins.slots * layout.RECORD)
+        rows = buffers.empty(bins.num_slots * layout.RECORD)
         parallel(
             raster_backward.raster_backward, bins.entries, bins.starts, ends, records, background_flat, w, h,
             options.tiles_x, *pictures, v_image, v_alpha, v_depth, rows, scratch=raster_backward.SCRATCH,

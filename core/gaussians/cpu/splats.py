@@ -69,7 +69,7 @@ class _Splat(torch.autograd.Function):
         h, w = grid.height, grid.width
         v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
         v_alpha = EMPTY if d_alpha is None else flat(d_alpha)
-        rows = buffers.empty(bins.slots * layout.RECORD)
+        rows = buffers.empty(bins.num_slots * layout.RECORD)
         tiles = (bins.entries, bins.starts, ends, records)
         pictures = (flat(image), flat(alpha))
         has_shapes = rings is not None or arcs is not None

@@ -41,14 +41,14 @@ class Bins:
     starts       (tiles + 1,) number of the first entry of each tile
     first_slots  (n,) first slot of each Gaussian
     counts       (n,) number of its slots
-    slots        number of all slots, including unused ones
+    num_slots    number of all slots, including unused ones
     """
 
     entries: Array
     starts: Array
     first_slots: Array
     counts: Array
-    slots: int
+    num_slots: int
 
 
 def flat(tensor: Tensor) -> Array:

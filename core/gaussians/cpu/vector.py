@@ -214,8 +214,8 @@ def load_rows(typing_context, array, index, stride):  # noqa: ARG001
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         rows = []
         for i in range(LANES):
-            at = builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), i)))
-            address = _address(context, builder, sig.args[0], args[0], at)
+            row_index = builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), i)))
+            address = _address(context, builder, sig.args[0], args[0], row_index)
             rows.append(builder.load(builder.bitcast(address, _LLVM["float32"].as_pointer()), align=4))
         return _make_tuple(context, builder, rows)
 
@@ -229,8 +229,8 @@ def store_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         for i in range(count):
-            at = builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), i)))
-            address = _address(context, builder, sig.args[0], args[0], at)
+            row_index = builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), i)))
+            address = _address(context, builder, sig.args[0], args[0], row_index)
             row = builder.extract_value(args[3], i)
             builder.store(row, builder.bitcast(address, row.type.as_pointer()), align=4)
         return context.get_dummy_value()
@@ -246,8 +246,8 @@ def stream_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         for i in range(count):
-            at = builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), i)))
-            address = _address(context, builder, sig.args[0], args[0], at)
+            row_index = builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), i)))
+            address = _address(context, builder, sig.args[0], args[0], row_index)
             row = builder.extract_value(args[3], i)
             written = builder.store(row, builder.bitcast(address, row.type.as_pointer()), align=4 * LANES)
             written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(_INT, 1)]))
@@ -486,20 +486,20 @@ def _interleave_halves(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, step: in
 def _reduce_eight(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
     """Return 8 lanes, of which lane i is the sum of vector i of up to 8: a transposition that adds at each step."""
     low, high = range(LANES // 2), range(LANES // 2, LANES)
-    level: list[ir.Value | None] = [
+    partial_sums: list[ir.Value | None] = [
         builder.fadd(_shuffle(builder, v, None, low), _shuffle(builder, v, None, high)) for v in vectors
     ]
-    level += [None] * (LANES // 2 - len(level))
+    partial_sums += [None] * (LANES // 2 - len(partial_sums))
     for step in (4, 2, 1):
-        half = len(level) // 2
-        following: list[ir.Value | None] = []
-        for a, b in zip(level[:half], level[half:], strict=True):
+        num_pairs = len(partial_sums) // 2
+        next_sums: list[ir.Value | None] = []
+        for a, b in zip(partial_sums[:num_pairs], partial_sums[num_pairs:], strict=True):
             if a is not None:
                 other = ir.Constant(a.type, ir.Undefined) if b is None else b
                 a = builder.fadd(*_interleave_halves(builder, a, other, step))
-            following.append(a)
-        level = following
-    return level[0]
+            next_sums.append(a)
+        partial_sums = next_sums
+    return partial_sums[0]
 
 
 @intrinsic
@@ -507,10 +507,12 @@ def reduce_add(typing_context, a):  # noqa: ARG001
     """Return the sum of all lanes, float32; in the same order on every machine."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
-        value = args[0]
+        partial_sum = args[0]
         for step in (8, 4, 2, 1):
-            value = builder.fadd(value, _shuffle(builder, value, None, [(i + step) % LANES for i in range(LANES)]))
-        return builder.extract_element(value, ir.Constant(_INT, 0))
+            partial_sum = builder.fadd(
+                partial_sum, _shuffle(builder, partial_sum, None, [(i + step) % LANES for i in range(LANES)])
+            )
+        return builder.extract_element(partial_sum, ir.Constant(_INT, 0))
 
     return types.float32(FLOATS), emit
 
@@ -546,7 +548,7 @@ def multiply_each(typing_context, a, b):  # noqa: ARG001
     """Multiply two tuples of the same number of vectors, element by element."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
-        pairs = [[builder.extract_value(side, i) for side in args] for i in range(len(a))]
+        pairs = [[builder.extract_value(operand, i) for operand in args] for i in range(len(a))]
         return _make_tuple(context, builder, [builder.fmul(*pair, flags=_CONTRACT) for pair in pairs])
 
     return types.UniTuple(FLOATS, len(a))(a, b), emit
@@ -568,21 +570,21 @@ def transpose(typing_context, vectors):  # noqa: ARG001
 
 
 def _permute(context: Any, builder: ir.IRBuilder, vectors: ir.Value, count: int, *, invert: bool) -> ir.Value:
-    """Interleave the lanes of a tuple of `count` vectors, or invert that."""
-    parts = [builder.extract_value(vectors, i) for i in range(count)]
+    """Interleave the lanes of a tuple of `count` vectors, or invert that; see `interleave`."""
+    inputs = [builder.extract_value(vectors, i) for i in range(count)]
     results = []
-    for k in range(count):
+    for output in range(count):
         if invert:
-            positions = [divmod(i * count + k, LANES) for i in range(LANES)]  # (vector, lane) of each result lane
+            positions = [divmod(i * count + output, LANES) for i in range(LANES)]  # (vector, lane) of each result lane
         else:
-            positions = [divmod(k * LANES + i, count)[::-1] for i in range(LANES)]
-        # Step v takes the lanes that come from vector v. Step 1 also puts those of vector 0 into their places.
-        value = parts[0]
-        for v in range(1, count):
-            source = [LANES + lane if vector == v else (lane if v == 1 else i)
+            positions = [divmod(output * LANES + i, count)[::-1] for i in range(LANES)]
+        # Each step takes the lanes that come from its vector. Step 1 also puts those of vector 0 into their places.
+        result = inputs[0]
+        for vector_number in range(1, count):
+            source_lanes = [LANES + lane if vector == vector_number else (lane if vector_number == 1 else i)
                       for i, (vector, lane) in enumerate(positions)]  # fmt: skip
-            value = _shuffle(builder, value, parts[v], source)
-        results.append(value)
+            result = _shuffle(builder, result, inputs[vector_number], source_lanes)
+        results.append(result)
     return _make_tuple(context, builder, results)
 
 

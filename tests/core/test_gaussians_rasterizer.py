@@ -309,7 +309,9 @@ def test_auto_selects_the_fastest_available_kernels(
     assert registry.select_kernels("auto", double) is tiles  # the CPU kernels would lose half of the digits
 
     load = registry._load_kernel_set
-    monkeypatch.setattr(registry, "_load_kernel_set", lambda name: ImportError("no numba") if name == "cpu" else load(name))
+    monkeypatch.setattr(
+        registry, "_load_kernel_set", lambda name: ImportError("no numba") if name == "cpu" else load(name)
+    )
     registry._warn_once.cache_clear()
     with caplog.at_level(logging.WARNING):
         assert registry.select_kernels("auto", single) is tiles

@@ -23,8 +23,8 @@ def _as_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
         rasterize_scene=partial(tiled.rasterize_scene, warp_kernels.draw, warp_kernels.TILE),
         splat=partial(tiled.splat, warp_kernels.draw, warp_kernels.TILE),
     )
-    load = kernels._load
-    monkeypatch.setattr(kernels, "_load", lambda name: stand_in if name == "cuda" else load(name))
+    load = kernels._load_kernel_set
+    monkeypatch.setattr(kernels, "_load_kernel_set", lambda name: stand_in if name == "cuda" else load(name))
 
 
 @pytest.mark.usefixtures("_as_cuda")

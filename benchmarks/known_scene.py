@@ -42,9 +42,11 @@ class KnownScene(Trainer):
 
 @torch.no_grad()
 def score_flare(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
-    """Return mean scores over views: of the flare as |composite - scene| in display space, compared with exact layers
-    or, without these, with frames and clean frames, whose noise is no error of a fit; and of the linear layer outside
-    clipped pixels, compared with the exact one."""
+    """Return the mean scores of the flare over views, in the form of `eval`.
+
+    "flare": |composite - scene| in display values, compared with exact layers; without these, with frame minus clean
+    frame. "flare_linear": the linear layer outside clipped pixels, compared with the exact one.
+    """
     display_psnr, linear_psnr, relative_errors = [], [], []
     for view in views:
         targets = trainer.frames.targets(view)

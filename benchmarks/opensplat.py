@@ -46,7 +46,8 @@ PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
 
 
 def build_module(checkout: Path) -> Any:
-    """Build the rasterizer as a module with `forward` and `backward`. Raises SystemExit for another `checkout`."""
+    """Build the rasterizer as a module with `forward` and `backward`. Raises SystemExit if
+    `checkout` is not a checkout of OpenSplat."""
     from torch.utils.cpp_extension import load
 
     source = checkout / "rasterizer" / "gsplat-cpu" / "gsplat_cpu.cpp"

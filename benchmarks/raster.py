@@ -151,8 +151,8 @@ class Iteration:
             parameters |= {f"flare{i}": p for i, p in enumerate(self.flares)}
             rates |= {f"flare{i}": 1e-6 for i in range(len(self.flares))}
         rates = {name: rate * 0 for name, rate in rates.items()}
-        self.fused = "auto" if kernel_set == "cpu" else "torch"
-        self.optimiser = Adam(parameters, rates, kernels=self.fused)  # type: ignore[arg-type]
+        self.fused_kernels = "auto" if kernel_set == "cpu" else "torch"
+        self.optimiser = Adam(parameters, rates, kernels=self.fused_kernels)  # type: ignore[arg-type]
 
     def step(self) -> None:
         """Make one iteration: render, L1 + SSIM, backward and Adam."""
@@ -167,7 +167,7 @@ class Iteration:
             )  # fmt: skip
             picture = over(splats, picture)
         self.optimiser.zero_grad()
-        loss = l1_ssim(picture, self.target, 0.8, kernels=self.fused)  # type: ignore[arg-type]
+        loss = l1_ssim(picture, self.target, 0.8, kernels=self.fused_kernels)  # type: ignore[arg-type]
         with self.optimiser.step_in_backward():  # as the trainer does where the scene is rendered once
             loss.backward()
         self.optimiser.step()

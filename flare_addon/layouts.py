@@ -40,12 +40,12 @@ def label_lines(layout: Any, text: str, icon: str = "NONE", width: int = 44) -> 
         width = max(int((region.width - 50 * scale) / (6.4 * scale)), 16)
     column = layout.column(align=True)
     column.scale_y = 0.85
-    for number, line in enumerate(_wrapped(text, width)):
+    for number, line in enumerate(_wrap(text, width)):
         # Further lines are indented by the width of the icon.
         column.label(text=line, icon=icon if number == 0 else "BLANK1" if icon != "NONE" else "NONE")
 
 
-def _wrapped(text: str, width: int) -> list[str]:
+def _wrap(text: str, width: int) -> list[str]:
     """Return a text as lines of `width` characters; a longer word, such as a path, is cut into pieces."""
     lines, line = [], ""
     for word in [*text.split(), ""]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import FitFlareError
 from ..core.look import Look, PlaneGaussians, to_pixels
-from ..core.look.drawing import OPACITY_MAX, extent
+from ..core.look.drawing import OPACITY_MAX, cutoff_radii
 from ..core.look.network import OffsetsBudget
 from ..core.look.plane import arc_log_peak, arcs_to_pixels, concatenate
 from . import baking, cameras, highlight, looks
@@ -195,7 +195,7 @@ def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -
     they are drawn in. Lengths are pixels of that buffer; quads are in drawing order, with "over" back to front."""
     blend = look.blend
     centres, covariances = to_pixels(gaussians, window.intrinsics, look.pixel_grid)
-    radii, arcs = extent(gaussians, blend), arcs_to_pixels(gaussians, window.intrinsics)
+    radii, arcs = cutoff_radii(gaussians, blend), arcs_to_pixels(gaussians, window.intrinsics)
     rows = np.flatnonzero(touches_region(centres, covariances, radii, window.width, window.height))
     opacities = gaussians.opacities if blend == "add" else np.minimum(gaussians.opacities, OPACITY_MAX)
     rings = gaussians.rings

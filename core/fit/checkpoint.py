@@ -145,7 +145,7 @@ class FitInputs:
                            "put the old ones back, or begin the fit anew in another folder.")
 
     def _digest(self, view: View) -> str:
-        """Hash the camera and the files of a view: frame, mask and, with `removed`, clean frame."""
+        """Hash the camera and the files of a view: frame, mask and, if the fit uses it, clean frame."""
         capture, camera = self._capture, view.camera
         mask = capture.mask_path(view)
         files = [capture.frame_path(view), *([capture.clean_frame_path(view)] if self._uses_clean_frames else []),

@@ -238,8 +238,8 @@ class Trainer(FlareTrainer):
         self._excess_ratio = excess_ratio(residual(view) for view in subsample(self.views, SAMPLED_VIEWS))
 
     def _occlusion_loss(self, targets: Targets) -> Tensor | None:
-        """Return the loss of a scene that hides a light, which the frame shows, from everywhere; None if there is no
-        such light."""
+        """Return the loss that clears the scene in front of lights that the frame shows although the scene hides them
+        from every view; None if there is no such light."""
         visibility = self.settings.flare.active_visibility
         if self.flare is None or visibility is None or not self.fits_scene or bool((self.flare.clear > 0).all()):
             return None

@@ -180,9 +180,10 @@ def _has_claims(segment: bytes) -> bool:
 
 
 def _without_claims(segment: bytes) -> bytes:
-    """Return an XMP segment without thumbnails, and without the properties by which it claims parts that are not kept.
+    """Return an XMP segment without thumbnails, and without the properties that announce parts (gain map, clip) which
+    are not kept.
 
-    One without any stays byte for byte; one with some that cannot be parsed is left out (empty).
+    A segment with none of these stays byte for byte; one with some that cannot be parsed is left out (empty).
     """
     if not _has_claims(segment) and _THUMBNAILS.encode() not in segment:
         return segment

@@ -59,7 +59,7 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
     if format_name == "tiff":
         spec.attribute("planarconfig", "contig")
         compression = spec.get_string_attribute("compression")
-        if compression in ("jpeg", "webp", "lerc"):  # which may lose
+        if compression in ("jpeg", "webp", "lerc"):  # lossy
             spec.attribute("compression", "zip")
     with atomic_path(path) as temporary:
         output = oiio.ImageOutput.create(format_name)

@@ -240,7 +240,7 @@ class _OtherStreams:
     """
 
     def __init__(self, source: Any, out: Any, video: Video, left_out: list[str]) -> None:
-        """Add the streams to `out`. source: the container of the video, opened anew."""
+        """Add the streams to the container `out`. source: the container of the video, opened anew."""
         self._out, self._targets, self._encoded = out, dict[int, Any](), dict[int, Any]()
         copied_streams = list[Any]()
         for stream in source.streams:

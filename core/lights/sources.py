@@ -162,25 +162,26 @@ def _softness(mask: Mask, corner: tuple[int, int], luminance: NDArray[np.float32
     """Return how softly a spot ends: the light in the ring NEAR outside its edge minus that in the ring FAR.
 
     It is relative to the same difference for the spot itself, which is at 1: 1 for a glow as bright as the spot, about
-    0 for a hard edge. Of the values of all sectors the SIDE_QUANTILE counts; 0 where none can be measured. luminance:
-    (height, width), clipped at 1. scale: pixels of this frame to one of a frame with a diagonal of REFERENCE.
+    0 for a hard edge. It is measured in SECTORS of the ring, of which the quantile SIDE_QUANTILE counts; 0 where none
+    can be measured. mask: the spot within its box. corner: (x, y) of the box. luminance: (height, width), clipped at 1.
+    scale: pixels of this frame to one of a frame with a diagonal of REFERENCE.
     """
     import cv2
 
     height, width = luminance.shape
-    room = int(np.ceil(FAR[1] * scale)) + 1
-    left, top = max(corner[0] - room, 0), max(corner[1] - room, 0)
-    right, bottom = min(corner[0] + mask.shape[1] + room, width), min(corner[1] + mask.shape[0] + room, height)
+    margin = int(np.ceil(FAR[1] * scale)) + 1
+    left, top = max(corner[0] - margin, 0), max(corner[1] - margin, 0)
+    right, bottom = min(corner[0] + mask.shape[1] + margin, width), min(corner[1] + mask.shape[0] + margin, height)
     area = np.ones((bottom - top, right - left), np.uint8)
     y, x = corner[1] - top, corner[0] - left
     area[y:y + mask.shape[0], x:x + mask.shape[1]][mask] = 0
     distance = np.asarray(cv2.distanceTransform(area, cv2.DIST_L2, 5))
-    around = luminance[top:bottom, left:right]
+    surroundings = luminance[top:bottom, left:right]
     v, u = np.mgrid[:bottom - top, :right - left]
     sector = _sectors(u - x - 0.5 * mask.shape[1], v - y - 0.5 * mask.shape[0])
     values = []
     for number in range(SECTORS):
-        near, far = (around[(distance > low * scale) & (distance <= high * scale) & (sector == number)]
+        near, far = (surroundings[(distance > low * scale) & (distance <= high * scale) & (sector == number)]
                      for low, high in (NEAR, FAR))
         if len(near) and len(far):
             outside = float(np.median(far))

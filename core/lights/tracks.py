@@ -157,20 +157,20 @@ def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], 
     return messages
 
 
-def _is_ghost(chain: Chain, lamps: Sequence[Chain], centre: Floats, diagonal: float) -> bool:
-    """True if a chain is a ghost of one of the others among `lamps`: a larger one, which moves.
+def _is_ghost(chain: Chain, others: Sequence[Chain], centre: Floats, diagonal: float) -> bool:
+    """True if a chain is a ghost of a chain among `others`: of larger spots, which move.
 
     A ghost keeps to one ratio of the way from the principal point to its light. centre: principal point (2,), pixels.
     diagonal: of the frame, pixels.
     """
-    for light in lamps:
+    for light in others:
         shared = sorted(set(chain.frames) & set(light.frames))
         if light is chain or len(shared) < max(3, 0.7 * len(chain.frames)):
             continue
         ghost_sources, light_sources = ([path.sources[path.frames.index(frame)] for frame in shared]
                                         for path in (chain, light))
-        ghost, source = (np.array([each.xy for each in sources]) - centre for sources in (ghost_sources, light_sources))
-        radius, light_radius = (np.median([each.detection.radius for each in sources])
+        ghost, source = (np.array([spot.xy for spot in sources]) - centre for sources in (ghost_sources, light_sources))
+        radius, light_radius = (np.median([spot.detection.radius for spot in sources])
                                 for sources in (ghost_sources, light_sources))
         if radius > 0.9 * light_radius or np.ptp(source, axis=0).max() < MIN_GHOST_MOTION * diagonal:
             continue
@@ -204,9 +204,9 @@ def _to_light(chain: Chain, capture: Capture, diagonal: float, motion: Backgroun
     brightness = fit_brightness(np.array(profiles), np.array([frame in source_by_frame for frame in frames]))
     tolerated = TOLERATED_ERROR * diagonal / REFERENCE
     keys = {}
-    for frame, place, error, on, inside in zip(frames, places, errors, brightness, is_inside, strict=True):
+    for frame, place, error, value, inside in zip(frames, places, errors, brightness, is_inside, strict=True):
         confidence = 1 / (1 + (error / tolerated) ** 2)
-        known_brightness = _known_brightness(on, source_by_frame.get(frame), confidence, inside)
+        known_brightness = _known_brightness(value, source_by_frame.get(frame), confidence, inside)
         keys[capture.views[frame].name] = LightKey(None, place, known_brightness, float(confidence))
     colour = np.median([source.detection.colour for source in chain.sources], axis=0)
     return TrackedLight(keys, tuple(capture.views[frame].name for frame in chain.frames), chain.evidence,

@@ -22,7 +22,7 @@ Box = tuple[int, int, int, int]
 """Left, top, right, bottom of a rectangle of pixels; the last two are outside."""
 
 
-def extent(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
+def cutoff_radii(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
     """Return the Mahalanobis radius (n,) of each Gaussian beyond which it is not drawn."""
     if blend == "add":
         radius = np.full(len(gaussians), math.sqrt(-2 * math.log(PROFILE_MIN)), np.float32)
@@ -55,9 +55,9 @@ def draw_with_transmittance(flares: Iterable[PlaneGaussians], intrinsics: ArrayL
         return picture, transmittance
     centres, covariances = to_pixels(gaussians, intrinsics, pixel_grid)
     arcs = arcs_to_pixels(gaussians, intrinsics)
-    cutoff_radii = extent(gaussians, blend)
+    radii = cutoff_radii(gaussians, blend)
     for index in range(len(gaussians)):
-        box = bounding_box(centres[index], covariances[index], float(cutoff_radii[index]), width, height)
+        box = bounding_box(centres[index], covariances[index], float(radii[index]), width, height)
         if box is None:
             continue
         ring = None if gaussians.rings is None else gaussians.rings[index]

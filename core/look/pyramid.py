@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..colour.srgb import linear_from_srgb
 from ..conventions.splatting import PROFILE_MIN
-from .drawing import Box, bounding_box, draw_with_transmittance, extent, profile_in_box
+from .drawing import Box, bounding_box, cutoff_radii, draw_with_transmittance, profile_in_box
 from .look import Look
 from .plane import Floats, PlaneGaussians, arcs_to_pixels, to_pixels
 
@@ -53,7 +53,7 @@ def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, 
 def draw_added(gaussians: PlaneGaussians, look: Look, intrinsics: ArrayLike, width: int, height: int) -> Floats:
     """Return the scene-linear light (height, width, 3) of Gaussians of a look whose light adds."""
     centres, covariances = to_pixels(gaussians, intrinsics, look.pixel_grid)
-    arcs, radii = arcs_to_pixels(gaussians, intrinsics), extent(gaussians)
+    arcs, radii = arcs_to_pixels(gaussians, intrinsics), cutoff_radii(gaussians)
     indices = level_indices(covariances, gaussians.rings)
     picture: Floats | None = None
     for index in reversed(range(len(LEVELS))):
@@ -77,7 +77,7 @@ def _add_gaussian(grid: Floats, centre: Floats, covariance: Floats, radius: floa
                   light: Floats) -> None:
     """Add one Gaussian to a grid (rows, columns, 3). Lengths are in texels of the grid.
 
-    radius: see `drawing.extent`. arc: see `arcs_to_pixels`. light: RGB at the peak."""
+    radius: see `drawing.cutoff_radii`. arc: see `arcs_to_pixels`. light: RGB at the peak."""
     box = bounding_box(centre, covariance, radius, grid.shape[1], grid.shape[0])
     for band in () if box is None else _bands(box, centre, covariance, radius):
         left, top, right, bottom = band

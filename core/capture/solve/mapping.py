@@ -12,7 +12,7 @@ import signal
 import sqlite3
 import threading
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -204,26 +204,36 @@ def _check_frames_differ(sources: Sequence[SourceFrame], work: Path) -> None:
     raise CaptureError(f"All {len(sources)} frames show the same picture; a solve needs a camera that moves.")
 
 
+def _group_frames(pycolmap: Any, db: Any, sources: Sequence[SourceFrame], extracted: Container[str], work: Path,
+                  settings: SolveSettings) -> dict[tuple[int, bool], list[str]]:
+    """Return the names of the frames without features, by the id of their camera and whether they have little texture.
+
+    Frames of one size and focal length share a camera; cameras that the open database `db` lacks are added to it.
+    extracted: names of the frames with features.
+    """
+    camera_by_format: dict[tuple[int, int, float | None], int] = {}
+    camera_ids = {(c.width, c.height, round(c.params[0], 6)): c.camera_id for c in db.read_all_cameras()}
+    names_by_group: dict[tuple[int, bool], list[str]] = {}
+    for source in sources:
+        frame_format = (source.width, source.height, source.focal)
+        if frame_format not in camera_by_format:
+            camera = _make_camera(pycolmap, picture_size(work / "small" / source.name), source.focal, settings.lens)
+            parameters = (camera.width, camera.height, round(camera.params[0], 6))
+            camera_by_format[frame_format] = camera_ids.get(parameters) or db.write_camera(camera)
+            camera_ids[parameters] = camera_by_format[frame_format]
+        if source.name not in extracted:
+            group = (camera_by_format[frame_format], _has_little_texture(work / "small" / source.name))
+            names_by_group.setdefault(group, []).append(source.name)
+    return names_by_group
+
+
 def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, database: Path,
                       settings: SolveSettings, progress: Progress) -> None:
-    """Extract features of every frame that has none in the database; one camera for all frames of one size and focal
-    length."""
+    """Extract features of every frame that has none in the database."""
     with _open_database(pycolmap, database) as db:
         extracted = {image.name for image in db.read_all_images()
                      if db.num_keypoints_for_image(image.image_id) or db.exists_descriptors(image.image_id)}
-        cameras: dict[tuple[int, int, float | None], int] = {}
-        camera_ids = {(c.width, c.height, round(c.params[0], 6)): c.camera_id for c in db.read_all_cameras()}
-        names_by_group: dict[tuple[int, bool], list[str]] = {}
-        for source in sources:
-            key = (source.width, source.height, source.focal)
-            if key not in cameras:
-                camera = _make_camera(pycolmap, picture_size(work / "small" / source.name), source.focal, settings.lens)
-                parameters = (camera.width, camera.height, round(camera.params[0], 6))
-                cameras[key] = camera_ids.get(parameters) or db.write_camera(camera)
-                camera_ids[parameters] = cameras[key]
-            if source.name not in extracted:
-                group = (cameras[key], _has_little_texture(work / "small" / source.name))
-                names_by_group.setdefault(group, []).append(source.name)
+        names_by_group = _group_frames(pycolmap, db, sources, extracted, work, settings)
     progress.stage("find features", len(sources), len(extracted))
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = settings.features

@@ -46,6 +46,38 @@ PRIOR_WEIGHT = 1e-4
 """Weight per pixel of the fitted gains of 1; it exceeds the frame's for flares of a thousandth of white."""
 
 
+class _FittedFlareCleaner:
+    """Subtracts the fitted flare from one frame after the other, for `write_clean_frames`.
+
+    The arguments are those of `remove_fitted_flare`. views_by_name: by the name of the clean frame.
+    """
+
+    def __init__(self, renderer: ViewRenderer, capture: Capture, views_by_name: Mapping[Path, View],
+                 progress: Progress, fit_digest: str, *, above_white: bool) -> None:
+        self._renderer, self._capture, self._views_by_name = renderer, capture, views_by_name
+        self._progress, self._fit_digest, self._above_white = progress, fit_digest, above_white
+        self._light_numbers = [tuple(light.numbers) for light in capture.lights]
+        self.dim_counts = Counter[str]()
+        """Number of written frames in which a light's flare has a gain below DIM_FLARE, by the light's name."""
+
+    def digest(self, frame: CleanFrame) -> str:
+        """Hash the fit, the lights, and the frame with its camera."""
+        camera = self._views_by_name[frame.name].camera
+        return digest_inputs(repr((self._fit_digest, camera.numbers, self._light_numbers)), [frame.source])
+
+    def clean(self, frame: CleanFrame) -> PreparedResults:
+        """Subtract the flare from a frame, and prepare its results."""
+        clean_view = _clean_view(self._renderer, self._capture, self._views_by_name[frame.name], self._above_white)
+        return PreparedResults(lambda: self._write(frame, clean_view))
+
+    def _write(self, frame: CleanFrame, clean_view: _CleanView) -> None:
+        """Write the results, and count the lights whose flare is dim."""
+        write_results(frame.results, clean_view.plate, clean_view.codes, clean_view.flare)
+        if clean_view.plate.warning:
+            self._progress.say(clean_view.plate.warning)
+        self.dim_counts.update(light for light, gain in clean_view.gains.items() if gain < DIM_FLARE)
+
+
 def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequence[View], folder: Path,
                         progress: Progress, *, flare_folder: Path | None = None, overwrite: bool = False,
                         fit_digest: str = "", above_white: bool = False) -> dict[str, Any]:
@@ -68,28 +100,11 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
     check_no_overwrite([frame.source for frame in frames],
                        itertools.chain.from_iterable(frame.results for frame in frames))
     progress.stage("remove", len(views))
-    manifest, lights = Manifest(folder), [tuple(light.numbers) for light in capture.lights]
-    dim_counts = Counter[str]()
-
-    def digest(frame: CleanFrame) -> str:
-        camera = views_by_name[frame.name].camera
-        return digest_inputs(repr((fit_digest, camera.numbers, lights)), [frame.source])
-
-    def clean(frame: CleanFrame) -> PreparedResults:
-        """Compute a frame's results; frames with a dim flare are counted when they are written."""
-        clean_view = _clean_view(renderer, capture, views_by_name[frame.name], above_white)
-
-        def write() -> None:
-            write_results(frame.results, clean_view.plate, clean_view.codes, clean_view.flare)
-            if clean_view.plate.warning:
-                progress.say(clean_view.plate.warning)
-            dim_counts.update(light for light, gain in clean_view.gains.items() if gain < DIM_FLARE)
-
-        return PreparedResults(write)
-
-    written, kept_counts = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
-                                              keep_finished=not overwrite, overwrite=overwrite)
-    for light, count in dim_counts.items():
+    manifest = Manifest(folder)
+    cleaner = _FittedFlareCleaner(renderer, capture, views_by_name, progress, fit_digest, above_white=above_white)
+    written, kept_counts = write_clean_frames(frames, manifest, progress, digest=cleaner.digest,
+                                              clean=cleaner.clean, keep_finished=not overwrite, overwrite=overwrite)
+    for light, count in cleaner.dim_counts.items():
         progress.say(f"{count} of {written} frames show less than half of the flare that {light!r} has in the fit; no "
                      "more than they show was removed.")
     manifest.report_kept(kept_counts, progress)

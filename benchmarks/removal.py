@@ -123,17 +123,20 @@ def measure_speed(weights: Path | None = None) -> None:
 
 def score_sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | None = None,
                  sheet: Path | None = None) -> None:
-    """Measure the PSNR of every frame against the exact scene, and flicker."""
+    """Print the PSNR of every frame against the exact scene, and the flicker; with `sheet`, draw some frames.
+
+    cleaned: folder of clean frames to score in place of those of the network.
+    """
     previous_errors: Any = None
     scores, flicker, rows = [], [], []
     paths = sorted((capture / "images").iterdir())
     results = _clean_by_network(paths, weights) if cleaned is None else _read_cleaned(paths, cleaned)
-    shown = sheet_frames(len(paths))
+    sheet_numbers = sheet_frames(len(paths))
     for number, (path, codes) in enumerate(zip(paths, results, strict=True)):
         truth = read_picture(capture / "truth" / "scene" / f"{path.stem}.exr").display()
         frame, result = (values.astype(np.float32) / 255 for values in (read_plate(path).codes, codes))
         scores.append((psnr(frame, truth), psnr(result, truth)))
-        if number in shown:
+        if number in sheet_numbers:
             rows.append(np.concatenate([frame, result, np.clip(truth, 0, 1)], 1))
         errors = (frame - truth, result - truth)
         if previous_errors is not None:

@@ -439,10 +439,10 @@ def has_display_footage(camera: Any) -> bool:
     """Return whether a camera shows footage, behind or in front of the scene, that bypasses the view transform."""
     if not camera.data.show_background_images:
         return False
-    return any(back.alpha > 0 and not (back.source == "IMAGE" and back.image is not None
-                                       and back.image.use_view_as_render)
-               for back in camera.data.background_images
-               if (back.image if back.source == "IMAGE" else back.clip) is not None)
+    return any(background.alpha > 0 and not (background.source == "IMAGE" and background.image is not None
+                                             and background.image.use_view_as_render)
+               for background in camera.data.background_images
+               if (background.image if background.source == "IMAGE" else background.clip) is not None)
 
 
 def add_to_picture(target: Any, scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> None:

@@ -270,8 +270,8 @@ def _manifest_entry(out: Path, frame: NumberedFrame, extra_files: Sequence[Path]
     """Return the entry of a finished frame in bake.json."""
     with open_regular(out / frame.file) as stream:
         width, height = exr_header.windows(stream)["dataWindow"]
-    rest = {"rest": [path.relative_to(out).as_posix() for path in extra_files]} if extra_files else {}
-    return {"file": frame.file, "frame": frame.number, "view": frame.view, "width": width, "height": height, **rest}
+    extra = {"rest": [path.relative_to(out).as_posix() for path in extra_files]} if extra_files else {}
+    return {"file": frame.file, "frame": frame.number, "view": frame.view, "width": width, "height": height, **extra}
 
 
 def _check_is_current(out: Path, cache_key: dict[str, Any], layer_by_light: dict[str, str]) -> None:

@@ -273,11 +273,11 @@ def _square_samples(columns: int) -> tuple[Floats, NDArray[np.int64]]:
 
 def _radical_inverse(numbers: NDArray[Any], base: int) -> Floats:
     """Return Van der Corput's sequence (n,), 0..1, at these numbers."""
-    values, factor, rest = np.zeros(len(numbers)), 1.0, np.array(numbers, np.int64)
-    while rest.any():
+    values, factor, remaining = np.zeros(len(numbers)), 1.0, np.array(numbers, np.int64)
+    while remaining.any():
         factor /= base
-        values += factor * (rest % base)
-        rest //= base
+        values += factor * (remaining % base)
+        remaining //= base
     return values
 
 

@@ -69,21 +69,22 @@ def brightest_element(look: Look, lights: Sequence[PlacedLight], flares: Mapping
 
     flares: of the placed lights with these edits, as `Look.evaluate_lights` returns them.
     """
-    whole = concatenate(list(flares.values()))
-    if whole is None:
+    gaussians_of_all = concatenate(list(flares.values()))
+    if gaussians_of_all is None:
         return None
     sources = {light.name: light for light in look.lights}
     source_of = {light.name: sources[light.source] for light in lights if light.source in sources}
-    luminance = light_at(whole, intrinsics, point, look.blend, look.pixel_grid)
-    brightest, most, start = None, MIN_LIGHT, 0
+    luminance = light_at(gaussians_of_all, intrinsics, point, look.blend, look.pixel_grid)
+    brightest, max_sum, start = None, MIN_LIGHT, 0
     for name, gaussians in flares.items():
-        own = luminance[start:start + len(gaussians)]
+        light_luminance = luminance[start:start + len(gaussians)]
         start += len(gaussians)
         source = source_of[name]
         indices = _element_indices(source, name, edits, len(gaussians))
-        sums = np.bincount(indices[indices >= 0], own[indices >= 0], len(source.elements))
-        if len(sums) and sums.max() >= most:
-            brightest, most = (name, source.elements[int(sums.argmax())].name), float(sums.max())
+        has_element = indices >= 0
+        sums = np.bincount(indices[has_element], light_luminance[has_element], len(source.elements))
+        if len(sums) and sums.max() >= max_sum:
+            brightest, max_sum = (name, source.elements[int(sums.argmax())].name), float(sums.max())
     return brightest
 
 

@@ -90,14 +90,14 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
         sockets.update(_crop_overscan(tree, layers, {name: sockets[name] for name in shown_names}))
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
-    # artists_picture: the output socket under the flare, to which `remove_nodes` connects the output again.
     end = _final_input(tree)
-    artists_picture = _feeding_socket(end)
+    final_picture = _feeding_socket(end)
     # Set up earlier, perhaps with nodes of the artist after it.
-    is_set_up = artists_picture is not None and _depends_on(artists_picture.node, node)
-    if is_set_up or artists_picture is None or _is_ours(artists_picture.node):
+    is_set_up = final_picture is not None and _depends_on(final_picture.node, node)
+    artists_picture = final_picture
+    if is_set_up or final_picture is None or _is_ours(final_picture.node):
         artists_picture = _image_under_flare(tree, node, scene[STATE_PROPERTY])
-    if artists_picture is not None:
+    if artists_picture is not None:  # the socket to which `remove_nodes` connects the output again
         scene[STATE_PROPERTY].update({"from": artists_picture.node.name, "socket": artists_picture.identifier})
     if plate is not None:
         scene_picture = _footage_node(tree, plate).outputs["Image"]
@@ -108,10 +108,15 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
     _connect_scene_picture(tree, node, scene_picture)
     if not is_set_up or end.links[0].from_node == node:  # else the artist has nodes between ours and the output
         tree.links.new(node.outputs["Image"], end)
-    if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
-        viewer = _set_name(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
-        tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
+    _add_viewer(tree, node)
     return node
+
+
+def _add_viewer(tree: Any, node: Any) -> None:
+    """Show our node in the backdrop, unless the tree has a viewer."""
+    if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
+        viewer = _set_name(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)
+        tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
 
 
 def _change_inputs(tree: Any, node: Any, layer_names: Sequence[str]) -> None:

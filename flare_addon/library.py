@@ -125,7 +125,10 @@ def write_png(path: Path, display: NDArray[np.float32]) -> None:
 
 
 def menu_items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, int, int]]:
-    """Return the items of the preview menu: file, name, notes, icon, number. They are cached until a file changes."""
+    """Return the items of the preview menu: file, name, notes, icon, number. They are cached until a file changes.
+
+    Writes the thumbnails that flares of the user lack.
+    """
     global _previews, _items, _stamps
     stamps = []
     for path in files():

@@ -137,7 +137,7 @@ class Capture:
         yield
         matched = yield from match_frames_in_steps(solve)
         yield
-        turned = [each for frame in solve.frames if (each := turned_frame(frame, matched.files.get(frame.name)))]
+        turned = list(filter(None, (turned_frame(frame, matched.files.get(frame.name)) for frame in solve.frames)))
         upright, orientation_warnings = (find_upright(turned, solve.points) if has_cameras
                                          else ({frame.posed.name for frame in turned}, []))  # its camera is upright
         turned_by_name = {frame.posed.name: frame for frame in turned if frame.posed.name in upright}

@@ -427,6 +427,7 @@ def _to_cloud(path: Path, values: Floats, rgb: NDArray[np.uint8]) -> PointCloud:
 
 
 def _data_lines(lines: list[str]) -> list[tuple[int, str]]:
+    """Return (line number from 1, line) of the lines that are neither empty nor comments."""
     return [(number, line) for number, line in enumerate(lines, 1)
             if line.strip() and not line.lstrip().startswith("#")]
 

@@ -198,7 +198,7 @@ class LightPath:
         views_by_name = {_canonical(name): name for name in names}
         self._keys = {views_by_name[_canonical(name)]: key for name, key in light.keys.items()
                       if _canonical(name) in views_by_name}
-        self.unknown = [name for name in light.keys if _canonical(name) not in views_by_name]
+        self.unknown_frames = [name for name in light.keys if _canonical(name) not in views_by_name]
         """Names of frames in the file that are not among the views."""
         keys = self._keys.items()
         self._place_keys = sorted((self._times[name], name) for name, key in keys if key.place is not None)
@@ -209,7 +209,7 @@ class LightPath:
         """True if the light's place is known in some view."""
         return bool(self._place_keys) or not self.light.moves or self.light.xy is not None
 
-    def missing(self) -> list[str]:
+    def interpolated_views(self) -> list[str]:
         """Return the names of the views whose place is interpolated."""
         placed = {name for _, name in self._place_keys}
         return [name for name in self._times if name not in placed] if placed else []
@@ -261,13 +261,14 @@ class LightPath:
     def warnings(self) -> list[str]:
         """Return sentences for the user on frames in which the place is interpolated, and on frames of lights.json that
         the capture lacks."""
-        missing, warnings = self.missing(), []
-        if missing:
-            warnings.append(f"The light {self.light.name!r} has no place in {len(missing)} of {len(self._times)} "
-                            f"frames ({_list(missing)}); it is interpolated there.")
-        if self.unknown:
-            warnings.append(f"lights.json has entries of the light {self.light.name!r} for {len(self.unknown)} frames "
-                            f"that are not in the capture ({_list(self.unknown)}); they are left out.")
+        interpolated, warnings = self.interpolated_views(), []
+        if interpolated:
+            warnings.append(f"The light {self.light.name!r} has no place in {len(interpolated)} of {len(self._times)} "
+                            f"frames ({_list_first(interpolated)}); it is interpolated there.")
+        if self.unknown_frames:
+            warnings.append(f"lights.json has entries of the light {self.light.name!r} for {len(self.unknown_frames)} "
+                            f"frames that are not in the capture ({_list_first(self.unknown_frames)}); they are left "
+                            "out.")
         return warnings
 
 
@@ -315,7 +316,8 @@ def _canonical(name: str) -> str:
     return str(PurePosixPath(text).with_suffix("")) if PurePosixPath(text).name else text
 
 
-def _list(names: Sequence[str]) -> str:
+def _list_first(names: Sequence[str]) -> str:
+    """Return the first names, and how many more there are."""
     more = len(names) - MAX_LISTED
     return ", ".join(names[:MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
 

@@ -79,20 +79,22 @@ def find_upright(frames: Sequence[TurnedFrame], points: PointCloud) -> tuple[set
             undecided.setdefault(frame.orientation, []).append(frame)
         elif fits_shown:
             upright.add(frame.posed.name)
-    warnings = [_describe(sorted(upright), "as shown, by the sizes of their cameras")] if upright else []
+    warnings = [_describe_reading(sorted(upright), "as shown, by the sizes of their cameras")] if upright else []
     for orientation, group in sorted(undecided.items()):
         names = [frame.posed.name for frame in group]
         is_upright = _matches_upright(group, points)
         if is_upright is None:
-            warnings.append(_describe(names, f"as stored, though their Exif orientation is {orientation}: no coloured "
-                                             "points show which. If the fit comes out turned, remove that tag"))
+            warnings.append(_describe_reading(
+                names, f"as stored, though their Exif orientation is {orientation}: no coloured points show which. If "
+                "the fit comes out turned, remove that tag"))
         elif is_upright:
             upright.update(names)
-            warnings.append(_describe(names, "as shown, by the colours of the points"))
+            warnings.append(_describe_reading(names, "as shown, by the colours of the points"))
     return upright, warnings
 
 
-def _describe(names: Sequence[str], reading: str) -> str:
+def _describe_reading(names: Sequence[str], reading: str) -> str:
+    """Return a warning on how photographs of these names are read. reading: as stored or as shown, and why."""
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
     return f"Photographs with an Exif orientation ({names[0]}{more}) are read {reading}."
 

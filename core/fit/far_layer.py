@@ -147,21 +147,24 @@ class SweepCosts(NamedTuple):
 
 
 def sweep_patches(views: list[SweepView]) -> SweepCosts:
-    """Sweep spheres about the cameras of views; patches that too few views see are left out."""
+    """Return how much the views disagree on each patch of directions, on spheres about the cameras of several radii.
+
+    Patches that too few views see are left out.
+    """
     cameras = [view.camera for view in views]
     focal = float(np.median([camera.focal_length for camera in cameras]))
     pitch = PITCH_PX / focal
     directions = _visible_directions(cameras, pitch)
     patch_directions = _visible_directions(cameras, PATCH_PITCHES * pitch)
-    patch_of = _nearest_indices(directions, patch_directions)
-    sizes = np.bincount(patch_of, minlength=len(patch_directions))  # directions in each patch
-    spheres = (0.0, BARE_PARALLAX_PX, *PARALLAXES_PX)
-    costs = np.full((len(spheres), len(patch_directions)), np.nan)
-    for row, parallax in zip(costs, spheres, strict=True):
+    patch_indices = _nearest_indices(directions, patch_directions)
+    sizes = np.bincount(patch_indices, minlength=len(patch_directions))  # directions in each patch
+    parallaxes = (0.0, BARE_PARALLAX_PX, *PARALLAXES_PX)  # of the spheres: infinite, bare parallax, near
+    costs = np.full((len(parallaxes), len(patch_directions)), np.nan)
+    for row, parallax in zip(costs, parallaxes, strict=True):
         # A point at distance r has a parallax of focal * spread / r pixels.
         cost, visible = _disagreement(views, directions, parallax / focal / _camera_spread(cameras))
-        sums = np.bincount(patch_of, np.where(visible, cost, 0), len(patch_directions))
-        visible_counts = np.bincount(patch_of, visible, len(patch_directions))
+        sums = np.bincount(patch_indices, np.where(visible, cost, 0), len(patch_directions))
+        visible_counts = np.bincount(patch_indices, visible, len(patch_directions))
         is_visible = (visible_counts > 0) & (visible_counts >= MIN_VISIBLE_SHARE * sizes)
         row[:] = np.where(is_visible, sums / np.maximum(visible_counts, 1), np.nan)
     # Known on the infinite sphere, on that of bare parallax, and on some near one.

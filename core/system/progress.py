@@ -276,12 +276,13 @@ class OpenJdProgress(Progress):
         self._reported = -1
         self._last = 0.0
 
-    def _line(self, kind: str, text: str) -> None:
+    def _write_update(self, kind: str, text: str) -> None:
+        """Write one line of the Open Job Description. kind: "status", "progress" or "fail"."""
         _write_line(self._stream, f"openjd_{kind}: {' '.join(text.split())}")
 
     def _show_stage(self) -> None:
         self._reported, self._last = -1, 0.0
-        self._line("status", f"{self._stage} {self._done}/{self._total}")
+        self._write_update("status", f"{self._stage} {self._done}/{self._total}")
         self._show_progress({})
 
     def _show_progress(self, figures: dict[str, float]) -> None:  # noqa: ARG002 - the base's signature
@@ -290,13 +291,13 @@ class OpenJdProgress(Progress):
         if percent == self._reported or (percent < 100 and now - self._last < OPEN_JD_INTERVAL_S):
             return
         self._reported, self._last = percent, now
-        self._line("progress", f"{percent}")
+        self._write_update("progress", f"{percent}")
 
     def say(self, text: str) -> None:
-        self._line("status", text)
+        self._write_update("status", text)
 
     def error(self, text: str) -> None:
-        self._line("fail", text)
+        self._write_update("fail", text)
 
 
 @contextlib.contextmanager

@@ -201,7 +201,7 @@ def _prepare_folder(source: Path, work: Path, number: int, size: int,
 
 def _prepare_video(source: Path, work: Path, number: int, size: int,
                    progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
-    """Prepare the frames of a video; see `prepare_frames`.
+    """Prepare the frames of a video; see `prepare_frames`. None is reported as left out.
 
     It is read twice: for the sharpness of every frame, then for the chosen ones.
     """

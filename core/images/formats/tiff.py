@@ -210,13 +210,13 @@ def with_directory(data: bytes, number: int, tags: Mapping[int, Tag]) -> bytes:
         return data
     result = bytearray(data + b"\0" * (len(data) % 2))
     entry_list = []
-    for name, (kind, values) in sorted(tags.items()):
+    for tag_number, (kind, values) in sorted(tags.items()):
         raw = values.astype(values.dtype.newbyteorder(order)).tobytes()
         value_field = raw.ljust(4, b"\0") if len(raw) <= 4 else struct.pack(order + "I", len(result))
         if len(raw) > 4:
             result += raw + b"\0" * (len(raw) % 2)
         count = len(values) // (2 if kind in _RATIONALS else 1)
-        entry_list.append(struct.pack(order + "HHI", name, kind, count) + value_field)
+        entry_list.append(struct.pack(order + "HHI", tag_number, kind, count) + value_field)
     directory_offset = len(result)
     result += struct.pack(order + "H", len(entry_list)) + b"".join(entry_list) + bytes(4)
     return with_tags(bytes(result), {number: Tag(4, np.array([directory_offset], np.uint32))})

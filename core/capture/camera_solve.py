@@ -2,7 +2,7 @@
 """Reads the camera solve of a capture, of whatever program, and matches its poses with the pictures on disk.
 
 `Capture.open` calls `read_solve_in_steps`, then `match_frames_in_steps`; it makes its views of the result and passes
-the sentences on.
+the warnings on.
 """
 from __future__ import annotations
 
@@ -101,6 +101,14 @@ def _with_relative_names(root: Path, frames: list[PosedFrame]) -> list[PosedFram
         if any(index.find(name) for name in names):
             return [replace(frame, name=name) for frame, name in zip(frames, names, strict=True)]
     return frames
+
+
+def check_single_poses(solve: CameraSolve, folder: Path) -> None:
+    """Raise CaptureError, which names the folder of the capture, for a frame that has two poses."""
+    names = [frame.name for frame in solve.frames]
+    if len(set(names)) < len(names):
+        duplicate = next(name for name in names if names.count(name) > 1)
+        raise CaptureError(f"{folder}: the frame {duplicate} has two poses; remove one of them.")
 
 
 @dataclass

@@ -30,15 +30,21 @@ from ..images.formats.exif import SWAPS_SIDES
 from ..images.picture import Picture, same_aspect
 from ..images.read import has_float_pixels, read_picture
 from ..images.size import picture_size
-from ..images.video import is_video
 from ..system.file_names import canonical_name, find_entry
 from ..system.files import read_json, safe_join
 from ..system.steps import FRAMES_PER_STEP, Steps, finish
 from .camera import Camera, Floats
-from .camera_solve import CameraSolve, geometry_warnings, match_frames_in_steps, read_solve_in_steps
+from .camera_solve import (
+    CameraSolve,
+    check_single_poses,
+    geometry_warnings,
+    match_frames_in_steps,
+    read_solve_in_steps,
+)
 from .colmap import PointCloud, PosedFrame
 from .frame_files import mask_pictures, matching_pictures, view_name
 from .frame_sizes import checked_size, size_or_model_size
+from .layout import check_is_folder
 from .lens import PINHOLES, Lens
 from .lights import Light, LightState, check_places, light_paths, read_lights
 from .orientation import TurnedFrame, exif_orientation, find_upright, turned_frame
@@ -97,7 +103,7 @@ class Capture:
         self._focal: float | None = None
         self._split_lists: tuple[set[str] | None, ...] = (None, None)
         self.warnings: tuple[str, ...] = ()
-        """What the user should know of the capture before it is used."""
+        """Sentences for the user, who should read them before the capture is used."""
         self.left_out: dict[str, tuple[str, ...]] = {}
         """Names of frames that are not among the views, by reason."""
 
@@ -119,21 +125,14 @@ class Capture:
     @classmethod
     def open_in_steps(cls, folder: Path | str, *, need_frames: bool = True, cache_bytes: int = 1 << 30,
                       need_cameras: bool = True, focal: float | None = None) -> Steps[Capture]:
-        """Read a capture as `open` does, in steps."""
+        """Read a capture as `open` does, in steps: camera solve, frames by their poses, views, lights, checks."""
         folder = Path(folder)
-        if folder.is_file() and is_video(folder):
-            raise CaptureError(f"{folder} is a video; make a capture of it by `solve {folder.name} --out my_capture`, "
-                               "and name that.")
-        if not folder.is_dir():
-            raise CaptureError(f"{folder} is {'no folder' if folder.exists() else 'missing'}; name a capture's folder.")
+        check_is_folder(folder)
         solve, focal_source = (yield from read_solve_in_steps(folder, required=need_cameras)), "solved"
         has_cameras = solve is not None
         if solve is None:
             solve, focal_source = cameras_without_solve(folder, focal)
-        posed_names = [frame.name for frame in solve.frames]
-        if len(set(posed_names)) < len(posed_names):
-            duplicate = next(name for name in posed_names if posed_names.count(name) > 1)
-            raise CaptureError(f"{folder}: the frame {duplicate} has two poses; remove one of them.")
+        check_single_poses(solve, folder)
         yield
         matched = yield from match_frames_in_steps(solve)
         yield
@@ -151,16 +150,16 @@ class Capture:
         capture._order, capture.has_cameras = opened.order, has_cameras
         capture._focal, capture.focal_source = focal, focal_source
         check_places(capture.lights, capture.folder / LIGHTS, list(opened.files), has_cameras)
-        capture._split_lists = tuple(None if each is None else {names[name] for name in each if name in names}
-                                     for each in (solve.training, solve.held_out))
+        capture._split_lists = tuple(None if split is None else {names[name] for name in split if name in names}
+                                     for split in (solve.training, solve.held_out))
         capture._masks.update({names[name]: path for name, path in solve.masks.items() if name in names})
         yield
         if need_frames:
             yield from capture._check_layer_sizes()
             capture.warnings = (*solve.warnings, *matched.warnings, *orientation_warnings, *geometry_warnings(solve),
                                 *capture.light_warnings)
-            capture.left_out = {reason: tuple(each) for reason, each in (
-                ("no pose", matched.unposed), ("a pose without a frame", matched.missing)) if each}
+            capture.left_out = {reason: tuple(left_out) for reason, left_out in (
+                ("no pose", matched.unposed), ("a pose without a frame", matched.missing)) if left_out}
         if (folder / "split.json").exists():
             capture.split(None)  # raises where it is not valid
         return capture

@@ -11,6 +11,8 @@ import struct
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from ..errors import CaptureError
+from ..images.video import is_video
 from ..system.file_names import find_entry, natural_key
 from ..system.reading import MAX_MODEL_BYTES, UTF8_SIG, open_regular, read_text
 from .colmap import image_lines
@@ -23,6 +25,15 @@ _MAX_DEPTH, _MAX_FOLDERS = 3, 200
 """Levels of folders, and folders of a level, that are searched for a model in another place."""
 _MIN_IMAGE_BYTES = 73
 """Bytes of an image in images.bin, without its name and observations."""
+
+
+def check_is_folder(folder: Path) -> None:
+    """Raise CaptureError, which says what to do, for a capture that is a video, another file, or missing."""
+    if folder.is_file() and is_video(folder):
+        raise CaptureError(f"{folder} is a video; make a capture of it by `solve {folder.name} --out my_capture`, and "
+                           "name that.")
+    if not folder.is_dir():
+        raise CaptureError(f"{folder} is {'no folder' if folder.exists() else 'missing'}; name a capture's folder.")
 
 
 def find_models(folder: Path, places: Iterable[str] = MODEL_PLACES) -> list[Path]:

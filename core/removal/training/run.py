@@ -79,9 +79,9 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
           progress: Progress | None = None) -> Path:
     """Train in `folder` and return the path of the weights (safetensors, fp16).
 
-    validation: backgrounds and lenses kept out of training; with them the log has validation gains and the weights are
-    those of the best one. Without them, and with user_flares, which the validation has none of, the weights are the
-    last. resume: continue the training in the folder, by the given recipe from there on. start: weights to begin with,
+    validation: backgrounds and lenses kept out of training; with them the log has validation gains, and the weights are
+    those of the best gain. They are the last ones without `validation`, and with user_flares, which no validation
+    shows. resume: continue the training in the folder, by the given recipe from there on. start: weights to begin with,
     in a network of their widths and with as many blocks as they or the recipe have, whichever are more. processes: how
     many share the work, this one included; on a CPU the pictures are the same for any number, the weights but for
     rounding.

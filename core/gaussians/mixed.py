@@ -62,7 +62,8 @@ def splat_mixed(
     kernels: KernelSet, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
     width: int, height: int, *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """Rasterize as `splat` of the package does with resolution "mixed"."""
+    """Rasterize by these kernels as `splat` of the package does with resolution "mixed"; it explains arguments and
+    result."""
     factors = choose_reductions(covariances, rings, arcs)
     picture = None
     for factor in REDUCTIONS:  # front to back

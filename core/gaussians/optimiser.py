@@ -190,7 +190,9 @@ def adam_step(
     parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: Rate,
     *, beta1: float, beta2: float, epsilon: float,
 ) -> None:  # fmt: skip
-    """Make one step in place, in torch; `step` counts from 1, `rate` is a float or has the shape of a row."""
+    """Step a parameter and its moments `first` and `second` in place, in torch, by the formula of the module head.
+
+    step: counts from 1; rate: a float, or a tensor of the shape of a row."""
     first.lerp_(gradient, 1 - beta1)
     second.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     root = (second.sqrt() / math.sqrt(1 - beta2**step)).add_(epsilon)

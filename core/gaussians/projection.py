@@ -103,7 +103,9 @@ def half_sizes(covariances: Tensor, radii: Tensor) -> Tensor:
 def visible_radii(
     centres: Tensor, covariances: Tensor, radii: Tensor, width: int, height: int
 ) -> Tensor:
-    """Return (n,) 3 sigma of the longer axis, px; 0 where the box at Mahalanobis radius `radii` misses the frame."""
+    """Return (n,) 3 sigma of the longer axis, px; 0 where the box at Mahalanobis radius `radii` (n,) misses the frame.
+
+    centres (n, 2) px; covariances (n, 3) xx, xy, yy, px²."""
     half = half_sizes(covariances, radii)
     frame = torch.tensor([width, height], dtype=centres.dtype, device=centres.device)
     inside = ((centres + half > 0) & (centres - half < frame)).all(-1) & (radii > 0)

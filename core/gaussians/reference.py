@@ -34,7 +34,7 @@ from .rendering import (
     Rendering,
     Splats,
     activate,
-    extent,
+    cutoff_radii,
     record_gradient,
 )
 from .spherical_harmonics import colours as colours_of
@@ -104,7 +104,7 @@ def rasterize_scene(
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
-    """Render as `rasterization` of the package does."""
+    """Render as `rasterization` of the package does, which explains arguments and results."""
     scales, opacities = activate(scales, opacities, raw)
     projected = project(means, quats, scales, world_to_camera, intrinsics, width, height, near, dilation)
     order = torch.argsort(projected.depths, stable=True)
@@ -133,7 +133,7 @@ def rasterize_scene(
             _map_chunks(pixels, len(index), median).reshape(height, width) if depth else means.new_empty(0, 0)
         )
         all_centres = torch.zeros_like(means[:, :2]).index_copy_(0, index, centres)
-        reach = extent(opacities.clamp(max=OPACITY_MAX))
+        reach = cutoff_radii(opacities.clamp(max=OPACITY_MAX))
         radii = torch.zeros_like(means[:, 0]).index_copy_(
             0, index, visible_radii(centres, covariances, reach, width, height)
         )
@@ -150,7 +150,7 @@ def splat(
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
     *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """Rasterize as `splat` of the package does at full resolution."""
+    """Rasterize as `splat` of the package does at full resolution; it explains arguments and result."""
     index = torch.nonzero(determinants(covariances) > 0)[:, 0]  # a degenerate ellipse covers nothing
     centres, covariances, opacities, colours = (
         part[index] for part in (centres, covariances, opacities, colours)

@@ -78,15 +78,15 @@ def normalise_arcs(arcs: Tensor, covariances: Tensor, rings: Tensor | None) -> T
 
         -(r - r0)² / (2 w²) + beta r c - m  =  -(r - r0 - w² beta)² / (2 w²) - beta r (1 - c)
 
-    so the profile is nowhere above a ring of radius r0 + w² beta and width w, which `extent` uses, and equals it at
-    c = 1.
+    so the profile is nowhere above a ring of radius r0 + w² beta and width w, which `cutoff_radii` uses, and equals it
+    at c = 1.
     """
     beta = arc_strengths(covariances, arcs)
     r0, w = (0.0, 1.0) if rings is None else rings.to(beta.dtype).unbind(-1)
     return torch.cat([arcs, (beta * (r0 + beta * w * w / 2)).to(arcs.dtype)[:, None]], -1)
 
 
-def extent(
+def cutoff_radii(
     peaks: Tensor, blend: Blend = "over", rings: Tensor | None = None, strengths: Tensor | None = None
 ) -> Tensor:
     """Return (n,) the Mahalanobis radius beyond which a Gaussian is not drawn; 0 if it is not drawn at all.

@@ -154,7 +154,8 @@ class SceneGaussians(nn.Module):
 
     def _filter_ratios(self, world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
                        filter_size: float) -> Tensor:
-        """Return (n,) ratios of the projected areas without and with the low-pass filter; 1 for culled Gaussians."""
+        """Return (n,) square roots of the ratios of the projected covariances' determinants without and with the
+        low-pass filter of filter_size px²; 1 for culled Gaussians."""
         projected = project(self.means, self.quaternions, self.scales, world_to_camera, intrinsics, width, height,
                             self.near, 0.0)
         plain = determinants(projected.covariances).clamp(min=0)

@@ -28,7 +28,7 @@ from .rendering import (
     Splats,
     activate,
     arc_strengths,
-    extent,
+    cutoff_radii,
     record_gradient,
 )
 from .spherical_harmonics import colours as colours_of
@@ -181,7 +181,8 @@ def rasterize_scene(
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
-    """Render as `rasterization` of the package does. draw: draws the tiles; tile_size: px."""
+    """Render as `rasterization` of the package does, which explains arguments and results. draw: draws the tiles;
+    tile_size: px."""
     scales, opacities = activate(scales, opacities, raw)
     dtype = means.dtype
     projected = project(
@@ -189,7 +190,7 @@ def rasterize_scene(
         _to_double(intrinsics), width, height, near, dilation,
     )  # fmt: skip
     with torch.no_grad():
-        reach = extent(opacities[projected.indices].clamp(max=OPACITY_MAX))
+        reach = cutoff_radii(opacities[projected.indices].clamp(max=OPACITY_MAX))
         visible = visible_radii(projected.centres, projected.covariances, reach, width, height)
         order = torch.argsort(projected.depths, stable=True)
         order = order[visible[order] > 0]
@@ -228,7 +229,8 @@ def splat(
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
     *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """Rasterize as `splat` of the package does at full resolution. draw: draws the tiles; tile_size: px."""
+    """Rasterize as `splat` of the package does at full resolution; it explains arguments and result. draw: draws the
+    tiles; tile_size: px."""
     centres, covariances = _to_double(centres), _to_double(covariances)
     index = torch.nonzero(determinants(covariances) > 0)[:, 0]  # a degenerate ellipse covers nothing
     centres, covariances, opacities, colours = (
@@ -241,7 +243,7 @@ def splat(
         peaks = torch.ones_like(opacities)
         colours = opacities[:, None] * colours
     with torch.no_grad():
-        reach = extent(peaks, blend, rings, None if arcs is None else arc_strengths(covariances, arcs))
+        reach = cutoff_radii(peaks, blend, rings, None if arcs is None else arc_strengths(covariances, arcs))
     values = torch.cat([peaks[:, None], colours, torch.ones_like(colours[:, :1])], -1)
     whitening_factors = whitening(covariances)
     if arcs is not None:

@@ -163,7 +163,7 @@ def _trace_path(lens: Prescription, index: Array, i: int, j: int, focus: float) 
     curvature, thickness, last = lens.curvature, lens.thickness, len(index) - 1
 
     def forward(system: Array, first: int, end: int) -> Array:
-        """Refract at `first`..`end` - 1, each followed by its gap."""
+        """Refract at `first`..`end` - 1, each followed by its gap; note the passages of the stop in `crossings`."""
         for k in range(first, end):
             system = _refraction(_index_before(index, k), index[k], curvature[k]) @ system
             if k == lens.stop:

@@ -73,9 +73,8 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
     """Trace one ray that meets the plane z = 0 at (x, y), from a light at tan(field angle) = `slope` along +x.
 
     first < second: the pair of surfaces that reflects; both -1 for none. The arrays describe the surfaces, as in
-    `Prescription`; stop: index of the stop; sensor: its z. Returns False where the ray misses a surface or is reflected
-    totally. `out` (FIELDS,) receives the result.
-    """
+    `Prescription`; coating, wavelength: see `reflectance`; stop: index of the stop; sensor: its z. Returns False where
+    the ray misses a surface or is reflected totally. `out` (FIELDS,) receives the result."""
     slope_norm = math.sqrt(1.0 + slope * slope)
     dx, dy, dz = -slope / slope_norm, 0.0, 1.0 / slope_norm
     px, py, pz = x, y, 0.0

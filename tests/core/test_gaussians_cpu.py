@@ -383,10 +383,10 @@ def test_ellipses_far_larger_than_the_picture_are_listed_within_their_rows(monke
         two = np.maximum(*ends) > layout.TILE_HEIGHT
         few = tiles >= 0
         assert (packed[few] >= 0).all()
-        assert (tiles[few & two] + grid.tiles_x < grid.tiles).all()
+        assert (tiles[few & two] + grid.tiles_x < grid.num_tiles).all()
         bins = bin_gaussians(*given)
         met = np.flatnonzero(few)
-        assert (bins.counts <= bounds)[given[1] < binning.CULLED_KEY].all()
+        assert (bins.slot_counts <= bounds)[given[1] < binning.CULLED_KEY].all()
         return bins
 
     monkeypatch.setattr(rendering, "bin_gaussians", listed)

@@ -17,7 +17,7 @@ from core.gaussians import kernels as registry
 from core.gaussians import rasterization, splat
 from core.gaussians.projection import project, rotation_matrices
 from core.gaussians.reference import profiles
-from core.gaussians.rendering import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN, arc_strengths, extent, normalise_arcs
+from core.gaussians.rendering import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN, arc_strengths, cutoff_radii, normalise_arcs
 from core.gaussians.spherical_harmonics import basis, colours
 
 SETS = [name for name in ("torch", "tiles", "cpu") if registry.is_available(name)]
@@ -160,7 +160,7 @@ def test_an_arc_of_a_plain_gaussian_is_its_shift(kernels: str) -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_arcs_have_a_peak_of_one_and_end_at_their_extent(seed: int) -> None:
-    """At the radius r0 + w² beta towards covariance b, and nowhere beyond what `extent` says."""
+    """At the radius r0 + w² beta towards covariance b, and nowhere beyond what `cutoff_radii` says."""
     rng = np.random.default_rng(seed)
     factor = torch.tensor([[3.0, 0.0], [rng.normal(), rng.uniform(1, 4)]], dtype=torch.float64)
     (xx, xy), (_, yy) = (factor @ factor.T).tolist()
@@ -177,7 +177,7 @@ def test_arcs_have_a_peak_of_one_and_end_at_their_extent(seed: int) -> None:
     peak, *g = profiles(torch.cat([brightest[None], grid]) @ factor.T, torch.zeros(1, 2), covariance, rings, arcs)[0]
     assert peak.item() == pytest.approx(1) and max(g) <= 1
     for opacity, blend, least in ((1.0, "add", PROFILE_MIN), (0.3, "over", ALPHA_MIN / 0.3)):
-        reach = extent(torch.tensor([opacity]), blend, rings, arc_strengths(covariance, b)).item()
+        reach = cutoff_radii(torch.tensor([opacity]), blend, rings, arc_strengths(covariance, b)).item()
         drawn = grid[torch.stack(g) >= least]
         assert drawn.norm(dim=1).max() <= reach * (1 + 1e-6)
         edge = reach * a / beta  # on the bright side nothing is given away

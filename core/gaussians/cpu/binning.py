@@ -82,8 +82,9 @@ HISTOGRAM_BINS = 1 << 10
 """Bins of the histogram of keys; parts are cut between bins."""
 GAUSSIAN_COST = 2
 """Cost of sorting and visiting a Gaussian, relative to listing one tile."""
-LIST_ENTRY = 3
-"""int32 numbers of an entry of a tile list: Gaussian, slot, and tile with first and last row packed."""
+LIST_ENTRY, LIST_SLOT, LIST_TILE = 3, 1, 2
+"""int32 numbers of an entry of a tile list: Gaussian, slot, and tile with first and last row packed; offsets of the
+latter two."""
 NEXT_LINE = 32
 """Offset, in int32 numbers, of the cache line that is prefetched behind an entry."""
 CULLED_KEY = 0x7F800000
@@ -128,11 +129,15 @@ def _ellipse_rows(half_x, root_squared, root_falloff, shear, x):
 
 @inlined
 def small_footprints(x, y, half_x, half_y, major, k, minor, reach, is_visible, width, height):
-    """Return the tiles that 16 Gaussians cover, from the fields of their records; width, height: of the picture.
+    """Return the tiles that 16 Gaussians cover, from the fields of their records, as vectors; width, height: of the
+    picture.
 
     For Gaussians with at most two columns and rows of tiles: the first tile (-1 for all others), and the first and end
     pixel row in each column, counted from the first tile's top row. The left column takes the lowest COLUMN_BITS; each
-    column has FIRST_BITS and END_BITS, 0 if it is not covered. major, minor, reach: A, D and t of the module head."""
+    column has FIRST_BITS and END_BITS, 0 if it is not covered.
+
+    x, y, half_x, half_y: centre and half size, px; major, k, minor, reach: A, k, D and t of the module head;
+    is_visible: false for Gaussians that are not drawn."""
     padded_half_x = half_x + ROW_MARGIN
     tile_column = to_ints(maximum(x - padded_half_x, ZERO)) >> TILE_SHIFT_X
     extra_columns = (to_ints(minimum(x + padded_half_x, splat(np.float32(width - 1)))) >> TILE_SHIFT_X) - tile_column
@@ -197,14 +202,16 @@ def _list_two_tiles(tile, first_row, end_row, tiles_x, i, slot_offset, tile_list
     one that is not counted."""
     has_upper = np.int64(first_row < end_row) & np.int64(first_row < TILE_HEIGHT)
     has_lower = np.int64(end_row > TILE_HEIGHT)
-    tile_list[place * LIST_ENTRY], tile_list[place * LIST_ENTRY + 1] = i, place + slot_offset
-    tile_list[place * LIST_ENTRY + 2] = ((tile << ROW_BITS | first_row) << ROW_BITS) | (_min(end_row, TILE_HEIGHT) - 1)
+    tile_list[place * LIST_ENTRY], tile_list[place * LIST_ENTRY + LIST_SLOT] = i, place + slot_offset
+    tile_rows = ((tile << ROW_BITS | first_row) << ROW_BITS) | (_min(end_row, TILE_HEIGHT) - 1)
+    tile_list[place * LIST_ENTRY + LIST_TILE] = tile_rows
     tile_counts[tile] += has_upper
     place += has_upper
     tile += tiles_x * has_lower  # without a lower tile it stays, so that the index below is inside tile_counts
-    tile_list[place * LIST_ENTRY], tile_list[place * LIST_ENTRY + 1] = i, place + slot_offset
+    tile_list[place * LIST_ENTRY], tile_list[place * LIST_ENTRY + LIST_SLOT] = i, place + slot_offset
     first_row = _max(first_row - TILE_HEIGHT, 0)
-    tile_list[place * LIST_ENTRY + 2] = ((tile << ROW_BITS | first_row) << ROW_BITS) | (end_row - TILE_HEIGHT - 1)
+    tile_rows = ((tile << ROW_BITS | first_row) << ROW_BITS) | (end_row - TILE_HEIGHT - 1)
+    tile_list[place * LIST_ENTRY + LIST_TILE] = tile_rows
     tile_counts[tile] += has_lower
     return place + has_lower
 
@@ -221,8 +228,9 @@ def _list_column(column, top_row, bottom_row, tiles_x, i, slot_offset, tile_list
         first_row = top_row - tile_top if top_row > tile_top else 0
         last_row = bottom_row - tile_top if bottom_row - tile_top < ROW_MASK else ROW_MASK
         tile = tile_row * tiles_x + column
-        tile_list[place * LIST_ENTRY], tile_list[place * LIST_ENTRY + 1] = i, place + slot_offset
-        tile_list[place * LIST_ENTRY + 2] = ((tile << ROW_BITS | first_row) << ROW_BITS) | last_row
+        tile_list[place * LIST_ENTRY], tile_list[place * LIST_ENTRY + LIST_SLOT] = i, place + slot_offset
+        tile_rows = ((tile << ROW_BITS | first_row) << ROW_BITS) | last_row
+        tile_list[place * LIST_ENTRY + LIST_TILE] = tile_rows
         tile_counts[tile] += 1
         place += opaque_one
         tile_row += opaque_one
@@ -231,8 +239,10 @@ def _list_column(column, top_row, bottom_row, tiles_x, i, slot_offset, tile_list
 
 @inlined
 def _list_gaussian(records, i, width, height, tiles_x, slot_offset, tile_list, place, tile_counts):
-    """List the tiles of a Gaussian i of any size from `place` on; return the next free place. The arguments are those
-    of `_list_column`."""
+    """List the tiles of a Gaussian i of any size from `place` on; return the next free place.
+
+    width, height: of the picture; tiles_x: tiles in a row of them; slot_offset, tile_list, tile_counts: see
+    `_list_column`."""
     record = i * RECORD
     x, half_x = load_scalar(records, record + X), load_scalar(records, record + HALF_X)
     padded_half_x = half_x + ROW_MARGIN
@@ -380,8 +390,8 @@ def _list_part(
 ):  # fmt: skip
     """List the tiles of `count` sorted Gaussians, whose pairs start at `begin`; return the end of the list.
 
-    place: where the list begins; tile_counts (tiles,): of this part; the other arguments: `list_sorted`. Replaces
-    their max_tiles by the number of tiles, and first_slots by their first slot."""
+    place: where the list begins; tile_counts (tiles,): of this part; `list_sorted` explains the others. Replaces their
+    max_tiles by the number of tiles, and first_slots by their first slot."""
     end = begin + count
     for pair_index in range(begin, end):
         # Accesses are scattered in memory.
@@ -422,9 +432,10 @@ def list_sorted(
     first_slots              first slot within the chunk; replaced by that among all
     chunk_starts             first slot of each chunk
     cuts                     (parts + 1,) keys at which parts begin and end
+    width, height, tiles_x   size of the picture, px, and tiles in a row of them
     cursors                  0, 0: next free places of pairs and tile_list, shared by the threads
     places, pairs            (parts, DIGITS, 2^11), (2, n + parts): workspaces
-    tile_list                result: Gaussian, slot, and tile with first and last row packed, for each pair of the two
+    tile_list                result: Gaussian, slot, and tile with first and last row packed, for each pair of these two
     spans                    result: (parts, 2) range of each part in tile_list, lowest key first
     tile_counts              result: (parts, tiles) entries of each part in each tile"""
     parts = tile_counts.shape[0]
@@ -469,12 +480,12 @@ def scatter_entries(counter, tile_list, spans, places, entries):
             break
         part_offsets = places[part]
         for source in range(spans[part, 0] * LIST_ENTRY, spans[part, 1] * LIST_ENTRY, LIST_ENTRY):
-            packed = np.int64(load_scalar(tile_list, source + 2))
+            packed = np.int64(load_scalar(tile_list, source + LIST_TILE))
             tile = packed >> (2 * ROW_BITS)
             target = part_offsets[tile] * ENTRY
             part_offsets[tile] += 1
             prefetch_to_write(entries, target + NEXT_LINE)
             entries[target + GAUSSIAN] = load_scalar(tile_list, source)
-            entries[target + SLOT] = load_scalar(tile_list, source + 1)
+            entries[target + SLOT] = load_scalar(tile_list, source + LIST_SLOT)
             entries[target + FIRST_ROW] = (packed >> ROW_BITS) & ROW_MASK
             entries[target + END_ROW] = (packed & ROW_MASK) + 1

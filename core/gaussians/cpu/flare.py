@@ -17,6 +17,8 @@ so its gradients are those of the plain one with g replaced by
 
 and an arc depends on the centre through b·d as well: d ln G = -b. The gradients of b and m are sums of g u, g d_y and
 g, since d_x is u - k d_y.
+
+The head of `raster_forward` lists the arguments; shapes: SHAPE numbers for each Gaussian, see R0 ... ARC_NORM.
 """
 from __future__ import annotations
 
@@ -174,7 +176,7 @@ def prepare_records(
         opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), rendering.OPACITY_MAX)
         r0, ring_width = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
         cutoff = _cutoff_log2(opacity, add)
-        # Mahalanobis; see `normalise_arcs` and `extent` of `..rendering`.
+        # Mahalanobis; see `normalise_arcs` and `cutoff_radii` of `..rendering`.
         plain_reach = math.sqrt(2.0 * math.log(2.0) * max(cutoff, 0.0))
         reach = r0 + ring_width * ring_width * _arc_strength(arcs, i, xx, xy, yy) + abs(ring_width) * plain_reach
         keys[i], max_tiles[i] = CULLED_KEY, 0
@@ -340,10 +342,10 @@ def raster(
     counter, state, entries, starts, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
     image, alphas, ends,
 ):  # fmt: skip
-    """Write colour (h w 3) and alpha (h w), flat; ends (tiles,): the end of each tile's drawn entries.
+    """Write colour and alpha of all tiles; ends (tiles,): the end of each tile's drawn entries.
 
     shaped: there are rings or arcs, else plain Gaussians, which this kernel draws with the blend "add" only; arcs:
-    there are arcs; add: the blend is "add", else "over". The other arguments: `raster_forward.raster`."""
+    there are arcs; add: the blend is "add", else "over"; counter, state, starts: see `raster_forward.raster`."""
     no_depth = np.bool_(False)
     while True:
         tile = atomic_increment(counter)
@@ -518,7 +520,7 @@ def raster_backward(
 ):  # fmt: skip
     """Write the gradient row of each slot, RECORD numbers, to `gradients`. d_alphas may be empty.
 
-    shaped, arcs, add: see `raster`; the other arguments: `raster_backward.raster_backward`."""
+    shaped, arcs, add: see `raster`; counter, scratch, starts, ends: see `raster_backward.raster_backward`."""
     state, padded = scratch[:STATE_BACKWARD], scratch[STATE_BACKWARD:SCRATCH].reshape(6, PADDED_ROW)
     no_depth = np.bool_(False)
     while True:
@@ -557,10 +559,11 @@ def sum_gradients(
     row, covariances, opacities, colours, arcs, gradients, first_slots, counts, add,
     d_centres, d_covariances, d_opacities, d_colours, d_rings, d_arcs,
 ):  # fmt: skip
-    """Write the gradients of the inputs from the gradient rows; see `projection` for the moments.
+    """Write the gradients of the inputs (d_...) from the gradient rows; see `projection` for the moments.
 
-    row: workspace of 16; gradients: the rows, by slot; first_slots, counts: first slot and number of slots of each
-    Gaussian; add: the blend is "add". d_rings, d_arcs may be empty."""
+    row: workspace of 16; covariances, opacities, colours, arcs: see `prepare_records`; gradients: the rows, by slot;
+    first_slots, counts: first slot and number of slots of each Gaussian; add: the blend is "add". d_rings, d_arcs may
+    be empty."""
     for i in range(opacities.size):
         _write_row_sum(gradients, first_slots[i], counts[i], row)
         xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])

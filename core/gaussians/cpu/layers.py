@@ -112,9 +112,10 @@ def _gather_pixels(row, padding, channels, factor, small_width, out, out_start):
 def upsample_backward_kernel(
     counter, row, d_colour, d_t, small_width, small_height, factor, width, height, out_colour, out_t
 ):  # fmt: skip
-    """Write the gradients of the small picture, border included, from those of the large one; d_t may be empty.
+    """Write the gradients of the small picture (out_colour, out_t), border included, from those of the large one
+    (d_colour, d_t), all flat; d_t may be empty.
 
-    counter: of the next small row; row: scratch."""
+    counter: of the next small row; row: scratch; small_width, small_height: with the border; factor: of the size."""
     padding = 3 * PADDING
     row[:] = ZERO
     while True:
@@ -132,7 +133,8 @@ def upsample_backward_kernel(
 
 @kernel
 def composite_kernel(counter, colour, t, behind, out):
-    """Write colour + t behind to `out`; colour, behind and out (n, 3), t (n,), n at least 16."""
+    """Write colour + t behind to `out`; colour, behind and out (n 3), t (n,), all flat; n at least 16. counter: of the
+    next task."""
     n = t.size
     while True:
         start = atomic_increment(counter) * PIXELS_PER_TASK
@@ -148,7 +150,8 @@ def composite_kernel(counter, colour, t, behind, out):
 
 @kernel
 def composite_backward_kernel(counter, gradient, t, behind, d_t, d_behind):
-    """Write d_t = gradient . behind and d_behind = t gradient."""
+    """Write d_t = gradient . behind and d_behind = t gradient, in the shapes of `composite_kernel`. counter: of the
+    next task."""
     n = t.size
     while True:
         start = atomic_increment(counter) * PIXELS_PER_TASK

@@ -124,8 +124,8 @@ def _column_moments(x, y, row, column, row_length, height):
 
 @inlined
 def _moments_down_columns(x, y, first_row, end_row, row_length, height, rows):
-    """Write the column moments of rows first_row .. end_row - 1 of the picture to `rows` of scratch (3, BAND, padded);
-    loads the rows of all windows once."""
+    """Write the column moments of rows first_row .. end_row - 1 of the pictures x and y to `rows` of scratch (3, BAND,
+    padded); loads the rows of all windows once. row_length: numbers in a row."""
     for block in range(0, row_length, LANES):
         column = min(block, row_length - LANES)
         if _is_interior(first_row, height):
@@ -211,9 +211,10 @@ def _compute_maps(x, y, mu_y, s_y, first_row, row_length, height, rows, maps, su
 def _write_gradient(
     x, y, maps_above, maps_here, maps_below, first_row, row_length, height, by_l1, by_similarity, rows, out
 ):  # fmt: skip
-    """Write by_l1 sign(x - y) + by_similarity dS/dx of a band to `out`, from its maps and those of its neighbours.
+    """Write by_l1 sign(x - y) + by_similarity dS/dx of the band from first_row on to `out`.
 
-    x, y, out: flat; rows: scratch; row_length: numbers in a row."""
+    x, y, out: flat; maps_above, maps_here, maps_below: of the band and of its neighbours; rows: scratch; row_length:
+    numbers in a row."""
     _maps_down_columns(maps_above, maps_here, maps_below, row_length, rows)
     for row in range(first_row, min(first_row + BAND, height)):
         band_row = row - first_row

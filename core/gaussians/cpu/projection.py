@@ -20,6 +20,22 @@ With `raw`, scales are logarithms and opacities logits, the form in which they a
 In the backward pass the rasterizer provides moments of g = dL / d ln alpha over the pixels: sums of g, g u, g d_y,
 g u², g u d_y, g d_y². They give the gradients of centre, covariance and opacity (`_gradients_from_moments`). The
 gradients of colour and depth are sums themselves.
+
+Arguments, all flat:
+
+    means, quats, scales, opacities   see `rasterization`; with `raw`, logarithms and logits
+    sh, sh_width     coefficients, and how many numbers of them a Gaussian has
+    degree           of the harmonics that are used
+    camera           from `pack_camera`
+    width, height    size of the picture, px
+    records          result, see `layout`
+    centres, radii   results: (n 2) px; 3 sigma of the longer axis, px
+    depths           result: infinite for a Gaussian that is not drawn
+    max_tiles        result: upper bounds on the numbers of tiles
+    small_tiles, small_rows        results of `small_footprints`: first tiles, and packed rows
+    first_slots, chunk_max_tiles   results: exclusive sums of max_tiles within chunks, and their sums by chunk
+    colour_slopes    result: gradients of the colours by the means, SLOPES vectors for each block of 16; empty if no
+                     gradients are needed
 """
 from __future__ import annotations
 
@@ -119,7 +135,8 @@ RUN_LOG2_RANGE, RUN_MAX = np.float32(40), np.float32(32)
 
 @kernel
 def pack_camera(world_to_camera, intrinsics, width, height, near, dilation, camera):
-    """Write the packed camera (CAMERA,) from the flat matrices (4, 4) and (3, 3); the position is -R^T t."""
+    """Write the packed camera (CAMERA,): the flat matrices (4, 4) and (3, 3) in the offsets above, and the bounds of
+    x/z and y/z for J. The position is -R^T t; near, dilation: see `rasterization`."""
     for i in range(3):
         position = 0.0
         for j in range(3):
@@ -155,7 +172,7 @@ def _add_scaled(a, s, b):
 
 @inlined
 def _rotation(w, x, y, z):
-    """Return the rows of the rotation of a unit quaternion."""
+    """Return the rows of the rotation of a unit quaternion w, x, y, z."""
     x2, y2, z2 = x * TWO, y * TWO, z * TWO
     xx, yy, zz = x * x2, y * y2, z * z2
     xy, xz, yz = x * y2, x * z2, y * z2
@@ -169,7 +186,7 @@ def _rotation(w, x, y, z):
 
 @inlined
 def _rotation_backward(w, x, y, z, g):
-    """Return the gradient of the unit quaternion from that of the rotation's rows."""
+    """Return the gradient of the unit quaternion w, x, y, z from g, that of the rotation's rows."""
     # Sums and differences of mirrored elements.
     s01, s02, s12 = g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][2] + g[2][1]
     d10, d02, d21 = g[1][0] - g[0][1], g[0][2] - g[2][0], g[2][1] - g[1][2]
@@ -302,10 +319,8 @@ def _project_block(
     means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, transposed, basis,
     records, centres, radii, depths, max_tiles, small_tiles, small_rows, colour_slopes,
 ):  # fmt: skip
-    """Project the 16 Gaussians from `first` on.
-
-    colour_slopes: of this block, see `project`; transposed, basis: workspaces of TRANSPOSED and SQUARE numbers; all
-    other arguments as in `project`."""
+    """Project the 16 Gaussians from `first` on; colour_slopes: of this block. transposed, basis: workspaces of
+    TRANSPOSED and SQUARE numbers. The module head lists the others."""
     mean = _load3(means, first)
     px, py, pz = _to_camera(camera, mean)
     is_in_front = pz > camera[NEAR]
@@ -349,7 +364,7 @@ def _project_block(
 
     red, green, blue = zero, zero, zero
     if any_of(is_visible):
-        harmonics.gather(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), transposed)
+        harmonics.load_transposed(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), transposed)
         direction, inverse = _direction(mean, camera)
         red, green, blue = harmonics.colours(transposed, degree, direction[0], direction[1], direction[2], basis)
         if colour_slopes.size > 0:
@@ -374,7 +389,7 @@ def _store2(array, first, x, y):
 @inlined
 def _colour_slopes(transposed, degree, direction, inverse_distance, colour_slopes):
     """Write the gradient of each colour by the mean: the slope's component tangential to the sphere of directions, over
-    the distance. transposed: coefficients from `spherical_harmonics.gather`."""
+    the distance. transposed: coefficients from `spherical_harmonics.load_transposed`."""
     for channel in range(3):
         g = harmonics.colour_slope(transposed, degree, direction[0], direction[1], direction[2], channel)
         g = _scale(inverse_distance, _add_scaled(g, -_dot(g, direction), direction))
@@ -387,20 +402,9 @@ def project(
     records, centres, radii, depths, max_tiles, small_tiles, small_rows, first_slots, chunk_max_tiles, d_centres,
     colour_slopes,
 ):  # fmt: skip
-    """Project n >= 16 Gaussians; see `projection` of the package for means, quats, scales, opacities.
+    """Project n >= 16 Gaussians, on all threads; sets d_centres to zero.
 
-    sh, sh_width        coefficients, flat, and the numbers of a Gaussian's row of them
-    degree              of the harmonics that are used
-    raw                 scales are logarithms and opacities logits
-    camera              from `pack_camera`
-    records, centres    results, see `layout`; (n, 2) px
-    radii, depths       results: 3 sigma, px; infinite depth for a culled Gaussian
-    max_tiles           result: upper bounds on the numbers of tiles
-    small_tiles, small_rows        results of `small_footprints`: first tiles, and packed rows
-    first_slots, chunk_max_tiles   results: exclusive sums of max_tiles within chunks, and their sums by chunk
-    d_centres           set to zero
-    colour_slopes       result: gradients of the colours by the means, SLOPES vectors per block of 16; empty without
-                        gradients"""
+    counter: of the next chunk; scratch: workspace of SCRATCH numbers. The module head lists the others."""
     n = opacities.size
     transposed, basis = scratch[:TRANSPOSED], scratch[TRANSPOSED : TRANSPOSED + SQUARE]
     while True:
@@ -499,11 +503,12 @@ def _project_block_backward(
     transposed, rows, d_means, d_quats, d_scales, d_opacities, d_sh, target_row, keep_cached, d_centres, sums,
     with_camera,
 ):  # fmt: skip
-    """Write the gradients of the 16 Gaussians from `first` on to rows from target_row on.
+    """Write the gradients (d_...) of the 16 Gaussians from `first` on to rows from target_row on; d_centres from
+    `first` on.
 
-    fields: the summed gradient rows, one vector per field; colour_slopes: of this block, see `project`; keep_cached:
-    keep the gradients of sh in the cache, since they are read soon; is_new, sums: for the camera, see
-    `_add_camera_gradients`; transposed, rows: workspaces."""
+    fields: the summed gradient rows, one vector per field; colour_slopes: of this block; keep_cached: keep the
+    gradients of sh in the cache, since they are read soon; with_camera, is_new, sums: for the camera, see
+    `_add_camera_gradients`; transposed, rows: workspaces. The module head lists the others."""
     mean, scale = _load3(means, first), _load_scales(scales, first, raw)
     px, py, pz = _to_camera(camera, mean)
     is_in_front = pz > camera[NEAR]
@@ -564,7 +569,7 @@ def _project_block_backward(
     )
     direction, _ = _direction(mean, camera)
     harmonics.coefficients_backward(degree, direction[0], direction[1], direction[2], d_colour, rows, transposed)
-    harmonics.scatter(transposed, target_row, sh_width, d_sh, keep_cached)
+    harmonics.store_transposed(transposed, target_row, sh_width, d_sh, keep_cached)
     offset = _offset_gradient(d_colour, colour_slopes)
     d_mean = (
         fma(dp[0], camera[0], fma(dp[1], camera[3], fma(dp[2], camera[6], offset[0]))),
@@ -586,9 +591,9 @@ def project_backward(
 
     parameters: means, quats, scales, opacities, and sh if they are stepped; d_parameters: the gradients of all five. If
     these are empty, the parameters are stepped by their gradients instead, chunk by chunk; first_moments,
-    second_moments, rates, constants: see `stepping.StepArrays`.
-    gradients: one row for each pair of Gaussian and tile; Gaussian i has counts[i] rows from first_slots[i] on.
-    colour_slopes: from `project`; d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if with_camera."""
+    second_moments, rates, constants: see `stepping.StepArrays`. gradients: one row for each pair of Gaussian and tile;
+    Gaussian i has counts[i] rows from first_slots[i] on. d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if
+    with_camera. counter, scratch: see `project`. The module head lists the others."""
     means, quats, scales, opacities, _ = parameters
     n = opacities.size
     transposed, rows = scratch[:TRANSPOSED], scratch[TRANSPOSED : TRANSPOSED + SQUARE]

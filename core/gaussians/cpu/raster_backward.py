@@ -14,7 +14,7 @@ row through k d_y alone, so three sums per lane suffice, combined after the last
 `raster_forward`) sum the products themselves, which would cancel otherwise.
 
 Every pair of Gaussian and tile writes its own row: no two threads write to the same memory, and the sums do not depend
-on the number of threads.
+on the number of threads. The head of `raster_forward` lists the arguments.
 """
 from __future__ import annotations
 
@@ -83,9 +83,8 @@ def _init_row(
 ):  # fmt: skip
     """Write one row of a tile's state before its first Gaussian: S and the gradients of the pixels.
 
-    row: of the tile; pixel: flat index of its first pixel. image (h w 3), alphas and depths (h w): the pictures, each
-    with its gradient. The background counts as an opposite gradient of alpha. Depth adds nothing to S, since the sum of
-    w (depth - mean depth) is 0."""
+    row: of the tile; pixel: flat index of its first pixel. The background counts as an opposite gradient of alpha.
+    Depth adds nothing to S, since the sum of w (depth - mean depth) is 0."""
     state_row = row * ROW
     colour_index = 3 * pixel
     colour = deinterleave((load(image, colour_index), load(image, colour_index + 16), load(image, colour_index + 32)))
@@ -241,7 +240,7 @@ def _pad_row(padded, pixel, count, image, alphas, depths, d_image, d_alphas, d_d
 def init_tile_backward(
     state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth, padded
 ):  # fmt: skip
-    """Write the state of a tile before its first Gaussian; pictures and gradients: see `_init_row`.
+    """Write the state of a tile before its first Gaussian.
 
     padded: workspace (6, PADDED_ROW) for tiles that reach beyond the right edge of the picture."""
     init_tile(state, ROW, left, top, width, height)
@@ -286,8 +285,8 @@ def raster_backward(
 ):  # fmt: skip
     """Write the gradient row of each slot, RECORD numbers, to `gradients`; d_alphas and d_depths may be empty.
 
-    counter: of the next tile; scratch: workspace of SCRATCH numbers; d_image (h w 3), d_alphas, d_depths (h w):
-    gradients of the pictures; all else as `raster` of `raster_forward` had it or wrote it."""
+    counter: of the next tile; scratch: workspace of SCRATCH numbers; starts, ends: see `raster_forward.raster`. The
+    head of `raster_forward` lists the others."""
     state, padded = scratch[:STATE], scratch[STATE:SCRATCH].reshape(6, PADDED_ROW)
     with_depth = d_depths.size > 0
     while True:

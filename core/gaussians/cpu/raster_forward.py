@@ -11,13 +11,20 @@ r = 2^(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(2 (A k² + D)) - 1, which 
 The recurrence restarts after `run` rows, over which e changes by 40 powers of two, so that neither underflow nor
 rounding spoils it. Where runs would be too short (needles), e is computed for each row.
 
-Arguments of the functions here and in `raster_backward` and `flare`:
+Arguments here and in `raster_backward` and `flare`:
 
     records, record      the records, and the index of the Gaussian's first number in them
     left, top            first pixel column and row of the tile
     first_row, end_row   rows of the tile that the Gaussian covers: its first, and the one after its last
     state                the tile's workspace, ROW numbers for each of its rows
     run_start            e, r and d_y in the first row, from `start_run`
+    entries, begin, end  the entries of all tiles (`layout`); those of the tile are numbers begin .. end - 1
+    width, height        size of the picture, px
+    tiles_x              number of tiles in a row of them
+    background           (3,) colour behind all Gaussians
+    image, alphas        the pictures, flat: colour (h w 3), alpha (h w)
+    depths, medians      mean and median depth, flat (h w); neither read nor written unless `with_depth`
+    d_image, ...         the gradients of the pictures
 """
 from __future__ import annotations
 
@@ -244,9 +251,7 @@ def _copy_pixels(source, source_index, target, target_index, count):
 
 @inlined
 def write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth):
-    """Write the finished tile, over the background (3,), to the flat pictures; overwrites the state.
-
-    depths, medians: not written unless `with_depth`."""
+    """Write the finished tile, over the background, to the pictures; overwrites the state."""
     visible_columns = width - left
     row, opaque_one = 0, opaque(1)
     while row < min(TILE_HEIGHT, height - top):
@@ -296,11 +301,11 @@ def _raster_tile(entries, begin, end, records, left, top, state, with_depth):
 def raster(
     counter, state, entries, starts, records, background, width, height, tiles_x, image, alphas, depths, medians, ends
 ):  # fmt: skip
-    """Write colour (h w 3) and alpha (h w), flat; mean and median depth too unless `depths` is empty.
+    """Write colour and alpha of all tiles; mean and median depth too unless `depths` is empty.
 
-    counter: of the next tile; state: workspace of STATE numbers; entries, records: see `layout`; starts (tiles + 1,):
-    number of each tile's first entry; background (3,); tiles_x: tiles in a row of them; ends (tiles,): the end of each
-    tile's drawn entries, written for the backward pass."""
+    counter: of the next tile; state: workspace of STATE numbers; starts (tiles + 1,): number of each tile's first
+    entry; ends (tiles,): the end of each tile's drawn entries, written for the backward pass. The module head lists the
+    others."""
     with_depth = depths.size > 0
     while True:
         tile = atomic_increment(counter)

@@ -40,7 +40,8 @@ class _Rasterize(torch.autograd.Function):
         world_to_camera: Tensor, intrinsics: Tensor, background: Tensor, options: _RasterOptions,
         centre_gradients: Tensor,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
-        """Return colour, alpha, mean depth and median depth, the last two None without depth.
+        """Return colour, alpha, mean depth and median depth, the last two None without depth; the inputs are those of
+        `rasterization`.
 
         Puts centres and radii into options.projected, and zeros into centre_gradients (n, 2). colour_slopes are written
         for the backward pass alone."""
@@ -74,7 +75,7 @@ class _Rasterize(torch.autograd.Function):
         (depth, depth_flat), (median, median_flat) = (
             buffers.tensor_and_array(h, w) if options.depth else (None, EMPTY) for _ in range(2)
         )
-        ends, background_flat = np.empty(options.tiles, np.int64), flat(background)
+        ends, background_flat = np.empty(options.num_tiles, np.int64), flat(background)
         parallel(
             raster_forward.raster, bins.entries, bins.starts, records, background_flat, w, h, options.tiles_x,
             image_flat, alpha_flat, depth_flat, median_flat, ends, scratch=raster_forward.STATE,
@@ -116,7 +117,7 @@ class _Rasterize(torch.autograd.Function):
         sums = np.zeros((-(-n // layout.CHUNK) if with_camera else 0, projection.CAMERA_SUMS), np.float32)
         parallel(
             projection.project_backward, (*inputs, flat(sh) if steps else EMPTY), sh.shape[1] * 3, options.sh_degree,
-            options.raw, camera, records, colour_slopes, rows, bins.first_slots, bins.counts, gradients_flat,
+            options.raw, camera, records, colour_slopes, rows, bins.first_slots, bins.slot_counts, gradients_flat,
             d_centres, sums, with_camera, *(steps or stepping.NO_STEPS),
             scratch=projection.STEP_SCRATCH if steps else projection.SCRATCH,
         )  # fmt: skip
@@ -149,7 +150,7 @@ def rasterize_scene(
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
-    """Render as `rasterization` of the package does."""
+    """Render as `rasterization` of the package does, which explains arguments and results."""
     n = len(means)
     inputs = [_to_float32(t) for t in (means, quats, scales, opacities, sh)]
     if n < LANES:  # the kernels process 16 at a time; pad with Gaussians of opacity 0

@@ -4,7 +4,7 @@
     colour_c = sum_k b_k(x, y, z) sh_kc + 1/2
 
 with the basis b of `..spherical_harmonics`. Coefficients are transposed to 48 rows (k, c) of 16 Gaussians, one vector
-per row (`gather`). In the backward pass, with the gradient v_c of the colours:
+per row (`load_transposed`). In the backward pass, with the gradient v_c of the colours:
 
     d sh_kc = b_k v_c        d direction = sum_c v_c slope_c,   slope_c = sum_k sh_kc grad b_k
 
@@ -29,41 +29,42 @@ ZERO, HALF, TWO, THREE, FOUR, EIGHT = (np.float32(number) for number in (0, 0.5,
 
 
 @inlined
-def gather(sh, first, width, used_width, transposed):
-    """Transpose the first `used` of the `width` numbers of 16 Gaussians, from row `first` of sh (n, width) on."""
+def load_transposed(sh, first_gaussian, width, used_width, transposed):
+    """Write the first used_width of the `width` numbers of 16 Gaussians, from row first_gaussian of sh (n, width) on,
+    to `transposed`, one vector for each number."""
     opaque_one = opaque(1)
     column = 0
     while column < used_width:
         if column + LANES <= width:
-            rows = load_rows(sh, first * width + column, width)
+            rows = load_rows(sh, first_gaussian * width + column, width)
             store_rows(transposed, column * LANES, LANES, transpose(rows))
             column += LANES
         else:
             i = 0
             while i < LANES:
-                transposed[column * LANES + i] = sh[(first + i) * width + column]
+                transposed[column * LANES + i] = sh[(first_gaussian + i) * width + column]
                 i += opaque_one
             column += opaque_one
 
 
 @inlined
-def scatter(transposed, first, width, sh, keep_cached):
-    """Invert `gather`: write all `width` numbers of 16 Gaussians to sh (n, width), from row `first` on; past the caches
-    unless keep_cached."""
+def store_transposed(transposed, first_gaussian, width, sh, keep_cached):
+    """Invert `load_transposed`: write all `width` numbers of 16 Gaussians to sh (n, width), from row first_gaussian on;
+    past the caches unless keep_cached."""
     opaque_one = opaque(1)
     column = 0
     while column < width:
         if column + LANES <= width:
             rows = load_rows(transposed, column * LANES, LANES)
             if width == ROWS and not keep_cached:  # rows of 48 numbers begin at cache lines, as `stream_rows` requires
-                stream_rows(sh, first * width + column, width, transpose(rows))
+                stream_rows(sh, first_gaussian * width + column, width, transpose(rows))
             else:
-                store_rows(sh, first * width + column, width, transpose(rows))
+                store_rows(sh, first_gaussian * width + column, width, transpose(rows))
             column += LANES
         else:
             i = 0
             while i < LANES:
-                sh[(first + i) * width + column] = transposed[column * LANES + i]
+                sh[(first_gaussian + i) * width + column] = transposed[column * LANES + i]
                 i += opaque_one
             column += opaque_one
 
@@ -90,8 +91,9 @@ def _write_basis(degree, x, y, z, basis):
 
 @inlined
 def colours(transposed, degree, x, y, z, basis):
-    """Return the colours (r, g, b), not yet clamped at 0, along unit directions; transposed: coefficients from
-    `gather`; basis: workspace of 16 vectors."""
+    """Return the colours (r, g, b), not yet clamped at 0, along unit directions x, y, z.
+
+    transposed: coefficients from `load_transposed`; degree: of those that are used; basis: workspace of 16 vectors."""
     _write_basis(degree, x, y, z, basis)
     red, green, blue = splat(HALF), splat(HALF), splat(HALF)
     for k in range((degree + 1) * (degree + 1)):
@@ -104,10 +106,8 @@ def colours(transposed, degree, x, y, z, basis):
 
 @inlined
 def coefficients_backward(degree, x, y, z, d_colours, basis, transposed):
-    """Write the gradients of the coefficients, transposed as by `gather`, from those of the colours; zeros above the
-    degree.
-
-    basis: workspace of 16 vectors."""
+    """Write the gradients of the coefficients, transposed as by `load_transposed`, from d_colours, those of the colours
+    along unit directions x, y, z; zeros above the degree. basis: workspace of 16 vectors."""
     _write_basis(degree, x, y, z, basis)
     num_coefficients = (degree + 1) * (degree + 1)
     for k in range(num_coefficients):
@@ -120,8 +120,8 @@ def coefficients_backward(degree, x, y, z, d_colours, basis, transposed):
 
 @inlined
 def colour_slope(transposed, degree, x, y, z, channel):
-    """Return the gradient of a channel's colour by the direction, sum_k sh_k grad b_k, not yet projected on the sphere;
-    transposed: coefficients from `gather`."""
+    """Return the gradient of a channel's colour by the direction, sum_k sh_k grad b_k, at unit directions x, y, z; not
+    yet projected on the sphere. transposed: coefficients from `load_transposed`."""
     rows, stride = transposed[channel * LANES :], 3 * LANES  # coefficient k is at row k * stride
     zero = splat(ZERO)
     dx, dy, dz = zero, zero, zero

@@ -23,7 +23,7 @@ class _Splat(torch.autograd.Function):
         ctx: Any, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
         rings: Tensor | None, arcs: Tensor | None, add: bool, grid: TileGrid,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Return colour (h, w, 3) and alpha (h, w), over black; arcs: (n, 3) b and m.
+        """Return colour (h, w, 3) and alpha (h, w), over black; the inputs are those of `splat`, arcs (n, 3) b and m.
 
         Rings, arcs and the blend "add" have kernels of their own; other Gaussians use the scene's."""
         n, h, w = len(centres), grid.height, grid.width
@@ -43,7 +43,7 @@ class _Splat(torch.autograd.Function):
 
         image, image_flat = buffers.tensor_and_array(h, w, 3)
         alpha, alpha_flat = buffers.tensor_and_array(h, w)
-        ends = np.empty(grid.tiles, np.int64)
+        ends = np.empty(grid.num_tiles, np.int64)
         tiles = (bins.entries, bins.starts, records)
         if has_shapes or add:
             parallel(
@@ -86,7 +86,7 @@ class _Splat(torch.autograd.Function):
         gradients = [None if t is None else torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs]
         flare.sum_gradients(
             np.empty(layout.RECORD, np.float32), flat(covariances), flat(opacities), flat(colours),
-            EMPTY if arcs is None else flat(arcs), rows, bins.first_slots, bins.counts, add,
+            EMPTY if arcs is None else flat(arcs), rows, bins.first_slots, bins.slot_counts, add,
             *(EMPTY if t is None else flat(t) for t in gradients),
         )  # fmt: skip
         return (*gradients, None, None)
@@ -96,7 +96,7 @@ def splat(
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
     *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """Rasterize as `splat` of the package does at full resolution."""
+    """Rasterize as `splat` of the package does at full resolution; it explains arguments and result."""
     inputs_or_none = (centres, covariances, opacities, colours, rings, arcs)
     inputs = (None if t is None else t.to(torch.float32) for t in inputs_or_none)
     colour, alpha = _Splat.apply(*inputs, blend == "add", TileGrid(width, height))

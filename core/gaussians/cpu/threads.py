@@ -53,18 +53,18 @@ class _Worker:
         """counters: the two of the pool, one a row."""
         self._counters = counters
         self._call: _Call | None = None
-        self._number = 0  # of the latest call
+        self._call_number = 0  # of the latest call
         self._done = np.zeros(1, np.int64)  # number of the latest call that is done; the caller spins on it
         self._error: BaseException | None = None
         self._is_asleep = False
-        self._state = threading.Lock()  # guards _call and _is_asleep
+        self._lock = threading.Lock()  # guards _call and _is_asleep
         self._wakeup = threading.Semaphore(0)
         threading.Thread(target=self._run, name="kernels", daemon=True).start()
 
     def start(self, number: int, call: _Call) -> None:
         """Pass call `number` to the thread."""
-        self._number = number
-        with self._state:
+        self._call_number = number
+        with self._lock:
             self._call = call
             was_asleep, self._is_asleep = self._is_asleep, False
         if was_asleep:
@@ -72,7 +72,7 @@ class _Worker:
 
     def wait(self) -> BaseException | None:
         """Wait until the call is done; return the error it raised, or None."""
-        while not spin_until(self._done, self._number, MAX_SPINS):
+        while not spin_until(self._done, self._call_number, MAX_SPINS):
             time.sleep(POLL_SECONDS)
         error, self._error = self._error, None
         return error
@@ -81,9 +81,9 @@ class _Worker:
         """Make one call after the other, for ever; between them spin for a moment, then sleep."""
         torch.set_flush_denormal(True)  # a register of the thread
         while True:
-            number = self._number
+            number = self._call_number
             finish_and_spin(self._done, number, self._counters[(number + 1) % 2], MAX_SPINS)
-            with self._state:
+            with self._lock:
                 is_asleep = self._is_asleep = self._call is None
             if is_asleep:
                 self._wakeup.acquire()
@@ -101,7 +101,7 @@ class _ThreadPool:
 
     def __init__(self) -> None:
         self._workers: list[_Worker] = []
-        self._number = 0
+        self._call_number = 0
         self._counters = np.zeros((2, buffers.CACHE_LINE // 8), np.int64)
 
     def call(
@@ -113,12 +113,12 @@ class _ThreadPool:
         scratch_size: see `parallel`."""
         while len(self._workers) < thread_count - 1:
             self._workers.append(_Worker(self._counters))
-        self._number += 1
-        self._counters[(self._number + 1) % 2] = 0  # workers read it once they have finished this call
-        call = (function, scratch_size, (self._counters[self._number % 2], *arguments))
+        self._call_number += 1
+        self._counters[(self._call_number + 1) % 2] = 0  # workers read it once they have finished this call
+        call = (function, scratch_size, (self._counters[self._call_number % 2], *arguments))
         workers = self._workers[: thread_count - 1]
         for worker in workers:
-            worker.start(self._number, call)
+            worker.start(self._call_number, call)
         try:
             _run_call(*call)
         finally:

@@ -29,7 +29,7 @@ class TileGrid:
         return -(-self.width // layout.TILE_WIDTH)
 
     @property
-    def tiles(self) -> int:
+    def num_tiles(self) -> int:
         return self.tiles_x * -(-self.height // layout.TILE_HEIGHT)
 
 
@@ -40,14 +40,14 @@ class Bins:
     entries      flat, `layout.ENTRY` numbers each, tile by tile
     starts       (tiles + 1,) number of the first entry of each tile
     first_slots  (n,) first slot of each Gaussian
-    counts       (n,) number of its slots
+    slot_counts  (n,) number of its slots
     num_slots    number of all slots, including unused ones
     """
 
     entries: Array
     starts: Array
     first_slots: Array
-    counts: Array
+    slot_counts: Array
     num_slots: int
 
 
@@ -76,14 +76,14 @@ def bin_gaussians(
     )  # fmt: skip
     # Each part needs one place more than it lists: it may write an entry that it does not count.
     tile_list = buffers.empty((num_slots + parts) * binning.LIST_ENTRY, np.int32)
-    spans, tile_counts = np.empty((parts, 2), np.int64), np.empty((parts, grid.tiles), np.int32)
+    spans, tile_counts = np.empty((parts, 2), np.int64), np.empty((parts, grid.num_tiles), np.int32)
     parallel(
         binning.list_sorted, records, keys, small_tiles, small_rows, max_tiles, first_slots, chunk_starts, cuts,
         grid.width, grid.height, grid.tiles_x, np.zeros(2, np.int64),
         np.empty((parts, binning.DIGITS, 1 << 11), np.int32), buffers.empty(2 * (n + parts), np.int64).reshape(2, -1),
         tile_list, spans, tile_counts,
     )  # fmt: skip
-    starts = np.empty(grid.tiles + 1, np.int64)
+    starts = np.empty(grid.num_tiles + 1, np.int64)
     binning.scan_tile_counts(tile_counts, starts)
     entries = buffers.empty(int(starts[-1]) * layout.ENTRY, np.int32)
     parallel(binning.scatter_entries, tile_list, spans, tile_counts, entries)

@@ -143,47 +143,78 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
     keyed, lights, elements = settings.keyed.with_always(settings.edits), source.lights, source.elements
     # Invalid edits raise before any file is deleted.
     edits = {frame.view: _parse_edits(frame.number, renderer_for(frame), keyed, lights, elements) for frame in frames}
-    space = settings.colour_space()
-    cache_key = _cache_key(source.fingerprint, settings, keyed)
-    layer_by_light = layer_names(lights)
-    _claim_folder(out, cache_key, layer_by_light, overwrite)
-
-    def header_notes(frame: NumberedFrame) -> dict[str, Any]:
-        """Return the entries of a frame's header, by which `_is_up_to_date` knows the frame again."""
-        inputs = renderer_for(frame).fingerprint
-        frame_edits = {"inputs": inputs} if inputs else {}
-        return {"view": frame.view, "frame": frame.number, **frame_edits, **cache_key}
-
-    finished = [frame for frame in frames if _is_up_to_date(out / frame.file, header_notes(frame))
-                and all(path.is_file() for path in renderer_for(frame).extra_files)]
-    manifest = _add_to_manifest(out, cache_key, layer_by_light,
-                                [_manifest_entry(out, frame, renderer_for(frame).extra_files) for frame in finished])
+    writer = _FrameWriter(out, settings, settings.colour_space(), cameras, renderer_for, lights,
+                          _cache_key(source.fingerprint, settings, keyed), layer_names(lights))
+    _claim_folder(out, writer.cache_key, writer.layer_by_light, overwrite)
+    finished = [frame for frame in frames if writer.is_finished(frame)]
+    manifest = writer.add_to_manifest(finished)
     progress.stage("bake", len(frames), len(finished))
-
-    def render(frame: NumberedFrame) -> FrameLayers:
-        camera, renderer = settings.scaled(cameras[frame.view]), renderer_for(frame)
-        return renderer.finish(_render_layers(renderer, camera, edits[frame.view], lights).in_space(space), camera)
-
-    @contextlib.contextmanager
-    def commit_lock() -> Iterator[None]:
-        """While a frame takes its name: nobody else writes here, and the folder is still this bake's."""
-        with file_lock(out / LOCK):
-            _check_is_current(out, cache_key, layer_by_light)
-            yield
-
     for frame in frames:
         if frame in finished:
             continue
-        path = out / frame.file
-        _check_is_current(out, cache_key, layer_by_light)  # before it is rendered in vain
-        # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
-        write_layers(path, render(frame), half=settings.half, chromaticities=space.chromaticities,
-                     notes=header_notes(frame),
-                     pixel_aspect=settings.scaled(cameras[frame.view]).pixel_aspect, commit_lock=commit_lock())
-        manifest = _add_to_manifest(out, cache_key, layer_by_light,
-                                    [_manifest_entry(out, frame, renderer_for(frame).extra_files)])
+        writer.write(frame, edits[frame.view])
+        manifest = writer.add_to_manifest([frame])
         progress.advance()
     return manifest
+
+
+@dataclass(frozen=True, eq=False)
+class _FrameWriter:
+    """Renders and writes the frames of one bake into its folder `out`.
+
+    space: of the layers. cameras, renderer_for: as of `bake_frames`. cache_key, layer_by_light: see `_cache_key` and
+    `layer_names`.
+    """
+
+    out: Path
+    settings: BakeSettings
+    space: ColourSpace
+    cameras: Mapping[str, Camera]
+    renderer_for: Callable[[NumberedFrame], FrameRenderer]
+    lights: Sequence[str]
+    cache_key: dict[str, Any]
+    layer_by_light: dict[str, str]
+
+    def is_finished(self, frame: NumberedFrame) -> bool:
+        """True if the layers of the frame and the files beside them are up to date."""
+        return (_is_up_to_date(self.out / frame.file, self._header_notes(frame))
+                and all(path.is_file() for path in self.renderer_for(frame).extra_files))
+
+    def write(self, frame: NumberedFrame, edits: LookEdits) -> None:
+        """Render and write the layers of a frame. Raises RunError if another bake has taken the folder."""
+        _check_is_current(self.out, self.cache_key, self.layer_by_light)  # before it is rendered in vain
+        # The layers have no name here, so that they are freed early: at 4K those of one frame are half a gigabyte.
+        write_layers(self.out / frame.file, self._render(frame, edits), half=self.settings.half,
+                     chromaticities=self.space.chromaticities, notes=self._header_notes(frame),
+                     pixel_aspect=self._camera(frame).pixel_aspect, commit_lock=self._commit_lock())
+
+    def add_to_manifest(self, frames: Iterable[NumberedFrame]) -> dict[str, Any]:
+        """Add finished frames to bake.json; return its content."""
+        return _add_to_manifest(self.out, self.cache_key, self.layer_by_light, [
+            _manifest_entry(self.out, frame, self.renderer_for(frame).extra_files) for frame in frames])
+
+    def _camera(self, frame: NumberedFrame) -> Camera:
+        """Return the camera of a frame at the size of the layers."""
+        return self.settings.scaled(self.cameras[frame.view])
+
+    def _render(self, frame: NumberedFrame, edits: LookEdits) -> FrameLayers:
+        """Render the layers of a frame in their colour space."""
+        camera, renderer = self._camera(frame), self.renderer_for(frame)
+        return renderer.finish(_render_layers(renderer, camera, edits, self.lights).in_space(self.space), camera)
+
+    def _header_notes(self, frame: NumberedFrame) -> dict[str, Any]:
+        """Return the entries of a frame's header, by which `_is_up_to_date` recognises the frame."""
+        inputs = self.renderer_for(frame).fingerprint
+        inputs_entry = {"inputs": inputs} if inputs else {}
+        return {"view": frame.view, "frame": frame.number, **inputs_entry, **self.cache_key}
+
+    @contextlib.contextmanager
+    def _commit_lock(self) -> Iterator[None]:
+        """Hold the lock under which a frame takes its name: nobody else writes here, and the folder is still this
+        bake's."""
+        with file_lock(self.out / LOCK):
+            _check_is_current(self.out, self.cache_key, self.layer_by_light)
+            yield
 
 
 def _parse_edits(number: int, renderer: FrameRenderer, keyed: KeyedEdits, lights: Sequence[str],

@@ -35,7 +35,7 @@ STEP_SCALE = 0.2
 """Change of brightness from frame to frame that counts as usual."""
 MIN_CERTAINTY = 1e-3
 """Certainty of a brightness that a frame does not show."""
-FLARE_ERROR, OUTSIDE_ERROR, PRIOR_ERROR = 0.1, 2.0, 0.1
+FLARE_ERROR, OUTSIDE_ERROR, PRIOR_ERROR = 0.1, 2.0, 0.25
 """Standard deviations of a brightness by the flare, at the least, of one by the flare of a light outside the frame, and
 of one in the lights' file: a plate that holds part of the flare biases the first, the second has only ghosts, and
 clipping and glare bias the third."""

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images.homographies import HomographyMatcher
+from ..images.homographies import FrameMatch, HomographyMatcher
 from ..removal.inference.optical_flow import dense_flow, forward_backward_confidence, to_grey_codes, warp
 
 Pixels = NDArray[np.float32]
@@ -43,6 +43,8 @@ class Alignment:
         self._codes: dict[str, NDArray[np.uint8]] = {}
         self.travels = self._camera_travels()
         """True if no homography aligns the frames."""
+        self.stands = not self.travels and self._camera_stands()
+        """True if the camera neither travels nor turns: frames need no alignment."""
 
     def neighbours(self, name: str) -> Sequence[str]:
         """Return the frames that are compared with a frame."""
@@ -67,13 +69,22 @@ class Alignment:
         return np.asarray(cv2.warpPerspective(picture, matrix, (width, height), flags=cv2.INTER_LINEAR,
                                               borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 3), np.float32)
 
+    def _probed_matches(self) -> list[FrameMatch]:
+        """Return the matches of a few pairs of frames of the shot; none for a shot that is too short for a pair."""
+        pairs = list(zip(self._names, self._names[PROBED_OFFSET:], strict=False))
+        return [self._matcher.match(*pair) for pair in pairs[::max(len(pairs) // PROBES, 1)]]
+
     def _camera_travels(self) -> bool:
         """True if homographies explain too few matches of the probed pairs of frames, or no pair has enough matches;
         False for a shot that is too short for a pair."""
-        pairs = list(zip(self._names, self._names[PROBED_OFFSET:], strict=False))
-        probed = [self._matcher.match(*pair).inlier_share for pair in pairs[::max(len(pairs) // PROBES, 1)]]
-        shares = [share for share in probed if share is not None]
-        return bool(pairs) and (not shares or float(np.median(shares)) < TURNING_INLIER_SHARE)
+        matches = self._probed_matches()
+        shares = [match.inlier_share for match in matches if match.inlier_share is not None]
+        return bool(matches) and (not shares or float(np.median(shares)) < TURNING_INLIER_SHARE)
+
+    def _camera_stands(self) -> bool:
+        """True if all homographies of the probed pairs are the identity."""
+        matrices = [match.matrix for match in self._probed_matches() if match.matrix is not None]
+        return bool(matrices) and all(np.array_equal(matrix, np.eye(3)) for matrix in matrices)
 
     def _flow(self, source: str, target: str) -> Pixels:
         """Return the flow (height, width, 2) from a frame to another, pixels."""

@@ -4,13 +4,17 @@
 The removal network cleans each frame by itself, and misses the same sharp ghosts in many. Other frames show the
 background without flare in that place. So each frame is compared with the median of its aligned neighbours, the
 background, times a gain that changes smoothly over the picture, since light on the walls changes from frame to frame.
-The gain follows the network's plate, which keeps light on walls, and ignores what is small: missed ghosts. It follows
-the texture too, for light on a wall raises its texture, and a flare does not.
+The gain ignores what is small: ghosts. It follows the texture too, for light on a wall raises its texture, and a flare
+does not.
 
 A flare adds light and hides nothing. So something before the background shows itself: a channel is darker than the
 background, the background's texture is absent, or the gain is far from 1. There the network's plate stays. Elsewhere
-the background replaces what is small and brighter in the network's plate. Differences over large areas stay, because
-they come from the gain as often as from a flare.
+the background counts.
+
+Where the camera stands, the background is exact: the gain is that of the frame, so that light on walls stays where the
+network has removed it, and the background replaces the network's plate. Where frames are aligned, the gain is that of
+the network's plate, and the plate only becomes darker, by small differences: those over large areas come from the gain
+as often as from a flare.
 
 `plate_trainer` calls it before a fit, and during it with the fitted flare subtracted, if the settings say so.
 """
@@ -46,7 +50,7 @@ DISPLAY_SLOPE = 2.4
 WINDOW_SAMPLES, TEXTURE_TOLERANCE, MAX_DEVIATION = 20.0, 0.25, 2.0
 """Independent pixels of the window of texture; error of the local gain where the fit is exact; and deviations below 1
 at which the local gain says that the background's texture is absent."""
-MAX_DEFICIT = 0.08
+MAX_DEFICIT = 0.25
 """Mean relative deficit of a channel at which the background counts as half hidden."""
 MAX_GAIN = 2.2
 """Gain, or its inverse, at which the background counts as half hidden."""
@@ -54,7 +58,7 @@ GHOST_RADIUS = 0.06
 """Half the side of the window, as a share of the frame's width, about which missed flare is smaller."""
 MAX_MISSED_FLARE = 0.6
 """Difference of display values that the network does not miss: a larger one counts as half hidden."""
-CLOSING, GROWTH = 0.05, 0.012
+CLOSING, GROWTH = 0.02, 0.012
 """Radii by which hidden areas are closed and grown, as shares of the frame's width."""
 
 
@@ -90,13 +94,16 @@ class PlateEstimator:
         background = linear_from_srgb(_median(stack))
         frame, own = linear_from_srgb(shot.frames[name]), linear_from_srgb(shot.plates[name])
         usable = (frame.max(-1, keepdims=True) < USABLE).astype(np.float32)
-        gain = smooth_gain(own, background, usable)
-        gain = gain * local_gain(own, gain * background)
+        gain_source = frame if alignment.stands else own
+        gain = smooth_gain(gain_source, background, usable)
+        gain = gain * local_gain(gain_source, gain * background)
         hidden = hidden_share(frame, gain * background, gain)
         confidence = ((1 - hidden) * np.clip(count / MIN_NEIGHBOURS, 0, 1))[..., None]
-        # A flare only adds light, so no plate is brighter than its frame.
-        lowest = srgb_from_linear(np.minimum(np.minimum(gain * background, frame), own).clip(0))
-        change = -_small_parts(shot.plates[name] - lowest)  # 0 or less: the plate only becomes darker
+        expected = np.minimum(gain * background, frame)  # a flare only adds light: no plate is brighter than its frame
+        if alignment.stands:
+            change = srgb_from_linear(expected.clip(0)) - shot.plates[name]
+        else:  # the plate only becomes darker
+            change = -_small_parts(shot.plates[name] - srgb_from_linear(np.minimum(expected, own).clip(0)))
         # A change that is very large is no missed flare.
         confidence = confidence / (1 + (change.min(-1, keepdims=True) / MAX_MISSED_FLARE) ** 4)
         return np.asarray(shot.plates[name] + confidence * change, np.float32)
@@ -131,19 +138,19 @@ def _blur(values: Pixels, sigma: float) -> Pixels:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), np.float32).reshape(values.shape)
 
 
-def smooth_gain(plate: Pixels, background: Pixels, usable: Pixels) -> Pixels:
-    """Return the gain (height, width, 3) of a plate over a background, a gain that changes smoothly over the picture.
+def smooth_gain(picture: Pixels, background: Pixels, usable: Pixels) -> Pixels:
+    """Return the gain (height, width, 3) of a picture over a background, a gain that changes smoothly.
 
-    plate, background: (height, width, 3), linear light. usable: (height, width, 1) weights of the pixels. It is a least
-    squares fit of relative errors in a window. Pixels whose gain differs from that around them count less, for they may
-    hold flare.
+    picture, background: (height, width, 3), linear light. usable: (height, width, 1) weights of the pixels. It is a
+    least squares fit of relative errors in a window. Pixels whose gain differs from that around them count less, for
+    they may hold flare.
     """
-    sigma = max(GAIN_WINDOW * plate.shape[1], 1.0)
+    sigma = max(GAIN_WINDOW * picture.shape[1], 1.0)
     base = usable / (background + DARK) ** 2
     weight, prior = base, 1e-5  # of a gain of 1, where nothing is usable
     for _ in range(GAIN_REWEIGHTINGS):
-        gain = (_blur(weight * plate * background, sigma) + prior) / (_blur(weight * background**2, sigma) + prior)
-        error = (plate - gain * background) / (background + DARK)
+        gain = (_blur(weight * picture * background, sigma) + prior) / (_blur(weight * background**2, sigma) + prior)
+        error = (picture - gain * background) / (background + DARK)
         weight = base / (1 + (error / GAIN_ERROR) ** 2)
     return np.asarray(gain, np.float32)
 
@@ -162,9 +169,9 @@ def hidden_share(frame: Pixels, expected: Pixels, gain: Pixels) -> NDArray[np.fl
     deficit = _blur(np.maximum(-((frame - expected) / (expected + DARK)).min(-1), 0).clip(0, 1), sigma)
     visible = expected.mean(-1) > NOISE
     change = np.abs(np.log(np.maximum(gain.mean(-1), 1e-3)))
-    hidden = np.maximum(_step(deficit, MAX_DEFICIT, 60), _step(_texture_deviation(frame, expected, sigma),
-                                                               MAX_DEVIATION, 4))
-    hidden = np.maximum(hidden, visible * _step(change, np.log(MAX_GAIN), 8)).astype(np.float32)
+    hidden = np.maximum(_logistic(deficit, MAX_DEFICIT, 60),
+                        _logistic(_texture_deviation(frame, expected, sigma), MAX_DEVIATION, 4))
+    hidden = np.maximum(hidden, visible * _logistic(change, np.log(MAX_GAIN), 8)).astype(np.float32)
 
     def disc(share: float) -> NDArray[np.uint8]:
         return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(share * width) + 1,) * 2), np.uint8)
@@ -173,20 +180,20 @@ def hidden_share(frame: Pixels, expected: Pixels, gain: Pixels) -> NDArray[np.fl
     return _blur(np.asarray(hidden, np.float32), max(GROWTH * width / 2, 0.5))
 
 
-def _step(values: Pixels, middle: float, steepness: float) -> Pixels:
+def _logistic(values: Pixels, middle: float, steepness: float) -> Pixels:
     """Return the logistic function of values: 0 far below `middle`, 0.5 there, 1 far above it. steepness: 4 times the
     slope there."""
     return np.asarray(1 / (1 + np.exp(np.clip(-steepness * (values - middle), -50, 50))), np.float32)
 
 
-def local_gain(plate: Pixels, expected: Pixels) -> Pixels:
-    """Return the gain (height, width, 1) of the texture of a plate over that of the expected plate, linear light.
+def local_gain(picture: Pixels, expected: Pixels) -> Pixels:
+    """Return the gain (height, width, 1) of the texture of a picture over that of the expected one, linear light.
 
     Light on a wall raises its texture too, a flare adds light alone. The gain is the estimate less one standard error,
     and 1 at least: the smallest that the texture makes likely.
     """
-    sigma = max(LIGHT_WINDOW * plate.shape[1], 1.0)
-    gain, error = _line_gain(plate, expected, sigma)
+    sigma = max(LIGHT_WINDOW * picture.shape[1], 1.0)
+    gain, error = _line_gain(picture, expected, sigma)
     change = np.clip(gain - error, 1, MAX_LOCAL_GAIN)
     return np.asarray(change, np.float32)[..., None]
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.fit.plate_estimates import PlateEstimator, ShotFrames
 
 WIDTH, HEIGHT, FRAMES, CHOSEN = 240, 136, 24, 12
@@ -58,6 +59,31 @@ def test_a_ghost_that_the_network_misses_goes(standing: tuple[ShotFrames, dict[s
     assert np.abs(plate - exact[name])[~ghost].mean() < 0.01
 
 
+def _ring(number: int) -> Pixels:
+    """A wide ring that moves through the shot, linear light."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    distance = np.hypot(x - 20 - 9 * number, y - 68)
+    return np.asarray(0.05 * np.exp(-((distance - 34) / 9) ** 2)[..., None] * np.array([1.0, 0.8, 0.6]), np.float32)
+
+
+def test_of_a_standing_camera_a_wide_flare_goes_and_light_on_walls_stays_where_the_network_removed_it(
+        standing: tuple[ShotFrames, dict[str, Pixels]]) -> None:
+    _, exact = standing
+    frames = {name: srgb_from_linear(np.clip(linear_from_srgb(plate) + _ring(number), 0, 1))
+              for number, (name, plate) in enumerate(exact.items())}
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    lamp_spot = np.exp(-((x - 40) ** 2 + (y - 20) ** 2) / 4000)[..., None]
+    network = {name: np.asarray(frame * (1 - 0.12 * lamp_spot), np.float32) for name, frame in frames.items()}
+    estimator = PlateEstimator(ShotFrames(frames, network))
+    assert estimator.alignment.stands
+    plate, name = estimator.estimate(NAMES[CHOSEN]), NAMES[CHOSEN]
+    ring = _ring(CHOSEN).max(-1) > 0.02
+    missed = np.abs(frames[name] - exact[name])[ring].mean()
+    assert np.abs(plate - exact[name])[ring].mean() < missed / 2
+    spot = (lamp_spot[..., 0] > 0.7) & ~ring
+    assert np.abs(plate - exact[name])[spot].mean() < np.abs(network[name] - exact[name])[spot].mean() / 2
+
+
 def test_what_hides_the_background_stays(standing: tuple[ShotFrames, dict[str, Pixels]]) -> None:
     shot, _ = standing
     plate = PlateEstimator(shot).estimate(NAMES[CHOSEN])
@@ -79,7 +105,7 @@ def test_frames_of_a_turning_camera_are_aligned() -> None:
         exact[name] = wall[:, 4 * number:4 * number + WIDTH].copy()
         frames[name] = np.clip(exact[name] + _ghost(number), 0, 1)
     estimator = PlateEstimator(ShotFrames(frames, dict(frames)))
-    assert not estimator.alignment.travels
+    assert not estimator.alignment.travels and not estimator.alignment.stands
     plate, ghost = estimator.estimate(NAMES[CHOSEN]), _ghost(CHOSEN).max(-1) > 0
     before = np.abs(frames[NAMES[CHOSEN]] - exact[NAMES[CHOSEN]])[ghost].mean()
     assert np.abs(plate - exact[NAMES[CHOSEN]])[ghost].mean() < before / 2

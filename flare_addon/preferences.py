@@ -46,6 +46,7 @@ class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
     )
 
     def draw(self, _context: bpy.types.Context) -> None:
+        """Draw the places of engine, weights and library, and the states of engine and weights."""
         layout = self.layout
         column = layout.column()
         column.use_property_split = True

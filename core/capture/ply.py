@@ -49,15 +49,7 @@ def read_points(path: Path) -> PointCloud:
     if header.format not in ply.BYTE_ORDERS or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
         raise CaptureError(f"{path} is not a PLY file of points with x, y and z.")
     try:
-        if header.format == "ascii":
-            lines = data[header.start:].split(b"\n", number)[:number]
-            table = np.array([tuple(map(float, line.split())) for line in lines], [(name, "f8") for name in names])
-            if len(table) < number:
-                raise ValueError
-        else:
-            order = ply.BYTE_ORDERS[header.format]
-            row = np.dtype([(name, order + kind) for name, kind in layout])
-            table = ply.read_table(data, row, number, header.start)
+        table = _read_vertices(data, header, layout, number)
     except ValueError as problem:
         raise CaptureError(f"{path} is truncated or damaged; export it again.") from problem
     with np.errstate(over="ignore"):  # infinite values are refused below
@@ -65,6 +57,21 @@ def read_points(path: Path) -> PointCloud:
     if not np.isfinite(xyz).all():
         raise CaptureError(f"{path} has points that are not finite numbers; export it again.")
     return PointCloud(xyz, _read_colours(table, dict(layout), number), np.zeros(number, np.float32))
+
+
+def _read_vertices(data: bytes, header: ply.Header, layout: list[tuple[str, str]], number: int) -> NDArray[Any]:
+    """Return the first `number` rows behind the header as a structured array. layout: (name, type) of each property.
+
+    Raises ValueError where they are truncated or damaged.
+    """
+    if header.format == "ascii":
+        lines = data[header.start:].split(b"\n", number)[:number]
+        table = np.array([tuple(map(float, line.split())) for line in lines], [(name, "f8") for name, _ in layout])
+        if len(table) < number:
+            raise ValueError
+        return table
+    order = ply.BYTE_ORDERS[header.format]
+    return ply.read_table(data, np.dtype([(name, order + kind) for name, kind in layout]), number, header.start)
 
 
 def _read_colours(table: NDArray[Any], kinds: dict[str, str], number: int) -> NDArray[np.uint8]:

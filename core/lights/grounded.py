@@ -37,6 +37,7 @@ class GroundedDetector:
 
     def __init__(self, threshold: float = 0.35, boxes: str | Path = BOX_WEIGHTS, masks: str | Path = MASK_WEIGHTS,
                  device: str = "auto") -> None:
+        """Load both networks. Raises EngineError where transformers is not installed."""
         try:
             import torch
             from transformers import AutoModelForZeroShotObjectDetection, AutoProcessor, Sam2Model, logging

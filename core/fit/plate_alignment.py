@@ -40,7 +40,7 @@ class Alignment:
         self._pictures, self._names = pictures, list(pictures)
         self._matcher = HomographyMatcher(pictures.__getitem__, MIN_INLIER_SHARE)
         self._flows: dict[tuple[str, str], Pixels] = {}
-        self._codes: dict[str, NDArray[np.uint8]] = {}
+        self._grey_codes: dict[str, NDArray[np.uint8]] = {}
         self.travels = self._camera_travels()
         """True if no homography aligns the frames."""
         self.stands = not self.travels and self._camera_stands()
@@ -52,15 +52,15 @@ class Alignment:
         return [self._names[other] for offset in (TRAVELLING_OFFSETS if self.travels else TURNING_OFFSETS)
                 for other in (index - offset, index + offset) if 0 <= other < len(self._names)]
 
-    def aligned(self, picture: Pixels, source: str, target: str) -> Pixels | None:
-        """Return a picture of frame `source` as the camera of frame `target` would show it, NaN where it shows
-        something else or nothing; None if the frames cannot be aligned."""
+    def align(self, picture: Pixels, source: str, target: str) -> Pixels | None:
+        """Return a picture of frame `source`, (height, width, 3), warped to the camera of frame `target`: NaN where the
+        source does not show what the target shows; None if the frames cannot be aligned."""
         import cv2
 
         if self.travels:
-            flow, back = self._flow(target, source), self._flow(source, target)
+            flow, backward_flow = self._dense_flow(target, source), self._dense_flow(source, target)
             warped = warp(picture, flow)
-            warped[forward_backward_confidence(flow, back) < MIN_FLOW_CONFIDENCE] = np.nan
+            warped[forward_backward_confidence(flow, backward_flow) < MIN_FLOW_CONFIDENCE] = np.nan
             return warped
         matrix = self._matcher.match(source, target).matrix
         if matrix is None:
@@ -86,11 +86,11 @@ class Alignment:
         matrices = [match.matrix for match in self._probed_matches() if match.matrix is not None]
         return bool(matrices) and all(np.array_equal(matrix, np.eye(3)) for matrix in matrices)
 
-    def _flow(self, source: str, target: str) -> Pixels:
+    def _dense_flow(self, source: str, target: str) -> Pixels:
         """Return the flow (height, width, 2) from a frame to another, pixels."""
         if (source, target) not in self._flows:
             for name in (source, target):
-                if name not in self._codes:
-                    self._codes[name] = to_grey_codes(self._pictures[name])
-            self._flows[source, target] = dense_flow(self._codes[source], self._codes[target])
+                if name not in self._grey_codes:
+                    self._grey_codes[name] = to_grey_codes(self._pictures[name])
+            self._flows[source, target] = dense_flow(self._grey_codes[source], self._grey_codes[target])
         return self._flows[source, target]

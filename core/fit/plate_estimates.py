@@ -81,20 +81,20 @@ class PlateEstimator:
         """Return the plate of a frame, display values; the network's plate if no neighbour can be aligned.
 
         cleaned: frames minus the fitted flare, which show the background in place of the network's plates. The frame
-        itself stays as filmed: a flare subtracted from its own frame would hide its own errors.
+        itself stays as filmed: a flare subtracted from the frame that it was fitted to would hide its own errors.
         """
         shot, alignment = self._shot, self.alignment
         plates = shot.plates if cleaned is None else cleaned
         aligned = [warped for other in alignment.neighbours(name)
-                   if (warped := alignment.aligned(plates[other], other, name)) is not None]
+                   if (warped := alignment.align(plates[other], other, name)) is not None]
         if not aligned:
             return shot.plates[name]
         stack = np.stack([plates[name], *aligned])
         count = np.isfinite(stack[..., 0]).sum(0) - 1  # neighbours only
         background = linear_from_srgb(_median(stack))
-        frame, own = linear_from_srgb(shot.frames[name]), linear_from_srgb(shot.plates[name])
+        frame, network_plate = linear_from_srgb(shot.frames[name]), linear_from_srgb(shot.plates[name])
         usable = (frame.max(-1, keepdims=True) < USABLE).astype(np.float32)
-        gain_source = frame if alignment.stands else own
+        gain_source = frame if alignment.stands else network_plate
         gain = smooth_gain(gain_source, background, usable)
         gain = gain * local_gain(gain_source, gain * background)
         hidden = hidden_share(frame, gain * background, gain)
@@ -103,7 +103,7 @@ class PlateEstimator:
         if alignment.stands:
             change = srgb_from_linear(expected.clip(0)) - shot.plates[name]
         else:  # the plate only becomes darker
-            change = -_small_parts(shot.plates[name] - srgb_from_linear(np.minimum(expected, own).clip(0)))
+            change = -_small_parts(shot.plates[name] - srgb_from_linear(np.minimum(expected, network_plate).clip(0)))
         # A change that is very large is no missed flare.
         confidence = confidence / (1 + (change.min(-1, keepdims=True) / MAX_MISSED_FLARE) ** 4)
         return np.asarray(shot.plates[name] + confidence * change, np.float32)

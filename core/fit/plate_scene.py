@@ -50,14 +50,14 @@ class PlateScene:
         The camera may show a part of the frame, at any scale. Raises RunError for a camera of no frame, such as one of
         another shot.
         """
-        whole = self._cameras.get(camera.frame)
-        plate = None if whole is None else self._read(camera.frame)
-        if whole is None or plate is None:
+        full_camera = self._cameras.get(camera.frame)
+        plate = None if full_camera is None else self._read(camera.frame)
+        if full_camera is None or plate is None:
             raise RunError("The scene of this fit is one plate per frame, and there is none for "
                            f"{camera.frame or 'this camera'}; use the frames of the fitted shot.")
-        scale_x, scale_y = camera.fx / whole.fx, camera.fy / whole.fy
-        size = max(round(whole.width * scale_x), 1), max(round(whole.height * scale_y), 1)
-        left, top = round(whole.cx * scale_x - camera.cx), round(whole.cy * scale_y - camera.cy)
+        scale_x, scale_y = camera.fx / full_camera.fx, camera.fy / full_camera.fy
+        size = max(round(full_camera.width * scale_x), 1), max(round(full_camera.height * scale_y), 1)
+        left, top = round(full_camera.cx * scale_x - camera.cx), round(full_camera.cy * scale_y - camera.cy)
         pixels = torch.from_numpy(plate.resized(*size).display(self.display_white))
         colour = _cropped(pixels, left, top, camera)
         empty = colour.new_zeros(colour.shape[:2])

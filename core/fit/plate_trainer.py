@@ -49,11 +49,12 @@ PLATE_CODES = 65535
 
 
 class PlateTrainer(FlareTrainer):
-    """The flare of a shot over its plates under optimisation. Raises CaptureError without clean frames or lights."""
+    """Fits the flare of a shot, composited over its plates. Raises CaptureError without clean frames or lights."""
 
     def __init__(self, capture: Capture, settings: FitSettings, exposures: Mapping[str, float] | None = None,
                  progress: Progress | None = None) -> None:
-        """exposures: of the views, by name; a plate has that of its frame."""
+        """Read the frames and clean frames, start the flare, and estimate the first plates. exposures: by the names of
+        views; a plate has the exposure of its frame."""
         super().__init__(settings)
         self.exposures = exposures or {}
         self.capture = capture = capture.with_frame_names()
@@ -150,10 +151,10 @@ class PlateTrainer(FlareTrainer):
         (loss + self._flare_penalty(pose, targets.camera.frame)).backward()
         self.optimisers.step(scene=False)
         self._change_flare_density()
-        self._update()
+        self._refine()
         return figures
 
-    def _update(self) -> None:
+    def _refine(self) -> None:
         """At a few iterations, solve the brightness of the lights in all frames; from `refine_at` on, estimate the
         plates again, too, with the flare subtracted."""
         every = max(round(self.settings.brightness.solve_every * self.settings.iterations), 1)

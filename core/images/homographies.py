@@ -50,7 +50,7 @@ class HomographyMatcher:
 
     def __init__(self, read: Callable[[str], Pixels], min_inlier_share: float) -> None:
         self._read, self._min_inlier_share = read, min_inlier_share
-        self._features: dict[str, _Features] = {}
+        self._features_by_name: dict[str, _Features] = {}
         self._matches: dict[tuple[str, str], FrameMatch] = {}
 
     def match(self, source: str, target: str) -> FrameMatch:
@@ -67,7 +67,7 @@ class HomographyMatcher:
         stands."""
         import cv2
 
-        first, second = self._described(source), self._described(target)
+        first, second = self._sift_features(source), self._sift_features(target)
         if min(len(first.points), len(second.points)) < MIN_INLIERS:
             return FrameMatch(None, None)
         matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, 2)
@@ -85,15 +85,16 @@ class HomographyMatcher:
         stands = np.median(motion) < STANDING_PX
         return FrameMatch(np.eye(3) if stands else np.asarray(matrix, np.float64), share)
 
-    def _described(self, name: str) -> _Features:
+    def _sift_features(self, name: str) -> _Features:
         """Return the SIFT features of a frame."""
         import cv2
 
-        if name not in self._features:
+        if name not in self._features_by_name:
             grey = np.clip(self._read(name) @ LUMINANCE * 255 + 0.5, 0, 255).astype(np.uint8)
             keys, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(grey, np.array([]))
-            self._features[name] = _Features(np.array([key.pt for key in keys], np.float32).reshape(-1, 2), descriptors)
-        return self._features[name]
+            points = np.array([key.pt for key in keys], np.float32).reshape(-1, 2)
+            self._features_by_name[name] = _Features(points, descriptors)
+        return self._features_by_name[name]
 
 
 def project(matrix: Matrix, points: NDArray[np.float64]) -> NDArray[np.float64]:

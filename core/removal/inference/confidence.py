@@ -61,7 +61,7 @@ class FlareFeatures(NamedTuple):
     light: log of the mean linear light.
     disagreement: log of (standard deviation over test-time augmentations / mean).
     peak: log of (maximum / mean).
-    fine_fraction: of the prediction that is narrower than one patch.
+    fine_fraction: share of the prediction that lies in detail narrower than one patch.
     """
 
     regraded_ratio: float
@@ -88,6 +88,7 @@ def extract_features(display: Pixels, mean_prediction: Pixels, deviation: Pixels
     mean = max(float(mean_prediction.mean()), 1e-9)
     coarse = downsample(mean_prediction.mean(-1))
     patch = max(coarse.shape) // PATCHES_PER_SIDE | 1  # odd, so that it has a centre
+    # The morphological opening removes what is narrower than a patch.
     broad = cv2.morphologyEx(coarse, cv2.MORPH_OPEN, np.ones((patch, patch), np.uint8))
     return FlareFeatures(
         regraded_ratio=float(np.log(regraded_prediction.mean() / mean + REGRADED_FLOOR)),

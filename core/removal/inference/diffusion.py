@@ -100,8 +100,8 @@ class DiffusionRemoval(nn.Module):
         self.vae.decoder.conv_out.requires_grad_(True)
 
     def _create_skips(self) -> nn.ModuleList:
-        """Return 1x1 convolutions from the input of each block of the encoder to that of the decoder, deepest first;
-        almost zero at first."""
+        """Return 1x1 convolutions from the input of each encoder block to the input of the matching decoder block,
+        deepest first, with weights of almost zero."""
         encoder, decoder = self.vae.encoder, self.vae.decoder
         in_channels = [block.resnets[0].in_channels for block in encoder.down_blocks][::-1]
         out_channels = [block.resnets[0].in_channels for block in decoder.up_blocks]
@@ -154,8 +154,8 @@ class DiffusionRemoval(nn.Module):
                               {"kind": KIND, "rank": str(self.rank), **(metadata or {})})
 
     def load(self, path: Path | str) -> dict[str, str]:
-        """Read the file that `save` wrote, and return the text of its header. Raises RunError where it is another kind
-        of file, or belongs to another base model."""
+        """Load the trained tensors from a file that `save` wrote, and return the metadata of its header. Raises
+        RunError where it is another kind of file, or belongs to another base model."""
         tensors, metadata = weights.read_weights(path)
         trained = self.trained_tensors()
         if metadata.get("kind") != KIND or tensors.keys() != trained.keys() or any(
@@ -214,8 +214,8 @@ class DiffusionRemover(Remover):
     min_mean_flare = 0.0
 
     def __init__(self, base: Path | str, lora: Path | str, *, working_size: int = WORKING_SIZE) -> None:
-        """base: as for `DiffusionRemoval`. lora: the file that `DiffusionRemoval.save` wrote. working_size: long side
-        of the model's input, pixels. Raises EngineError, RunError."""
+        """base: folder of the base model, or its name in the local cache. lora: the file that `DiffusionRemoval.save`
+        wrote. working_size: long side of the model's input, pixels. Raises EngineError, RunError."""
         # Remover.__init__ would load the network. The model does not separate the glow, so all of it is removed.
         self.working_size, self.glow = working_size, "remove"
         self.model = DiffusionRemoval(base, read_rank(lora))
@@ -239,11 +239,12 @@ class DiffusionRemover(Remover):
 def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw_pair: Callable[[int], tuple[Pixels, Pixels]],
                     iterations: int, progress: Progress, *, resume: bool = False,
                     perceptual: Callable[[Tensor, Tensor], Tensor] | None = None) -> Path:
-    """Train the model and return the path of its weights, lora.safetensors in `folder`, which is saved every SAVE_EVERY
-    iterations.
+    """Train the model and return the path of its weights, lora.safetensors in `folder`, which are saved every
+    SAVE_EVERY iterations and when the training ends or is stopped.
 
-    draw_pair: returns the frame and the scene of an iteration. perceptual: as for `DiffusionTrainer`. resume: continue
-    the training in the folder; the moments of the optimiser start at zero. Raises RunError, SettingsError, Cancelled.
+    draw_pair: returns the frame and the scene of an iteration. perceptual: returns the LPIPS of two batches of
+    pictures; None for L2 alone. resume: continue the training in the folder; the moments of the optimiser start at
+    zero. Raises RunError, SettingsError, Cancelled.
     """
     if iterations < 1:
         raise SettingsError("A training needs at least one iteration.")

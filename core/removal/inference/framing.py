@@ -34,8 +34,9 @@ WRAP_SHARE = 8
 def fill_hidden(plate: Plate) -> Plate:
     """Return the plate opaque, its hidden parts filled with a continuation of the colours beside them.
 
-    A plate without straight alpha below 1 is returned as it is: premultiplied codes hold no hidden colours. Those that
-    a file stores under straight alpha 0 are arbitrary, and black there would look like a vignette.
+    A plate without straight alpha below 1 is returned unchanged: premultiplied codes hold no hidden colours. The
+    colours that a file stores under straight alpha 0 are arbitrary, and black ones would look like a vignette to the
+    network.
     """
     import cv2
 
@@ -115,8 +116,8 @@ def merge_margins(light: Pixels, margin: int) -> Pixels:
 
 
 def input_size(width: int, height: int, working_size: int) -> tuple[int, int]:
-    """Return (width, height) of the network's input for a picture: the long side is the working size, or that of each
-    part of a long picture; multiples of SIZE_MULTIPLE."""
+    """Return (width, height) of the network's input for a picture, multiples of SIZE_MULTIPLE. The working size is the
+    long side of the picture or, if it is predicted in parts, of each part."""
     long_side, short_side = max(width, height), min(width, height)
     scale = working_size / long_side
     if long_side > MAX_ASPECT * short_side:
@@ -129,9 +130,9 @@ def input_size(width: int, height: int, working_size: int) -> tuple[int, int]:
 
 
 def predict_in_parts(display: Pixels, predict: Callable[[Pixels], Pixels]) -> Pixels:
-    """Return `predict` of display values (h, w, 3); of a long picture, of overlapping parts, merged where they overlap.
+    """Predict display values (h, w, 3); a long picture in parts, whose predictions are averaged where they overlap.
 
-    predict: (h, w, 3) to (h, w, n), h and w multiples of SIZE_MULTIPLE.
+    predict: the network, (h, w, 3) to (h, w, n), h and w multiples of SIZE_MULTIPLE.
     """
     height, width = display.shape[:2]
     if max(height, width) <= MAX_ASPECT * min(height, width):

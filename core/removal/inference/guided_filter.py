@@ -43,8 +43,9 @@ class GuidedFilterMaps:
 def fit_guided_filter(display: Pixels, flare: Pixels) -> GuidedFilterMaps:
     """Fit the maps to a flare in linear light, both (h, w, 3) at the working size.
 
-    The offset is the flare itself; around clipped pixels, the maps are those of a guided filter of each channel. It
-    fits each window, and averages the fits of the windows around a pixel; windows with an edge have more weight.
+    Away from clipped pixels the gain is 0 and the offset is the flare. Around clipped pixels each channel has a guided
+    filter: a linear fit in every window, then for every pixel the mean of the fits of the windows that contain it,
+    weighted by their variance, so that windows with an edge count most.
     """
     import cv2
 
@@ -63,7 +64,7 @@ def fit_guided_filter(display: Pixels, flare: Pixels) -> GuidedFilterMaps:
     covariance = mean(display * flare) - mean_display * mean_flare
     variance = np.maximum(mean(display * display) - mean_display**2, 0)
     gain = np.clip(covariance / (variance + np.float32(EPSILON)), -MAX_GAIN, MAX_GAIN)
-    # Running sums leave rounding errors where there is no flare at all.
+    # This mask clears the rounding errors that the means' running sums leave where there is no flare at all.
     near_flare = cv2.dilate((flare > 0).any(-1).astype(np.uint8), np.ones(window, np.uint8))[..., None]
     offset = mean_flare - gain * mean_display
     guidance = guidance * cv2.dilate(near_flare, np.ones(window, np.uint8))[..., None]
@@ -78,7 +79,7 @@ def upsample_flare(maps: GuidedFilterMaps, codes: NDArray[Any], encoding: Encodi
                    max_code: float) -> Iterator[tuple[slice, Pixels]]:
     """Yield (rows, linear flare of those rows (n, width, 3)) for a plate's codes (height, width, 3), top to bottom.
 
-    max_code: the code of white, of "srgb" codes. The flare is 0 or more, and no more than the plate's light.
+    max_code: the code of white, if the encoding is "srgb". The flare is 0 or more, and no more than the plate's light.
     """
     height, width = codes.shape[:2]
     map_height, map_width = maps.gain.shape[:2]

@@ -49,9 +49,9 @@ MAX_GLOW_KEPT, GLOW_FALLOFF = 0.5, 0.05
 """Fraction of the glow that is kept at a light disc, and the distance, relative to the frame's long side, over which
 that fraction falls to 1 / e."""
 DARK_SCENE_RAMP = (0.2, 0.3)
-"""Median brightness of the frame without the flare at which all and none of that fraction is kept."""
+"""Median brightness of the frame without the flare at which all and none of MAX_GLOW_KEPT is kept."""
 DISC_PEAK_RAMP = (0.9, 0.97)
-"""Brightness of the brightest pixel of a light disc at which none and all of that fraction is kept."""
+"""Brightness of the brightest pixel of a light disc at which none and all of MAX_GLOW_KEPT is kept."""
 DISTANCE_LEVELS = 4
 """Number of steps in which a region's certainty of being a light disc weights the glow about it."""
 
@@ -74,8 +74,8 @@ class _LightDiscs(NamedTuple):
 def retained_fraction(display: Pixels, flare: Pixels, glow_fraction: Pixels, *, keep_glow: bool = True) -> Pixels:
     """Return the fraction of a predicted flare that stays in the frame, 0..1, (h, w, 3).
 
-    display: display values 0..1. flare: what the flare adds to them. glow_fraction: of the flare that is glow about
-    lights, 0..1. All (h, w, 3). keep_glow: keep part of the glow about light discs, not the discs alone.
+    display: display values 0..1. flare: what the flare adds to them. glow_fraction: share of the flare that is glow
+    about lights, 0..1. All (h, w, 3). keep_glow: keep part of the glow about light discs, not the discs alone.
     """
     observed, clean = display.mean(-1), np.maximum(display - flare, 0).mean(-1)
     discs = _find_light_discs(observed, clean, flare.mean(-1), (flare * glow_fraction).mean(-1))
@@ -107,8 +107,8 @@ def _retained_glow_fraction(discs: _LightDiscs, clean: Pixels) -> NDArray[Any]:
     certainty = (certainty * np.interp(discs.peak_observed, DISC_PEAK_RAMP, (0, 1)))[discs.labels]
     falloff = np.float32(GLOW_FALLOFF * max(certainty.shape))
     proximity = np.zeros(certainty.shape, np.float32)
-    # At each of some levels: the falloff from the nearest disc of greater certainty. Their mean weights the glow about
-    # a disc by its certainty.
+    # For each of DISTANCE_LEVELS certainties: the falloff with the distance to the nearest disc of greater certainty.
+    # The mean over the levels weights the glow about each disc by its certainty.
     for level in range(DISTANCE_LEVELS):
         outside = (certainty <= (level + 0.5) / DISTANCE_LEVELS).astype(np.uint8)
         if not outside.all():
@@ -136,7 +136,7 @@ def _find_light_discs(observed: Pixels, clean: Pixels, flare: Pixels, glow: Pixe
     pixels = np.bincount(labels.ravel(), minlength=count)
     area_weight = np.interp(pixels / observed.size, DISC_AREA_RAMP, (1, 0))
     area_weight[pixels < MIN_DISC_PIXELS] = 0
-    area_weight[0] = 0  # the label of what is outside
+    area_weight[0] = 0  # label 0 is outside all regions
     return _LightDiscs(
         labels=labels,
         contrast_certainty=area_weight * np.interp(contrast, CONTRAST_RAMP, (0, 1)),

@@ -58,9 +58,10 @@ class ShotPredictor:
     def predict(self, path: Path) -> tuple[Plate, FlarePrediction]:
         """Read a plate and predict its flare.
 
-        Its neighbours are read first, so that one plate is in memory at a time. Those that cannot be read are skipped,
-        and those of another shot before the network runs, which takes far longer than reading. The network runs once
-        for each frame. Raises FrameError where the plate itself cannot be read.
+        Neighbours are read first and only their features are kept, so that one plate is in memory at a time. Neighbours
+        that cannot be read or belong to another shot are skipped before the network runs, which takes far longer than
+        reading. Predictions are cached: the network runs once for each frame. Raises FrameError where the plate itself
+        cannot be read.
         """
         before, after = self._before.get(path, ()), self._after.get(path, ())
         self._evict({path, *before, *after}, before)
@@ -81,11 +82,11 @@ class ShotPredictor:
                      side: Sequence[Path]) -> Iterator[tuple[Path, FrameFeatures, np.float32]]:
         """Yield (frame, its features, its weight) at NEIGHBOUR_OFFSETS to one side of a frame, nearest first.
 
-        features: of the frame. side: the frames on that side, nearest first. A weight, 0..1, is the least
+        features: features of the frame. side: the frames on that side, nearest first. A weight, 0..1, is the least
         `shot_similarity` of two successive frames on the way.
 
-        A moving camera soon shows something else, so the shot is followed from each of its frames to the next. Frames
-        that differ, as by a flash, are skipped.
+        A moving camera soon shows something else, so each frame is compared with the last similar one before it, not
+        with the first. Frames that differ, for instance by a flash, are skipped.
         """
         min_similarity, previous_features = np.float32(1), features
         for offset, path in enumerate(side, 1):
@@ -123,7 +124,7 @@ class ShotPredictor:
         return self._flows[source, target]
 
     def _evict(self, in_reach: Container[Path], before: Container[Path]) -> None:
-        """Drop what belongs to frames out of reach, and the flows between two frames of `before`.
+        """Drop the cached features, predictions and flows of frames out of reach, and the flows within `before`.
 
         in_reach: a plate and its neighbours. before: its earlier neighbours. Plates are predicted in order, so two
         earlier ones need no flow between them any more.

@@ -60,7 +60,7 @@ def warp(values: Pixels, flow: Pixels) -> Pixels:
 
 def forward_backward_confidence(flow_forward: Pixels, flow_backward: Pixels) -> Pixels:
     """Return the confidence in the flow to another frame by its consistency with the flow back, 0..1, (h, w); 0 where
-    it leads out of that frame."""
+    the flow leads out of that frame."""
     height, width = flow_forward.shape[:2]
     x, y = _target_coordinates(flow_forward)
     error = np.linalg.norm(flow_forward + warp(flow_backward, flow_forward), axis=-1)

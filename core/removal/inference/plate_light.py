@@ -41,7 +41,7 @@ _MAX_SAMPLES = 500_000
 def gain_to_usual_exposure(plate: Plate) -> np.float32:
     """Return the gain that brings a scene-linear plate to the exposure of a usual photograph; 1 for other plates.
 
-    A multiple of the exposure gives the same picture times the gain, so the network predicts the same flare.
+    Plates that differ only by an exposure factor then look the same to the network, so it predicts the same flare.
     """
     if plate.encoding != "linear":
         return np.float32(1)
@@ -56,15 +56,15 @@ def gain_to_usual_exposure(plate: Plate) -> np.float32:
 
 
 def to_network_plate(plate: Plate) -> tuple[Plate, np.float32]:
-    """Return a plate as the network sees it, sRGB codes or Rec. 709 light of a usual exposure, and the gain that its
-    light was multiplied by for that; the plate itself if nothing had to change."""
+    """Return (plate as the network sees it, gain that its light was multiplied by): sRGB codes, or Rec. 709 light at a
+    usual exposure; the plate itself if nothing had to change."""
     rec709 = plate.in_rec709
     gain = gain_to_usual_exposure(rec709)
     return (rec709 if gain == 1 else replace(rec709, codes=finite_light(rec709.codes) * gain, extras={})), gain
 
 
 def to_linear(codes: NDArray[Any], encoding: Encoding, max_code: float) -> Pixels:
-    """Convert codes to linear light, float32. max_code: the code of white, of "srgb" codes."""
+    """Convert codes to linear light, float32. max_code: the code of white, if the encoding is "srgb"."""
     if encoding == "srgb":
         if codes.dtype == np.uint8:
             return _LINEAR_FROM_UINT8[codes]
@@ -78,10 +78,10 @@ def to_display(light: Pixels) -> Pixels:
 
 
 def downscale_linear(codes: NDArray[Any], encoding: Encoding, max_code: float, width: int, height: int) -> Pixels:
-    """Downscale a plate by area in linear light clipped to 0..1, as a lens would, (height, width, 3).
+    """Downscale a plate to (height, width, 3) by averaging areas of linear light, clipped to 0..1 before.
 
-    Works in strips of whole result rows, whose borders are rounded to whole rows of the plate: the floats of the whole
-    plate might not fit into memory.
+    Works in strips of result rows, whose borders are rounded to whole rows of the plate: the whole plate as floats
+    might not fit into memory.
     """
     import cv2
 
@@ -111,8 +111,9 @@ def removed_light(codes: NDArray[Any], clean: NDArray[Any], flare: Pixels, encod
                   max_code: float) -> Pixels:
     """Return the flare to write, in scene-linear light, at most MAX_FLOAT16.
 
-    For linear codes it is `flare`, the linear flare that was subtracted; for display codes the difference of codes and
-    clean codes by the sRGB curve, since `flare` is by `image_formation.GAMMA`.
+    For linear codes that is `flare`, the linear flare that was subtracted. For display codes it is the light of the
+    codes minus that of the clean codes, both by the sRGB curve; `flare` itself is by another curve
+    (`image_formation.GAMMA`).
     """
     if encoding == "linear":
         return np.minimum(flare, MAX_FLOAT16)

@@ -16,8 +16,8 @@ class TtaPrediction(NamedTuple):
 
     mean: over the augmentations, (h, w, 3).
     per_channel: predicted from each channel alone, shown as a grey frame, (h, w, 3).
-    per_channel_weight: how far that counts where it exceeds the mean, 0..1.
-    glow_fraction: of the mean that is glow about lights, 0..1, (h, w, 3).
+    per_channel_weight: weight of what per_channel exceeds the mean by, 0..1.
+    glow_fraction: share of the mean that is glow about lights, 0..1, (h, w, 3).
     features: what the confidence is computed from; None where the mean is too faint to need one.
     """
 
@@ -33,8 +33,8 @@ class FlarePrediction(NamedTuple):
 
     display: the network's input, display values 0..1, (h, w, 3).
     flare: what a flare adds to them, if there is one, (h, w, 3).
-    confidence: that it is a flare, not the scene or its grade, 0..1.
-    glow_fraction: of the flare that is glow about lights, 0..1, (h, w, 3).
+    confidence: how sure it is that this is a flare, not the scene or its grade, 0..1.
+    glow_fraction: share of the flare that is glow about lights, 0..1, (h, w, 3).
     """
 
     display: Pixels

@@ -74,7 +74,7 @@ class Remover:
     _model_key: str
     """Text that changes with the model, its weights and its settings."""
     _controls_key: str = ""
-    """The same of `use_controls`; "" for the default controls."""
+    """Text that changes with the choices of `use_controls`; "" for the default ones."""
 
     def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
                  glow: Glow = "keep at lights") -> None:
@@ -102,7 +102,7 @@ class Remover:
 
     def use_controls(self, amount: float = 1.0, sensitivity: str = "normal") -> None:
         """Set how much of a flare is removed, 0..MAX_AMOUNT, and how much evidence that needs, a key of
-        SENSITIVITIES; results of other choices are made again. Raises SettingsError."""
+        SENSITIVITIES. Changes `cache_key`, so results of other choices are made again. Raises SettingsError."""
         if not 0 <= amount <= MAX_AMOUNT:  # also false for NaN
             raise SettingsError(f"An amount of {amount} is outside 0 to {MAX_AMOUNT}.")
         if sensitivity not in SENSITIVITIES:
@@ -136,8 +136,8 @@ class Remover:
         there, whatever its confidence. prediction: for the plate, where it is known (`neighbours.ShotPredictor`); None
         to predict it here.
 
-        Where the network takes the plate's own codes, the flare is subtracted from them. Where they had to be
-        converted, exposed, filled or wrapped for it, the flare's light is subtracted from the plate.
+        If the network can take the plate's own codes, the flare is subtracted from them. If they had to be converted,
+        exposed, filled or wrapped for the network, the flare is converted back and subtracted from the plate's light.
         """
         opaque, margin = fill_hidden(plate), wrap_margin(plate)
         network_plate, gain = to_network_plate(opaque)
@@ -197,8 +197,8 @@ class Remover:
 
     @torch.inference_mode()
     def _forward(self, display: Pixels) -> Pixels:
-        """Run the network once, in half precision on a GPU: display values (h, w, 3) to (h, w, 6), the flare and what
-        of it is glow (`test_time_augmentation.PredictFn`). If all glow is kept, both are without it."""
+        """Run the network once, in half precision on a GPU: display values (h, w, 3) to (h, w, 6), the flare and the
+        part of it that is glow. If all glow is kept, the flare is without glow and the second part is 0."""
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None].to(self.device)
         with torch.autocast(self.device.type, torch.float16, enabled=self.device.type != "cpu"):
             output = self.network(frame)
@@ -241,8 +241,8 @@ def _subtract_upsampled(plate: Plate, maps: GuidedFilterMaps, matte: Pixels | No
 
 
 def compute_cache_key(model: str, weights: Path | str, *settings: Any) -> str:
-    """Return a short text that changes whenever results would: by the content of the weights file, not its name, the
-    settings and `REVISION`."""
+    """Return a short hash of the model, the content of its weights file (not the name), the settings and `REVISION`. It
+    changes whenever results would."""
     digest = hashlib.sha256(read_bytes(weights))
     digest.update(repr((REVISION, model, *settings)).encode())
     return digest.hexdigest()[:16]

@@ -87,7 +87,7 @@ def frame_features(display: Pixels) -> FrameFeatures:
 
 
 def shot_similarity(first: FrameFeatures, second: FrameFeatures) -> np.float32:
-    """Return how far two frames are of one shot, 0..1; 0 where their sizes differ."""
+    """Return how likely two frames belong to one shot, 0..1, by the correlation of their detail; 0 if sizes differ."""
     if first.display.shape != second.display.shape:
         return np.float32(0)
     a, b = first.detail, second.detail
@@ -116,8 +116,11 @@ def filter_in_time(frame: FramePrediction, neighbours: Sequence[Neighbour],
 
 
 class _CleanEstimate(NamedTuple):
-    """A frame at the size of the flow: the scene without flare and fine detail (h, w, 3), the greatest flare of a
-    channel (h, w), and the confidence that each pixel shows the same place as the filtered frame, 0..1 (h, w)."""
+    """A frame at the size of the flow.
+
+    scene: display values without flare and fine detail (h, w, 3). flare: the flare in its strongest channel (h, w).
+    flow_confidence: that a pixel shows the same place as in the frame to be filtered, 0..1 (h, w).
+    """
 
     scene: Pixels
     flare: Pixels
@@ -130,7 +133,7 @@ class _CleanEstimate(NamedTuple):
 
 
 def _clean_estimate(frame: FramePrediction) -> _CleanEstimate:
-    """Return a frame's own estimate, by the prediction for it alone; the confidence is 1."""
+    """Return the clean estimate of a frame from the prediction for it alone; its flow confidence is 1."""
     flare = downsample(merge_flare(frame.prediction))
     scene = blur(downsample(frame.features.display) - flare, SCENE_SIGMA)
     greatest: Pixels = flare.max(-1)
@@ -138,7 +141,7 @@ def _clean_estimate(frame: FramePrediction) -> _CleanEstimate:
 
 
 def _warped_neighbour(reference: _CleanEstimate, neighbour: Neighbour) -> _CleanEstimate:
-    """Return the estimate of a neighbour, warped to the filtered frame and at its exposure."""
+    """Return the clean estimate of a neighbour, warped to the frame to be filtered and scaled to its exposure."""
     scene, flare, _ = _clean_estimate(neighbour.frame)
     warped = optical_flow.warp(np.dstack([scene, flare]), neighbour.flow_forward)
     flow_confidence = optical_flow.forward_backward_confidence(neighbour.flow_forward, neighbour.flow_backward)
@@ -148,9 +151,9 @@ def _warped_neighbour(reference: _CleanEstimate, neighbour: Neighbour) -> _Clean
 
 def _exposure_ratio(reference: _CleanEstimate, other: _CleanEstimate) -> np.float32:
     """Return the factor that brings the scene of `other` to the exposure of the reference: the median of their ratio
-    over pixels that both show without flare, neither black nor clipped.
+    over the pixels that have no flare and are neither dark nor clipped in both; 1 if there are too few of these.
 
-    Without it a camera that changes its exposure, or a fade, would pass for a flare. 1 where there are too few pixels.
+    Without it a change of the camera's exposure, or a fade, would pass for a flare.
     """
     reference_level, other_level = reference.scene.mean(-1), other.scene.mean(-1)
     comparable = np.minimum(reference_level, other_level) > MIN_EXPOSURE_LEVEL
@@ -163,8 +166,12 @@ def _exposure_ratio(reference: _CleanEstimate, other: _CleanEstimate) -> np.floa
 
 
 def _residual_flare(reference: _CleanEstimate, others: Sequence[_CleanEstimate]) -> Pixels:
-    """Return the flare that the prediction for a frame misses, display values (h, w, 3) at the size of the flow, by the
-    warped neighbours; below 0 where the prediction is too great."""
+    """Return the flare that the prediction for a frame misses, display values (h, w, 3) at the size of the flow; below
+    0 where the prediction is too great.
+
+    It is the frame's own clean estimate minus the weighted median of all, smoothed, and bounded by the flare about it.
+    others: the clean estimates of the warped neighbours.
+    """
     estimates = [reference, *others]
     scene = _weighted_median(np.stack([estimate.scene for estimate in estimates]),
                              np.stack([estimate.weights for estimate in estimates])[..., None])

@@ -68,8 +68,8 @@ def predict_with_tta(display: Pixels, predict: PredictFn) -> TtaPrediction:
 
 
 def merge_flare(prediction: TtaPrediction) -> Pixels:
-    """Return what a flare adds to display values (h, w, 3): the prediction in colour, and the per-channel one where it
-    exceeds it."""
+    """Return what a flare adds to display values (h, w, 3): the prediction in colour, plus the weighted and gated
+    excess of the per-channel prediction over it."""
     flare = prediction.mean
     if prediction.per_channel_weight > 0:
         excess = prediction.per_channel_weight * np.maximum(prediction.per_channel - flare, 0)

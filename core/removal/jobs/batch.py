@@ -36,7 +36,8 @@ MIN_CONFIDENCE = 0.5
 
 
 def collect_plates(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) -> list[tuple[Path, Path]]:
-    """Return (file, name below the output folder) of the pictures among `inputs` and of all pictures in folders there.
+    """Return (file, name below the output folder) of every plate: the pictures among `inputs`, and all pictures in the
+    folders among them.
 
     exclude: files and folders that hold no plates, such as the results of this run and mattes. Results of earlier runs,
     which their manifests list, are excluded too unless their own folder is an input. Raises SettingsError where no
@@ -67,9 +68,10 @@ def collect_plates(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) 
 
 
 def collect_with_neighbours(inputs: Sequence[Path], exclude: Iterable[Path | None] = ()) -> list[Path]:
-    """Return the plates of `collect_plates`, and all other pictures in the folders of those inputs that are files.
+    """Return the plates of `collect_plates` and, for each input that is a file, all other pictures in its folder.
 
-    With them as neighbours, a frame that is cleaned by itself gets the same result as with its whole shot.
+    They are the frames that may be neighbours: with them, a frame that is cleaned by itself gets the same result as
+    with its whole shot.
     """
     excluded_inputs = [other for other in exclude if other is not None]
     plates = dict.fromkeys(path for path, _ in collect_plates(inputs, excluded_inputs))
@@ -81,8 +83,8 @@ def collect_with_neighbours(inputs: Sequence[Path], exclude: Iterable[Path | Non
 
 
 def _excluded_paths(folder: Path, excluded: Iterable[Path]) -> set[Path]:
-    """Return files and folders in `folder` that hold no plates: those of `excluded` that lie in it, and all results
-    that manifests in `excluded` list."""
+    """Return files and folders that hold no plates of `folder`: the entries of `excluded` that lie in it, and all
+    results that the manifests in `excluded` list."""
     excluded_paths = {other.resolve() for other in excluded if folder.resolve() in other.resolve().parents}
     return excluded_paths.union(*(Manifest(other).result_paths() for other in excluded))
 
@@ -94,10 +96,10 @@ def _self_and_parents(path: Path) -> list[Path]:
 
 
 def left_out_files(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) -> dict[str, list[str]]:
-    """Return the files without a plate in the folders among `inputs`: their names, by the reason.
+    """Return the files in the folders among `inputs` that are left out because they are no plates: the names by reason.
 
-    A name is the path below its input. exclude: as for `collect_plates`; these, manifests and hidden entries are not
-    mentioned.
+    A name is the path below its input. exclude: files and folders to leave unmentioned, as manifests and hidden entries
+    are.
     """
     names_by_reason: dict[str, list[str]] = {}
     for item in inputs:
@@ -150,7 +152,7 @@ class _PlateCleaner:
 
     def _write(self, frame: CleanFrame, plate: Plate, prediction: FlarePrediction, matte: Pixels | None) -> None:
         """Write the clean plate, and its flare where the frame has a second result. matte: (height, width), 0..1."""
-        # The eyes of a stereo picture; the prediction is that of the first one.
+        # A stereo picture has two views; `prediction` is for the first.
         (_, first_view), *other_views = split_views(plate)
         view_results = [self._remover.remove(first_view, matte, prediction),
                         *(self._remover.remove(view, matte) for _, view in other_views)]
@@ -163,11 +165,11 @@ def clean_plates(inputs: Sequence[Path], folder: Path, remover: Remover, progres
                  flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
                  only: Container[Path] | None = None, independent: bool = False,
                  failed_inputs: Sequence[str] = ()) -> dict[str, Any]:
-    """Clean every plate into `folder`; return the counts, and the confidence of each plate's flare, 0..1, by name. The
-    events of `remove` have the same keys.
+    """Clean every plate into `folder`; return the result of the command for other programs: the folder, the counts of
+    plates made, kept and left out, and the confidence of each plate's flare, 0..1, by name.
 
-    A result is kept if it was made from the same plate, neighbours and matte by the same remover, or if it was edited
-    since it was made from the same plate (`Manifest`).
+    An existing result is kept if it is up to date (same plate, neighbours, matte and remover), or if someone edited it
+    and the plate has not changed since (`Manifest`).
 
     flare_folder: where to write the removed flares, if at all. mattes: where flares may be removed; None for
     everywhere. overwrite: make every frame again. only: names below the output folder of the plates to clean; None for

@@ -57,8 +57,8 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress,
                   flared: Collection[str] = ()) -> Path:
     """Clean every frame into the capture's removed/ and return that folder; frames of an interrupted call are kept.
 
-    JPEG frames are written as PNG. remover: one that removes all of a glow, if the frames are for a fit. flared: names
-    of views that are known to show a flare, since a light is on; what is predicted there is removed with confidence 1.
+    JPEG frames are written as PNG. remover: for a fit, one that removes all of the glow. flared: names of views that
+    certainly show a flare, since a light is on in them; the flare predicted there gets confidence 1.
 
     Raises CaptureError where removed/ exists already, where the folder cannot be written to and where two frames would
     have one clean file; FrameError for a frame that cannot be read; Cancelled.
@@ -78,7 +78,8 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress,
     try:
         write_clean_frames(frames, Manifest(unfinished), progress, digest=cleaner.digest, clean=cleaner.clean,
                            keep_finished=True, overwrite=True)
-        # In this order: if another fit has just renamed the folder, `target` exists by the second test.
+        # Files first, then `target`: if another fit renames the folder just before the files are tested, `target`
+        # exists.
         if not all(frame.results[0].is_file() for frame in frames) and not target.exists():
             raise CaptureError(f"Another fit is cleaning the frames of {capture.folder} with other settings; wait "
                                "for it, and start this one again.")
@@ -93,8 +94,8 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress,
 
 
 def _clean_names(capture: Capture) -> dict[str, Path]:
-    """Return each view's clean file below the folder, by view name. Raises CaptureError where two would be one file, on
-    any file system."""
+    """Return the path of each view's clean file below removed/, by view name. Raises CaptureError where two views would
+    have the same file, also where upper and lower case are not distinguished."""
     clean_names: dict[str, Path] = {}
     view_by_key: dict[str, str] = {}
     for view in capture.views:

@@ -18,8 +18,8 @@ from .manifest import KeepReason, Manifest
 class CleanFrame(NamedTuple):
     """One frame to clean.
 
-    name: of the result below the output folder, its key in the manifest. source: the frame as filmed. results: the
-    files to write, the clean frame first, then its flare where one is requested.
+    name: path of the clean frame below the output folder, which is its key in the manifest. source: path of the frame
+    as filmed. results: paths of the files to write, the clean frame first, then its flare where one is requested.
     """
 
     name: Path
@@ -30,7 +30,8 @@ class CleanFrame(NamedTuple):
 class PreparedResults(NamedTuple):
     """The results of a frame before they are written.
 
-    write: writes them. confidence: that the removed flare is a flare, 0..1; None where nothing judged it.
+    write: writes the files. confidence: how sure the remover is that the removed light is a flare, 0..1; None where a
+    matte or a fit decided it.
     """
 
     write: Callable[[], None]
@@ -46,8 +47,8 @@ def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progres
 
     digest: a text that changes whenever the result would (`digest_inputs`). clean: reads and cleans a frame; nothing is
     deleted if it raises. keep_finished: keep results that are up to date, and edited ones unless `overwrite`.
-    overwrite: replace files that are not in the manifest or were edited. on_error: called with an exception; it raises
-    it, or returns so that the next frame follows. Without it, the first exception is raised.
+    overwrite: replace files that are not in the manifest or were edited. on_error: called with a frame and its
+    exception; it raises to stop, or returns to go on to the next frame. None: the first exception stops.
     """
     written, kept_counts = 0, Counter[KeepReason]()
     for frame in frames:

@@ -29,8 +29,8 @@ RECORD = "clean_video.json"
 def require_single_video(inputs: Sequence[Path], target: Path, codec: str | None) -> Path:
     """Return the video among `inputs` that is to be cleaned to `target`.
 
-    codec: its name, None for one that suits. Raises SettingsError for anything but one video, and for a target that
-    cannot be written with this codec.
+    codec: name of the codec; None to choose one that suits. Raises SettingsError for anything but one video, and for a
+    target that cannot be written with this codec.
     """
     check_target(target, codec)
     if len(inputs) != 1 or not is_video(inputs[0]) or not inputs[0].is_file():
@@ -50,9 +50,9 @@ def write_clean_video(source: Path, target: Path, codec: str | None, progress: P
                       overwrite: bool = False) -> bool:
     """Write the clean frames in `frames_folder` as a video; False while some are missing, else True.
 
-    codec: its name, None for one that suits source and target. A video that was written of the same frames is kept.
-    Raises SettingsError where the target is another file, unless `overwrite`, and FrameError where it cannot be
-    written.
+    codec: name of the codec; None to choose one that suits source and target. A video that was written from the same
+    frames with the same codec is kept. Raises SettingsError where the target exists and was not written here, unless
+    `overwrite`, and FrameError where it cannot be written.
     """
     folder = frames_folder(target)
     extracted = {path.stem: path for path in pictures_in(folder / f"{source.name}.frames")}
@@ -80,8 +80,8 @@ def _changed_pixels(source: Path, folder: Path, extracted: Mapping[str, Path],
                     frame: VideoFrame) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
     """Return the pixels of a frame of the video `source` as extracted and as cleaned; None where they are the same.
 
-    folder: of the clean frames. extracted: the extracted frames by the stem of their names. Raises FrameError for a
-    frame that is not among them.
+    folder: holds the clean frames. extracted: paths of the extracted frames, by the stems of their names. Raises
+    FrameError for a frame that is not among `extracted`.
     """
     stem = f"{source.stem}.{frame.number + 1:06d}"
     if stem not in extracted:
@@ -92,18 +92,18 @@ def _changed_pixels(source: Path, folder: Path, extracted: Mapping[str, Path],
 
 
 def _write_record(path: Path, digest: str, target: Path, finished: Path) -> None:
-    """Record the finished video and the one that it replaces. digest: of what it was made from.
+    """Record the content hashes of the finished video and of the one that it replaces.
 
-    It is called before the video has its name `target`: a process that is killed between the two must leave neither of
-    them looking like someone's work.
+    digest: hash of what the video was made from. finished: the video under its temporary name. Called before the video
+    is renamed to `target`: if the process is killed in between, neither file is mistaken for someone's work.
     """
     replaced = {"replaced": content_hash(target)} if target.exists() else {}
     write_json(path, {"from": digest, "written": content_hash(finished), **replaced})
 
 
 def _is_up_to_date(target: Path, record: Mapping[str, object], digest: str) -> bool:
-    """True if the existing video was written from what `digest` stands for. Raises SettingsError where it is another
-    file than the record names."""
+    """True if the existing video was made from the inputs that `digest` was computed from. Raises SettingsError where
+    the record does not name the existing file."""
     existing_hash = content_hash(target)
     if existing_hash not in (record.get("written"), record.get("replaced")):
         raise SettingsError(f"{target} exists and was not made from these frames, so it may be someone's work; "

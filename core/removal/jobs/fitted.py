@@ -43,7 +43,7 @@ MAX_SCENE_GAIN = 1.25
 """Largest factor by which a frame's scene may be brighter or darker than it was fitted: what `core.fit.metering`
 leaves."""
 PRIOR_WEIGHT = 1e-4
-"""Weight per pixel of the fitted gains of 1; it exceeds the frame's for flares of a thousandth of white."""
+"""Weight per pixel of the prior that every gain is 1; it outweighs the frame for flares of a thousandth of white."""
 
 
 class _FittedFlareCleaner:
@@ -85,11 +85,12 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
 
     Each frame keeps its name, file format and depth. A result is kept if it was made from the same frame, camera,
     lights and fit, or edited since, unless `overwrite`. flare_folder: where to write the removed flares, if at all.
-    fit_digest: changes whenever the fit's pictures do. above_white: the fit was given light above white.
+    fit_digest: a text that changes whenever the fit would render other layers. above_white: the fit was given light
+    above white.
 
-    Raises CaptureError for frames with lens distortion, without which the flare was fitted; SettingsError where frames
-    would be overwritten; FrameError for a frame that cannot be read, and for a file in `folder` that is not listed in
-    its manifest.
+    Raises CaptureError for frames with lens distortion, since the flare was fitted to undistorted ones; SettingsError
+    where frames would be overwritten; FrameError for a frame that cannot be read, and for a file in `folder` that is
+    not listed in its manifest.
     """
     if any(view.lens for view in views):
         raise CaptureError(f"The frames of {capture.folder} are distorted by their lens, and the flare was fitted "
@@ -121,8 +122,11 @@ def _result_paths(view: View, folder: Path, flare_folder: Path | None) -> list[P
 
 
 class _CleanView(NamedTuple):
-    """plate: as its file stores it. codes: of the clean frame. flare: the removed one, linear light (height, width, 3).
-    gains: of each light's flare, 0..1."""
+    """A clean frame before it is written.
+
+    plate: the frame as its file stores it. codes: codes of the clean frame. flare: the removed flare, linear light
+    (height, width, 3). gains: gain of each light's flare in the frame, 0..1, by the light's name.
+    """
 
     plate: Plate
     codes: NDArray[Any]
@@ -143,7 +147,8 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View, above_whit
         names = " and ".join(name for name, _ in views)
         raise FrameError(f"{stored.path} holds the views {names}, and the fit has the "
                          "cameras of one; export each view as a file of its own.")
-    # From these codes the flare can be subtracted as it is; others are converted to Rec. 709 to find what is removed.
+    # From these codes the flare is subtracted directly. Others are converted to Rec. 709, and the light that is removed
+    # there is then subtracted from the stored plate.
     is_direct = stored.is_rec709 or (stored.encoding == "linear" and stored.space.is_linear)
     plate = stored if is_direct else stored.in_rec709
     height, width = plate.codes.shape[:2]
@@ -181,11 +186,11 @@ def _to_plate_light(plate: Plate, light: Pixels) -> Pixels:
 
 
 def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) -> dict[str, float]:
-    """Return the gain of each light's flare in the frame, 0..1, by least absolute errors, with the scene's gain.
+    """Return the gain of each light's flare in the frame, 0..1, by the light's name.
 
-    A light that is switched off, or hidden by something that the fit does not know, then leaves no dark flare. The
-    scene has a gain too, within MAX_SCENE_GAIN, or an underexposed frame would seem to lack flare. Clipped pixels do
-    not count.
+    Fits frame = scene gain * scene + sum of gain * flare by least absolute errors, without clipped pixels. A light that
+    is off in the frame, or hidden by something that the fit does not know, gets a small gain, so that no dark flare is
+    left. The scene's gain, within MAX_SCENE_GAIN, keeps an underexposed frame from seeming to lack flare.
     """
     if not flares:
         return {}
@@ -205,8 +210,8 @@ def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) 
 
 
 def _linear_light(plate: Plate) -> Pixels:
-    """Return linear light of the codes by sRGB's curve, which the layers of a fit have; the network has a gamma of its
-    own (`image_formation.GAMMA_RANGE`)."""
+    """Return the linear light of the codes, by sRGB's curve as in the layers of a fit (the removal network uses a gamma
+    instead, `image_formation.GAMMA`)."""
     if plate.encoding == "srgb":
         return linear_from_srgb(_display_values(plate))
     return finite_light(plate.codes)

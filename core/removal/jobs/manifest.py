@@ -31,8 +31,8 @@ written. By frame: confidence of the network that its flare is a flare, 0..1."""
 def digest_inputs(maker: str, sources: Iterable[Path]) -> str:
     """Return a short text that changes whenever a clean frame would.
 
-    maker: identifies the network or fit with its settings. sources: all files that the result depends on; one that
-    cannot be read counts as unreadable, whatever it holds.
+    maker: identifies the network or fit with its settings. sources: all files that the result depends on; the text
+    "none" stands for the content of a file that cannot be read.
     """
     digest = hashlib.sha256(maker.encode())
     for path in sources:
@@ -80,7 +80,7 @@ class Manifest:
                     confidence: float | None = None) -> None:
         """Enter a frame before its files are written, and delete those that were made with another digest.
 
-        confidence: that the removed flare is a flare, 0..1; None where nothing judged it.
+        confidence: how sure the remover is that the removed light is a flare, 0..1; None where it did not judge.
 
         A process that is killed afterwards leaves no old file under the new digest. Raises FrameError for a file that
         the manifest does not list or that was edited, unless `overwrite`.
@@ -91,7 +91,7 @@ class Manifest:
             new = {table: {**rows} for table, rows in old.items()}
             for table, value in {**self._entries(digest, results), "sources": content_hash(source)}.items():
                 new[table][key] = value
-            # Of the clean frame and of its flare, in the order of `results`.
+            # For the clean frame, then for its flare: the order of `results`.
             is_listed = (key in old["plates"], old["flares"].get(key) == new["flares"].get(key))
             for path, listed in zip(results, is_listed, strict=False):
                 if not overwrite and not listed and path.exists():
@@ -119,12 +119,12 @@ class Manifest:
             self._write_tables(tables)
 
     def confidence(self, names: Iterable[Path]) -> dict[str, float]:
-        """Return the confidence that each frame's flare is one, 0..1, by the frame's name; without those of frames
-        that have none, such as those with a matte or of a fit."""
+        """Return the recorded confidence in each frame's flare, 0..1, by the frame's name. Frames without a record are
+        left out: those cleaned with a matte or from a fit."""
         table = self._read_tables()["confidence"]
         values: dict[str, float] = {}
         for name in names:
-            with contextlib.suppress(KeyError, ValueError):  # edited by hand
+            with contextlib.suppress(KeyError, ValueError):  # none recorded, or edited by hand
                 values[name.as_posix()] = float(table[name.as_posix()])
         return values
 
@@ -137,15 +137,16 @@ class Manifest:
                          "--overwrite makes them again.")
 
     def changed_sources(self, sources: Mapping[Path, Path]) -> list[Path]:
-        """Return the names of those frames that were made from another content than `sources` (by name) has now."""
+        """Return the names of the frames whose source has changed since they were made. sources: files by frame
+        name."""
         recorded = self._read_tables()["sources"]
         return [name for name, source in sources.items()
                 if name.as_posix() in recorded and recorded[name.as_posix()] != content_hash(source)]
 
     def unedited_frames(self, names: Iterable[Path]) -> Iterator[Path]:
-        """Yield those of the frames that `remove` made and nobody has edited since.
+        """Yield the names of the frames that `remove` made and nobody has edited since.
 
-        Each one's file is read when its turn comes.
+        A frame's file is read only when its turn comes, so a caller may stop early.
         """
         tables = self._read_tables()
         for name in names:
@@ -172,13 +173,15 @@ class Manifest:
         return entered and all(path.is_file() and path.stat().st_size for path in results)
 
     def _edited_files(self, tables: _Tables, results: Sequence[Path]) -> list[Path]:
-        """Return those files that hold something else than was written; one without an entry does not count."""
+        """Return the files among `results` whose content differs from the recorded one; unrecorded files are left
+        out."""
         written = tables["written"]
         return [path for path in results if path.is_file()
                 and written.get(_relative_path(self._folder, path), content_hash(path)) != content_hash(path)]
 
     def _entries(self, digest: str, results: Sequence[Path]) -> dict[str, str]:
-        """Return a frame's entry for each table that has one when it is begun."""
+        """Return the entries, by table, that a frame gets before its files are written: digests and the flare's
+        path."""
         flare = ({"flares": _relative_path(self._folder, results[1]), "flares_made": digest} if results[1:] else {})
         return {"plates": digest, **flare}
 

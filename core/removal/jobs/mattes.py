@@ -47,11 +47,10 @@ class Mattes:
         return matte
 
     def read(self, name: Path, plate_window: DataWindow, orientation: int = UPRIGHT) -> NDArray[np.float32]:
-        """Return a plate's matte, 0..1, for the pixels that the plate's file stores, (height, width): its brightest
-        channel times its alpha.
+        """Read a plate's matte, (height, width) of the pixels that the plate's file stores, 0..1.
 
-        name: of the plate below its folder. plate_window: where its stored pixels lie in its frame. orientation: its
-        Exif orientation.
+        name: path of the plate below its folder. plate_window: where the plate's stored pixels lie in its frame.
+        orientation: the plate's Exif orientation.
 
         The matte may have the size of the plate's frame, another size of the same aspect, or that of its stored pixels.
         Raises FrameError for a damaged matte, and for one of another aspect.
@@ -63,7 +62,8 @@ class Mattes:
         oriented = undo_orientation(apply_orientation(values, read_exif(path)[0]), orientation)
         size = oriented.shape[1], oriented.shape[0]
         if window.is_frame and _is_same_aspect(size, plate_window.frame):
-            # Painted on the plate as viewers show it; otherwise on its stored pixels, by a program that ignores Exif.
+            # The matte was painted on the plate as viewers show it. If the aspects differ after the turn, it was
+            # painted on the stored pixels, in a program that ignores Exif.
             window, values = DataWindow(size, (0, 0), size), oriented
         if window.is_frame and window.size == plate_window.size:  # painted on the stored pixels, with their overscan
             return np.clip(values, 0, 1)
@@ -75,7 +75,7 @@ class Mattes:
         if (matte_width, matte_height) != (width, height):
             values = np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
         x, y = plate_window.origin
-        # Crop the frame to the plate's stored pixels, which take the part of the display window here.
+        # Crop to the plate's stored pixels: the plate's data window is passed as the display window of the matte.
         values = crop_to_display_window(values, DataWindow(plate_window.frame, (-x, -y), plate_window.size))
         return np.clip(values, 0, 1)
 

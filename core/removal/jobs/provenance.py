@@ -24,8 +24,8 @@ def has_exact_clean_frames(capture: Capture) -> bool:
 
 
 def check_clean_frames_current(capture: Capture) -> None:
-    """Raise CaptureError if clean frames were made by `remove` from other frames than the capture has now. Those that
-    no manifest lists are someone's own and pass."""
+    """Raise CaptureError if `remove` made clean frames from other frames than the capture has now. Clean frames that
+    the manifest does not list were made by a person, and pass."""
     folder, sources = capture.folder / REMOVED, _frames_by_clean_name(capture)
     if others := Manifest(folder).changed_sources(sources):
         raise CaptureError(f"{len(others)} of the {len(sources)} clean frames in {folder} were made from other frames "
@@ -34,7 +34,7 @@ def check_clean_frames_current(capture: Capture) -> None:
 
 
 def _frames_by_clean_name(capture: Capture) -> dict[Path, Path]:
-    """Return the frame of every clean frame, by the latter's name below removed/."""
+    """Return the path of each frame as filmed, by the name of its clean frame below removed/."""
     folder = (capture.folder / REMOVED).resolve()
     frames = {capture.clean_frame_path(view).resolve(): view for view in capture.views}
     return {path.relative_to(folder): capture.frame_path(view) for path, view in frames.items()

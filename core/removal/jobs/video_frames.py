@@ -37,9 +37,11 @@ def expand_videos(inputs: Iterable[Path], folder: Path, progress: Progress,
 
 
 def extract_frames(video: Path, folder: Path, progress: Progress, space: str | None = None) -> Path:
-    """Return the folder NAME.frames below `folder` with a video's frames, STEM.000001 and on: PNGs of 8 bits, or of 16
-    where the video has more, in the colours that players show; EXRs of linear light for PQ and HLG. Alpha is kept, and
-    so are frames that exist already. space: as for `expand_videos`.
+    """Write a video's frames to NAME.frames below `folder`, unless that exists, and return it.
+
+    The files are STEM.000001 and on: PNGs of 8 bits, or of 16 where the video has more, in the colours that players
+    show; EXRs of linear light for PQ and HLG. Alpha is kept. Problems of the video are printed, also when its frames
+    exist already. space: the colour space that the user names for the plates; None for what the video declares.
 
     Raises FrameError for a video without a readable frame and for one whose own colours exclude the named space,
     SettingsError where the folder holds frames of another video.

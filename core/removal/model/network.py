@@ -42,7 +42,7 @@ class NetworkOutput(NamedTuple):
 
 def pyramid_inputs(display: Tensor) -> list[Tensor]:
     """Return the input of each level, finest first, (n, INPUT_CHANNELS, h / side, w / side), where `side` is that of a
-    position in pixels: SHUFFLE_FACTOR, doubled from level to level. The finest has the pixels of the frame besides
+    position in pixels: SHUFFLE_FACTOR, doubled from level to level. The finest level also holds the pixels of the frame
     (pixel unshuffle).
 
     display: whole frames (n, 3, h, w), values 0..1, principal point in the centre; h and w multiples of SIZE_MULTIPLE.
@@ -64,8 +64,8 @@ def pyramid_inputs(display: Tensor) -> list[Tensor]:
 
 
 def _position_channels(like: Tensor, height: int, width: int) -> Tensor:
-    """Return (3, height, width): x, y and x^2 + y^2 from the centre, which is 1 at the corners. like: has the dtype
-    and device."""
+    """Return (3, height, width): x, y and x^2 + y^2 of each position from the centre, in half diagonals, so that the
+    last is 1 at the corners. like: a tensor of the dtype and device to use."""
     half_diagonal = (height**2 + width**2) ** 0.5 / 2
     y = (torch.arange(height, dtype=like.dtype, device=like.device) + 0.5 - height / 2) / half_diagonal
     x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5 - width / 2) / half_diagonal
@@ -112,7 +112,7 @@ class Attention(nn.Module):
     """
 
     def __init__(self, width: int, heads: int, octaves: int = 0) -> None:
-        """width: channels, a multiple of `heads`. octaves: see the class."""
+        """width: number of channels, a multiple of `heads`."""
         super().__init__()
         self.heads, self.octaves = heads, octaves
         self.norm = ChannelNorm(width)

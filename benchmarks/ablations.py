@@ -74,10 +74,10 @@ STUDIES = ("form", "comparison", "robustness", "robustness-ours", "supervision",
 class Experiment:
     """One fit of each capture.
 
-    displacement: of the lights, by Gaussian noise of this sigma, scene units. known_scene: the flare alone, over the
-    exact scene. stretch: a stretch of the path is held out. frames: what the scene of a fit without flare is trained
-    on, as filmed, as filmed with a bilateral grid for each, or without flare; "cleaned": with what `remove` makes for
-    flare-free frames.
+    displacement: sigma, scene units, of the Gaussian noise that moves the lights. known_scene: the flare alone is
+    fitted, over the exact scene. stretch: a stretch of the path is held out. frames: what a fit is trained on:
+    "filmed", the frames as they are; "graded", the same with a bilateral grid for each; "removed", the flare-free
+    frames in place of them; "cleaned", the frames, with what `remove` makes of them as flare-free frames.
     """
 
     study: str
@@ -207,7 +207,7 @@ def run_experiment(experiment: Experiment, folder: Path, capture: Path, width: i
                    progress: Progress) -> dict[str, Any]:
     """Return the scores of one experiment: read from `folder` if it is finished, else fitted and written there.
 
-    folder: of this experiment and capture. width: of the frames that are fitted, pixels.
+    folder: the one of this experiment and capture. width: pixels of the frames that are fitted.
     """
     score_file = folder / SCORES
     if score_file.exists():
@@ -271,7 +271,7 @@ def _fit_with_grids(capture: Capture, settings: FitSettings, progress: Progress)
 def _link_capture(folder: Path, capture: Path, **origins: str) -> Capture:
     """Make a capture of links to another's frames, cameras and lights, without its clean frames.
 
-    origins: the file or folder of `capture` that a name links to instead.
+    origins: by name of a link, the file or folder of `capture` that it leads to if that has another name.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("images", "sparse", "split.json", "lights.json"):
@@ -293,7 +293,8 @@ def _score_held_out(renderer: Run | _SceneRenderer, folder: Path, settings: FitS
                     progress: Progress) -> dict[str, Any]:
     """Return mean scores over the held-out views of the unchanged capture: lights are displaced for the fit alone.
 
-    folder: of the capture. `hidden`: see `hidden_lights`, over all views, since few of those held out hide a light.
+    folder: the capture's. `hidden`, the flare of lights that geometry hides, is measured over all views, since few of
+    those held out hide a light.
     """
     capture = Capture.open(folder)
     held_out = capture.split(settings.holdout)[1]
@@ -364,7 +365,7 @@ def table_by_capture(rows: Mapping[str, Mapping[str, dict[str, Any]]]) -> str:
 def plot_displacements(rows: Mapping[str, Mapping[str, dict[str, Any]]], picture: Path) -> None:
     """Plot the flare's PSNR against the displacement of its light, a line for each choice of corrections.
 
-    rows: of a study of robustness, named "CORRECTIONS, sigma S".
+    rows: scores of a robustness study, by row and capture; a row's name is "CORRECTIONS, sigma S".
     """
     import matplotlib
 
@@ -391,7 +392,7 @@ def _current_commit() -> str:
 
 
 def write_results(results: Results, section: str, conditions: str, document: Path) -> str:
-    """Write the tables, with commit and settings, into a section of the document; return the text.
+    """Write the tables, with commit and settings, into a section of the document, and plots beside it; return the text.
 
     conditions: a phrase on preset, iterations and size, for the heading.
     """

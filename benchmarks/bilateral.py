@@ -34,7 +34,11 @@ class BilateralGrids(torch.nn.Module):
         self.cells = torch.nn.ParameterList(Parameter(identity.clone()) for _ in range(views))
 
     def forward(self, index: int, picture: Tensor) -> Tensor:
-        """Return the picture (h, w, 3), display values, with the transforms of frame `index` applied."""
+        """Return the picture (h, w, 3), display values, with the transforms of frame `index` applied.
+
+        Each pixel has a transform of its own, interpolated from the grid at its x, y and luma. Gradients do not pass
+        through the luma.
+        """
         height, width, _ = picture.shape
         y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
         luma = (picture.detach() @ picture.new_tensor(LUMA)).clamp(0, 1) * 2 - 1

@@ -78,7 +78,7 @@ def make_flare(path: Path) -> Path:
     arrays["0.gaussians.opacity_logits"] -= 3
     arrays["0.gaussians.rings"] = np.zeros((count, 2))
     arrays["0.gaussians.offsets"], arrays["0.gaussians.latent"] = np.zeros((count, 2)), random.normal(size=(count, 4))
-    # Two features for each level of two hash grids; the offsets of every parameter and of the place on the plane.
+    # features: two for each level of both hash grids. outputs: offsets of all parameters and of the place on the plane.
     features, outputs = 4 * LEVELS, sum(widths.values()) + 2
     shapes = {"view_layer": (128, features), "layers.0": (128, 128), "layers.1": (128, 128), "head": (outputs, 128),
               "correction.0": (128, features), "correction.2": (2, 128)}
@@ -121,7 +121,8 @@ def time_range(call: Any, repeats: int = 10) -> tuple[float, float]:
 def time_lamp_overlay(looks: Any, overlay: Any, look: Path, window: Any) -> list[str]:
     """Return lines on the overlay of a hundred lamps with one look, with a camera that moves and one that stands.
 
-    A moving camera is timed as the camera view draws it, with lamps that take turns, and with all lamps exact.
+    A moving camera is timed twice: as the camera view draws it, where lamps take turns within a budget of time, and
+    with all lamps exact.
 
     looks, overlay: modules of the add-on. look: a .flare. window: the region that is drawn.
     """
@@ -156,7 +157,9 @@ def time_lamp_overlay(looks: Any, overlay: Any, look: Path, window: Any) -> list
 
 
 def time_import(importing: Any, capture: Path, kind: str) -> str:
-    """Return a line on the import of a capture into an empty file. importing: module of the add-on. kind: of cameras.
+    """Return a line on the import of a capture into an empty file. kind: "each" or "animated" cameras.
+
+    importing: module of the add-on.
     """
     import bpy
 

@@ -78,7 +78,7 @@ def compose_pictures(photos: Sequence[Path], number: int, seed: int) -> Iterator
 
 
 def detect_in_pictures(detector: Detector, photos: Sequence[Path], number: int, seed: int) -> dict[float, Tally]:
-    """Return tallies by threshold; the detector, made for the lowest, runs once for each picture."""
+    """Return tallies by threshold; the detector, made for the lowest threshold, runs once for each picture."""
     tallies = {threshold: Tally() for threshold in THRESHOLDS}
     for picture in compose_pictures(photos, number, seed):
         detections = detector.detect(picture.picture)
@@ -88,7 +88,10 @@ def detect_in_pictures(detector: Detector, photos: Sequence[Path], number: int, 
 
 
 def print_capture_errors(folders: Sequence[Path], detector: Detector) -> None:
-    """Print, for every light of every capture, the error of the nearest detected light that no other light has."""
+    """Find the lights of every capture; print, for every exact light, its distance from the nearest one found.
+
+    A found light is matched with one exact light at most.
+    """
     print(f"{'capture':24s} {'light':12s} {'error':>9s} {'of extent':>9s} {'median px':>9s} {'support':>8s}")
     for folder in folders:
         try:
@@ -116,7 +119,7 @@ def print_capture_errors(folders: Sequence[Path], detector: Detector) -> None:
 
 
 def main() -> None:
-    """Parse the arguments and print the tables."""
+    """Make each detector, measure it on the pictures and captures that the arguments name, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=Path, help="folder of photographs, searched with its subfolders")
     parser.add_argument("--pictures", type=int, default=500)
@@ -146,7 +149,7 @@ def main() -> None:
 
 
 def _print_picture_scores(method: str, tallies: dict[float, Tally], number: int) -> None:
-    """Print precision, recall, F1 and IoU of each threshold. number: of pictures."""
+    """Print precision, recall, F1 and IoU of each threshold. number: how many pictures were composed."""
     print(f"{method}, {number} pictures, {next(iter(tallies.values())).lights} lights")
     print("          |        shape             |        glare             | by light")
     print("threshold |  P     R     F1    IoU   |  P     R     F1    IoU   | recall  precision  false per picture")

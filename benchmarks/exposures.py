@@ -50,16 +50,16 @@ class DriftingCapture(Capture):
         return self._filmed_frame(super().frame(view, size), view)
 
     def clean_frame(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
-        """Return its clean frame."""
+        """Return the view's clean frame, filmed alike."""
         picture = super().clean_frame(view, size)
         return None if picture is None else self._filmed_frame(picture, view)
 
     def truth_scene(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
-        """Return its exact scene layer."""
+        """Return the view's exact scene layer."""
         return self._scaled_layer(super().truth_scene(view, size), view)
 
     def truth_flare(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
-        """Return its exact flare layer."""
+        """Return the view's exact flare layer."""
         return self._scaled_layer(super().truth_flare(view, size), view)
 
     def _filmed_frame(self, picture: Picture, view: View) -> Picture:

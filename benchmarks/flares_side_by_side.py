@@ -28,7 +28,7 @@ Pixels = NDArray[np.float32]
 
 
 def side_by_side(capture: Capture, name: str, runs: list[Run]) -> Pixels:
-    """Return the picture, display values (h, w, 3), at the width of the first run. name: of the view, any suffix.
+    """Return the picture, display values (h, w, 3), at the width of the first run. name: the view's, with any suffix.
 
     Raises CaptureError if the view or its layers are missing.
     """

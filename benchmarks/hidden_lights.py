@@ -18,12 +18,12 @@ SHARES = "truth/visible_share.json"
 
 
 def hidden_flare(renderer: ViewRenderer, folder: Path, cameras: Mapping[View, Camera]) -> dict[str, Any] | None:
-    """Return energies of the lights' flares (means of the linear layer over pixels and channels), averaged over views
-    and lights.
+    """Return how much flare remains of hidden lights: `residual`, the mean over lights, and `by_light`, their figures.
 
-    `hidden` where the visibility is 0, `partial` in between, `visible` where it is 1; `residual`: hidden / visible.
-    `by_light`: the same by light, whose views differ in brightness less. None where the capture has no visibilities, or
-    no light is hidden in one of these views and visible in another.
+    A light's figures are mean energies (of its linear flare layer, over pixels and channels) in views where it is
+    `hidden` (visibility 0), `visible` (1) and `partial` (between), the numbers of these views, and `residual`:
+    hidden / visible. Lights without hidden or without visible views are left out. None if no light is left, or the
+    capture has no visibilities.
     """
     if not (folder / SHARES).is_file():
         return None

@@ -92,13 +92,17 @@ def _draw_shape(size: tuple[int, int], centre: NDArray[np.float64], radius: floa
 
 
 def _render_light(shape: Pixels, radius: float, rng: np.random.Generator) -> Pixels:
-    """Render a light as a lens images it, linear (h, w, 3). shape: its coverage (h, w). radius: pixels."""
+    """Render a light as a lens images it, linear (h, w, 3): its shape, blurred, and scattered into a glow and a star.
+
+    shape: coverage (h, w), 0..1. radius: pixels.
+    """
     tint = rng.uniform(0, 1)
     colour = np.array([1, 0.55 + 0.45 * tint, 0.25 + 0.75 * tint]) if rng.uniform() < 0.7 else \
         np.array([0.45 + 0.4 * tint, 0.7 + 0.3 * tint, 1])
     radiance = np.exp(rng.uniform(np.log(3), np.log(200)))
     core = cv2.GaussianBlur(shape, (0, 0), rng.uniform(0.5, 1.2))
-    # A point spread function sampled at pixels is enough: it is smooth where it is far from the light.
+    # The scattered light is the shape convolved, by FFT, with a point spread function of glow and starburst. Samples
+    # at the pixels are enough: the function is smooth where it is far from the light.
     height, width = shape.shape
     v, u = np.mgrid[-height:height, -width:width].astype(np.float32)
     r2 = u * u + v * v

@@ -86,7 +86,7 @@ def make_capture(folder: Path, count: int, width: int, height: int) -> Path:
 
 
 def measure_bake(run: Path, size: str) -> None:
-    """Measure bakes of one frame and of several, at one size."""
+    """Print memory and time of bakes of one frame and of several, at one size."""
     with tempfile.TemporaryDirectory() as folder:
         for frames in ("10", "10-12", "10-15"):
             peak, seconds = measure_process([sys.executable, RUN, "bake", run, "--out", Path(folder) / frames,
@@ -95,7 +95,7 @@ def measure_bake(run: Path, size: str) -> None:
 
 
 def measure_fit(counts: list[int], size: str) -> None:
-    """Measure fits that visit every view once. counts: numbers of frames. size: WIDTHxHEIGHT.
+    """Print memory and time of fits that visit every view once. counts: numbers of frames. size: WIDTHxHEIGHT.
 
     There is no preview and no occlusion, and few scene Gaussians, so that the frames make the difference.
     """

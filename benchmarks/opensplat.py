@@ -65,7 +65,7 @@ def build_module(checkout: Path) -> Any:
 class Rasterizer:
     """A scene that is projected once; only its rasterization is repeated.
 
-    module: of `build_module`. camera: world to camera (4, 4) and intrinsics (3, 3). upstream: gradient of the
+    module: from `build_module`. camera: world to camera (4, 4) and intrinsics (3, 3). upstream: gradient of the
     picture (h, w, 3).
     """
 
@@ -81,7 +81,7 @@ class Rasterizer:
             xx, xy, yy = projected.covariances.unbind(-1)
             conics = torch.stack([yy, -xy, xx], -1) / (xx * yy - xy * xy)[:, None]
             covariances = torch.stack([torch.stack([xx, xy], -1), torch.stack([xy, yy], -1)], -2)
-            # Its pixel centres are at whole numbers; ours at + 0.5. The background is black.
+            # OpenSplat's pixel centres are at whole numbers, ours at + 0.5. The background is black.
             inputs = (projected.centres - 0.5, conics, colours[projected.indices], opacities[projected.indices, None],
                       torch.zeros(3), covariances, projected.depths)  # fmt: skip
         self.inputs = [value.detach().contiguous() for value in inputs]

@@ -81,7 +81,7 @@ TILES_LIMIT = 150_000
 
 
 def our_rasterizer(name: str) -> Rasterizer:
-    """Return one of our kernel sets as a rasterizer."""
+    """Return the kernel set of this name as a rasterizer."""
 
     def render(*args: object) -> Tensor:
         return rasterization(*args, kernels=name, depth=False).colour  # type: ignore[arg-type]
@@ -180,7 +180,7 @@ def is_too_slow(name: str, case: Case) -> bool:
 
 
 def raster_section(rasterizers: dict[str, Rasterizer], thread_counts: list[int], rounds: int, device: str) -> str:
-    """Return tables of forward, and of forward + backward. Keys of the times: case, rasterizer, threads, kind."""
+    """Return tables of forward, and of forward + backward. Keys of times: "CASE|RASTERIZER|THREADS|KIND"."""
     work: dict[str, Callable[[], object]] = {}
     for case in RASTER_CASES:
         for name, rasterizer in rasterizers.items():
@@ -278,7 +278,7 @@ def stage_section(thread_counts: list[int], rounds: int) -> str:
 
 
 def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Return the median seconds of each stage over repetitions of a step; the stages are timed inside `parallel`."""
+    """Return the median seconds of each stage over repeated steps; `parallel`, which starts each kernel, is timed."""
     step()  # loads the kernels
     seconds: dict[str, float] = {}
     parallel = importlib.import_module("core.gaussians.cpu.threads").parallel
@@ -378,7 +378,7 @@ def curve_section(rasterizers: dict[str, Rasterizer], rounds: int, device: str, 
 
 
 def peer_section(checkout: Path, rounds: int) -> str:
-    """Return the table of OpenSplat's rasterizer, built from `checkout`, beside ours; it has colours in place of SH."""
+    """Return a table of OpenSplat's rasterizer, built from `checkout`, and ours; OpenSplat's gets colours, not SH."""
     module, rows = opensplat.build_module(checkout), []
     threads = torch.get_num_threads()
     for case in PEER_CASES:

@@ -32,7 +32,10 @@ BT709_MATRIX = np.array([[1.04, -0.03, -0.01], [-0.02, 1.04, -0.02], [-0.01, -0.
 
 
 def write_inputs(folder: Path, frames: int) -> dict[str, Path]:
-    """Write a video of 8 bits, one of 10, and pictures: a moving view of patches with grain."""
+    """Write videos of 8 and 10 bits and folders of PNGs and JPEGs: a moving view of patches with grain.
+
+    Returns the paths by the names that the table shows.
+    """
     random = np.random.default_rng(0)
     scene = cv2.resize(random.integers(20, 220, (40, 60, 3), np.uint8), (SIZE[0] + frames, SIZE[1] + frames),
                        interpolation=cv2.INTER_CUBIC)
@@ -97,7 +100,7 @@ def read_pictures(folder: Path) -> int:
 
 def fastest_times(readers: dict[str, Callable[[Path], int]], path: Path, frames: int,
                   rounds: int) -> dict[str, tuple[float, float]]:
-    """Return for each reader the milliseconds per frame by the clock and by processor time, of its fastest round."""
+    """Return for each reader the milliseconds per frame by the clock and by processor time, each of its best round."""
     fastest = dict.fromkeys(readers, (np.inf, np.inf))
     for _ in range(rounds):
         for name, read in readers.items():
@@ -110,7 +113,7 @@ def fastest_times(readers: dict[str, Callable[[Path], int]], path: Path, frames:
 
 
 def main() -> None:
-    """Print a table."""
+    """Write the inputs, time the readers and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--rounds", type=int, default=3)

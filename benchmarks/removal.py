@@ -88,7 +88,7 @@ def draw_plate(path: Path, width: int, height: int) -> None:
 
 
 def measure_plate(plate: Path, size: int = WORKING_SIZE, weights: Path | None = None) -> None:
-    """Print seconds and peak megabytes of one plate; `speed` runs it in a process of its own."""
+    """Clean one plate twice and print seconds and peak MB as JSON; `speed` runs this in a process of its own."""
     start = time.perf_counter()
     remover = Remover(weights, working_size=size)
     loaded = time.perf_counter()
@@ -100,7 +100,7 @@ def measure_plate(plate: Path, size: int = WORKING_SIZE, weights: Path | None = 
 
 
 def measure_speed(weights: Path | None = None) -> None:
-    """Measure time and memory of each case, at the working size and at full size."""
+    """Print time and memory of each case, at the working size and at full size."""
     for name, (width, height) in CASES.items():
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"plate.{name.split()[1]}"
@@ -180,7 +180,7 @@ def _read_cleaned(paths: list[Path], folder: Path) -> Iterator[Any]:
 
 
 def measure_clean_pictures(folders: list[Path], weights: Path | None = None) -> None:
-    """Measure the change of pictures without flare."""
+    """Print how much pictures without flare are changed."""
     from core.removal.training.backgrounds import PHOTO_SUFFIXES, list_pictures
 
     remover = Remover(weights)
@@ -200,7 +200,7 @@ def measure_clean_pictures(folders: list[Path], weights: Path | None = None) -> 
 
 
 def measure_clean_scenes(folders: list[Path], weights: Path | None = None, count: int = 300) -> None:
-    """Measure the change of held-out scenes without flare."""
+    """Print how much held-out scenes without flare are changed."""
     from core.optics.prescription import built_in_lenses
     from core.removal.training.backgrounds import read_backgrounds
     from core.removal.training.flare_bank import SingleFlareBank
@@ -241,7 +241,7 @@ CLASSES_WITH_LIGHTS = ("scatter", "ghosts", "streak", "glow", "mixed")
 
 def measure_against_light(folders: list[Path], lenses: Path | None = None, weights: Path | None = None,
                           count: int = 20) -> None:
-    """Measure the gain where lights are in a bright part of the scene, and where they are anywhere."""
+    """Print the gain where lights are in a bright part of the scene, and where they are anywhere."""
     from core.removal.evaluation import CANVAS_SIZE
     from core.removal.training.flare_bank import SingleFlareBank
 
@@ -255,7 +255,7 @@ def measure_against_light(folders: list[Path], lenses: Path | None = None, weigh
 
 def measure_coloured_lights(folders: list[Path], lenses: Path | None = None, weights: Path | None = None,
                             count: int = 20) -> None:
-    """Measure the gain for flares of lights of a saturated colour, and for the same of white lights."""
+    """Print the gain for flares of lights of a saturated colour, and for the same flares of white lights."""
     from core.removal.evaluation import CANVAS_SIZE
     from core.removal.synthesis.flare import FLARE_CLASSES
     from core.removal.training.flare_bank import SingleFlareBank, draw_saturated_colour
@@ -296,10 +296,10 @@ def fit_confidence(folders: list[Path], lenses: Path | None = None, weights: Pat
 
 
 def _draw_features(remover: Remover, seed: int, count: int, backgrounds: Any, lenses: Any) -> tuple[Any, Any]:
-    """Return (n, 5) features of frames with a prediction, a third of `count` of them with flares; and (n,) the gain of
-    applying it, dB.
+    """Draw `count` frames, a third of them with flares; return (n, 5) features of their predictions and (n,) the gains
+    of applying these, dB.
 
-    Frames without flare that keep 45 dB are left out; the gain of the others counts as -5.
+    Frames without flare count with a gain of -5. Left out are those that keep 45 dB, and frames without a prediction.
     """
     from core.removal.synthesis.flare import FLARE_CLASSES
     from core.removal.training.flare_bank import SingleFlareBank
@@ -326,8 +326,8 @@ def _draw_features(remover: Remover, seed: int, count: int, backgrounds: Any, le
 def _fit_logistic_regression(features: Any, gains: Any) -> Any:
     """Fit weights (6,) of features (n, 5) and a constant to the log odds that a prediction is useful.
 
-    The constant is last. Predictions are weighted by the size of their gain, up to 15 dB. Newton's method; the weights
-    of the standardised features, but not the constant, have a ridge of one observation.
+    The constant is last. Predictions are weighted by the size of their gain, up to 15 dB. Newton's method, with a ridge
+    penalty on the weights of the standardised features, none on the constant.
     """
     mean, deviation = features.mean(0), features.std(0)
     design = np.column_stack([(features - mean) / deviation, np.ones(len(features))])
@@ -363,7 +363,7 @@ class _AsphericBank:
 
 
 def measure_aspheric_ghosts(folders: list[Path], weights: Path | None = None, count: int = 64) -> None:
-    """Measure the gain for ghosts of moulded lenses, of lights that have no other flare."""
+    """Print the gain for ghosts of moulded lenses, of lights that have no other flare."""
     remover, backgrounds = Remover(weights), _held_out_backgrounds(folders)
     seeds = [(1005, number) for number in range(count)]
     _print_gains("moulded lenses", [_removal_gain(remover, seed, _AsphericBank(seed), backgrounds) for seed in seeds])
@@ -401,7 +401,7 @@ def _print_gains(name: str, gains: Any) -> None:
 
 def measure_matte_gain(folders: list[Path], lenses: Path | None = None, weights: Path | None = None,
                        count: int = 20) -> None:
-    """Measure the gain with a rough matte of the flare, and without."""
+    """Print the gain with a rough matte of the flare, and without."""
     from core.images.plates import Plate
     from core.removal.evaluation import synthetic_cases
 
@@ -416,7 +416,7 @@ def measure_matte_gain(folders: list[Path], lenses: Path | None = None, weights:
 
 
 def _rough_matte(frame: Any, truth: Any) -> Any:
-    """Return a matte (height, width), 0..1, of where the pictures differ: specks are left out, the rest is widened."""
+    """Return a matte (height, width), 0..1, of where the pictures differ: without specks, widened, its rim soft."""
     import cv2
 
     changed = (np.abs(frame - truth).max(-1) > 0.05).astype(np.uint8)
@@ -427,7 +427,8 @@ def _rough_matte(frame: Any, truth: Any) -> Any:
 
 
 def print_coverage(sheet: Path | None = None, count: int = 400) -> None:
-    """Print a histogram of the coverage of synthesised flares, and draw a sheet of them."""
+    """Print a histogram of the coverage of synthesised flares, the share of the frame that holds nine tenths of their
+    energy; with `sheet`, draw a sheet of them."""
     from core.optics.prescription import built_in_lenses
     from core.removal.model.image_formation import coverage
     from core.removal.synthesis.flare import FLARE_CLASSES, add_aspheric_ghosts, synthesise_flare

@@ -77,7 +77,7 @@ def synthetic_scene(
 def load_run(folder: Path) -> RenderedScene:
     """Return a run's scene and flares, for its capture's first camera with all lights in front of it.
 
-    A run with fewer than three lights has its first one again.
+    Where the run has fewer than three lights, its first one is repeated.
     """
     from core.capture import Capture
 

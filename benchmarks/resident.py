@@ -18,7 +18,7 @@ def resident_memory() -> float:
 def peak_memory() -> float:
     """Return the peak resident memory of this program, MB.
 
-    On Linux getrusage would include the parent process.
+    On Linux VmHWM is read, since getrusage would include the parent process.
     """
     if sys.platform == "win32":
         return float(psutil.Process().memory_info().peak_wset) / _MEGABYTE

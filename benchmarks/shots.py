@@ -67,8 +67,10 @@ def main() -> None:
 
 
 def score(args: argparse.Namespace, name: str, seed: int) -> list[str]:
-    """Return the cells of `COLUMNS` for one shot. Those of *no flare*, *network* and *fit* have two figures each: PSNR
-    of the flare, dB, and its relative error."""
+    """Fit one shot, clean it by the fit, and return the cells of `COLUMNS`.
+
+    *no flare*, *network* and *fit* have two figures each: PSNR of the flare, dB, and its relative error.
+    """
     folder = prepare(args.out, name, seed, args.tracks)
     capture = Capture.open(folder, need_cameras=False)
     mode: Any = "default" if args.plates == "exact" else "estimated"
@@ -92,7 +94,7 @@ def score(args: argparse.Namespace, name: str, seed: int) -> list[str]:
 
 
 def prepare(out: Path, name: str, seed: int, tracks: str) -> Path:
-    """Return the folder of a shot with lights and clean frames, made where they are missing.
+    """Render a shot, find its lights and clean its frames, each where it is missing; return the shot's folder.
 
     tracks: "lights" for those that the command finds, "exact" for the exact ones.
     """
@@ -109,7 +111,7 @@ def prepare(out: Path, name: str, seed: int, tracks: str) -> Path:
     capture = Capture.open(folder, need_cameras=False)
     if not (folder / NETWORK).is_dir():
         clean_capture(capture, Remover(glow="remove"), Progress()).rename(folder / NETWORK)
-    if not (folder / "removed").is_dir():
+    if not (folder / "removed").is_dir():  # only frames in which a light may be on are cleaned
         flared = [view.name for view in capture.views
                   if any(capture.light_state(light, view).on != 0 for light in capture.lights)]
         clean_capture(capture, Remover(glow="remove"), Progress(), flared)
@@ -117,7 +119,7 @@ def prepare(out: Path, name: str, seed: int, tracks: str) -> Path:
 
 
 def _with_exact_plates(folder: Path) -> Capture:
-    """Return the shot without removed/, whose exact scene layers a fit of mode default then takes."""
+    """Copy the shot to exact/, once, without removed/: a fit of mode default then takes the exact scene layers."""
     exact = folder / "exact"
     if not exact.is_dir():
         shutil.copytree(folder, exact, ignore=shutil.ignore_patterns("removed", NETWORK, "run-*", "clean-*", "exact"))
@@ -127,9 +129,9 @@ def _with_exact_plates(folder: Path) -> Capture:
 def _score_view(run: Run, capture: Capture, view: View, size: int, folder: Path, label: str) -> list[float] | None:
     """Return nine scores of a view; None where it shows no flare.
 
-    Three pairs of the flare's PSNR, dB, and its relative error in linear light: for no flare, for the network, for the
-    fit. Then the PSNR against the exact scene: of the frame, the network's clean frame and the fit's. size: width,
-    pixels. folder: of the shot. label: of the fit, as in the name of its folder of clean frames.
+    First the flare's PSNR, dB, and its relative error in linear light: for no flare, for the network, for the fit.
+    Then the PSNR against the exact scene: of the frame, of the network's clean frame and of the fit's. size: width of
+    the pictures, pixels. folder: the shot's. label: ends the name of the folder with the fit's clean frames.
     """
     camera = view.camera.scaled(size)
     frame = capture.frame(view, camera.size)
@@ -160,9 +162,8 @@ def _read(path: Path, size: tuple[int, int]) -> Pixels:
 def _brightness_error(run: Run, capture: Capture, folder: Path) -> float:
     """Return the largest error of the brightness of a light in the frame, over the shot.
 
-    Brightness has no unit, so each light's is scaled to the exact one by least squares.
-
-    Lights are compared with the exact ones nearest to their paths.
+    Each fitted light is compared with the exact light whose path is nearest, in the frames that contain the latter.
+    Brightness has no unit, so each fitted light's is scaled to the exact one's by least squares.
     """
     exact = capture.with_lights(read_lights(folder / "truth" / "lights.json"))
     fitted = capture.with_lights(read_lights(run.folder / FRAME_LIGHTS))

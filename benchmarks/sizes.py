@@ -44,7 +44,7 @@ class SizeScores(NamedTuple):
 def mean_scores(run: Run, capture: Capture, views: Sequence[View], width: int) -> SizeScores:
     """Return scores averaged over the views.
 
-    width: at which they are rendered, pixels. Raises CaptureError without exact layers.
+    width: pixels of the rendered pictures. Raises CaptureError without exact layers.
     """
     rows = []
     for view in views:
@@ -64,7 +64,10 @@ def mean_scores(run: Run, capture: Capture, views: Sequence[View], width: int) -
 
 
 def compare_sizes(run: Run, capture: Capture, fitted_width: int, max_width: int) -> list[list[str]]:
-    """Return two rows for each size up to `max_width`: with the pixel grid of the fit, and without."""
+    """Return two rows for each size up to `max_width`: with the pixel grid of the fit, and without.
+
+    Leaves the run without its pixel grids.
+    """
     _, views = capture.split(run.settings.holdout)
     scene, flare = run.scene, run.flare
     assert flare is not None

@@ -125,7 +125,7 @@ def measure_growth(kind: str, count: int) -> int:
 
 
 def main(argv: list[str]) -> int:
-    """Measure each kind in a process of its own."""
+    """Measure each kind in a process of its own; return the exit status, 1 where something grows too much."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     limited = [kind for kind in WORK if kind not in UNLIMITED]
     parser.add_argument("kinds", nargs="*", default=limited, metavar="KIND", help=", ".join(WORK))

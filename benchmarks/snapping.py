@@ -28,9 +28,9 @@ MAX_NEAR_ERROR = 0.012
 
 
 def light_errors(capture: Capture, positions: ArrayLike) -> NDArray[np.float64]:
-    """Return (lights,): the mean distance of each light from its `positions` (lights, 3), in widths of the frame.
+    """Return (lights,): the mean distance, as views show it, of each light from its place in `positions` (lights, 3).
 
-    Views in which one of the two is behind the camera are left out.
+    Distances are relative to the frame's width. Views in which light or place is behind the camera are left out.
     """
     distances = []
     for view in capture.views:
@@ -42,7 +42,7 @@ def light_errors(capture: Capture, positions: ArrayLike) -> NDArray[np.float64]:
 
 
 def main() -> None:
-    """Print a row for each capture and sigma."""
+    """Measure each capture at each sigma: rows go to stderr as they are measured, the table to stdout at the end."""
     parser = argparse.ArgumentParser(description="Errors of noisy lights before and after snapping.")
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--seeds", type=int, default=6)

@@ -42,13 +42,13 @@ class TrackScores(NamedTuple):
     visible: int
     """Frames that show the light."""
     followed: int
-    """Those of them in which it was followed."""
+    """Frames that show the light and in which it was followed."""
     keys: int
     """Frames with a key."""
     doubtful: int
     """Frames whose key is doubtful."""
     doubtful_visible: int
-    """Those of them that show the light."""
+    """Frames that show the light and whose key is doubtful."""
     visible_errors: list[float]
     """Pixels, in frames that show the light."""
     confident_errors: list[float]
@@ -57,7 +57,7 @@ class TrackScores(NamedTuple):
 
 
 def score_track(capture: Capture, truth: Light, visible: dict[str, float], light: TrackedLight) -> TrackScores:
-    """Return the scores of one light. truth: the exact one. visible: share of its disc that is visible, by frame."""
+    """Compare a followed light with the exact one, `truth`. visible: share of its disc that is visible, by frame."""
     size = np.array(capture.views[0].camera.size)
     errors, visible_frames, brightness_errors = {}, [], []
     for name, key in truth.keys.items():
@@ -81,7 +81,7 @@ def score_track(capture: Capture, truth: Light, visible: dict[str, float], light
 
 
 def match_light(truth: Light, lights: list[TrackedLight]) -> TrackedLight | None:
-    """Return the light that is near (MAX_MATCH_DISTANCE) a true one in the most frames; None where none ever is."""
+    """Return the light that is within MAX_MATCH_DISTANCE of `truth` in the most frames; None where none ever is."""
     def count_near(light: TrackedLight) -> int:
         return sum(float(np.linalg.norm(light.keys[name].place - truth.keys[name].xy)) < MAX_MATCH_DISTANCE
                    for name in light.support)
@@ -106,7 +106,7 @@ def score_columns(scores: TrackScores) -> str:
 
 
 def main() -> None:
-    """Parse the arguments and print the table."""
+    """Render the shots that are missing, follow the lights of all, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shots", type=Path, default=CACHE, help="folder of the rendered shots, SHOT_SEED")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])

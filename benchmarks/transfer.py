@@ -58,7 +58,7 @@ class ExactFrame:
 
 
 class FrameScores(NamedTuple):
-    """Scores by frame, and what no frame's scores have."""
+    """Scores by frame, and figures of the whole transfer."""
 
     rows: list[dict[str, Any]]
     """By frame: "flare" and "flare_linear" are PSNR of the transferred flare, "empty" that of none, dB. "inside": the
@@ -229,8 +229,8 @@ def main() -> None:
 def is_in_trained_range(training: object, view: ViewOfLight, distance: float) -> bool:
     """Return whether a light is in the range of the training views.
 
-    training: of `Transfer.training_views`. The range is of the light's place in the frame, up to mirroring, and of its
-    distance from the camera.
+    The range has two parts: the light's place in the frame, up to mirroring, and its distance from the camera.
+    training: the value of `Transfer.training_views` for the light's source.
     """
     lights, distances = np.abs(training.lights), training.distances  # type: ignore[attr-defined]
     position = np.abs(view.light)

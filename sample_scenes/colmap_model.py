@@ -71,7 +71,7 @@ def _pinhole_parameters(camera: Pinhole) -> list[float]:
 
 
 def _posed_cameras(scene: SceneDescription, database: Path) -> Any:
-    """Return a reconstruction of the true cameras without points, with the database's numbers and keypoints."""
+    """Return a model of the true cameras without points; image numbers and keypoints come from the COLMAP database."""
     import pycolmap
 
     true_cameras = pycolmap.Reconstruction()
@@ -90,7 +90,7 @@ def _posed_cameras(scene: SceneDescription, database: Path) -> Any:
 
 
 def _filter_points(reconstruction: Any) -> Any:
-    """Return the model with good points only, and only the image points that belong to them."""
+    """Return the model without inexact points and points of short tracks, and without the image points of either."""
     import pycolmap
 
     good_points = {number: point for number, point in reconstruction.points3D.items()
@@ -98,7 +98,7 @@ def _filter_points(reconstruction: Any) -> Any:
     filtered = pycolmap.Reconstruction()
     for camera in reconstruction.cameras.values():
         filtered.add_camera_with_trivial_rig(camera)
-    # Index of an image point in the filtered model, by its image and its index before.
+    # From (image, index of an image point in the full model) to its index in the filtered model.
     new_index: dict[tuple[int, int], int] = {}
     for number, image in sorted(reconstruction.images.items()):
         observations = [(index, point.xy) for index, point in enumerate(image.points2D)

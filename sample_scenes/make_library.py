@@ -142,7 +142,10 @@ def read_index(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def make_library(folder: Path, names: list[str], progress: Progress) -> None:
-    """Make the looks with these names, all for an empty list; a file made with the same settings is kept."""
+    """Fit the looks with these names, or all for an empty list, and write their files, thumbnails and index entries.
+
+    A file made with the same settings is kept.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for look in LOOKS:
         settings, file = look.settings, folder / f"{look.name}.flare"

@@ -2,8 +2,8 @@
 """Lay traced flares over a real capture: `python sample_scenes/over_photos.py CAPTURE --light X Y Z --out FOLDER`.
 
 The capture has images/ and sparse/0; distorted frames are undistorted. A light is placed at a point in its world, its
-flare is traced for every view and added in linear light, and the result is clipped and stored as a frame; where the
-photographs' exposure changes the flare's does too. The new capture has those frames in images/, the untouched
+flare is traced for every view and added in linear light, and the result is clipped and stored as a frame. The flare is
+scaled by the exposure of each photograph. The new capture has those frames in images/, the untouched
 photographs in removed/, the flares in truth/flare, lights.json, and cameras scaled to the new size. Objects in front of
 the light do not hide it: the visible share is 1 in every view.
 """

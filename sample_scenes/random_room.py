@@ -64,7 +64,7 @@ class Room:
             self._add_light("AREA", self._random_position(self.height * 0.97), math.exp(random.uniform(2, 6)))
 
     def _add_sky(self) -> None:
-        """Light the world by a random environment map, or half of the indoor rooms evenly and dimly."""
+        """Set a random environment map as the world; half of the indoor rooms get one even pale light instead."""
         random = self.random
         if self.indoors and random.random() < 0.5:
             stage.set_uniform_world(random_colour(random, 0.3), 0.01 if self.dark else 0.2)
@@ -132,7 +132,8 @@ class Room:
     def _add_lamp(self) -> None:
         """Add a lamp: a bulb, a screen or a tube that is seen, or a spot, which only lights.
 
-        Its power is divided by about its surface; a small constant bounds the radiance of the smallest.
+        A visible lamp emits its power divided by roughly its surface; the constant added to the surface bounds the
+    radiance of the smallest lamps.
         """
         random = self.random
         position = self._random_position(random.uniform(0.6, self.height * 0.95), min_distance=2)
@@ -191,8 +192,8 @@ class Room:
                   strength: float = 0.0, glass: bool = False, repeat: float = 1.0) -> Any:
         """Return a material, half of the time with a bumpy surface.
 
-        photo: show a random photograph in place of `colour`. strength: of the emission, in the colour or that of the
-        photograph. repeat: how often the photograph is repeated.
+        photo: show a random photograph in place of `colour`. strength: of the emission, 0 for none; it has
+        the surface's colours. repeat: how often the photograph is repeated.
         """
         random = self.random
         material = bpy.data.materials.new("Surface")
@@ -252,7 +253,10 @@ class Room:
         return np.asarray(light, np.float32)
 
     def _add_mist(self, light: Pixels, depth: Pixels) -> Pixels:
-        """Return the light (height, width, 3) through a mist of random density and colour. depth: (height, width)."""
+        """Return light (height, width, 3) through a mist of random density and colour: light * t + airlight * (1 - t).
+
+        The transmission t falls exponentially with `depth` (height, width), the distance of what each pixel shows.
+        """
         random, depth = self.random, np.minimum(depth, self.depth * 6)
         transmission = np.exp(depth * (-math.exp(random.uniform(-2.5, 0.5)) / self.depth))[..., None]
         colour = np.array(random_colour(random, random.random() * 0.4), np.float32)

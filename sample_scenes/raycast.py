@@ -29,7 +29,7 @@ MAX_REMAP_ROWS = 32000
 class Quad:
     """A rectangle: corner (3,), edges u and v (3,), perpendicular; texture (h, w, 3), linear reflectance.
 
-    radiance: factor by which the texture emits, whatever lights it.
+    radiance: 0 for a surface that reflects; otherwise it emits its texture times this factor and reflects nothing.
     """
 
     corner: Array
@@ -108,8 +108,7 @@ def camera_rays(camera: Pinhole, rotation: Array) -> Pixels:
 def cast_rays(quads: Sequence[Quad], eye: Array, rays: Pixels) -> Hits:
     """Return the nearest hits of unit rays (n, 3) from `eye`.
 
-    Where nothing is hit, the distance is infinite and the rest 0. Normals face the eye. A rectangle that emits reflects
-    nothing.
+    Where nothing is hit, the distance is infinite, and albedo, emission and normal are 0. Normals face the eye.
     """
     count = len(rays)
     hits = Hits(np.full(count, np.inf, np.float32), *(np.zeros((count, 3), np.float32) for _ in range(3)))
@@ -144,7 +143,8 @@ def _sample_texture(texture: Pixels, columns: Pixels, rows: Pixels) -> Pixels:
 def _intersect(rectangle: Quad, eye: Array, rays: Pixels) -> tuple[Pixels, Pixels, Pixels]:
     """Return where rays meet the plane of a rectangle: distances along them, and coordinates along u and v, each (n,).
 
-    Behind the eye and on parallel rays the distance is infinite. Coordinates are 0..1 inside the rectangle.
+    The distance is infinite for rays parallel to the plane, and where they meet it behind the eye. Coordinates are 0..1
+    inside the rectangle, and -1 where infinity times 0 leaves them undefined.
     """
     normal = np.cross(rectangle.u, rectangle.v)
     normal_component = rays @ normal.astype(np.float32)
@@ -188,9 +188,9 @@ def shade(hits: Hits, eye: Array, rays: Pixels, lamps: Sequence[Lamp], ambient: 
 def _lamp_disc_mask(lamp: Lamp, eye: Array, rays: Pixels, distance: Pixels) -> NDArray[np.bool_]:
     """Return a mask (n,) of the rays that meet a lamp's sphere before the surfaces at these distances (n,)."""
     to_lamp = lamp.xyz - eye
-    # The distance along the ray at which it is nearest to the sphere's centre.
+    # Distance from the eye to the point of each ray that is nearest to the sphere's centre.
     centre_distance = rays @ to_lamp.astype(np.float32)
-    # The squared distance of the sphere's centre from the ray.
+    # Squared distance from that point to the sphere's centre, by Pythagoras.
     squared_offset = np.float32(to_lamp @ to_lamp) - centre_distance * centre_distance
     is_nearer = centre_distance - lamp.radius < distance
     return np.asarray((centre_distance > 0) & (squared_offset < lamp.radius**2) & is_nearer)

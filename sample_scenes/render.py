@@ -53,7 +53,7 @@ def render_scene(scene: SceneDescription, out: Path, progress: Progress) -> None
 
 
 def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
-    """Write truth/flare, images and removed, of views that lack one of them.
+    """Write the flare layer, the frame (images) and the clean frame (removed) of each view that lacks one of the three.
 
     A frame and its clean frame have the same noise.
     """

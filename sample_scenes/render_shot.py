@@ -67,7 +67,7 @@ class LightInFrame(NamedTuple):
 
 
 def lights_in_frame(scene: ShotScene, state: FrameState) -> dict[str, LightInFrame]:
-    """Return the lights of a frame by name."""
+    """Return, by name, where each light of a frame is, how much of it is visible, and the strength of its flare."""
     lights, camera = {}, scene.camera
     for name, lamp in state.lamps.items():
         camera_xyz = state.rotation @ (lamp.xyz - state.eye)
@@ -80,7 +80,7 @@ def lights_in_frame(scene: ShotScene, state: FrameState) -> dict[str, LightInFra
 
 
 def make_shot(name: str, seed: int, out: Path, progress: Progress) -> None:
-    """Make the whole folder; frames whose files all exist are kept.
+    """Render the frames and layers of a shot into its folder, with its truth; frames whose files all exist are kept.
 
     A frame and its clean frame have the same noise.
     """
@@ -118,7 +118,8 @@ def write_truth(shot: str, scene: ShotScene, states: list[FrameState],
                 lights_by_frame: list[dict[str, LightInFrame]], out: Path, stems: list[str]) -> None:
     """Write truth/lights.json, truth/camera.json and split.json.
 
-    stems: of the frames' file names. "on" is the strength of a light's flare, relative to its largest in the shot.
+    stems: file names of the frames, without suffix. "on" is the strength of a light's flare, relative to its largest in
+    the shot.
     """
     lights = []
     for name in states[0].lamps:

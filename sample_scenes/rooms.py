@@ -4,9 +4,9 @@ FOLDER`.
 
 What a network most often mistakes for a flare is bright and soft and belongs to the scene. Photographs show few such
 places, and none that are certainly free of flare; rooms that Cycles renders (`random_room`) have no lens flare at all.
-Photographs are their pictures and textures, environment maps their skies; those that trainings hold out are left out
-here too. A room is a function of its number and of the pictures, but for the render noise; existing ones are not
-rendered again.
+Photographs serve as pictures on walls and as textures, environment maps as skies; files that trainings hold out are
+left out here too. Apart from the render noise a room depends on its number and on these files only. Rooms that exist
+are not rendered again.
 """
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from core.system.files import atomic_path
 
 
 def psnr_without_flare(frame: NDArray[np.float32], scene: NDArray[np.float32]) -> float:
-    """Return the PSNR of no flare against |frame - scene|, display values; infinite where there is no flare."""
+    """Return the PSNR, dB, of black as an estimate of the flare |frame - scene|; infinite where there is no flare."""
     error = float(np.mean((frame - scene) ** 2))
     return -10 * math.log10(error) if error > 0 else math.inf
 
@@ -30,7 +30,7 @@ def psnr_without_flare(frame: NDArray[np.float32], scene: NDArray[np.float32]) -
 def contact_sheet(capture: Path, columns: int, rows: int, width: int) -> NDArray[np.uint8]:
     """Return the sheet, (height, width, 3) BGR, of columns x rows views spread evenly over the capture.
 
-    width: of a picture, pixels.
+    Prints the score of an empty flare for each of them. width: of one picture, pixels.
     """
     frames = sorted(path for path in (capture / "images").iterdir() if not path.name.startswith("."))
     chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, columns * rows).round().astype(int)]

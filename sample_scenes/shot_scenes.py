@@ -31,7 +31,7 @@ OUT_FRAMES = 8
 class FrameState:
     """One frame of a shot: eye (3,), rotation (3, 3) world to camera, moving rectangles, lamps and their strengths.
 
-    strengths: of the flares, by the lamps' names, without the distance and without what hides the lamp.
+    strengths: of the lamps' flares, by lamp name: with nothing before the lamp, at the shot's `reference_distance`.
     """
 
     eye: Array
@@ -46,7 +46,8 @@ class ShotScene:
     """A shot: camera, lens setup, rectangles that do not move, ambient light (3,), and a function that returns the
     state of a frame from its index.
 
-    reference_distance: from a lamp, at which its flare has its strength. fixed_camera: it never moves.
+    reference_distance: metres from a lamp at which its flare has the strength of `FrameState.strengths`; it falls with
+    the square of the distance. fixed_camera: whether the camera neither moves nor turns.
     """
 
     camera: Pinhole
@@ -59,7 +60,7 @@ class ShotScene:
 
 
 def _to_albedo(texture: Pixels, dim: float = 1.0) -> Pixels:
-    """Return the reflectance of a texture of display values, at most 0.85. dim: a further factor."""
+    """Return the linear reflectance, at most 0.85 * dim, of a texture of display values."""
     return np.asarray(linear_from_srgb(np.clip(texture, 0, 1)) * np.float32(0.85 * dim), np.float32)
 
 
@@ -115,7 +116,8 @@ def torch_shot(seed: int) -> ShotScene:
     room += box_sides((screen_left, -0.9, 3.1), (screen_left + 0.75, 1.2, 3.25), weave)
     room += box_sides((1.5, 0.3, 4.4), (2.6, 1.2, 5.2), _to_albedo(patterns.planks(rng, 120, 160, patterns.WARM), 0.7))
     walker = _make_walker(rng, 1.8, (0.88, 0.87, 0.85))
-    # period: frames of one round of the torch. direction, start_x: of the walker.
+    # phase, period: of the torch's path; period in frames. direction: the side the walker comes from, -1 left, 1 right.
+    # start_x: metres from the middle at which the walker starts.
     phase, period, direction = rng.uniform(0, 2 * np.pi, 4), rng.uniform(26, 34), rng.choice([-1.0, 1.0])
     colour = np.array([1.0, 0.9, 0.75]) if seed % 2 else np.array([0.85, 0.95, 1.0])
     start_x = rng.uniform(2.4, 3.0)
@@ -135,7 +137,7 @@ def torch_shot(seed: int) -> ShotScene:
 
 
 def drive_shot(seed: int) -> ShotScene:
-    """Return the shot of a drive through a street at dusk; a car comes the other way, and one headlight of it fails."""
+    """Return the shot of a drive through a street at dusk; the right headlight of an oncoming car fails for a while."""
     rng = np.random.default_rng((seed, 2))
     camera = _random_camera(rng)
     street = [quad((-60, -70, 90), (120, 0, 0), (0, 72, 0), _plain_texture(0.5, 0.42, 0.45), 0.28),
@@ -164,12 +166,13 @@ def drive_shot(seed: int) -> ShotScene:
     approach = (start_distance - rng.uniform(6.2, 8.0)) / FRAMES
 
     def state(index: int) -> FrameState:
-        """Return frame `index`: the camera 0.22 m farther than in the one before, the other car, and its headlights."""
+        """Return frame `index`: the camera, which drives 0.22 m in a frame, the other car, and its two headlights."""
         eye = np.array([1.4, 0.0, 0.22 * index]) + jitter[index]
         car_z = start_distance + 0.22 * index - approach * index  # the camera drives 0.22 a frame
         sway = 0.12 * np.sin(index / 5)
         offset = np.array([lane + sway, 0.3, car_z])
         car_sides = [side_of_car.moved(offset) for side_of_car in car]
+        # The right headlight flickers for 6 frames before it is out and for 4 after.
         is_out = out_frame <= index < out_frame + OUT_FRAMES
         flickers = out_frame - 6 <= index < out_frame or out_frame + OUT_FRAMES <= index < out_frame + OUT_FRAMES + 4
         brightness = {"left": 1.0, "right": 0.0 if is_out else float(flicker[index]) if flickers else 1.0}
@@ -221,7 +224,7 @@ def pan_shot(seed: int) -> ShotScene:
     shake = np.cumsum(rng.normal(size=(FRAMES, 2)), 0) * 0.0006
 
     def state(index: int) -> FrameState:
-        """Return frame `index`: the turned camera, walker and cart, and the lamp."""
+        """Return frame `index`: the camera turned to its angle, walker and cart in their places, and the lamp."""
         progress = index / (FRAMES - 1)
         angle = direction * max_angle * np.cos(np.pi * (progress * 1.15 - 0.05)) + 0.12 + shake[index, 0]
         rotation = _pitch_rotation(float(-0.05 + shake[index, 1])) @ _yaw_rotation(float(angle))

@@ -90,12 +90,12 @@ def visible_share(light: LightSource, eye: Array) -> float:
     scene, depsgraph = bpy.context.scene, bpy.context.evaluated_depsgraph_get()
     centre, origin = np.array(light.xyz), np.asarray(eye, float)
     points = disc_points(centre, origin, light.radius, SHARE_SAMPLES, up=(0.0, 0.0, 1.0))
+    # The bulbs are hidden meanwhile, since they would stop the rays.
     bulbs = [item for item in scene.objects if item.get("light_source")]
     for bulb in bulbs:
         bulb.hide_viewport = True
     depsgraph.update()
     visible = 0
-    # The bulbs themselves, which are hidden now, would stop the rays.
     for point in points:
         ray = point - origin
         length = float(np.linalg.norm(ray))

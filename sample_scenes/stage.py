@@ -77,8 +77,9 @@ def place(obj: Any, location: Vec, turn: float = 0.0, tilt: Vec = (0.0, 0.0)) ->
 
 def add_box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: float = 0.0,
             tilt: Vec = (0.0, 0.0), bevel: float = 0.0) -> Any:
-    """Add a box of `size`, its base centre at `location`; turn and tilt as for `place`.
+    """Add a box of `size`, its base centre at `location`.
 
+    turn: degrees about z, after `tilt`: degrees about x and y.
     materials: one for all faces, or one each for the sides (-y, +x, +y, -x) and top; the bottom has the last one. Each
     face shows its whole texture. bevel: width of the rounded edges, 0 for none.
     """
@@ -107,7 +108,7 @@ def add_sheet(name: str, width: float, height: float, location: Vec, material: A
               tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
     """Add a rectangle in x and y about its centre; tilt (90, 0) stands it up.
 
-    repeat: how often the texture is repeated across and up. turn and tilt: as for `place`.
+    repeat: how often the texture is repeated across and up. turn: degrees about z, after `tilt`: degrees about x and y.
     """
     mesh = bmesh.new()
     uv = mesh.loops.layers.uv.new("UVMap")
@@ -122,8 +123,8 @@ def add_lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, 
               segments: int = 48, turn: float = 0.0, tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
     """Add a surface of revolution about z: `profile` is (radius, height) from below to the top.
 
-    segments: quads around. repeat: how often the texture is repeated around the axis and along the profile. turn and
-    tilt: as for `place`.
+    segments: quads around. repeat: how often the texture is repeated around the axis and along the profile. turn:
+    degrees about z, after `tilt`: degrees about x and y.
     """
     mesh = bmesh.new()
     uv = mesh.loops.layers.uv.new("UVMap")

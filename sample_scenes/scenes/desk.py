@@ -13,7 +13,7 @@ LANTERN = LightSource("lantern", (1.15, 1.35, 1.42), (0.45, 0.72, 1.0), 0.075, 3
 def camera_path(numbers: Array) -> Array:
     """Return poses (n, 4, 4), world to camera, on a figure of eight in front of the desk.
 
-    It is 80 degrees wide and moves nearer and farther; a round takes 66 views.
+    The path is 80 degrees wide and comes nearer and goes farther; a round takes 66 views.
     """
     poses = []
     for t in np.asarray(numbers) / 66 * 2 * np.pi:

@@ -12,7 +12,10 @@ LAMP = LightSource("lamp", (0.2, 1.2, 2.1), (0.95, 0.9, 1.0), 0.1, 40.0, 320.0, 
 
 
 def camera_path(numbers: Array) -> Array:
-    """Return poses (n, 4, 4), world to camera, half round the lamp at changing height, near and far."""
+    """Return poses (n, 4, 4), world to camera, on an arc of 120 degrees around the lamp.
+
+    Height and distance change along it.
+    """
     poses = []
     for t in np.asarray(numbers) / 40:
         azimuth = np.radians(-60 + 120 * t)

@@ -14,7 +14,7 @@ SUN = LightSource("sun", (float(DISTANCE * np.sin(AZIMUTH) * np.cos(ELEVATION)),
 
 
 def camera_path(numbers: Array) -> Array:
-    """Return poses (n, 4, 4), world to camera, of a walk along the terrace: to either side and back in 60 numbers.
+    """Return poses (n, 4, 4), world to camera, of a walk along the terrace: to either side and back in 60 views.
 
     The camera faces the terrace's centre as it walks, and pans, so that the sun leaves the frame at times.
     """

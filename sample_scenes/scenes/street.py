@@ -12,7 +12,7 @@ SUN = LightSource("sun", (4.0, 118.0, 19.0), (1.0, 0.82, 0.6), 0.95, 60.0, 2.6, 
 def camera_path(numbers: Array) -> Array:
     """Return poses (n, 4, 4), world to camera, of a walk up the street.
 
-    It sways from side to side and pans until the sun leaves the frame.
+    The camera sways from side to side and pans until the sun leaves the frame.
     """
     poses = []
     for t in np.asarray(numbers) / 40:

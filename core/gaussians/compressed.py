@@ -28,13 +28,13 @@ from .spherical_harmonics import dc_from_colour
 CHUNK = 256
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _MAX_HEADER_BYTES = 1 << 16
-_STORED_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the components that are stored, w x y z
+_STORED_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # of w x y z; row i if i is the largest
 
 Floats = NDArray[np.float32]
 
 
 def is_compressed(path: Path) -> bool:
-    """Return whether the header is that of a compressed PLY. Raises OSError for an unreadable file."""
+    """Return whether a file begins with the header of a compressed PLY. Raises OSError for an unreadable file."""
     with open_regular(path) as file:
         head = file.read(_MAX_HEADER_BYTES).split(b"end_header")[0]
     return head.startswith(b"ply") and b" packed_position\n" in head.replace(b"\r", b"")
@@ -56,7 +56,7 @@ def read_compressed(path: Path) -> SceneGaussians:
         rgb = rgba[:, :3]  # older files have no range of colours: 0..1
         if "min_r" in (chunks.dtype.names or ()):
             rgb = _dequantise(chunks, chunk_of, rgb, "{}_r", "{}_g", "{}_b")
-        opacity = np.clip(rgba[:, 3], 0.5 / 255, 254.5 / 255)  # the ends have no finite logit
+        opacity = np.clip(rgba[:, 3], 0.5 / 255, 254.5 / 255)  # 0 and 1 have no finite logit
         sh = torch.zeros(count, COEFFICIENTS, 3)
         sh[:, 0] = dc_from_colour(torch.from_numpy(rgb))
         if "sh" in elements and (names := elements["sh"].dtype.names):
@@ -101,15 +101,18 @@ def _unpack(packed: NDArray[np.uint32], *bits: int) -> Floats:
 
 
 def _dequantise(chunks: NDArray[Any], chunk_of: NDArray[np.int64], fraction: Floats, *names: str) -> Floats:
-    """Map fractions 0..1 (n, 3) to the ranges of their chunks.
+    """Map fractions 0..1 (n, 3) linearly to the range min..max of each Gaussian's chunk.
 
-    names: of the three columns in `chunks`, with {} for "min" or "max"."""
+    chunk_of (n,): index of that chunk; names: three columns of `chunks`, with {} in place of "min" and "max"."""
     low, high = (np.stack([chunks[name.format(end)] for name in names], -1)[chunk_of] for end in ("min", "max"))
     return np.asarray(low + fraction * (high - low), np.float32)
 
 
 def _unpack_quaternions(packed: NDArray[np.uint32]) -> Floats:
-    """Unpack (n,) to unit quaternions (n, 4), w x y z: the components but the largest lie within ±1 / sqrt(2)."""
+    """Unpack (n,) to unit quaternions (n, 4), w x y z.
+
+    The top 2 bits are the index of the largest component, which follows from the length 1; the other three lie within
+    ±1 / sqrt(2) and have 10 bits each."""
     largest = (packed >> np.uint32(30)).astype(np.int64)
     stored = (_unpack(packed & np.uint32((1 << 30) - 1), 2, 10, 10, 10)[:, 1:] - np.float32(0.5)) * np.float32(
         math.sqrt(2))
@@ -121,7 +124,7 @@ def _unpack_quaternions(packed: NDArray[np.uint32]) -> Floats:
 
 
 def _dequantise_harmonics(stored: NDArray[np.uint8]) -> Floats:
-    """Map bytes to -4..4, each to the middle of its step, 0 and 255 to the ends."""
+    """Map bytes to -4..4: 0 and 255 to the ends, every other byte to the middle of its step."""
     fraction = (stored.astype(np.float32) + 0.5) / 256
     fraction = np.where(stored == 0, 0, np.where(stored == 255, 1, fraction))
     return np.asarray((fraction - 0.5) * 8, np.float32)

@@ -80,7 +80,7 @@ class Chain:
         return np.asarray((places[later] - places[earlier]) / step)
 
     def predict(self, frame: int) -> Floats:
-        """Return (2,) the place in a frame after the last or before the first one, at constant velocity."""
+        """Return the place (2,) in a frame after the chain's last or before its first one, at constant velocity."""
         at_end = frame >= self.frames[-1]
         start = self.frames[-1] if at_end else self.frames[0]
         return np.asarray(self.places[-1 if at_end else 0] + (frame - start) * self.velocity(at_end))
@@ -89,8 +89,8 @@ class Chain:
         """Return a high estimate of the acceleration, pixels per frame²: 1.5 times the 80th percentile of the changes
         of velocity.
 
-        It is kept within MIN_ACCELERATION and MAX_ACCELERATION; of fewer than three frames it is the former. diagonal:
-        of the frames, pixels.
+        The result is clipped to MIN_ACCELERATION and MAX_ACCELERATION; for fewer than three frames it is the former.
+        diagonal: length of the frames' diagonal, pixels.
         """
         places, frames = self.places, np.array(self.frames)
         low, high = MIN_ACCELERATION * diagonal, MAX_ACCELERATION * diagonal
@@ -102,7 +102,11 @@ class Chain:
 
 
 def follow_sources(sources: Sequence[Sequence[Source]], diagonal: float) -> list[Chain]:
-    """Return the chains of the sources of consecutive frames, the longest first. diagonal: of the frames, pixels."""
+    """Return the chains of the sources of consecutive frames, the longest first.
+
+    In each frame chains and sources are paired greedily, the pair with the smallest cost first. sources: those of each
+    frame. diagonal: length of the frames' diagonal, pixels.
+    """
     open_chains: list[Chain] = []
     closed: list[Chain] = []
     for frame, frame_sources in enumerate(sources):
@@ -131,7 +135,8 @@ def _patience(chain: Chain) -> int:
 def _link_cost(chain: Chain, frame: int, source: Source, diagonal: float) -> float | None:
     """Return the cost of joining a chain to a source of a later frame; None beyond the gate.
 
-    The gate is the largest distance, pixels, of a source from the predicted place. diagonal: of the frames, pixels.
+    The gate is the largest distance, pixels, of a source from the predicted place. diagonal: length of the frames'
+    diagonal, pixels.
     """
     gap = frame - chain.frames[-1]
     last = chain.sources[-1]
@@ -162,7 +167,8 @@ def _link_cost(chain: Chain, frame: int, source: Source, diagonal: float) -> flo
 
 
 def _appearance_difference(first: Source, second: Source) -> float:
-    """Return how much two sources differ in size, colour and evidence; one that the frame's edge cuts has no size."""
+    """Return the weighted differences of two sources in size, colour and evidence; size does not count if the frame's
+    edge cuts either."""
     first_detection, second_detection = first.detection, second.detection
     is_cut = first_detection.is_cut or second_detection.is_cut
     size = 0.0 if is_cut else abs(float(np.log(first_detection.radius / second_detection.radius)))
@@ -173,7 +179,8 @@ def _appearance_difference(first: Source, second: Source) -> float:
 def _join_chains(chains: list[Chain], diagonal: float) -> list[Chain]:
     """Join chains where one ends before another begins and both extrapolations meet, the best pair first.
 
-    Only chains that look like lamps are joined. Returns all chains, the longest first.
+    Only chains that look like lamps are joined; joined chains may be joined again. Returns all chains, the longest
+    first. diagonal: length of the frames' diagonal, pixels.
     """
     likely = {number: chain for number, chain in enumerate(chains) if chain.evidence >= LIKELY}
     others = [chain for number, chain in enumerate(chains) if number not in likely]
@@ -197,7 +204,8 @@ def _join_chains(chains: list[Chain], diagonal: float) -> list[Chain]:
 def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
     """Return the cost of taking two chains for one thing; None where that cannot be.
 
-    `first` must end before `second` begins. diagonal: of the frames, pixels.
+    `first` must end before `second` begins; both are extrapolated to the middle of the gap, where they must meet.
+    diagonal: length of the frames' diagonal, pixels.
     """
     gap = second.frames[0] - first.frames[-1]
     if not 0 < gap <= MAX_GAP:
@@ -212,7 +220,7 @@ def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
     speeds = [float(np.linalg.norm(chain.velocity(at_end))) for chain, at_end in ((first, True), (second, False))]
     if is_single:  # a single frame has no velocity; it may have the other's
         gate += 0.5 * gap * max(speeds)
-    # Half the way by each: the velocities need not agree, only the places in the middle.
+    # Each is extrapolated over half the gap: the velocities need not agree, only the places in its middle.
     middle = first.frames[-1] + gap / 2
     middle_by_first = first.places[-1] + first.velocity(at_end=True) * (middle - first.frames[-1])
     middle_by_second = second.places[0] - second.velocity(at_end=False) * (second.frames[0] - middle)
@@ -224,7 +232,7 @@ def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
 
 
 def _typical_source(chain: Chain, at_end: bool) -> Source:
-    """Return the source of median size among the last few of a chain, or the first few: the very last may be half
-    hidden."""
+    """Return the source of median size among the last TYPICAL of a chain if `at_end`, else the first: the very last may
+    be half hidden."""
     near = chain.sources[-TYPICAL:] if at_end else chain.sources[:TYPICAL]
     return sorted(near, key=lambda source: source.detection.radius)[len(near) // 2]

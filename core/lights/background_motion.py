@@ -53,7 +53,9 @@ class BackgroundMotion:
         self._matcher = HomographyMatcher(read, MIN_INLIER_SHARE)
 
     def carry(self, frames: Sequence[int], places: Floats, targets: Iterable[int]) -> dict[int, CarriedPlace]:
-        """Return the places of a light in target frames, as far as the background tells them; none for a moving light.
+        """Return the places of a light in target frames to which homographies carry it; none for a moving light.
+
+        Each is the median of the places carried from the CARRIED_FROM nearest frames that show the light.
 
         frames: indices of the frames that show the light, ascending. places: (n, 2), pixels.
         """
@@ -73,8 +75,8 @@ class BackgroundMotion:
         return carried
 
     def _static_residual(self, frames: Sequence[int], places: Floats) -> float | None:
-        """Return the median distance, pixels, of a light from where the background carries it between frames that show
-        it; None if the light moves, or the frames do not tell."""
+        """Return the median distance, pixels, of a light from the place to which the background carries it from another
+        frame; None if the light moves, or if too few frames or too little motion of the background decide it."""
         partners = [(index, int(np.searchsorted(frames, frame + TEST_OFFSET))) for index, frame in enumerate(frames)]
         pairs = [(index, other) for index, other in partners
                  if other < len(frames) and frames[other] - frames[index] <= MAX_DISTANCE]

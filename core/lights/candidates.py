@@ -42,9 +42,9 @@ class Candidates:
         self._bounds = np.full(len(self._places), np.inf)
 
     def best(self, remaining: NDArray[np.bool_]) -> Floats | None:
-        """Return the place (4,) with the highest score over the remaining detections (d,); None where none scores.
+        """Return the place (4,) with the highest score over the remaining detections; None if no score is above 0.
 
-        `remaining` must shrink from call to call.
+        remaining: (d,), true for those detections; from call to call none may be added.
         """
         index = np.flatnonzero(remaining & (self._observations.weight > 0))
         while len(self._places):
@@ -59,9 +59,10 @@ class Candidates:
 
 def _intersections(observations: Observations, index: NDArray[np.int64], rng: np.random.Generator,
                    max_candidates: int) -> Floats:
-    """Return (n, 4), at most `max_candidates`: places where the rays of two of the detections `index` meet.
+    """Return (n, 4), at most `max_candidates` homogeneous places where the rays of two detections meet.
 
-    Rays meet at a place, finite or at infinity, that projects within tolerance of both detections.
+    Rays meet at a place, finite or at infinity, that projects within tolerance of both detections. index: detections
+    whose rays are paired.
     """
     first, second = _choose_pairs(observations, index, rng)
     places = np.concatenate([_triangulate(observations, first, second), _at_infinity(observations, first, second)])
@@ -74,9 +75,9 @@ def _intersections(observations: Observations, index: NDArray[np.int64], rng: np
 
 def _choose_pairs(observations: Observations, index: NDArray[np.int64],
                   rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Choose at most MAX_PAIRS pairs of the detections `index`, of different views, at random by their weights.
+    """Choose pairs of the detections `index` from different views: all, or MAX_PAIRS at random by their weights.
 
-    Returns the first and the second detection of each pair, (n,) each.
+    Returns the indices of the first and of the second detection of each pair, (n,) each.
     """
     if math.comb(len(index), 2) > MAX_LISTED_PAIRS:
         return _draw_pairs(observations, index, rng)
@@ -93,7 +94,7 @@ def _choose_pairs(observations: Observations, index: NDArray[np.int64],
 
 def _draw_pairs(observations: Observations, index: NDArray[np.int64],
                 rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Draw pairs as `_choose_pairs` does, without a list of all, which would fill the memory.
+    """Draw MAX_PAIRS pairs at random by their weights, without a list of all pairs, which would fill the memory.
 
     Pairs within one view and repeated pairs are dropped. Returns fewer where nearly all detections are of one view.
     """
@@ -102,7 +103,7 @@ def _draw_pairs(observations: Observations, index: NDArray[np.int64],
     for _ in range(MAX_DRAWS):
         drawn = np.sort(index[rng.choice(len(index), (2 * MAX_PAIRS, 2), p=weight)], axis=1)
         drawn = drawn[observations.view[drawn[:, 0]] != observations.view[drawn[:, 1]]]
-        # One number for each pair, which np.divmod below takes apart.
+        # One number for each pair, from which np.divmod below restores both indices.
         keys = np.concatenate([keys, drawn[:, 0] * len(observations.view) + drawn[:, 1]])
         keys = keys[np.sort(np.unique(keys, return_index=True)[1])]  # in the order of drawing
         if len(keys) >= MAX_PAIRS:
@@ -112,10 +113,10 @@ def _draw_pairs(observations: Observations, index: NDArray[np.int64],
 
 
 def _triangulate(observations: Observations, first: NDArray[np.int64], second: NDArray[np.int64]) -> Floats:
-    """Return (n, 4), the midpoints of the shortest segments between two detections' rays.
+    """Return (n, 4), the midpoint of the shortest segment between the two rays of each pair, with w = 1.
 
-    first, second: the detections of each pair (n,). Zeros for rays that are parallel, or that are nearest behind one of
-    the cameras.
+    first, second: indices (n,) of the detections. All zeros for rays that are parallel, or whose nearest points lie
+    behind a camera.
     """
     origin, other_origin = (observations.position[observations.view[index]] for index in (first, second))
     ray, other_ray = observations.ray[first], observations.ray[second]

@@ -60,11 +60,10 @@ def union_mask(detections: Sequence[Detection], size: tuple[int, int]) -> Mask:
 
 def measure_detection(mask: Mask, corner: tuple[int, int], picture: Picture, display: NDArray[np.float32],
                       score: float) -> Detection:
-    """Measure a detection from its mask (h, w) at `corner` (x, y) of a picture with these display values (height,
-    width, 3).
+    """Measure a detection from its mask (h, w), whose top left pixel is `corner` (x, y) of the picture.
 
-    The centroid weighs pixels from 0.8 of full scale up, one pixel past the mask: partly covered pixels of the rim then
-    locate the edge between two pixels.
+    display: the picture's display values (height, width, 3). The centroid weighs pixels from 0.8 of full scale up, also
+    one pixel outside the mask: partly covered pixels of the rim then locate the edge between two pixels.
     """
     import cv2
 
@@ -75,7 +74,7 @@ def measure_detection(mask: Mask, corner: tuple[int, int], picture: Picture, dis
     columns = slice(max(left, 0), min(left + grown.shape[1], width))
     grown = grown[rows.start - top:rows.stop - top, columns.start - left:columns.stop - left]
     value = display[rows, columns].max(axis=2)
-    # Above 0, so that a mask without bright pixels has a centroid too.
+    # Weights are above 0, so that a mask without bright pixels has a centroid too.
     weight = np.where(grown, np.clip((value - 0.8) / 0.2, 1e-3, 1.0), 0.0)
     v, u = np.mgrid[rows, columns] + 0.5
     xy = np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
@@ -89,8 +88,9 @@ def measure_detection(mask: Mask, corner: tuple[int, int], picture: Picture, dis
 def _glow_colour(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.float64]:
     """Return the colour of the glow: the light within half a radius of the disc minus that two to three radii away.
 
-    (3,) linear, the largest channel 1; white where no glow can be measured. At most half is subtracted, so that some
-    glow is left beside a bright surface. mask: (h, w) of the disc at `corner` (x, y).
+    (3,) linear, the largest channel 1; white where no glow can be measured. At most half of the near light is
+    subtracted, so that some glow is left beside a bright surface. mask: (h, w), the disc, whose top left pixel is
+    `corner` (x, y) of the picture.
     """
     import cv2
 

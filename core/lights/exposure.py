@@ -43,7 +43,11 @@ class ExposureDetector:
     clipped: float = 0.98
 
     def detect(self, picture: Picture) -> list[Detection]:
-        """Return the lights of a picture, highest score first."""
+        """Return the lights of a picture, highest score first.
+
+        Each clipped region is scored by its shape, size, whiteness and surroundings, by how far it continues past its
+        main body, and by the size of its group.
+        """
         import cv2
 
         display = picture.display()
@@ -59,7 +63,7 @@ class ExposureDetector:
             mask = _main_body(region, MAX_AREA_SHARE * clipped.size)
             if mask is None:
                 continue
-            # Clipped pixels of the region's group beside it, relative to its own.
+            # The group's clipped pixels outside the mask, relative to those in it.
             group_excess = float(group_areas[top:top + height, left:left + width][mask].max()) / float(mask.sum()) - 1
             score = (shape_score(mask, (left, top), display)
                      * smoothstep(_attached_share(mask, region), *ATTACHED_SHARES)
@@ -90,7 +94,8 @@ def _group_areas(clipped: NDArray[np.uint8]) -> NDArray[np.int64]:
 def _main_body(mask: NDArray[np.bool_], max_area: float) -> NDArray[np.bool_] | None:
     """Return the mask with holes filled and without thin parts, such as spikes of a starburst or a bright bracket.
 
-    Discs, ellipses and bars are unchanged. None where a disc of more than `max_area` pixels fits in.
+    Thin parts are removed by morphological opening; discs, ellipses and bars are unchanged. None where a disc of more
+    than `max_area` pixels fits in.
     """
     import cv2
 
@@ -126,10 +131,10 @@ def open_by_disc(mask: NDArray[np.uint8], reach: int) -> NDArray[np.uint8]:
 
 
 def _attached_share(core: NDArray[np.bool_], region: NDArray[np.bool_]) -> float:
-    """Return the share of a ring half the core's radius outside it where the clipped region continues.
+    """Return the share of a ring around the core, half its radius outside it, that the clipped region covers.
 
-    core, region: masks (h, w) of the region without thin parts and with them. High for a patch cut out of a surface,
-    low past the short spikes of a star or beside a bracket.
+    core, region: masks (h, w) of the region without thin parts and with them. The share is high for a patch cut out of
+    a surface, low for a lamp with the short spikes of a star or a bracket.
     """
     import cv2
 
@@ -142,7 +147,7 @@ def _attached_share(core: NDArray[np.bool_], region: NDArray[np.bool_]) -> float
 
 
 def smoothstep(value: float, low: float, high: float) -> float:
-    """0 below `low`, 1 above `high`, smooth between; reversed for low > high."""
+    """Return 0 below `low`, 1 above `high`, a cubic between; reversed for low > high."""
     t = min(max((value - low) / (high - low), 0.0), 1.0)
     return t * t * (3 - 2 * t)
 
@@ -150,9 +155,9 @@ def smoothstep(value: float, low: float, high: float) -> float:
 def shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:
     """Return the score, 0..1, of a mask's shape, size, whiteness and surroundings.
 
-    mask: (h, w) at `corner` (x, y) of a picture with these display values (height, width, 3). A score of 1 takes a
-    solid region (its share of its convex hull), not long (the ratio of its sides), small (its share of the frame),
-    white (its mean least channel), and darker surroundings.
+    The score is 1 for a region that is solid (its share of its convex hull), compact (the ratio of its sides), small
+    (its share of the frame), white (its mean least channel) and in darker surroundings. mask: (h, w), whose top left
+    pixel is `corner` (x, y) of the picture. display: the picture's display values (height, width, 3).
     """
     import cv2
 
@@ -171,7 +176,10 @@ def shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArr
 
 
 def _surrounding_level(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:
-    """Return the mean HSV value of the ring a radius away from the mask; 1 where the ring is out of frame."""
+    """Return the mean HSV value in the ring from 1 to 1.5 radii outside the mask; 1 where the ring is out of frame.
+
+    corner: (x, y) of the mask's top left pixel in the picture. display: its display values (height, width, 3).
+    """
     import cv2
 
     height, width = display.shape[:2]

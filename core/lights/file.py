@@ -34,7 +34,7 @@ SAME_PLACE = 0.02
 
 
 def check_replaceable(path: Path) -> None:
-    """Raise CaptureError where lights.json has entries that a person has added, renamed or moved."""
+    """Raise CaptureError if lights.json has entries that a person has added, renamed or moved."""
     if not path.exists():
         return
     read_lights(path)  # checks it
@@ -42,12 +42,12 @@ def check_replaceable(path: Path) -> None:
     places, paths = _read_earlier_places(data, path), _read_earlier_paths(data, path)
 
     def is_unchanged(entry: dict[str, Any]) -> bool:
-        """True if an earlier run wrote the entry's place or path."""
+        """Return whether an earlier run wrote the entry's place or path."""
         if "xyz" in entry:
             return any(np.allclose(entry["xyz"], place, rtol=1e-3, atol=1e-5) for place in places)
         return any(_places_by_frame(entry) == earlier for earlier in paths)
 
-    # An entry that a search wrote has a support, and the name of its number.
+    # An entry that a search wrote has a support, and is named light1, light2, ... by its position in the list.
     by_hand = [str(entry["name"]) for number, entry in enumerate(data["lights"], 1)
                if not ("support" in entry and entry["name"] == f"light{number}" and is_unchanged(entry))]
     if by_hand:
@@ -57,10 +57,11 @@ def check_replaceable(path: Path) -> None:
 
 def write_lights(path: Path, lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
                  keep: bool = False, tracked: Sequence[TrackedLight] = ()) -> list[dict[str, Any]]:
-    """Write lights.json and return its entries: existing ones if `keep`, and lights that are not among them.
+    """Write lights.json and return its entries: the existing ones if `keep`, and the lights that are not among them.
 
-    keep: see the module's head. views: names and cameras, by which lights count as the same. tracked: lights on paths.
-    Raises CaptureError where an existing file is to be kept and cannot be read.
+    keep: existing entries stay, and what a person deleted is not added again. views: names and cameras; lights that
+    fall on one spot in most of them are the same. tracked: lights on paths. Raises CaptureError if an existing file is
+    to be kept and cannot be read.
     """
     earlier = _read_earlier(path) if keep and path.exists() else _EarlierLights([], [], [])
     entries = list(earlier.entries)
@@ -86,7 +87,7 @@ class _EarlierLights(NamedTuple):
 
 
 def _read_earlier(path: Path) -> _EarlierLights:
-    """Read a lights.json that is to be kept. Raises CaptureError where that cannot be done."""
+    """Read a lights.json whose entries are to be kept. Raises CaptureError if it is invalid or not writable."""
     read_lights(path)  # checks it
     data = read_json(path, CaptureError)
     earlier = _EarlierLights(data["lights"], _read_earlier_places(data, path), _read_earlier_paths(data, path))
@@ -97,7 +98,8 @@ def _read_earlier(path: Path) -> _EarlierLights:
 
 def _add_tracks(entries: list[dict[str, Any]], tracked: Sequence[TrackedLight], earlier: _EarlierLights,
                 views: Sequence[tuple[str, Camera]]) -> list[dict[str, Any]]:
-    """Append to `entries` the lights on paths that are not known yet; return their paths, places by frame."""
+    """Append to `entries`, in place, the tracked lights whose paths are not known yet; return these paths, places by
+    frame."""
     known_paths = [*(_places_by_frame(entry) for entry in entries if "frames" in entry), *earlier.paths]
     new_paths = []
     for track in tracked:
@@ -110,15 +112,15 @@ def _add_tracks(entries: list[dict[str, Any]], tracked: Sequence[TrackedLight], 
 
 
 def _places_by_frame(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return the place of an entry's path by the name of the frame, [px, py] or [x, y, z]."""
+    """Return the path of an entry: its place, [px, py] or [x, y, z], by the name of the frame."""
     keys = entry.get("frames") or {}
     return {name: key.get("xy", key.get("xyz")) for name, key in keys.items() if {"xy", "xyz"} & key.keys()}
 
 
 def _is_same_path(path: dict[str, Any], other: dict[str, Any], camera: Camera) -> bool:
-    """True if two paths on the picture are close to each other in most frames that they share.
+    """Return whether two paths on the picture are close to each other in most frames that they share.
 
-    They must share half the frames of the shorter one. camera: its size is that of the frames.
+    They must share at least half the frames of the shorter path. camera: gives the size of the frames.
     """
     shared = [name for name in path if name in other and len(path[name]) == len(other[name]) == 2]
     if len(shared) < 0.5 * min(len(path), len(other)) or not shared:
@@ -148,7 +150,7 @@ def _read_earlier_places(data: dict[str, Any], path: Path) -> list[list[float]]:
 
 
 def _check_writable(entry: dict[str, Any], path: Path) -> None:
-    """Raise CaptureError for NaN and infinity, which can be read and not written."""
+    """Raise CaptureError if the entry contains NaN or infinity, which json reads but must not write here."""
     try:
         json.dumps(entry, allow_nan=False)
     except ValueError as problem:
@@ -184,7 +186,7 @@ def _free_name(used_names: set[str]) -> str:
 
 
 def _is_same_light(xyz: Any, other: Any, views: Sequence[tuple[str, Camera]]) -> bool:
-    """True if two places fall on one spot in most views that have either in frame."""
+    """Return whether two places in the world fall on one spot in most of the views that have either in frame."""
     matching_views = differing_views = 0
     for _, camera in views:
         pixels, depth = camera.project([xyz, other])

@@ -51,9 +51,9 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
                 gaussians: tuple[ArrayLike, ArrayLike] | None = None) -> Findings:
     """Find the lights of a capture in its frames.
 
-    With `gaussians`, the means (n, 3) and opacities (n,) of a fitted scene, detections are lifted on to it, the paper's
-    way; else their rays are triangulated. A capture in which no frame shows a light is searched for ghosts of one out
-    of frame.
+    With `gaussians`, the means (n, 3) and opacities (n,) of a fitted scene, detections are lifted on to its Gaussians,
+    as in the paper; else their rays are triangulated. Where no frame shows a light, one out of frame is searched by its
+    ghosts. Raises SettingsError for settings.min_views below 1.
     """
     progress, settings = progress or Progress(), settings or TriangulationSettings()
     if settings.min_views < 1:
@@ -90,7 +90,7 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
 
 def _detect(capture: Capture, detector: Detector, progress: Progress
             ) -> tuple[list[list[Detection]], dict[str, NDArray[np.bool_]]]:
-    """Return the detections of each view, and the `brightness_map` of each view by name."""
+    """Return the detections of each view, and by the view's name a small map, true where the frame is bright."""
     detections: list[list[Detection]] = []
     brightness_maps: dict[str, NDArray[np.bool_]] = {}
     progress.stage("look for lights", len(capture.views))
@@ -117,7 +117,7 @@ def track_moving_lights(capture: Capture, static_lights: Sequence[FoundLight], p
                         ) -> TrackFindings:
     """Follow the lights of a solved capture whose frames are consecutive; return those that move.
 
-    A light that keeps to the projections of one of `static_lights`, the lights with one place, is left out.
+    A light that keeps to the projections of one of `static_lights`, lights with one place in the world, is left out.
     """
     findings = track_lights(capture, progress)
     moving = [light for light in findings.lights if not _is_static(capture, light, static_lights)]
@@ -127,7 +127,7 @@ def track_moving_lights(capture: Capture, static_lights: Sequence[FoundLight], p
 
 
 def _is_static(capture: Capture, light: TrackedLight, static_lights: Sequence[FoundLight]) -> bool:
-    """True if a light that was followed keeps to the projections of a standing one."""
+    """Return whether a light that was followed keeps to the projections of one of the static lights."""
     views = [(view.name, view.camera) for view in capture.views if view.name in light.support]
     pixels = np.array([light.keys[name].xy for name, _ in views])
     for static_light in static_lights:
@@ -142,10 +142,10 @@ def _is_static(capture: Capture, light: TrackedLight, static_lights: Sequence[Fo
 
 def write_findings(capture: Capture, findings: Findings, keep: bool = False, tracked: TrackFindings | None = None
                    ) -> dict[str, Any]:
-    """Write lights.json, overlay sheets and a report into the capture; returns the report.
+    """Write lights.json, overlay sheets and a report into the capture; return the report.
 
-    keep: leave the entries of an existing lights.json as they are (see `file.py`). tracked: lights on paths.
-    lights/sheetN.png shows every view; lights/report.json lists support, residuals, and doubtful lights.
+    keep: leave the entries of an existing lights.json as they are. tracked: lights on paths. lights/sheetN.png shows
+    every view; lights/report.json lists support, residuals, and doubtful lights.
     """
     from .overlay import write_overlay_sheets
 
@@ -179,8 +179,8 @@ def write_findings(capture: Capture, findings: Findings, keep: bool = False, tra
 def write_tracks(capture: Capture, findings: TrackFindings, keep: bool = False) -> dict[str, Any]:
     """Write lights.json, sheets and a report of lights that were followed into the capture; return the report.
 
-    keep: leave the entries of an existing lights.json as they are (see `file.py`).
-    lights/sheetN.png shows every frame; lights/report.json lists evidence, doubtful frames, and doubtful lights.
+    keep: leave the entries of an existing lights.json as they are. lights/sheetN.png shows every frame;
+    lights/report.json lists evidence, doubtful frames, and doubtful lights.
     """
     from .track_sheet import write_track_sheets
 
@@ -209,7 +209,7 @@ def _round_finite(value: float) -> float | None:
 
 
 def _light_of_entry(entry: dict[str, Any], lights: Sequence[FoundLight]) -> FoundLight:
-    """Return the light of an entry; one made by hand has no support."""
+    """Return the found light at an entry's place; for an entry made by hand, a new one without support."""
     xyz = np.array(entry["xyz"], np.float64)
     for light in lights:
         if np.linalg.norm(light.xyz - xyz) <= 1e-4 * max(1.0, float(np.linalg.norm(xyz))):
@@ -220,8 +220,8 @@ def _light_of_entry(entry: dict[str, Any], lights: Sequence[FoundLight]) -> Foun
 def _lights_from_one_view(capture: Capture, detections: Sequence[Detection]) -> list[FoundLight]:
     """Place each detection of a single view at the median depth of the points around it in the picture.
 
-    Without a point within MAX_POINT_DISTANCE it is placed far away. The uncertainty is as large as the guessed
-    distance, and 0 where the light is far.
+    A detection without a point within MAX_POINT_DISTANCE is placed far away. The uncertainty of a light is as large as
+    its guessed distance, and 0 if it is far.
     """
     view = capture.views[0]
     pixels, depth = view.camera.project(capture.points.xyz)
@@ -254,9 +254,9 @@ def make_detector(method: str, threshold: float | None = None, boxes: str | Path
                   masks: str | Path | None = None) -> Detector:
     """Make the detector "exposure" or "grounded".
 
-    threshold: least score of a detection, 0..1; None for the method's own. boxes, masks: weights of "grounded", folders
-    or names on the hub; None for the usual ones.
-    Raises SettingsError for other names; EngineError where its weights or libraries are missing.
+    threshold: least score of a detection, 0..1; None for the method's default. boxes, masks: weights of "grounded",
+    folders or names on the hub; None for the defaults. Raises SettingsError for any other method or a threshold outside
+    0..1; EngineError if weights or libraries are missing.
     """
     if threshold is not None and not 0 <= threshold <= 1:
         raise SettingsError(f"The threshold is a score within 0 and 1, not {threshold:g}.")

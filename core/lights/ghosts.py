@@ -63,9 +63,8 @@ class Blob:
 def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
     """Find bright spots, strongest first, by difference of Gaussians over scales.
 
-    Their radii are near BLOB_RADII, their strength is above MIN_STRENGTH; MAX_BLOBS at most are returned. They are
-    found in the square root of linear light, and with `clean`, the clean frame, in the light that the frame has beyond
-    it.
+    Spots have radii near BLOB_RADII and a strength above MIN_STRENGTH; at most MAX_BLOBS are returned. The search is in
+    the square root of linear light; with `clean`, the clean frame, only in the light that the frame has beyond it.
     """
     import cv2
 
@@ -102,7 +101,8 @@ def locate_by_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequen
                      seed: int = 0, progress: Progress | None = None) -> list[FoundLight]:
     """Return at most one light that is out of frame, from the blobs of each view; none where too few views agree.
 
-    Raises Cancelled on a stop request.
+    The ratio of ghost to light is searched over GHOST_RATIOS, then refined. extent: size of the cameras' path, world
+    units. Raises Cancelled on a stop request.
     """
     progress = progress or Progress()
     best: FoundLight | None = None
@@ -114,30 +114,34 @@ def locate_by_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequen
             best, best_ratio = light, float(ratio)
     if best is None:
         return []
-    for step in (0.06, 0.03, 0.015):  # the ratio itself, finer
+    for step in (0.06, 0.03, 0.015):  # refine the ratio in steps of 6, 3 and 1.5 %
         for ratio in (best_ratio * (1 - step), best_ratio * (1 + step)):
             progress.check()
             light = _light_at_ratio(views, blobs, extent, ratio, seed)
             if light is not None and _rank(light, ratio) > _rank(best, best_ratio):
                 best, best_ratio = light, ratio
-    # The residual in pixels of the ghost: at the light it is 1 / ratio times as large.
+    # The residual is given in pixels at the ghost; at the light it is 1 / |ratio| times as large.
     return [replace(best, residual=best.residual * abs(best_ratio), how=f"from a ghost at {best_ratio:.2f} of the way")]
 
 
 def _rank(light: FoundLight, ratio: float) -> tuple[int, float]:
-    """Return the sort key of a light at a ratio: support first, then how well the blobs meet their predicted places, in
-    pixels of the ghost."""
+    """Return the sort key of a light at a ratio: its support, then the negative residual of the blobs, in pixels at the
+    ghost."""
     return len(light.support), -light.residual * abs(ratio)
 
 
 def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float, ratio: float,
                     seed: int) -> FoundLight | None:
-    """Return the light out of frame that most views' blobs claim if they are ghosts at this ratio, or None."""
+    """Return the light out of frame that the blobs of most views claim if they are ghosts at this ratio, or None.
+
+    Each blob claims a light at centre + (blob - centre) / ratio in its view; the claims are triangulated. extent: size
+    of the cameras' path, world units. seed: of the triangulation's random choices.
+    """
     claims = []
     for (_, camera), in_view in zip(views, blobs, strict=True):
         centre = np.array([camera.cx, camera.cy])
-        # The tolerance is half the radius (`Observations.of`): 1 % of the diagonal at the ghost, and 1 / ratio times as
-        # much at the light.
+        # Triangulation tolerates half a detection's radius: 1 % of the diagonal at the ghost, 1 / |ratio| times as much
+        # at the light.
         diagonal = float(np.hypot(*camera.size))
         claims.append([Detection(centre + (blob.xy - centre) / ratio, 0.02 * diagonal / abs(ratio), 1.0,
                                  np.ones(3), np.ones((1, 1), bool), (0, 0), False) for blob in in_view
@@ -147,7 +151,7 @@ def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequenc
                                      seed=seed)
     diagonal = float(np.hypot(*views[0][1].size))
     for light in triangulate_lights(views, claims, extent, settings):
-        # A light that many views would show themselves is not out of frame.
+        # A light that many views have well inside the frame is not out of frame.
         moved = np.ptp([detection.xy * ratio for _, detection in light.detections], axis=0).max()
         visible = sum(_is_well_inside(camera, light.xyz) for _, camera in views)
         if visible < MAX_VISIBLE_SHARE * len(views) and moved > MIN_MOTION * diagonal:
@@ -156,7 +160,7 @@ def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequenc
 
 
 def _is_well_inside(camera: Camera, xyz: NDArray[np.float64]) -> bool:
-    """True if a light is so far inside the frame that it would be visible itself."""
+    """Return whether a light is more than 5 % of the diagonal inside the frame, where it would itself be visible."""
     pixels, depth = camera.project(xyz[None])
     margin = 0.05 * float(np.hypot(*camera.size))
     return bool(depth[0] > 0 and (pixels[0] > margin).all() and (pixels[0] < np.array(camera.size) - margin).all())

@@ -31,13 +31,13 @@ MAX_OVERLAP = 0.5
 class GroundedDetector:
     """Detects lights by GroundingDINO and SAM 2.
 
-    boxes, masks: folders or hub names of the weights; threshold: GroundingDINO's, of the box. Raises EngineError where
+    boxes, masks: folders or hub names of the weights; threshold: least score of a box. Raises EngineError if
     transformers or weights are missing.
     """
 
     def __init__(self, threshold: float = 0.35, boxes: str | Path = BOX_WEIGHTS, masks: str | Path = MASK_WEIGHTS,
                  device: str = "auto") -> None:
-        """Load both networks. Raises EngineError where transformers is not installed."""
+        """Load both networks. Raises EngineError if transformers is not installed or weights are missing."""
         try:
             import torch
             from transformers import AutoModelForZeroShotObjectDetection, AutoProcessor, Sam2Model, logging
@@ -85,8 +85,8 @@ class GroundedDetector:
     def _predict_masks(self, image: NDArray[np.uint8], boxes: NDArray[np.float64]) -> list[Mask]:
         """Return SAM 2's mask (h, w) for each box.
 
-        Its input is the picture scaled to a square and normalised by ImageNet's statistics; transformers' processor
-        does the same, but needs torchvision.
+        The network's input is the picture, scaled to a square and normalised by ImageNet's statistics. The processor of
+        transformers does the same, but needs torchvision. boxes: (n, 4) left top right bottom.
         """
         import torch
         from torch.nn.functional import interpolate

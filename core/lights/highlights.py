@@ -40,14 +40,14 @@ class Highlights:
 def find_highlights(linear: NDArray[np.float32], threshold: float = 0.95, gain: float = 1.0) -> Highlights:
     """Return the highlights of a picture (height, width, 3), scene-linear.
 
-    threshold: luminance from which pixels count, 1 is white. gain: factor of the light.
+    threshold: luminance above which pixels count, 1 is white. gain: factor on the light.
     """
     height, width = linear.shape[:2]
     luminance = linear @ LUMINANCE.astype(np.float32)
     rows, columns = np.nonzero(np.isfinite(luminance) & (luminance > threshold))
     if not len(rows):
         return Highlights(np.zeros((0, 2)), np.zeros((0, 3)))
-    # The part above the threshold, so that no pixel appears at once.
+    # Weights rise smoothly above the threshold, so that no pixel appears suddenly.
     weights = _smoothstep((luminance[rows, columns].astype(np.float64) / threshold - 1) / SOFTNESS)
     colours = np.maximum(linear[rows, columns], 0).astype(np.float64) * weights[:, None]
     xy = np.stack([columns + 0.5, rows + 0.5], -1)
@@ -61,10 +61,11 @@ def find_highlights(linear: NDArray[np.float32], threshold: float = 0.95, gain: 
 
 
 def _share_among_nodes(xy: Floats, colours: Floats, width: int, height: int) -> tuple[Floats, Floats, Floats]:
-    """Share the light of pixels at `xy` (n, 2), with these colours (n, 3), among the nodes of the grid.
+    """Share the light of pixels at `xy` (n, 2), with these colours (n, 3), among a grid's nodes by a bilinear splat.
 
-    Returns for each node the light (nodes, 3), the sum of the pixels' places by strength (nodes, 2), and the strength
-    (nodes,), the sum of the light's channels. width, height: of the picture, pixels.
+    Returns for each node the light (nodes, 3), the sum of the pixels' places times their strength (nodes, 2), and the
+    sum of their strengths (nodes,). A strength is the sum of a light's channels. width, height: size of the picture,
+    pixels.
     """
     spacing = max(width, height) / (NODES - 1)
     # Nodes across and down, numbered by row.

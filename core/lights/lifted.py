@@ -36,8 +36,8 @@ def lift_to_gaussians(views: Sequence[tuple[str, Camera]], detections: Sequence[
                       ) -> list[FoundLight]:
     """Find lights from detections of each view and scene Gaussians: means (n, 3), opacities (n,) in 0..1.
 
-    At least `min_share` of the views that see a Gaussian, and `min_views`, must have it inside a detection. extent: of
-    the cameras' path (`Capture.extent`), world units.
+    At least `min_share` of the views that see a Gaussian, and at least `min_views` views, must have it inside a
+    detection. extent: size of the cameras' path, world units.
     """
     xyz, opacity = np.asarray(means, np.float64), np.asarray(opacities, np.float64)
     xyz, opacity = xyz[opacity > MIN_OPACITY], opacity[opacity > MIN_OPACITY]
@@ -64,9 +64,10 @@ def lift_to_gaussians(views: Sequence[tuple[str, Camera]], detections: Sequence[
 
 
 def _visible_points(camera: Camera, pixels: Floats, depth: Floats) -> NDArray[np.int64]:
-    """Return the indices of the points that are in frame and not hidden: near the front of their cell.
+    """Return the indices of the points that are in frame and not hidden.
 
-    pixels (n, 2), depth (n,): of the points.
+    A point is not hidden if it is near the nearest one in its cell of a coarse depth buffer. pixels (n, 2), depth (n,):
+    the points' projections and depths.
     """
     index = np.flatnonzero(camera.contains(pixels, depth))
     size = max(camera.size) / DEPTH_CELLS
@@ -78,8 +79,8 @@ def _visible_points(camera: Camera, pixels: Floats, depth: Floats) -> NDArray[np
 
 
 def _cluster(xyz: Floats, reach: float) -> list[NDArray[np.int64]]:
-    """Return the clusters of points (n, 3) that steps shorter than `reach` link, three points or more each, as arrays
-    of indices."""
+    """Return the clusters of points (n, 3) by single linkage, as arrays of indices: points nearer than `reach` share a
+    cluster, and clusters of fewer than three points are dropped."""
     remaining = np.ones(len(xyz), bool)
     clusters = []
     while remaining.any():
@@ -104,7 +105,7 @@ def _to_light(centre: Floats, spread: float, views: Sequence[tuple[str, Camera]]
               detections: Sequence[Sequence[Detection]]) -> FoundLight:
     """Return the light at a cluster's centroid, with the nearest detection of each view that shows it.
 
-    spread: standard distance of the cluster's Gaussians from the centroid, the light's uncertainty.
+    spread: root mean square distance of the cluster's Gaussians from the centroid, taken as the light's uncertainty.
     """
     residuals: list[float] = []
     matched: list[tuple[str, Detection]] = []

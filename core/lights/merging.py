@@ -20,9 +20,9 @@ MIN_RATIO_OFFSET = 0.05
 
 def merge_duplicates(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
                      extent: float) -> list[FoundLight]:
-    """Merge lights that most views show at one spot: the one with the most support stays and gets the others' views.
+    """Merge lights that most views show at one spot: the best supported stays and gets the support of the others.
 
-    Returns them by support, most first.
+    Returns the lights by support, most first. extent: size of the cameras' path, world units.
     """
     distinct: list[FoundLight] = []
     for light in _by_support(lights):
@@ -56,7 +56,8 @@ def _by_support(lights: Sequence[FoundLight]) -> list[FoundLight]:
 
 
 def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) -> bool:
-    """True if the detections of `light` are a ghost of `other`, see `remove_ghosts`. cameras: by the views' names."""
+    """Return whether `light` is a ghost of `other`: while its detections move over the frame, they keep to one ratio of
+    the way from the principal point to `other`. cameras: by the views' names."""
     ghosts, sources, tolerances = [], [], []
     for name, detection in light.detections:
         camera = cameras[name]
@@ -68,7 +69,7 @@ def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) 
             tolerances.append(GHOST_TOLERANCE * float(np.hypot(*camera.size)) + RADIUS_SHARE * detection.radius)
     if len(ghosts) < MIN_VIEWS:
         return False
-    # Offsets from the principal point; their ratio is a least squares fit.
+    # Both are offsets from the principal point; the ratio of ghost to source is fitted by least squares.
     ghost, source = np.array(ghosts), np.array(sources)
     ratio = float((ghost * source).sum() / (source * source).sum())
     distances = np.linalg.norm(ghost - ratio * source, axis=1) / tolerances
@@ -77,8 +78,9 @@ def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) 
 
 
 def _is_same_light(light: FoundLight, other: FoundLight, views: Sequence[tuple[str, Camera]], extent: float) -> bool:
-    """True if two lights fall on one spot: nearer than the sum of their radii in more than two thirds of the frames
-    that show either, or nearer in space than twice the sum of their uncertainties. Small tolerances are added to both.
+    """Return whether two lights are one: nearer to each other than the sum of their radii in more than two thirds of
+    the views that have either in frame, or nearer in space than twice the sum of their uncertainties. Small tolerances
+    are added to both distances. extent: size of the cameras' path, world units.
     """
     max_distance = 0.02 * extent + 2 * (light.uncertainty + other.uncertainty)
     if not light.far and not other.far and np.linalg.norm(light.xyz - other.xyz) < min(max_distance, 0.3 * extent):

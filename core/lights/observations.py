@@ -60,15 +60,15 @@ class Observations:
             detection=[detection for _, detection in flat])
 
     def project(self, places: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Project homogeneous places (n, 4) to pixels (n, v, 2) in every view; return also (n, v) whether they lie in
-        front."""
+        """Project homogeneous places (n, 4) to pixels (n, v, 2) in all v views; return also (n, v), whether each place
+        lies in front of the camera."""
         local = np.einsum("vij,nvj->nvi", self.rotation, places[:, None, :3] - places[:, None, 3:] * self.position)
         front = local[..., 2] > MIN_DEPTH
         depth = np.where(front, local[..., 2], 1.0)[..., None]
         return local[..., :2] / depth * self.focal + self.centre, front
 
     def is_inlier(self, places: Floats, index: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return (n,), whether each place (n, 4) projects within tolerance of the detection in its row of `index`."""
+        """Return (n,), whether place i of (n, 4) projects within tolerance of the detection index[i]."""
         view = self.view[index]
         local = np.einsum("nij,nj->ni", self.rotation[view], places[:, :3] - places[:, 3:] * self.position[view])
         front = local[:, 2] > MIN_DEPTH
@@ -76,9 +76,10 @@ class Observations:
         return np.asarray(front & (((pixel - self.pixel[index]) ** 2).sum(axis=1) < self.tolerance[index] ** 2))
 
     def inliers(self, place: Floats, remaining: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Return the remaining detections within tolerance of the place's (4,) projections, the nearest of each view.
+        """Return the indices of the detections within tolerance of a place's (4,) projections, at most the nearest of
+        each view.
 
-        remaining: (d,) which detections no light has claimed yet.
+        remaining: (d,), true for detections that no light has claimed yet; only these are returned.
         """
         pixels, front = self.project(place[None])
         distance = np.linalg.norm(pixels[0, self.view] - self.pixel, axis=1) / self.tolerance
@@ -92,7 +93,8 @@ class Observations:
     def scores(self, places: Floats, index: NDArray[np.int64]) -> Floats:
         """Return (n,), the score of each place (n, 4): the summed weights of the detections near its projections.
 
-        index: of the detections that count, ascending. Of each view the best one counts, the more the nearer it is.
+        index: the detections to consider, ascending. In each view only the best counts, with its weight times
+        1 - (distance / tolerance)².
         """
         pixels, front = self.project(places)
         view = self.view[index]

@@ -21,7 +21,7 @@ RING_COLOUR = (0.4, 1.0, 0.3)
 
 def write_overlay_sheets(folder: Path, capture: Capture, detections: Sequence[Sequence[Detection]],
                          lights: Sequence[tuple[str, FoundLight]]) -> list[Path]:
-    """Write sheet1.png, sheet2.png, ... of all views into `folder`; returns their paths.
+    """Write sheet1.png, sheet2.png, ... of all views into `folder`, in place of older ones; return their paths.
 
     A green ring is a detection; a cross with a name is a light's projection, thick where the view supports it. An arrow
     at the edge points to a light out of frame.
@@ -33,7 +33,7 @@ def write_overlay_sheets(folder: Path, capture: Capture, detections: Sequence[Se
 def write_sheets(folder: Path, count: int, draw_tile: Callable[[int], NDArray[np.float32]]) -> list[Path]:
     """Write sheet1.png, sheet2.png, ... of `count` tiles into `folder`, in place of older ones; return their paths.
 
-    draw_tile: draws the tile of a number, display values (height, TILE_WIDTH, 3); heights may differ.
+    draw_tile: returns the tile with a given number, display values (height, TILE_WIDTH, 3); heights may differ.
     """
     for old in folder.glob("sheet*.png"):
         remove_file(old)
@@ -53,8 +53,8 @@ def write_sheets(folder: Path, count: int, draw_tile: Callable[[int], NDArray[np
 
 def _draw_tile(capture: Capture, number: int, detections: Sequence[Detection],
                lights: Sequence[tuple[str, FoundLight]]) -> NDArray[np.float32]:
-    """Draw the frame of view `number` small, with its detections as rings and the lights as marks, or as arrows to
-    them."""
+    """Return a small picture of view `number`, with its detections as rings, and the lights as crosses in frame or as
+    arrows to them at the edge."""
     import cv2
 
     view = capture.views[number]
@@ -75,9 +75,9 @@ def _draw_tile(capture: Capture, number: int, detections: Sequence[Detection],
 
 def _draw_light(tile: NDArray[np.float32], place: NDArray[np.float64], name: str, colour: tuple[float, float, float],
                 thickness: int) -> None:
-    """Draw a light at `place` (2,), pixels of the tile, in place: a cross with its name, or at the edge an arrow to it.
+    """Draw a light into the tile: a cross with its name, or, if it lies outside, an arrow to it at the edge.
 
-    thickness: of the cross, pixels.
+    place: (2,), pixels of the tile. thickness: line width of the cross, pixels.
     """
     import cv2
 

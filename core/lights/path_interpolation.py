@@ -22,9 +22,10 @@ MIN_SIGNAL = 0.02
 
 
 def interpolate(frames: Floats, places: Floats, noise: float) -> dict[int, Floats]:
-    """Return the places (2,) in the frames between the first and the last measured one that have no measured place.
+    """Return, by frame, the places (2,) in all gaps between measured frames, on the path of least squared jerk.
 
-    frames: (n,) whole numbers, ascending. places: (n, 2), pixels. noise: standard deviation of places, pixels.
+    frames: (n,) the measured frames, whole numbers, ascending. places: (n, 2), pixels. noise: standard deviation of
+    measured places, pixels.
     """
     numbers = np.asarray(frames).astype(int)
     order = min(JERK_ORDER, len(numbers))
@@ -39,10 +40,11 @@ def interpolate(frames: Floats, places: Floats, noise: float) -> dict[int, Float
 
 
 def _smooth_path(frames: Floats, places: Floats, order: int, noise_variance: float, variance: float) -> Floats:
-    """Return the most likely path (last frame + 1, 2) through places (n, 2), measured in frames (n,), of which the
-    first is 0.
+    """Return the most likely path (last frame + 1, 2), one place for each frame from 0 on, through measured places.
 
-    variance: of the path's differences of this order, (pixels per frame^order)^2.
+    Both the errors of the places and the path's differences of this order are taken as normally distributed, so the
+    path solves one linear system. frames: (n,) whole numbers, the first is 0. places: (n, 2), pixels. noise_variance:
+    of the places, pixels². variance: of the differences, (pixels per frame^order)².
     """
     count = int(frames[-1]) + 1
     is_measured, measured = np.zeros(count), np.zeros((count, 2))
@@ -53,10 +55,10 @@ def _smooth_path(frames: Floats, places: Floats, order: int, noise_variance: flo
 
 
 def _variance_of_differences(frames: Floats, places: Floats, order: int, noise: float) -> float:
-    """Return the variance of the true path's differences of this order, from consecutive measured frames.
+    """Return the variance of the true path's differences of this order, estimated from consecutive measured frames.
 
-    Measured differences contain noise too, whose share is subtracted. Without consecutive frames the path follows the
-    measured places: the variance is that of the noise.
+    The variance that noise adds to measured differences is subtracted. Without order + 1 consecutive frames it is the
+    variance from noise alone. noise: standard deviation of the places, pixels.
     """
     coefficients = np.diff(np.eye(order + 1), order, axis=0)[0]
     noise_variance = float(np.square(coefficients).sum()) * noise ** 2

@@ -41,10 +41,10 @@ def parametrise(observations: Observations, place: Floats, inliers: NDArray[np.i
 
 def refine_until_stable(observations: Observations, place: Floats, remaining: NDArray[np.bool_],
                         extent: float) -> tuple[Floats, NDArray[np.int64], Floats]:
-    """Refine a place (4,) until its inliers no longer change.
+    """Refine a place (4,) and choose its inliers in turn, until they no longer change.
 
-    remaining: (d,) which detections may be inliers. extent: of the cameras' path, world units.
-    Returns the place, its inliers, and the covariance (3, 3) of direction (two angles) and inverse distance.
+    remaining: (d,), true for detections that may be inliers. extent: size of the cameras' path, world units. Returns
+    the place, the indices of its inliers, and the covariance (3, 3) of direction (two angles) and inverse distance.
     """
     inliers = observations.inliers(place, remaining)
     covariance = np.full((3, 3), np.inf)
@@ -63,8 +63,8 @@ def _refine(observations: Observations, place: Floats, inliers: NDArray[np.int64
             extent: float) -> tuple[Floats, Floats]:
     """Run Gauss-Newton with Huber weights; returns the place (4,) and its covariance (3, 3).
 
-    inliers: the detections (n,) to fit. extent: of the cameras' path, world units. The covariance is that of two angles
-    of the direction, radians, and the inverse distance.
+    inliers: indices (n,) of the detections to fit. extent: size of the cameras' path, world units. The covariance is
+    that of two angles of the direction, radians, and of the inverse distance.
     """
     origin, direction, inverse = parametrise(observations, place, inliers)
     # Standard deviation of each detection, pixels: a third of its tolerance, more for a low score.
@@ -77,12 +77,12 @@ def _refine(observations: Observations, place: Floats, inliers: NDArray[np.int64
         size = np.linalg.norm(residual, axis=1) / sigma
         weight = np.where(size < HUBER, 1.0, HUBER / np.maximum(size, 1e-9)) / sigma ** 2
         information = np.einsum("nij,nik,n->jk", jacobian, jacobian, weight)
-        # A weak pull towards infinity keeps the distance defined where the views hold none.
+        # A weak pull towards infinity keeps the distance defined where the views do not determine it.
         information[2, 2] += (PRIOR * extent) ** 2
         gradient = np.einsum("nij,ni,n->j", jacobian, residual, weight)
         gradient[2] += (PRIOR * extent) ** 2 * inverse
         step = np.linalg.solve(information + 1e-12 * np.trace(information) * np.eye(3), -gradient)
-        # The projection is far from linear in the inverse distance, so that a long step would miss.
+        # The projection is far from linear in the inverse distance, so its step is limited.
         step[2] = np.clip(step[2], -0.5 * abs(inverse) - 0.05 / extent, 0.5 * abs(inverse) + 0.05 / extent)
         direction = direction + basis @ step[:2]
         direction /= np.linalg.norm(direction)
@@ -91,7 +91,7 @@ def _refine(observations: Observations, place: Floats, inliers: NDArray[np.int64
         if np.abs(step * (1, 1, extent)).max() < 1e-9:
             break
     residual, _ = _residuals(observations, inliers, InverseDistance(origin, direction, inverse), basis)
-    # Scaled by the residuals, which are nearly zero for two or three detections whatever their errors.
+    # Scaled by the mean squared residual, at least 0.1: two or three detections always fit almost exactly.
     variance = max(float(np.mean((residual / sigma[:, None]) ** 2)), 0.1)
     covariance = np.linalg.inv(information) * variance
     return np.array([*(direction + inverse * origin), inverse]), covariance
@@ -99,9 +99,11 @@ def _refine(observations: Observations, place: Floats, inliers: NDArray[np.int64
 
 def _residuals(observations: Observations, inliers: NDArray[np.int64], place: InverseDistance,
                basis: Floats) -> tuple[Floats, Floats]:
-    """Return residuals (n, 2) in pixels, and their derivatives (n, 2, 3) by two angles and inverse distance.
+    """Return residuals (n, 2), projection minus detection in pixels, and their derivatives (n, 2, 3) by two angles and
+    the inverse distance.
 
-    basis: (3, 2), the axes of the angles, see `_tangent_basis`.
+    inliers: indices (n,) of the detections. basis: (3, 2), two unit vectors perpendicular to the place's direction,
+    along which the angles are measured.
     """
     view = observations.view[inliers]
     rotation, shift = observations.rotation[view], place.origin - observations.position[view]

@@ -58,7 +58,11 @@ class FlareView(NamedTuple):
 
 
 def flare_view(camera: Camera, frame: NDArray[np.float32], clean: NDArray[np.float32]) -> FlareView:
-    """Make a view from a frame and its clean frame, display values 0..1, (height, width, 3) of the camera's size."""
+    """Return the view of a flare: the light that a frame has beyond its clean frame.
+
+    A clipped light disc, which hides its flare, is given DISC_GAIN times the flare around it; clipped sky counts as not
+    observed. frame, clean: display values 0..1, (height, width, 3), of the camera's size.
+    """
     import cv2
 
     added = (linear_from_srgb(frame) - linear_from_srgb(clean)).clip(min=0).mean(-1)
@@ -91,8 +95,10 @@ def _components_with(mask: NDArray[np.bool_], seeds: NDArray[np.bool_]) -> NDArr
 
 
 def snap_lights(views: Sequence[FlareView], lights: ArrayLike) -> Floats:
-    """Return the positions of the lights (n, 3), world coordinates, on their flares; unchanged where there is no clear
-    peak."""
+    """Return the lights' positions (n, 3), world coordinates, moved to their flares by mean shift.
+
+    Lights that are on a peak already, that find no clear peak or that stand in clipped sky are unchanged.
+    """
     initial = np.array(lights, np.float64).reshape(-1, 3)
     positions, is_done = initial.copy(), _are_on_peaks(views, initial) | _are_in_clipped_sky(views, initial)
     for widest in reversed(range(len(WINDOWS) - 2)):  # from the narrowest three windows alone to all
@@ -107,9 +113,9 @@ def snap_lights(views: Sequence[FlareView], lights: ArrayLike) -> Floats:
 
 def _mean_shift(views: Sequence[FlareView], positions: Floats, free: NDArray[np.bool_],
                 windows: Sequence[float]) -> Floats:
-    """Return positions (n, 3) after mean shift of the lights that are `free` (n,).
+    """Return positions (n, 3) after mean shift of the lights that are `free` (n,), under one window after another.
 
-    The others stay, and keep their share of the pixels.
+    The other lights stay, and keep their share of the pixels. windows: standard deviations in frame widths.
     """
     positions = positions.copy()
     for window in windows:
@@ -128,7 +134,11 @@ def _mean_shift(views: Sequence[FlareView], positions: Floats, free: NDArray[np.
 
 
 def _are_on_peaks(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
-    """Return (n,), which lights sit on a peak of brightness."""
+    """Return (n,), True for each light on a peak of brightness.
+
+    On a peak the light in PEAK_WINDOW is MIN_PEAK_RATIO times as bright as in one twice as wide, and the mean shift is
+    small.
+    """
     fine, wide = (_observe(views, positions, window) for window in (PEAK_WINDOW, 2 * PEAK_WINDOW))
     on_peak = np.zeros(len(positions), bool)
     for light, (fine_observations, wide_observations) in enumerate(zip(fine, wide, strict=True)):
@@ -142,8 +152,10 @@ def _are_on_peaks(views: Sequence[FlareView], positions: Floats) -> NDArray[np.b
 
 
 def _are_in_clipped_sky(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
-    """Return (n,), True for each light that lies in clipped sky in most of its views: those that have it in the frame,
-    and a flare of at least MIN_FLARE of the mean over all views."""
+    """Return (n,), True for each light that lies in clipped sky in more than MAX_HIDDEN_SHARE of its views.
+
+    Its views are those with the light in frame and a flare of at least MIN_FLARE of the mean over all views.
+    """
     in_sky = np.zeros(len(positions), bool)
     levels = [float(view.flare.mean()) for view in views]
     flaring = [view for view, level in zip(views, levels, strict=True) if level >= MIN_FLARE * np.mean(levels)]
@@ -171,7 +183,10 @@ class _Observation(NamedTuple):
 
 
 def _least_squares_step(observations: Sequence[_Observation]) -> Floats:
-    """Return the step (3,), world units, that best fits the views' mean shifts; dim views have less weight."""
+    """Return the step (3,), world units, whose projections fit the views' mean shifts by damped least squares.
+
+    Views that are dimmer than the upper quartile have less weight.
+    """
     brightness = np.array([observation.brightness for observation in observations])
     weights = np.minimum(brightness / np.quantile(brightness, 0.75), 1)
     jacobians = np.stack([observation.jacobian for observation in observations])
@@ -182,9 +197,10 @@ def _least_squares_step(observations: Sequence[_Observation]) -> Floats:
 
 
 def _observe(views: Sequence[FlareView], positions: Floats, window: float) -> list[list[_Observation]]:
-    """Observe each light in the views that show flare under its window.
+    """Return the observations of each light, one for each view that has flare under the light's Gaussian window.
 
-    window: standard deviation in frame widths. Returns the observations by light.
+    Where windows overlap, lights share a pixel in proportion to their windows. window: standard deviation in frame
+    widths.
     """
     by_light: list[list[_Observation]] = [[] for _ in positions]
     for camera, flare, observed in views:
@@ -205,7 +221,7 @@ def _observe(views: Sequence[FlareView], positions: Floats, window: float) -> li
             window_sum, weight_sum = support.sum(), weights.sum()
             if weight_sum <= 1e-12 * max(window_sum, 1e-12):
                 continue
-            # Relative to the window's mean, which the frame's edge and the other lights' windows displace.
+            # Centroid of the light less that of the window, which the frame's edge and the other lights displace.
             shift = [(weights.sum(axis) @ coordinates) / weight_sum - (support.sum(axis) @ coordinates) / window_sum
                      for axis, coordinates in ((0, across), (1, down))]
             by_light[light].append(_Observation(float(weight_sum) / (2 * np.pi * deviation**2), np.array(shift),
@@ -214,7 +230,7 @@ def _observe(views: Sequence[FlareView], positions: Floats, window: float) -> li
 
 
 def _are_merged(views: Sequence[FlareView], positions: Floats) -> NDArray[np.bool_]:
-    """Return (n,), which lights coincide with another in most views."""
+    """Return (n,), True for each light that lies nearer than PEAK_WINDOW to another one in most views."""
     coincident_views = np.zeros((len(positions), len(positions)))
     for camera, _, _ in views:
         pixels, _ = camera.project(positions)
@@ -224,9 +240,9 @@ def _are_merged(views: Sequence[FlareView], positions: Floats) -> NDArray[np.boo
 
 
 def _are_in_reach(views: Sequence[FlareView], initial: Floats, positions: Floats) -> NDArray[np.bool_]:
-    """Return (n,), which positions are within MAX_OFFSET of the initial ones in the median view.
+    """Return (n,), True for each position within MAX_OFFSET of the initial one in the median view.
 
-    Farther ones are ghosts of a light out of frame.
+    A position farther away would be that of a ghost of a light out of frame.
     """
     in_reach = np.zeros(len(initial), bool)
     projections = [(camera.width, *camera.project(initial), *camera.project(positions)) for camera, _, _ in views]

@@ -79,7 +79,7 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
     clipped = (value >= clipped_from).astype(np.uint8)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(clipped, connectivity=8)
     min_area = max(3.0, np.pi * (MIN_RADIUS * diagonal) ** 2)
-    # Scores expect clipped pixels near 1, also in a shot that never reaches white.
+    # Scores expect clipped pixels near 1, so a shot that never reaches white is scaled.
     scaled = display if clipped_from >= CLIPPED else np.minimum(display / np.float32(clipped_from), 1)
     sources = []
     for label in range(1, count):
@@ -99,9 +99,10 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
 
 
 def _thick_parts(region: Mask, max_area: float) -> Iterator[tuple[Mask, tuple[int, int]]]:
-    """Yield the thick parts of a spot, without spikes, with their corners (x, y) in it.
+    """Yield the thick parts of a spot, without spikes: each as the mask within its box, and the box's corner (x, y).
 
-    region: mask (h, w) of the spot. Nothing is yielded where a disc with an area of more than `max_area` px² fits in.
+    Parts are separated by morphological opening. region: mask (h, w) of the spot. Nothing is yielded if a disc of more
+    than `max_area` px² fits in.
     """
     import cv2
 
@@ -112,7 +113,7 @@ def _thick_parts(region: Mask, max_area: float) -> Iterator[tuple[Mask, tuple[in
     thickest = float(thickness.max())
     if np.pi * thickest ** 2 > max_area:
         return
-    # A small disc separates the parts; spikes are removed by a larger one, of each part by its own thickness.
+    # Opening by a small disc separates the parts; then a larger disc, by each part's thickness, removes its spikes.
     count, labels = cv2.connectedComponents(_open(padded, MIN_THICKNESS * thickest), connectivity=4)
     if count <= 2:  # one part: label 0 is the background
         yield _largest_part(_open(padded, OPENING_RATIO * thickest))
@@ -161,10 +162,10 @@ def _with_flux_centroid(detection: Detection, linear: NDArray[np.float32]) -> De
 def _softness(mask: Mask, corner: tuple[int, int], luminance: NDArray[np.float32], scale: float) -> float:
     """Return how softly a spot ends: the light in the ring NEAR outside its edge minus that in the ring FAR.
 
-    It is relative to the same difference for the spot itself, which is at 1: 1 for a glow as bright as the spot, about
-    0 for a hard edge. It is measured in SECTORS of the ring, of which the quantile SIDE_QUANTILE counts; 0 where none
-    can be measured. mask: the spot within its box. corner: (x, y) of the box. luminance: (height, width), clipped at 1.
-    scale: pixels of this frame to one of a frame with a diagonal of REFERENCE.
+    This difference is divided by that of the spot itself, whose light is 1, from the ring FAR: 1 for a glow as bright
+    as the spot, about 0 for a hard edge. It is measured in each sector, and the quantile SIDE_QUANTILE over the sectors
+    is returned; 0 if none can be measured. mask: the spot within its box. corner: (x, y) of the box in the frame.
+    luminance: (height, width), clipped at 1. scale: the frame's diagonal over REFERENCE.
     """
     import cv2
 

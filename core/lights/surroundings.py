@@ -33,7 +33,7 @@ bright share of the frames by so much: in over-exposed frames, every direction i
 
 
 def brightness_map(picture: Picture) -> NDArray[np.bool_]:
-    """Return a small map (height, width), true where a picture is bright."""
+    """Return a small map (height, width), at most MAP_WIDTH wide, true where at least half the picture is clipped."""
     width = min(MAP_WIDTH, picture.size[0])
     height = max(round(picture.size[1] * width / picture.size[0]), 1)
     bright = (picture.display().max(axis=2, keepdims=True) >= CLIPPED).astype(np.float32)
@@ -46,8 +46,8 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
     """Return the share, 0..1, of the tests in which the far surrounding is bright where a light was detected.
 
     A test looks from another view in the direction of a detection, as if its light came from far away. cameras, maps:
-    of each view, by name. None if too few views decide: the light itself is far, or nearly in the same
-    direction from all.
+    camera and brightness map of each view, by name. None if fewer than MIN_TESTS tests decide, because the light itself
+    is far or nearly in the same direction from all views.
     """
     if light.far:
         return None
@@ -63,7 +63,7 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
             place, depth = camera.project(light.xyz[None])
             clearance = max(SEPARATION * light.radius * camera.width / cameras[name].width,
                             MIN_SEPARATION * camera.width)
-            # Both fall on one spot, so that a bright one does not tell a lamp from a far surrounding.
+            # The light and the direction fall on one spot here, so the test could not tell a lamp from the surrounding.
             if depth[0] > 0 and np.linalg.norm(place[0] - pixel) < clearance:
                 continue
             height, width = maps[other_name].shape
@@ -74,7 +74,10 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
 
 def split_gaps(lights: Sequence[FoundLight], cameras: Mapping[str, Camera],
                maps: Mapping[str, NDArray[np.bool_]]) -> tuple[list[FoundLight], list[FoundLight]]:
-    """Return the lamps among lights, and the gaps, which a bright far surrounding explains."""
+    """Return the lamps among the lights, and the gaps, whose light comes from a bright far surrounding.
+
+    cameras, maps: camera and brightness map of each view, by name.
+    """
     threshold = max(MIN_EXPLAINED, MIN_EXCESS + float(np.mean([bright.mean() for bright in maps.values()])))
     lamps: list[FoundLight] = []
     gaps: list[FoundLight] = []

@@ -31,7 +31,10 @@ def write_track_sheets(folder: Path, capture: Capture, sources: Sequence[Sequenc
 
 def _draw_tile(capture: Capture, index: int, sources: Sequence[Source], states: Sequence[Sequence[LightState]]
                ) -> NDArray[np.float32]:
-    """Draw the frame of view `index` small, with its sources and the lights. states: of each light, by view."""
+    """Return a small picture of view `index` with its sources, the lights, and the lights' paths.
+
+    states: the state of each light in each view, by view, then by light.
+    """
     import cv2
 
     view = capture.views[index]
@@ -54,9 +57,10 @@ def _draw_tile(capture: Capture, index: int, sources: Sequence[Source], states: 
 
 def _draw_light(tile: NDArray[np.float32], state: LightState, path: Sequence[tuple[int, int]],
                 colour: tuple[float, float, float], scale: float, margin: int) -> None:
-    """Draw a light on a tile, in place: its path, pixels of the tile, and a cross or dashed circle at its place.
+    """Draw a light into the tile: its path, and a cross at its place, or a dashed circle if the place is doubtful.
 
-    scale: size of the tile's frame relative to the frame. margin: border round it, pixels.
+    path: pixels of the tile. scale: pixels of the tile to one of the frame. margin: border round the frame on the tile,
+    pixels.
     """
     import cv2
 
@@ -76,6 +80,6 @@ def _draw_light(tile: NDArray[np.float32], state: LightState, path: Sequence[tup
 
 
 def _on_tile(place: NDArray[np.float64], scale: float, margin: int) -> tuple[int, int]:
-    """Return a place in pixels of the frame as one in pixels of the tile, within reach of drawing."""
+    """Return the pixel of the tile for a place (2,) in the frame, clipped to a range that cv2 can draw."""
     x, y = np.clip(place * scale + margin, -4 * TILE_WIDTH, 4 * TILE_WIDTH)
     return int(x), int(y)

@@ -158,10 +158,10 @@ def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], 
 
 
 def _is_ghost(chain: Chain, others: Sequence[Chain], centre: Floats, diagonal: float) -> bool:
-    """True if a chain is a ghost of a chain among `others`: of larger spots, which move.
+    """Return whether a chain is a ghost of one of `others` with larger spots, which move.
 
     A ghost keeps to one ratio of the way from the principal point to its light. centre: principal point (2,), pixels.
-    diagonal: of the frame, pixels.
+    diagonal: length of the frame's diagonal, pixels.
     """
     for light in others:
         shared = sorted(set(chain.frames) & set(light.frames))
@@ -187,7 +187,10 @@ def _is_ghost(chain: Chain, others: Sequence[Chain], centre: Floats, diagonal: f
 
 
 def _to_light(chain: Chain, capture: Capture, diagonal: float, motion: BackgroundMotion) -> TrackedLight:
-    """Return the light of a chain with its keys in all frames that its path reaches."""
+    """Return the light of a chain with its keys in all frames that its path reaches.
+
+    diagonal: length of the frame's diagonal, pixels. motion: carries a static light to frames that do not show it.
+    """
     size = np.array(capture.views[0].camera.size, np.float64)
     frames, places, errors = _fill_path(chain, len(capture.views), size, diagonal, motion)
     source_by_frame = dict(zip(chain.frames, chain.sources, strict=True))
@@ -217,8 +220,8 @@ def _to_light(chain: Chain, capture: Capture, diagonal: float, motion: Backgroun
 def _known_brightness(fitted: float, source: Source | None, confidence: float, is_inside: bool) -> float | None:
     """Return the brightness of a light in a frame; None where it is not known.
 
-    fitted: by `fit_brightness`. source: of the light in the frame, None if it was not detected. confidence: of its
-    place. is_inside: True if the place is in the frame.
+    fitted: brightness from the light's profile, NaN if unknown. source: the light's source in the frame, None if it was
+    not detected. confidence: of the light's place, 0..1. is_inside: True if the place is in the frame.
     """
     brightness = None if np.isnan(fitted) else float(fitted) if fitted >= DARK else 0.0
     if source is not None:
@@ -242,7 +245,8 @@ def recover_sources(chains: Sequence[Chain], sources: Sequence[Sequence[Source]]
                     ) -> None:
     """Add to chains of lamps, in place, the unused sources that lie on their paths, such as half hidden lamps.
 
-    sources: of each frame of the shot. size (2,), diagonal: of the frames, pixels.
+    The source nearest to a chain's path is added first. sources: those of each frame of the shot. size (2,), diagonal:
+    size of the frames and length of their diagonal, pixels.
     """
     lamps = [chain for chain in chains if chain.evidence >= MIN_EVIDENCE and len(chain.frames) >= MIN_FRAMES]
     used_ids = {id(source) for chain in lamps for source in chain.sources}
@@ -275,9 +279,9 @@ def _fill_path(chain: Chain, count: int, size: Floats, diagonal: float,
                motion: BackgroundMotion | None = None) -> tuple[list[int], Floats, Floats]:
     """Return the frames of a chain's path, places (n, 2) and expected errors (n,) in pixels.
 
-    count: number of frames of the shot. size (2,), diagonal: of the frames, pixels. motion: carries a static light to
-    frames that do not show it; None follows its own motion alone. Sources that the frame's edge cuts count as missing
-    where their path is known.
+    count: number of frames of the shot. size (2,), diagonal: size of the frames and length of their diagonal, pixels.
+    motion: carries a static light to frames that do not show it; None uses the chain's own motion alone. Sources that
+    the frame's edge cuts count as missing if at least two others are left.
     """
     uncut = _without_cut(chain)
     acceleration = chain.acceleration(diagonal)
@@ -329,9 +333,9 @@ def _without_cut(chain: Chain) -> Chain:
 def _velocity_at_end(frames: Floats, places: Floats, end: int) -> Floats:
     """Return the velocity (2,), pixels per frame, at the first or last measured place.
 
-    frames: (n,) numbers of the measured frames. places: (n, 2), pixels. end: 0 for the first, -1 for the last. It is
-    that of the parabola through the three places nearest to the end. Where they span more than MAX_PARABOLA_SPAN, it is
-    that of the straight line through the nearest two.
+    The velocity is that of the parabola through the three places nearest to the end, or, if they span more than
+    MAX_PARABOLA_SPAN frames, of the line through the nearest two; 0 for a single place. frames: (n,) numbers of the
+    measured frames. places: (n, 2), pixels. end: 0 for the first place, -1 for the last.
     """
     nearest = slice(None, 3) if end == 0 else slice(-3, None)
     if np.ptp(frames[nearest]) > MAX_PARABOLA_SPAN:
@@ -346,8 +350,8 @@ def _velocity_at_end(frames: Floats, places: Floats, end: int) -> Floats:
 def _expected_error(chain: Chain, index: int, acceleration: float) -> float:
     """Return the expected error, pixels, of the measured place `index` of a chain.
 
-    It is PLACE_ERROR, plus how much farther the place is from the straight line between its neighbours than
-    acceleration can bend a path. Without neighbours within MAX_OUTLIER_SPAN it is PLACE_ERROR.
+    PLACE_ERROR, plus how much farther the place is from the straight line between its neighbours than this acceleration
+    (pixels per frame²) can bend a path. Without neighbours within MAX_OUTLIER_SPAN frames it is PLACE_ERROR.
     """
     frames, places = chain.frames, chain.places
     if not 0 < index < len(frames) - 1 or frames[index + 1] - frames[index - 1] > MAX_OUTLIER_SPAN:
@@ -361,10 +365,12 @@ def _expected_error(chain: Chain, index: int, acceleration: float) -> float:
 def fit_brightness(profiles: Floats, is_detected: NDArray[np.bool_]) -> Floats:
     """Return the brightness (n,) of a light from its profiles (n, rings): 0..1, NaN where no ring is usable.
 
+    Alternating least squares fit brightness times one common profile plus a background to the profiles.
+
     is_detected: (n,) frames in which the light was detected; only they shape the common profile, and the 90th
-    percentile of their brightness is 1. The background is the median of the outer rings. Where the glow hardly stands
-    out of it, the brightness is drawn to the median of the frames with a detection, or to 0 in a frame without one. If
-    no frame with a detection has a usable ring, the brightness is 1 wherever a ring is usable.
+    percentile of their brightness is 1. The background is the median of the outer rings. Where the glow hardly exceeds
+    the background, the brightness is drawn to the median of the frames with a detection, or to 0 in a frame without
+    one. If no frame with a detection has a usable ring, the brightness is 1 wherever a ring is usable.
     """
     outer = profiles[:, -BACKGROUND_RINGS:]
     has_background = np.isfinite(outer).any(axis=1)

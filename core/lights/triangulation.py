@@ -59,7 +59,8 @@ def triangulate_lights(views: Sequence[tuple[str, Camera]], detections: Sequence
                        settings: TriangulationSettings | None = None) -> list[FoundLight]:
     """Find lights from the detections of each view, best supported first.
 
-    `extent` is the size of the cameras' path (`Capture.extent`), the unit in which a light counts as far.
+    The best candidate place is refined and its detections are removed, until no place has enough views; then duplicates
+    and ghosts are removed. extent: size of the cameras' path, world units.
     """
     settings = settings or TriangulationSettings()
     observations = Observations.of(views, detections, settings.tolerance)
@@ -73,9 +74,9 @@ def triangulate_lights(views: Sequence[tuple[str, Camera]], detections: Sequence
             break
         place, inliers, covariance = refine_until_stable(observations, place, remaining, extent)
         if len(np.unique(observations.view[inliers])) < settings.min_views:
-            # Rejected candidates have taken detections since the list was made: then a new list may have better places.
+            # If rejected candidates have removed detections since the list was made, a new list may have better places.
             if not candidates.rejected:
-                # Removed from the candidates, or the search would find it again without end.
+                # The place's detections are removed, or the search would find it again without end.
                 remaining[observations.inliers(place, remaining)] = False
                 failures += 1
             candidates = Candidates(observations, remaining, rng, settings.max_candidates)
@@ -96,7 +97,8 @@ def _to_light(observations: Observations, place: Floats, inliers: NDArray[np.int
               allow_out_of_frame: bool) -> FoundLight:
     """Return a refined place (4,) with its covariance (3, 3) and inliers as a light.
 
-    The covariance is that of `refine_until_stable`. allow_out_of_frame: count all views with the place in front.
+    covariance: of two angles of the direction, radians, and the inverse distance. extent: size of the cameras' path,
+    world units. allow_out_of_frame: count all views with the place in front of the camera as showing it.
     """
     view = observations.view[inliers]
     origin, direction, inverse = parametrise(observations, place, inliers)
@@ -125,10 +127,10 @@ def _to_light(observations: Observations, place: Floats, inliers: NDArray[np.int
 
 
 def _nfa(observations: Observations, support: int, visible: int) -> float:
-    """Return the number of false alarms: how many places chance would give that `support` of `visible` views agree on.
+    """Return the number of false alarms: how many places with `support` of `visible` views chance is expected to give.
 
     Every pair of detections claims a place, on which its two views agree by construction. Each other view has a
-    detection within tolerance of it with a small probability: the part of its frame that the tolerances of its
+    detection within tolerance of the place with a small probability: the part of its frame that the tolerances of its
     detections cover, here the mean over the views.
     """
     area = observations.size.prod(axis=1)

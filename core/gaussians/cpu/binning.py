@@ -118,10 +118,10 @@ def _pixel_rows(y, low, high, height):
 @inlined
 def _ellipse_rows(half_x, root_squared, root_falloff, shear, x):
     """Return the smallest and largest y, from the centre, of the ellipse at the horizontal offset x, which is clamped
-    to its extent.
+    to ± half_x.
 
-    They are shear x ± sqrt(root_squared - root_falloff x²): root_squared = t / C, root_falloff = A D / C²,
-    shear = -A k / C, see the module head."""
+    y = shear x ± sqrt(root_squared - root_falloff x²) with root_squared = t / C, root_falloff = A D / C² and
+    shear = -A k / C; the module head explains t, A, C, D, k."""
     x = _min(_max(x, -half_x), half_x)
     root, centre_y = math.sqrt(_max(root_squared - root_falloff * x * x, ZERO)), shear * x
     return centre_y - root, centre_y + root
@@ -129,15 +129,14 @@ def _ellipse_rows(half_x, root_squared, root_falloff, shear, x):
 
 @inlined
 def small_footprints(x, y, half_x, half_y, major, k, minor, reach, is_visible, width, height):
-    """Return the tiles that 16 Gaussians cover, from the fields of their records, as vectors; width, height: of the
-    picture.
+    """Return the tiles that 16 Gaussians cover, as two integer vectors: first tile, and packed pixel rows.
 
-    For Gaussians with at most two columns and rows of tiles: the first tile (-1 for all others), and the first and end
-    pixel row in each column, counted from the first tile's top row. The left column takes the lowest COLUMN_BITS; each
-    column has FIRST_BITS and END_BITS, 0 if it is not covered.
+    Only for visible Gaussians with at most two columns and two rows of tiles; all others get tile -1 and rows 0.
+    Packed rows: the left column's in the lowest COLUMN_BITS, the right column's above. A column's first pixel row has
+    FIRST_BITS, its end row END_BITS, both counted from the first tile's top row; all 0 if it is not covered.
 
     x, y, half_x, half_y: centre and half size, px; major, k, minor, reach: A, k, D and t of the module head;
-    is_visible: false for Gaussians that are not drawn."""
+    is_visible: false for Gaussians that are not drawn; width, height: size of the picture, px."""
     padded_half_x = half_x + ROW_MARGIN
     tile_column = to_ints(maximum(x - padded_half_x, ZERO)) >> TILE_SHIFT_X
     extra_columns = (to_ints(minimum(x + padded_half_x, splat(np.float32(width - 1)))) >> TILE_SHIFT_X) - tile_column
@@ -168,7 +167,7 @@ def small_footprints(x, y, half_x, half_y, major, k, minor, reach, is_visible, w
 
 @inlined
 def _pixel_row_vectors(y, low, high, height):
-    """Return the same as `_pixel_rows`, of vectors."""
+    """Return the result of `_pixel_rows` for vectors of 16 Gaussians."""
     top = maximum(y + low - (HALF + ROW_MARGIN), ZERO)
     bottom = minimum(y + high - (HALF - ROW_MARGIN), splat(np.float32(height - 1)))
     first = to_ints(top)
@@ -177,7 +176,7 @@ def _pixel_row_vectors(y, low, high, height):
 
 @inlined
 def _ellipse_row_vectors(half_x, root_squared, root_falloff, shear, x):
-    """Return the same as `_ellipse_rows`, of vectors."""
+    """Return the result of `_ellipse_rows` for vectors of 16 Gaussians."""
     x = minimum(maximum(x, -half_x), half_x)
     root, centre_y = sqrt(maximum(fma(-root_falloff * x, x, root_squared), ZERO)), shear * x
     return centre_y - root, centre_y + root
@@ -185,7 +184,7 @@ def _ellipse_row_vectors(half_x, root_squared, root_falloff, shear, x):
 
 @inlined
 def _pack_rows(y, half_y, low, high, height, origin_row):
-    """Pack the first and end pixel row of y + low .. y + high, clamped to the ellipse's own rows; 0 if none.
+    """Pack the first and end pixel row of y + low .. y + high, clamped to the ellipse's own rows; 0 if there are none.
 
     origin_row: the pixel row that is counted as 0."""
     first, last = _pixel_row_vectors(y, maximum(low, -half_y), minimum(high, half_y), height)
@@ -194,12 +193,12 @@ def _pack_rows(y, half_y, low, high, height, origin_row):
 
 @inlined
 def _list_two_tiles(tile, first_row, end_row, tiles_x, i, slot_offset, tile_list, place, tile_counts):
-    """List a tile and the one below for Gaussian i, which covers pixel rows first_row .. end_row - 1, counted from the
-    upper tile's first row.
+    """Append a tile and the tile below it to tile_list, each if Gaussian i covers it.
 
-    place: next free place of the list, which is returned; slot_offset: slot of an entry minus its place; tile_counts:
-    entries by tile, which are increased. Both entries are always written, without a branch; the next entry overwrites
-    one that is not counted."""
+    first_row, end_row: the pixel rows that the Gaussian covers, first and after the last, from the upper tile's top;
+    tiles_x: tiles in a row of the picture; slot_offset: slot of an entry minus its place; place: next free place of
+    tile_list, of which the new value is returned; tile_counts: entries by tile, which are increased. Both entries are
+    always written, without a branch; one that is not counted is overwritten by the next."""
     has_upper = np.int64(first_row < end_row) & np.int64(first_row < TILE_HEIGHT)
     has_lower = np.int64(end_row > TILE_HEIGHT)
     tile_list[place * LIST_ENTRY], tile_list[place * LIST_ENTRY + LIST_SLOT] = i, place + slot_offset
@@ -218,10 +217,10 @@ def _list_two_tiles(tile, first_row, end_row, tiles_x, i, slot_offset, tile_list
 
 @inlined
 def _list_column(column, top_row, bottom_row, tiles_x, i, slot_offset, tile_list, place, tile_counts):
-    """List the tiles of a column that cover pixel rows top_row .. bottom_row for Gaussian i.
+    """Append the tiles of a tile column that contain pixel rows top_row .. bottom_row to tile_list, for Gaussian i.
 
-    place: next free place of the list, which is returned; slot_offset: slot of an entry minus its place; tile_counts:
-    entries by tile, which are increased."""
+    tiles_x: tiles in a row of the picture; slot_offset: slot of an entry minus its place; place: next free place of
+    tile_list, of which the new value is returned; tile_counts: entries by tile, which are increased."""
     tile_row, opaque_one = top_row >> TILE_SHIFT_Y, opaque(1)
     while tile_row << TILE_SHIFT_Y <= bottom_row:
         tile_top = tile_row << TILE_SHIFT_Y
@@ -239,10 +238,11 @@ def _list_column(column, top_row, bottom_row, tiles_x, i, slot_offset, tile_list
 
 @inlined
 def _list_gaussian(records, i, width, height, tiles_x, slot_offset, tile_list, place, tile_counts):
-    """List the tiles of a Gaussian i of any size from `place` on; return the next free place.
+    """Append the tiles of Gaussian i, of any size, to tile_list from `place` on; return the next free place.
 
-    width, height: of the picture; tiles_x: tiles in a row of them; slot_offset, tile_list, tile_counts: see
-    `_list_column`."""
+    In each column of tiles, those between the ellipse's smallest and largest y (see the module head). width, height:
+    size of the picture, px; tiles_x: tiles in a row of it; slot_offset: slot of an entry minus its place; tile_counts:
+    entries by tile, which are increased."""
     record = i * RECORD
     x, half_x = load_scalar(records, record + X), load_scalar(records, record + HALF_X)
     padded_half_x = half_x + ROW_MARGIN
@@ -274,7 +274,7 @@ def _list_gaussian(records, i, width, height, tiles_x, slot_offset, tile_list, p
 
 @inlined
 def exclusive_sum(values, start, end, sums):
-    """Write the exclusive prefix sums of values[start:end] to sums[start:end]; return the sum of all."""
+    """Write the exclusive prefix sums of values[start:end] to sums[start:end]; return the sum of values[start:end]."""
     total = 0
     for i in range(start, end):
         sums[i] = total
@@ -284,12 +284,14 @@ def exclusive_sum(values, start, end, sums):
 
 @kernel
 def plan_parts(keys, max_tiles, chunk_max_tiles, stride, histogram, chunk_starts, cuts):
-    """Write the inputs of `list_sorted`: first slots of the chunks, and the cuts between parts of equal work; return
+    """Write the inputs of `list_sorted`: each chunk's first slot, and the cuts between parts of equal work; return
     the number of slots.
 
-    max_tiles (n,): of each Gaussian; chunk_max_tiles (chunks,): their sums, of which chunk_starts are the exclusive
-    sums. cuts (parts + 1,): keys; the work between them is estimated from every stride-th Gaussian. histogram
-    (HISTOGRAM_BINS,): workspace."""
+    keys, max_tiles (n,): key of each Gaussian, and upper bound on its number of tiles
+    chunk_max_tiles (chunks,): sums of max_tiles by chunk
+    chunk_starts (chunks,): result: first slot of each chunk, the exclusive prefix sums of chunk_max_tiles
+    cuts (parts + 1,): result: keys at which parts begin and end; every stride-th Gaussian serves to estimate the work
+    histogram (HISTOGRAM_BINS,): workspace"""
     num_slots = exclusive_sum(chunk_max_tiles, 0, chunk_max_tiles.size, chunk_starts)
     parts = cuts.size - 1
     cuts[0], cuts[1:] = 0, CULLED_KEY
@@ -320,11 +322,12 @@ def plan_parts(keys, max_tiles, chunk_max_tiles, stride, histogram, chunk_starts
 
 @inlined
 def _collect_part(keys, max_tiles, low, high, cursors, pairs):
-    """Collect the Gaussians with keys in low .. high - 1 in a range of pairs[0], key in the upper 32 bits, index below.
+    """Write the Gaussians with keys in low .. high - 1 to a range of pairs[0]: the key, less the smallest one, in the
+    upper 32 bits of a pair, the Gaussian's index in the lower.
 
-    The smallest key is subtracted. max_tiles: of each Gaussian. cursors[0]: next free place of pairs, shared by the
-    threads. Return the range's begin and length, the largest key that was written, and an upper bound on the length of
-    their tile list."""
+    max_tiles: upper bound on the number of tiles of each Gaussian; cursors[0]: next free place of pairs, shared by the
+    threads. Return the range's begin and length, the largest key that was written, and an upper bound on the number of
+    the Gaussians' tiles."""
     count, max_entries, smallest, largest = 0, 0, high, low
     for i in range(keys.size):
         key = np.int64(keys[i])
@@ -369,7 +372,9 @@ def _radix_sort(pairs, begin, count, largest_key, places):
 
 @inlined
 def _radix_pass(pairs, begin, count, shift, mask, places, out):
-    """Move pairs to `out` by the digit above `shift`; places: next free place of each digit."""
+    """Move `count` pairs from `begin` on to `out`, sorted by the digit (pair >> shift) & mask, equal ones in order.
+
+    places: next free place of each digit in `out`, which is advanced."""
     for pair_index in range(begin, begin + count):
         pair = pairs[pair_index]
         digit = (pair >> shift) & mask
@@ -390,8 +395,9 @@ def _list_part(
 ):  # fmt: skip
     """List the tiles of `count` sorted Gaussians, whose pairs start at `begin`; return the end of the list.
 
-    place: where the list begins; tile_counts (tiles,): of this part; `list_sorted` explains the others. Replaces their
-    max_tiles by the number of tiles, and first_slots by their first slot."""
+    place: where the list begins; tile_counts (tiles,): this part's entries in each tile; `list_sorted` explains the
+    others. In max_tiles each Gaussian's bound is replaced by its number of tiles, in first_slots its slot within the
+    chunk by that among all."""
     end = begin + count
     for pair_index in range(begin, end):
         # Accesses are scattered in memory.
@@ -423,13 +429,14 @@ def list_sorted(
     counter, records, keys, small_tiles, small_rows, max_tiles, first_slots, chunk_starts, cuts, width, height,
     tiles_x, cursors, places, pairs, tile_list, spans, tile_counts,
 ):  # fmt: skip
-    """List the tiles of all Gaussians, part by part, each part sorted by key; see `tiles.bin_gaussians`.
+    """List the tiles of all Gaussians, part by part, each part sorted by key.
 
-    records                  see `layout`
+    counter                  index of the next part, shared by the threads
+    records                  of the Gaussians, 16 numbers each (`layout`)
     keys                     uint32; CULLED_KEY for a Gaussian that is not drawn
     small_tiles, small_rows  from `small_footprints`
-    max_tiles                upper bounds on the numbers of tiles; replaced by the numbers
-    first_slots              first slot within the chunk; replaced by that among all
+    max_tiles                upper bounds on the Gaussians' numbers of tiles; replaced by the numbers
+    first_slots              each Gaussian's first slot within its chunk; replaced by that among all
     chunk_starts             first slot of each chunk
     cuts                     (parts + 1,) keys at which parts begin and end
     width, height, tiles_x   size of the picture, px, and tiles in a row of them
@@ -457,8 +464,8 @@ def list_sorted(
 
 @kernel
 def scan_tile_counts(tile_counts, starts):
-    """Replace counts (parts, tiles) by the offset of each part's entries in each tile; write the offset of each tile to
-    starts (tiles + 1,)."""
+    """Replace tile_counts (parts, tiles) by the index at which each part's entries of each tile begin, if entries are
+    ordered by tile, then by part; write the first index of each tile to starts (tiles + 1,)."""
     parts, tiles = tile_counts.shape
     offset = 0
     for tile in range(tiles):
@@ -472,8 +479,10 @@ def scan_tile_counts(tile_counts, starts):
 
 @kernel
 def scatter_entries(counter, tile_list, spans, places, entries):
-    """Write the entries of all tiles, lowest key first, from the lists of the parts; places (parts, tiles): the offsets
-    from `scan_tile_counts`, which it advances."""
+    """Write the entries of all tiles, lowest key first, from the lists of the parts.
+
+    counter: index of the next part, shared by the threads; spans (parts, 2): range of each part in tile_list; places
+    (parts, tiles): the indices from `scan_tile_counts`, which are advanced."""
     while True:
         part = atomic_increment(counter)
         if part >= spans.shape[0]:

@@ -141,7 +141,7 @@ def _cutoff_log2(opacity, add):
 
 @inlined
 def _arc_strength(arcs, i, xx, xy, yy):
-    """Return beta, see `arc_strengths` of `..rendering`; 0 without arcs."""
+    """Return beta = sqrt(b^T covariance b), from the arc's b and the covariance xx, xy, yy; 0 without arcs."""
     if arcs.size == 0:
         return 0.0
     b_x, b_y = np.float64(arcs[3 * i]), np.float64(arcs[3 * i + 1])
@@ -161,13 +161,16 @@ def prepare_records(
     centres, covariances, opacities, colours, rings, arcs, width, height, add,
     records, shapes, keys, max_tiles, first_slots, chunk_max_tiles,
 ):  # fmt: skip
-    """Write record, shape, key and an upper bound on the number of tiles of each Gaussian; in float64, for needles.
+    """Write record, shape, key and an upper bound on the number of tiles of each Gaussian.
+
+    Computed in float64, since in float32 xx yy - xy² cancels for needles. With the blend "add" the opacity is
+    multiplied into the colour, and the record's is 1.
 
     centres, covariances, opacities, colours, rings (n 2) and arcs (n 3): the arguments of `splat`, flat; rings and arcs
     are empty if there are none. keys: the index of a Gaussian, so that the given order is kept, or CULLED_KEY.
-    max_tiles, first_slots, chunk_max_tiles: see `tiles.bin_gaussians`. With the blend "add" the opacity is multiplied
-    into the colour, and the record's is 1."""
-    h = -0.5 / math.log(2.0)  # as in `projection`
+    max_tiles: the upper bounds; first_slots: their exclusive sums within chunks; chunk_max_tiles: their sums by
+    chunk."""
+    h = -0.5 / math.log(2.0)  # exp(-q / 2) = 2^(h q)
     for i in range(opacities.size):
         record = i * RECORD
         xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
@@ -176,7 +179,7 @@ def prepare_records(
         opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), rendering.OPACITY_MAX)
         r0, ring_width = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
         cutoff = _cutoff_log2(opacity, add)
-        # Mahalanobis; see `normalise_arcs` and `cutoff_radii` of `..rendering`.
+        # reach: Mahalanobis distance up to which the profile is drawn; an arc moves the ring out by w² beta at most.
         plain_reach = math.sqrt(2.0 * math.log(2.0) * max(cutoff, 0.0))
         reach = r0 + ring_width * ring_width * _arc_strength(arcs, i, xx, xy, yy) + abs(ring_width) * plain_reach
         keys[i], max_tiles[i] = CULLED_KEY, 0
@@ -211,8 +214,8 @@ def prepare_records(
 
 @inlined
 def _write_shape(shapes, i, r0, ring_width, cutoff, k, arcs):
-    """Write the shape of Gaussian i: radius and width of its ring, cutoff (log2), and its arc in the units of the
-    record.
+    """Write the shape of Gaussian i: radius and width of its ring, cutoff (log2), and its arc's b and m, over
+    ln 2 and in the record's coordinates u and d_y.
 
     k: of the record; arcs (n 3): flat, empty if there are none."""
     shape = i * SHAPE
@@ -238,7 +241,7 @@ def _row_start(records, record, left, y):
 
 @inlined
 def _distance(records, record, u, dy):
-    """Return the Mahalanobis distance r."""
+    """Return the Mahalanobis distance r = sqrt(-2 ln 2 (A u² + D d_y²)), at least RADIUS_MIN."""
     power = fma(u * load_scalar(records, record + A), u, load_scalar(records, record + D) * dy * dy)
     return sqrt(maximum(power * -TWO_LN2, RADIUS2_MIN))
 
@@ -260,7 +263,7 @@ def _negative_log2_profile(shapes, shape, radial_offset, u, dy, arcs):
 @inlined
 def _add_row(state, state_row, e, records, record):
     """Add one row of a Gaussian to the sums of a tile. state_row: index of the row's first number in the state; e:
-    profile."""
+    the profile G at the row's 16 pixels."""
     e = where(e >= PROFILE_MIN, e, ZERO)
     store(state, state_row + RED_PLANE, fma(e, load_scalar(records, record + RED), load(state, state_row + RED_PLANE)))
     green, blue = load(state, state_row + GREEN_PLANE), load(state, state_row + BLUE_PLANE)
@@ -345,7 +348,8 @@ def raster(
     """Write colour and alpha of all tiles; ends (tiles,): the end of each tile's drawn entries.
 
     shaped: there are rings or arcs, else plain Gaussians, which this kernel draws with the blend "add" only; arcs:
-    there are arcs; add: the blend is "add", else "over"; counter, state, starts: see `raster_forward.raster`."""
+    there are arcs; add: the blend is "add", else "over"; counter: index of the next tile; state: workspace of a tile;
+    starts (tiles + 1,): index of each tile's first entry."""
     no_depth = np.bool_(False)
     while True:
         tile = atomic_increment(counter)
@@ -356,7 +360,7 @@ def raster(
         init_tile(state, ROW, left, top, width, height)
         if not shaped:
             _draw_plain_tile(entries, begin, end, records, left, top, state)
-        elif add:  # two loops for LLVM to specialise
+        elif add:  # the same call twice: LLVM compiles each for its value of add
             end = _draw_shaped_tile(entries, begin, end, records, shapes, left, top, state, arcs, add)
         else:
             end = _draw_shaped_tile(entries, begin, end, records, shapes, left, top, state, arcs, add)
@@ -372,7 +376,7 @@ def raster(
 def _add_gradient(state, state_row, e, records, record):
     """Return g and w of one row for the blend "add", where Gaussians are independent: w = G, g = w v . colour.
 
-    state_row: index of the row's first number in the state."""
+    v: gradient of the pixels' colours; state_row: index of the row's first number in the state."""
     w = where(e >= PROFILE_MIN, e, ZERO)
     vc = load(state, state_row + V_RED) * load_scalar(records, record + RED)
     vc = fma(load(state, state_row + V_GREEN), load_scalar(records, record + GREEN), vc)
@@ -381,7 +385,7 @@ def _add_gradient(state, state_row, e, records, record):
 
 @inlined
 def _add_colours(state, state_row, w, colours):
-    """Add w v to the sums for red, green and blue."""
+    """Return the sums for red, green and blue with w v added; v: gradient of the pixels' colours in this row."""
     return (
         fma(w, load(state, state_row + V_RED), colours[0]),
         fma(w, load(state, state_row + V_GREEN), colours[1]),
@@ -441,7 +445,9 @@ def _plain_backward(state, records, record, left, top, first_row, end_row, run_s
 @inlined
 def _shaped_backward(state, records, record, shapes, shape, left, top, first_row, end_row, arcs, add):
     """Return the gradient row of a ring or arc: moments of h (see the module head), sums of g and of colours, the
-    gradients of r0 and w, and sums of g u and g d_y for b. Arguments as in `_draw_shaped`."""
+    gradients of r0 and w, and sums of g u and g d_y for b.
+
+    shape: index of its first number in `shapes`; arcs: whether there are arcs; add: the blend is "add", else "over"."""
     lane0_u, row_dy, k = _row_start(records, record, left, top + first_row)
     r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
     zero = splat(ZERO)
@@ -520,7 +526,9 @@ def raster_backward(
 ):  # fmt: skip
     """Write the gradient row of each slot, RECORD numbers, to `gradients`. d_alphas may be empty.
 
-    shaped, arcs, add: see `raster`; counter, scratch, starts, ends: see `raster_backward.raster_backward`."""
+    shaped: there are rings or arcs; arcs: there are arcs; add: the blend is "add", else "over"; counter: index of the
+    next tile; scratch: workspace of SCRATCH numbers; starts (tiles + 1,): index of each tile's first entry; ends
+    (tiles,): end of its drawn entries."""
     state, padded = scratch[:STATE_BACKWARD], scratch[STATE_BACKWARD:SCRATCH].reshape(6, PADDED_ROW)
     no_depth = np.bool_(False)
     while True:
@@ -535,7 +543,7 @@ def raster_backward(
         )  # fmt: skip
         if not shaped:
             _plain_tile_backward(entries, begin, end, records, left, top, state, gradients)
-        elif add:  # two loops for LLVM to specialise
+        elif add:  # the same call twice: LLVM compiles each for its value of add
             _shaped_tile_backward(
                 entries, begin, drawn_end, end, records, shapes, left, top, state, arcs, add, gradients
             )
@@ -559,9 +567,9 @@ def sum_gradients(
     row, covariances, opacities, colours, arcs, gradients, first_slots, counts, add,
     d_centres, d_covariances, d_opacities, d_colours, d_rings, d_arcs,
 ):  # fmt: skip
-    """Write the gradients of the inputs (d_...) from the gradient rows; see `projection` for the moments.
+    """Write the gradients of the inputs (d_...) from the gradient rows, sums of g and its moments (`layout`).
 
-    row: workspace of 16; covariances, opacities, colours, arcs: see `prepare_records`; gradients: the rows, by slot;
+    row: workspace of 16; covariances, opacities, colours, arcs: the flat inputs; gradients: the rows, by slot;
     first_slots, counts: first slot and number of slots of each Gaussian; add: the blend is "add". d_rings, d_arcs may
     be empty."""
     for i in range(opacities.size):
@@ -570,8 +578,8 @@ def sum_gradients(
         yy = np.float64(covariances[3 * i + 2])
         determinant = xx * yy - xy * xy
         if not (determinant > 0 and yy > 0):
-            determinant, yy = 1.0, 1.0  # it was not drawn: all sums are 0
-        # As `_from_moments` of `projection`, in float64.
+            determinant, yy = 1.0, 1.0  # such a Gaussian was not drawn: all its sums are 0
+        # The formulas of `_gradients_from_moments` in `projection`, in float64; alpha = yy / det.
         k, alpha, inverse = -xy / yy, yy / determinant, 1.0 / yy
         uu, uy, dd = alpha * row[G_UU], inverse * row[G_UY], inverse * inverse * row[G_YY]
         d_centres[2 * i] = alpha * row[G_U]

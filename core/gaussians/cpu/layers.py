@@ -62,7 +62,7 @@ def _upsample_row(row, channels, factor, width, out, out_start):
 def upsample_kernel(counter, row, colour, t, small_width, factor, width, height, out_colour, out_t):
     """Upsample colour (h, w, 3) and t (h, w), which have a border of one pixel, to (height, width), all flat.
 
-    counter: of the next row; row: scratch; small_width: w; factor: of the size."""
+    counter: index of the next row; row: scratch; small_width: w; factor: large size over small size."""
     while True:
         y = atomic_increment(counter)
         if y >= height:
@@ -81,7 +81,7 @@ def upsample_kernel(counter, row, colour, t, small_width, factor, width, height,
 def _gather_rows(plane, row_length, small_row, factor, height, row, padding):
     """Write the tent-weighted sum of the rows of a plane about small_row to row[padding : padding + row_length].
 
-    row_length, height: of the plane."""
+    row_length, height: numbers in a row of the plane, and its number of rows."""
     start = (small_row - 1) * factor - factor // 2
     first_row, end_row = max(start, 0), min(start + 2 * factor, height)
     for block in range(0, row_length, LANES):
@@ -115,7 +115,8 @@ def upsample_backward_kernel(
     """Write the gradients of the small picture (out_colour, out_t), border included, from those of the large one
     (d_colour, d_t), all flat; d_t may be empty.
 
-    counter: of the next small row; row: scratch; small_width, small_height: with the border; factor: of the size."""
+    counter: index of the next small row; row: scratch; small_width, small_height: with the border; factor: large size
+    over small size."""
     padding = 3 * PADDING
     row[:] = ZERO
     while True:
@@ -133,8 +134,9 @@ def upsample_backward_kernel(
 
 @kernel
 def composite_kernel(counter, colour, t, behind, out):
-    """Write colour + t behind to `out`; colour, behind and out (n 3), t (n,), all flat; n at least 16. counter: of the
-    next task."""
+    """Write colour + t behind to `out`; colour, behind and out (n 3), t (n,), all flat; n at least 16.
+
+    counter: index of the next task of PIXELS_PER_TASK pixels."""
     n = t.size
     while True:
         start = atomic_increment(counter) * PIXELS_PER_TASK
@@ -150,8 +152,9 @@ def composite_kernel(counter, colour, t, behind, out):
 
 @kernel
 def composite_backward_kernel(counter, gradient, t, behind, d_t, d_behind):
-    """Write d_t = gradient . behind and d_behind = t gradient, in the shapes of `composite_kernel`. counter: of the
-    next task."""
+    """Write d_t = gradient . behind and d_behind = t gradient, in the shapes of `composite_kernel`.
+
+    counter: index of the next task of PIXELS_PER_TASK pixels."""
     n = t.size
     while True:
         start = atomic_increment(counter) * PIXELS_PER_TASK
@@ -173,7 +176,9 @@ class _Upsample(torch.autograd.Function):
     def forward(  # type: ignore[override]
                 ctx: Any, colour: Tensor, t: Tensor, factor: int, width: int, height: int
     ) -> tuple[Tensor, Tensor]:
-        """Return colour (height, width, 3) and transmittance (height, width); see `upsample_layer` of `..layers`."""
+        """Return colour (height, width, 3) and transmittance (height, width), upsampled bilinearly by `factor`.
+
+        colour, t: the small pictures, with a border of one pixel."""
         small_height, small_width = t.shape
         ctx.sizes = small_width, small_height, factor, width, height
         ctx.set_materialize_grads(False)

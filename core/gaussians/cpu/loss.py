@@ -94,7 +94,7 @@ def _window_along_row(row, column):
 def _window_down_band(vectors, rows, column):
     """Apply the window down 16 columns of a band, and write them to rows of scratch from `column` on.
 
-    vectors: of the band's 6 rows, and of 5 more on both sides."""
+    vectors: the 16 columns in the band's 6 rows and in 5 more rows on each side."""
     store(rows[0], PAD + column, _apply_window(vectors[:11]))
     store(rows[1], PAD + column, _apply_window(vectors[1:12]))
     store(rows[2], PAD + column, _apply_window(vectors[2:13]))
@@ -125,7 +125,7 @@ def _column_moments(x, y, row, column, row_length, height):
 @inlined
 def _moments_down_columns(x, y, first_row, end_row, row_length, height, rows):
     """Write the column moments of rows first_row .. end_row - 1 of the pictures x and y to `rows` of scratch (3, BAND,
-    padded); loads the rows of all windows once. row_length: numbers in a row."""
+    padded). Within the picture each row is loaded once for all windows. row_length: numbers in a row."""
     for block in range(0, row_length, LANES):
         column = min(block, row_length - LANES)
         if _is_interior(first_row, height):
@@ -179,8 +179,8 @@ def _ssim_derivatives(mu, xx, xy, mu_y, s_y):
 
 @inlined
 def _compute_maps(x, y, mu_y, s_y, first_row, row_length, height, rows, maps, sums):
-    """Write the maps of S by mu, E[xx], E[xy] of a band, (3, BAND, row_length), zeros below the picture, and the row
-    sums (h, 2) of |x - y| and S.
+    """Write the derivatives of S by mu, E[xx] and E[xy] in a band to maps (3, BAND, row_length), zeros below the
+    picture, and the sums of |x - y| and of S along each row to sums (h, 2).
 
     x, y: image and target, flat; mu_y, s_y: moments of the target; row_length: numbers in a row, 3 w; rows: scratch."""
     end_row = min(first_row + BAND, height)
@@ -213,8 +213,8 @@ def _write_gradient(
 ):  # fmt: skip
     """Write by_l1 sign(x - y) + by_similarity dS/dx of the band from first_row on to `out`.
 
-    x, y, out: flat; maps_above, maps_here, maps_below: of the band and of its neighbours; rows: scratch; row_length:
-    numbers in a row."""
+    x, y, out: flat; maps_above, maps_here, maps_below: derivatives of S in the band above, in this one and in the one
+    below; rows: scratch; row_length: numbers in a row."""
     _maps_down_columns(maps_above, maps_here, maps_below, row_length, rows)
     for row in range(first_row, min(first_row + BAND, height)):
         band_row = row - first_row
@@ -232,9 +232,9 @@ def _write_gradient(
 
 @kernel
 def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, parts, parts_done, sums, value, out):
-    """Write the loss to value (1,) and its gradient by x to `out`, unless `out` is empty.
+    """Write the loss, lam L1 + (1 - lam) (1 - SSIM), to value (1,) and its gradient by x to `out`, unless it is empty.
 
-    counter: of the next part; x, y: image and target, flat; mu_y, s_y: from `target_moments_kernel`; lam: weight of L1;
+    counter: index of the next part; x, y: image and target, flat; mu_y, s_y: window means and variances of the target;
     parts: number of parts of the picture, each the work of a thread; parts_done (1,): 0, counts finished parts; sums
     (h, 2): workspace."""
     row_length = STEP * width
@@ -271,7 +271,7 @@ def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, par
 
 @kernel
 def target_moments_kernel(counter, scratch, y, width, height, mu_y, s_y):
-    """Write the window means mu_y and variances s_y of the target y, all flat. counter: of the next row."""
+    """Write the window means mu_y and variances s_y of the target y, all flat. counter: index of the next row."""
     row_length = STEP * width
     rows = scratch[: 2 * (row_length + 2 * PAD)].reshape(2, row_length + 2 * PAD)
     rows[:, :] = ZERO

@@ -37,7 +37,7 @@ def unpack_constants(constants):
 
 @inlined
 def step_lanes(parameter, first, second, index, gradient, rate, constants):
-    """Step the 16 numbers from flat index `index` on, with their moments.
+    """Make an Adam step on the 16 numbers of a parameter from flat index `index` on, and on their moments.
 
     gradient, rate: a vector each; constants: the tuple of `unpack_constants`."""
     beta1, one_minus_beta1, beta2, one_minus_beta2, correction1, correction2, epsilon = constants
@@ -51,7 +51,7 @@ def step_lanes(parameter, first, second, index, gradient, rate, constants):
 
 @inlined
 def step_array(parameter, gradient, first, second, rates, constants):
-    """Step all numbers of a parameter, with their `first` and `second` moments.
+    """Make an Adam step on all numbers of a parameter, and on their `first` and `second` moments.
 
     rates: the learning rates of a multiple of 16 numbers, repeated along the parameter. constants: the tuple of
     `unpack_constants`.
@@ -73,10 +73,10 @@ def step_array(parameter, gradient, first, second, rates, constants):
 
 @kernel
 def adam_kernel(counter, parameter, gradient, first, second, rates, task_size, constants):
-    """Step a parameter on all threads; arrays are flat.
+    """Make an Adam step on a parameter, on all threads; arrays are flat.
 
-    counter: of the next task; rates: see `step_array`; task_size: numbers of a task, a multiple of their size;
-    constants: an array, see `unpack_constants`."""
+    counter: index of the next task; rates: learning rates, repeated along the parameter; task_size: numbers of a task,
+    a multiple of the size of rates; constants: the array that `unpack_constants` reads."""
     while True:
         start = atomic_increment(counter) * task_size
         end = min(start + task_size, parameter.size)
@@ -128,7 +128,8 @@ def _step_all(counter: Array, calls: Sequence[_KernelArguments]) -> None:
 
 
 def repeat_rates(rate: float | Tensor) -> Array:
-    """Return a multiple of 16 numbers, to be repeated along the parameter."""
+    """Return a learning rate or a row of rates as a flat array of a multiple of 16 numbers, to be repeated along the
+    parameter."""
     if not isinstance(rate, Tensor):
         return _constant_rates(rate)
     row = flat(rate)

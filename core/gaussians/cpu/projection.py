@@ -135,8 +135,10 @@ RUN_LOG2_RANGE, RUN_MAX = np.float32(40), np.float32(32)
 
 @kernel
 def pack_camera(world_to_camera, intrinsics, width, height, near, dilation, camera):
-    """Write the packed camera (CAMERA,): the flat matrices (4, 4) and (3, 3) in the offsets above, and the bounds of
-    x/z and y/z for J. The position is -R^T t; near, dilation: see `rasterization`."""
+    """Write the packed camera (CAMERA,), at the offsets above, from the flat matrices (4, 4) and (3, 3).
+
+    It includes the camera's position -R^T t and the bounds of x/z and y/z for J. near: smallest depth that is drawn;
+    dilation: px², added to the variances."""
     for i in range(3):
         position = 0.0
         for j in range(3):
@@ -404,7 +406,7 @@ def project(
 ):  # fmt: skip
     """Project n >= 16 Gaussians, on all threads; sets d_centres to zero.
 
-    counter: of the next chunk; scratch: workspace of SCRATCH numbers. The module head lists the others."""
+    counter: index of the next chunk; scratch: workspace of SCRATCH numbers. The module head lists the others."""
     n = opacities.size
     transposed, basis = scratch[:TRANSPOSED], scratch[TRANSPOSED : TRANSPOSED + SQUARE]
     while True:
@@ -474,8 +476,8 @@ def _add_camera_gradients(sums, is_new, mean, q, dv, dp, offset, intrinsics):
 
     mean, q: m and the rows of Q. dv, dp, offset: gradients of V, of p, and of the offset from the camera to the mean.
     intrinsics: gradients of fx, fy, cx, cy.
-    V = R Q gives dV Q^T, p = R m + t gives dp m^T, and the position of the camera the opposite of the
-    means' part by direction.
+    The gradient of R is dV Q^T, from V = R Q, plus dp m^T, from p = R m + t; that of the camera's position is the
+    opposite of `offset`.
     """
     for i in range(3):
         _add_to(sums, 3 * i, _dot(dv[i], q[0]) + dp[i] * mean[0], is_new)
@@ -489,8 +491,8 @@ def _add_camera_gradients(sums, is_new, mean, q, dv, dp, offset, intrinsics):
 
 @inlined
 def _offset_gradient(d_colour, colour_slopes):
-    """Return the gradient of the offset from the camera to the means through the colours; colour_slopes: see
-    `project`."""
+    """Return the gradient of the offset from the camera to the means through the colours; colour_slopes: the
+    gradients of the colours by the means, 9 vectors."""
     slopes = colour_slopes
     result = _scale(d_colour[0], (load(slopes, 0), load(slopes, 16), load(slopes, 32)))
     result = _add_scaled(result, d_colour[1], (load(slopes, 48), load(slopes, 64), load(slopes, 80)))
@@ -591,9 +593,10 @@ def project_backward(
 
     parameters: means, quats, scales, opacities, and sh if they are stepped; d_parameters: the gradients of all five. If
     these are empty, the parameters are stepped by their gradients instead, chunk by chunk; first_moments,
-    second_moments, rates, constants: see `stepping.StepArrays`. gradients: one row for each pair of Gaussian and tile;
-    Gaussian i has counts[i] rows from first_slots[i] on. d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if
-    with_camera. counter, scratch: see `project`. The module head lists the others."""
+    second_moments, rates, constants: of Adam, an array for each parameter. gradients: one row for each pair of
+    Gaussian and tile; Gaussian i has counts[i] rows from first_slots[i] on. d_camera (chunks, CAMERA_SUMS): sums of
+    each chunk, if with_camera. counter: index of the next chunk, from the end; scratch: workspace of SCRATCH numbers, STEP_SCRATCH if
+    parameters are stepped. The module head lists the others."""
     means, quats, scales, opacities, _ = parameters
     n = opacities.size
     transposed, rows = scratch[:TRANSPOSED], scratch[TRANSPOSED : TRANSPOSED + SQUARE]

@@ -83,8 +83,8 @@ def _init_row(
 ):  # fmt: skip
     """Write one row of a tile's state before its first Gaussian: S and the gradients of the pixels.
 
-    row: of the tile; pixel: flat index of its first pixel. The background counts as an opposite gradient of alpha.
-    Depth adds nothing to S, since the sum of w (depth - mean depth) is 0."""
+    row: of the tile; pixel: flat index of its first pixel. Alpha hides the background, so v . background is
+    subtracted from the gradient of alpha. Depth adds nothing to S, since the sum of w (depth - mean depth) is 0."""
     state_row = row * ROW
     colour_index = 3 * pixel
     colour = deinterleave((load(image, colour_index), load(image, colour_index + 16), load(image, colour_index + 32)))
@@ -170,9 +170,9 @@ def moments(records, record, left, m0, m1, m2):
 
 @inlined
 def _recurrence_sums(state, records, record, left, top, first_row, end_row, run_start, with_depth):
-    """Return the sums of `_needle_sums` by the recurrence and three running sums per lane: of g over the rows, of the
-    values of the first sum, and of those of the second. A row j rows above the end counts 1, j and j (j + 1) / 2 times
-    in them."""
+    """Return the sums of `_needle_sums` by the recurrence and three running sums per lane: after each row g is added to
+    m0, then m0 to m1, then m1 to m2. In the end the row that is j rows above end_row counts 1, j and j (j + 1) / 2
+    times in them, from which the moments follow."""
     step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)
     zero = splat(ZERO)
     m0, m1, m2 = zero, zero, zero
@@ -285,8 +285,8 @@ def raster_backward(
 ):  # fmt: skip
     """Write the gradient row of each slot, RECORD numbers, to `gradients`; d_alphas and d_depths may be empty.
 
-    counter: of the next tile; scratch: workspace of SCRATCH numbers; starts, ends: see `raster_forward.raster`. The
-    head of `raster_forward` lists the others."""
+    counter: index of the next tile; scratch: workspace of SCRATCH numbers; starts (tiles + 1,): index of each tile's
+    first entry; ends (tiles,): end of its drawn entries. The head of `raster_forward` lists the others."""
     state, padded = scratch[:STATE], scratch[STATE:SCRATCH].reshape(6, PADDED_ROW)
     with_depth = d_depths.size > 0
     while True:
@@ -299,7 +299,7 @@ def raster_backward(
             state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths,
             with_depth, padded,
         )  # fmt: skip
-        if with_depth:  # two loops for LLVM to specialise
+        if with_depth:  # the same call twice: LLVM compiles each for its with_depth
             _tile_backward(entries, begin, drawn_end, end, records, left, top, state, gradients, with_depth)
         else:
             _tile_backward(entries, begin, drawn_end, end, records, left, top, state, gradients, with_depth)

@@ -102,7 +102,7 @@ def offsets(records, record, left, y):
 
 @inlined
 def needle_offsets(records, record, left, y):
-    """Return the same u and d_y, computed in float64 for needles, where u is a small sum of large numbers."""
+    """Return the u and d_y of `offsets`, computed in float64 for needles, where u is a small sum of large numbers."""
     dy = y + 0.5 - np.float64(load_scalar(records, record + Y))
     k = np.float64(load_scalar(records, record + K)) + np.float64(load_scalar(records, record + K_REST))
     u = left + 0.5 - np.float64(load_scalar(records, record + X)) + k * dy
@@ -199,7 +199,8 @@ def next_entry(entries, index, end, records, left, top):
     """Return the entry's record, first row, end row and run_start (see the module head) for the entry of this index, or
     for the last one if there are no more.
 
-    end: of the tile's entries. Called before the previous entry is drawn, to hide the latency of the exponentials."""
+    end: the index after the tile's last entry. Called before the previous entry is drawn, to hide the latency of the
+    exponentials."""
     entry = min(index, end - 1) * ENTRY
     prefetch(records, load_scalar(entries, min(index + PREFETCH_DISTANCE, end - 1) * ENTRY + GAUSSIAN) * RECORD)
     record = load_scalar(entries, entry + GAUSSIAN) * RECORD
@@ -238,7 +239,7 @@ def _blend(state, records, record, left, top, first_row, end_row, run_start, wit
 
 @inlined
 def _copy_pixels(source, source_index, target, target_index, count):
-    """Copy the first `count` of 16 numbers, from an index of the source to an index of the target: all if count is
+    """Copy the first `count` of 16 numbers, from an index of the source to an index of the target: all 16 if `count` is
     larger, none if it is negative."""
     if count >= TILE_WIDTH:
         store(target, target_index, load(source, source_index))
@@ -303,7 +304,7 @@ def raster(
 ):  # fmt: skip
     """Write colour and alpha of all tiles; mean and median depth too unless `depths` is empty.
 
-    counter: of the next tile; state: workspace of STATE numbers; starts (tiles + 1,): number of each tile's first
+    counter: index of the next tile; state: workspace of STATE numbers; starts (tiles + 1,): index of each tile's first
     entry; ends (tiles,): the end of each tile's drawn entries, written for the backward pass. The module head lists the
     others."""
     with_depth = depths.size > 0
@@ -314,7 +315,7 @@ def raster(
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         begin, end = starts[tile], starts[tile + 1]
         init_tile(state, ROW, left, top, width, height)
-        if with_depth:  # two loops for LLVM to specialise
+        if with_depth:  # the same call twice: LLVM compiles each for its with_depth
             ends[tile] = _raster_tile(entries, begin, end, records, left, top, state, with_depth)
         else:
             ends[tile] = _raster_tile(entries, begin, end, records, left, top, state, with_depth)

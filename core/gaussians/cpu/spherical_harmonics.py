@@ -49,8 +49,9 @@ def load_transposed(sh, first_gaussian, width, used_width, transposed):
 
 @inlined
 def store_transposed(transposed, first_gaussian, width, sh, keep_cached):
-    """Invert `load_transposed`: write all `width` numbers of 16 Gaussians to sh (n, width), from row first_gaussian on;
-    past the caches unless keep_cached."""
+    """Invert `load_transposed`: write all `width` numbers of 16 Gaussians to sh (n, width), from row first_gaussian on.
+
+    keep_cached: whether they are read soon; else they are written past the caches."""
     opaque_one = opaque(1)
     column = 0
     while column < width:
@@ -93,7 +94,7 @@ def _write_basis(degree, x, y, z, basis):
 def colours(transposed, degree, x, y, z, basis):
     """Return the colours (r, g, b), not yet clamped at 0, along unit directions x, y, z.
 
-    transposed: coefficients from `load_transposed`; degree: of those that are used; basis: workspace of 16 vectors."""
+    transposed: coefficients from `load_transposed`; degree: highest degree in use; basis: workspace of 16 vectors."""
     _write_basis(degree, x, y, z, basis)
     red, green, blue = splat(HALF), splat(HALF), splat(HALF)
     for k in range((degree + 1) * (degree + 1)):
@@ -106,8 +107,10 @@ def colours(transposed, degree, x, y, z, basis):
 
 @inlined
 def coefficients_backward(degree, x, y, z, d_colours, basis, transposed):
-    """Write the gradients of the coefficients, transposed as by `load_transposed`, from d_colours, those of the colours
-    along unit directions x, y, z; zeros above the degree. basis: workspace of 16 vectors."""
+    """Write the gradients of the coefficients to `transposed`, in the layout of `load_transposed`; zeros above the
+    degree.
+
+    d_colours: gradients of the colours along unit directions x, y, z; basis: workspace of 16 vectors."""
     _write_basis(degree, x, y, z, basis)
     num_coefficients = (degree + 1) * (degree + 1)
     for k in range(num_coefficients):

@@ -23,7 +23,7 @@ class _Splat(torch.autograd.Function):
         ctx: Any, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
         rings: Tensor | None, arcs: Tensor | None, add: bool, grid: TileGrid,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Return colour (h, w, 3) and alpha (h, w), over black; the inputs are those of `splat`, arcs (n, 3) b and m.
+        """Return colour (h, w, 3) and alpha (h, w), over black; inputs as for `splat`, except arcs (n, 3): b_x, b_y, m.
 
         Rings, arcs and the blend "add" have kernels of their own; other Gaussians use the scene's."""
         n, h, w = len(centres), grid.height, grid.width

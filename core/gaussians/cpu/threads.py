@@ -50,7 +50,7 @@ class _Worker:
     """A thread that waits for calls and makes them."""
 
     def __init__(self, counters: Array) -> None:
-        """counters: the two of the pool, one a row."""
+        """counters (2, ...): the pool's two task counters, the first number of each row."""
         self._counters = counters
         self._call: _Call | None = None
         self._call_number = 0  # of the latest call
@@ -79,7 +79,7 @@ class _Worker:
 
     def _run(self) -> None:
         """Make one call after the other, for ever; between them spin for a moment, then sleep."""
-        torch.set_flush_denormal(True)  # a register of the thread
+        torch.set_flush_denormal(True)  # the setting lies in a register of each thread
         while True:
             number = self._call_number
             finish_and_spin(self._done, number, self._counters[(number + 1) % 2], MAX_SPINS)
@@ -110,7 +110,7 @@ class _ThreadPool:
         """Call function(counter, [workspace,] *arguments) on the caller's thread and on thread_count - 1 workers, and
         wait; raise the first error.
 
-        scratch_size: see `parallel`."""
+        scratch_size: numbers of a thread's workspace, 0 for none."""
         while len(self._workers) < thread_count - 1:
             self._workers.append(_Worker(self._counters))
         self._call_number += 1

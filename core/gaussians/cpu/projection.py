@@ -595,8 +595,8 @@ def project_backward(
     these are empty, the parameters are stepped by their gradients instead, chunk by chunk; first_moments,
     second_moments, rates, constants: of Adam, an array for each parameter. gradients: one row for each pair of
     Gaussian and tile; Gaussian i has counts[i] rows from first_slots[i] on. d_camera (chunks, CAMERA_SUMS): sums of
-    each chunk, if with_camera. counter: index of the next chunk, from the end; scratch: workspace of SCRATCH numbers, STEP_SCRATCH if
-    parameters are stepped. The module head lists the others."""
+    each chunk, if with_camera. counter: index of the next chunk, from the end; scratch: workspace of SCRATCH numbers,
+    or of STEP_SCRATCH if parameters are stepped. The module head lists the others."""
     means, quats, scales, opacities, _ = parameters
     n = opacities.size
     transposed, rows = scratch[:TRANSPOSED], scratch[TRANSPOSED : TRANSPOSED + SQUARE]

@@ -101,8 +101,8 @@ class Camera:
     def normalised(self, xyz: ArrayLike) -> tuple[Floats, Floats]:
         """Project world points (n, 3) to ((n, 2) of x/z and y/z, (n,) depth z).
 
-        A point in the camera's plane (z = 0) has no image: its coordinates are not finite. A point behind (z < 0) has
-        mirrored ones; check the depth.
+        A point in the camera's plane (z = 0) has no image: its coordinates are not finite. The coordinates of a point
+        behind the camera (z < 0) are mirrored: check the depth.
         """
         points = np.asarray(xyz, np.float64).reshape(-1, 3)
         local = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
@@ -154,7 +154,8 @@ def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:
 def quaternion_from_rotation(rotation: ArrayLike) -> Floats:
     """(4,) unit quaternion (w, x, y, z), w >= 0, of a rotation (3, 3).
 
-    It is the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix (2000), without special cases.
+    Bar-Itzhack's method (2000): the quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 x 4
+    matrix, for every rotation alike.
     """
     r = np.asarray(rotation, np.float64)
     k_matrix = np.array([

@@ -35,8 +35,9 @@ MIN_FIELD_OF_VIEW, MAX_FIELD_OF_VIEW = 0.5, 170.0
 class CameraSolve:
     """Poses and points of a capture, before their pictures are looked at.
 
-    root: folder that the frames' names start from. masks: files by the frames' names. training, held_out: names in the
-    solve's own lists, None without. warnings: sentences for the user.
+    root: folder that the frames' names start from. masks: files by the frames' names. training, held_out: names of
+    the frames that the solve itself lists for training and for evaluation; None without such lists. warnings: sentences
+    for the user.
     """
 
     frames: list[PosedFrame]
@@ -51,7 +52,8 @@ class CameraSolve:
 def read_solve_in_steps(folder: Path, *, required: bool = True) -> Steps[CameraSolve | None]:
     """Read a COLMAP model or a transforms.json, in natural order of the frames.
 
-    Raises CaptureError where there is none; returns None instead if it is not `required`.
+    Order of preference: a model in one of the usual places, transforms.json, a model below colmap/. Without any it
+    raises CaptureError if a solve is `required`, and returns None otherwise.
     """
     models = find_models(folder)
     if not models and transforms_files(folder):
@@ -80,8 +82,8 @@ def _with_relative_names(root: Path, frames: list[PosedFrame]) -> list[PosedFram
     """Return a model's frames with names that start from `root`, the folder of the frames.
 
     COLMAP's names start from the folder that it was started on: "images/1.png", "/data/shot/images/1.png" of another
-    machine. As few leading folders as possible are left out until some name leads to a picture; only folders that all
-    names share. If nothing does, the names stay as they are.
+    machine. Of the leading folders that all names share, the fewest are dropped with which some name leads to a
+    picture. If no name ever does, the names stay as they are.
     """
     parts = [PurePosixPath(frame.name.replace("\\", "/")).parts for frame in frames]
     shared = 0
@@ -168,7 +170,8 @@ def _describe_matches(solve: CameraSolve, files: dict[str, Path], missing: list[
                       renamed: list[str]) -> list[str]:
     """Return sentences for the user on frames without a pose, poses without a frame, and frames of another name.
 
-    files, missing, unposed: as of `MatchedFrames`. renamed: "file for name" of each frame of another name.
+    files: pictures by the frames' names. missing: names of poses without a picture. unposed: names of pictures without
+    a pose. renamed: "file for name" of each picture whose name differs from that in the solve.
     """
     warnings = []
     if files and (missing or unposed):

@@ -114,8 +114,8 @@ class Capture:
 
         With `need_frames` every frame must exist, at the model's size or a uniform scale of it; without, cameras,
         points and lights suffice, and views whose frames are missing have the model's size. At most `cache_bytes` of
-        decoded pictures are cached. Without `need_cameras` a folder of frames without a camera solve is a shot; focal:
-        its focal length in pixels of the first frame, None for that of camera.json, of Exif data or a usual one.
+        decoded pictures are cached. Without `need_cameras`, frames without a camera solve get one camera at the origin;
+        focal: its focal length in pixels of the first frame, None for that of camera.json, of Exif data or a usual one.
 
         Raises CaptureError (model, lights, split) or FrameError (pictures), naming the file.
         """
@@ -138,7 +138,7 @@ class Capture:
         yield
         turned = list(filter(None, (turned_frame(frame, matched.files.get(frame.name)) for frame in solve.frames)))
         upright, orientation_warnings = (find_upright(turned, solve.points) if has_cameras
-                                         else ({frame.posed.name for frame in turned}, []))  # its camera is upright
+                                         else ({frame.posed.name for frame in turned}, []))  # without a solve
         turned_by_name = {frame.posed.name: frame for frame in turned if frame.posed.name in upright}
         yield
         opened = yield from _open_views_in_steps(folder, solve, matched.files, upright, turned_by_name, need_frames)
@@ -261,7 +261,7 @@ class Capture:
         return self._optional_picture(self._clean_frames, view, size, None if is_developed else self.plate_space)
 
     def has_other_format(self, view: View) -> bool:
-        """True if a view's clean frame is an EXR and its frame is none: linear light, whatever the frame's space."""
+        """True if a view's clean frame is an EXR and its filmed frame is not. The clean frame is then linear light."""
         path = self._clean_frames.get(view.name)
         return path is not None and path.suffix.lower() == ".exr" != self.frame_path(view).suffix.lower()
 
@@ -416,7 +416,8 @@ class Capture:
         return self._picture(paths[view.name], view, size, space) if view.name in paths else None
 
     def _read_held_out_names(self, path: Path) -> set[str]:
-        """Read the names of the held-out views from a split file. Raises CaptureError."""
+        """Read the names of the held-out views from a split file; frames that were left out on opening are ignored.
+        Raises CaptureError."""
         data = read_json(path, CaptureError)
         names = data.get("test") if isinstance(data, dict) else None
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -432,8 +433,8 @@ class Capture:
         return {view.name for view in views.values() if view is not None}
 
     def _check_layer_sizes(self) -> Steps[None]:
-        """Check the sizes of removed/, truth/ and masks/, and that removed/ is complete: an incomplete one is an
-        interrupted run."""
+        """Raise where a picture in removed/, truth/ or masks/ has another aspect than its frame, or removed/ lacks
+        frames, as an interrupted run leaves it."""
         if self._clean_frames and len(self._clean_frames) < len(self.views):
             lacking = [view.name for view in self.views if view.name not in self._clean_frames]
             raise CaptureError(f"{self.folder / 'removed'} lacks {len(lacking)} of {len(self.views)} frames, "
@@ -465,8 +466,8 @@ def _open_views_in_steps(folder: Path, solve: CameraSolve, files: Mapping[str, P
                          turned: Mapping[str, TurnedFrame], need_frames: bool) -> Steps[_OpenedViews]:
     """Check the pictures of the poses, and make views of them. Raises CaptureError and FrameError.
 
-    By pose name: files, the pictures; upright, poses solved from pixels as shown; turned, those of them with an Exif
-    orientation. need_frames: as of `Capture.open`.
+    files: pictures by pose name. upright: names of the poses solved from the picture as its Exif orientation turns it;
+    turned: these frames by name. need_frames: if False, a view without a picture gets the size of its model.
     """
     opened = _OpenedViews()
     for number, frame in enumerate(solve.frames):
@@ -490,7 +491,7 @@ def _open_views_in_steps(folder: Path, solve: CameraSolve, files: Mapping[str, P
 def _to_view(name: str, frame: PosedFrame, size: tuple[int, int], upright: bool) -> View:
     """Return the view of a frame whose picture has this size (width, height); a lens without distortion becomes None.
 
-    upright: as of `View`.
+    upright: the pose was solved from the picture as its Exif orientation turns it.
     """
     lens = frame.lens
     fx, fy, cx, cy = lens.pinhole

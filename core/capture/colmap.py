@@ -170,7 +170,8 @@ def _file_path(folder: Path, name: str) -> Path:
 
 
 def _read_file(folder: Path, name: str, binary_reader: Any, text_reader: Any) -> Steps[Any]:
-    """Read a part of a model by its binary or text reader, in steps; None without points3D. Raises CaptureError.
+    """Read a part of a model by its binary or text reader, in steps; None where points3D, which may be absent, is.
+    Raises CaptureError.
 
     binary_reader: takes a _ByteReader. text_reader: takes the path and the lines.
     """
@@ -376,8 +377,8 @@ _TRACK_LENGTH = struct.Struct("<Q")
 def _read_points_bin(file: _ByteReader) -> Steps[Points]:
     """Read a points3D.bin, in steps. Raises CaptureError.
 
-    Tracks make the points of different length, so the first pass finds where each starts. The second reads them in
-    blocks.
+    A point's track has any length, so a first pass finds the byte where each point starts; a second pass reads the
+    points in blocks.
     """
     number = file.read_count(_POINT.itemsize)
     data, offset, last_start = file.data, file.offset, len(file.data) - _POINT.itemsize
@@ -390,7 +391,7 @@ def _read_points_bin(file: _ByteReader) -> Steps[Points]:
         starts[i] = offset
         offset += _POINT.itemsize + 8 * _TRACK_LENGTH.unpack_from(data, offset + _TRACK_AT)[0]
     file.offset = min(offset, len(data))
-    file.require(offset - file.offset)
+    file.require(offset - file.offset)  # raises where the last track would end behind the file
     points, data_bytes = np.empty(number, _POINT), np.frombuffer(data, np.uint8)
     for first in range(0, number, _POINTS_PER_STEP):
         yield

@@ -14,10 +14,10 @@ from .orientation import TurnedFrame
 
 
 def checked_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:
-    """Return the size (width, height) of a frame's picture, as it was solved. Raises FrameError for another shape than
-    the camera's, and for a file of a kind that is not read.
+    """Return the size (width, height) of a frame's picture, turned as it was for the camera solve.
 
-    turned: the frame, if it was solved as its Exif orientation shows it; None for its stored pixels.
+    turned: given where the solve saw the picture turned by its Exif orientation; None where it saw the stored pixels.
+    Raises FrameError where the aspect differs from that of `lens`, and for a kind of file that is not read.
     """
     size = turned.upright_size if turned else picture_size(path)
     if not same_aspect(size, (lens.width, lens.height)):

@@ -118,8 +118,8 @@ def _relative(path: Path, folder: Path) -> str:
 def frames_folder(folder: Path, model: Path) -> Path:
     """Return the folder that the names of a model's images start from.
 
-    It is images/ of the capture, or of the folder that holds the model; where there is none, and the model lies beside
-    its frames, that folder.
+    It is images/ in the capture, in the model's folder or in one of the two folders above the model, the first that
+    exists. Without any: the capture's folder where the model lies in it directly, else its images/, which is missing.
     """
     for parent in (folder, model, model.parent, model.parent.parent):
         if parent.is_relative_to(folder):

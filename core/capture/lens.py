@@ -268,7 +268,7 @@ def _project_aria(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
 
 
 def _fov(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
-    """Devernay and Faugeras 2001: r_d = atan(2 r tan(omega / 2)) / omega."""
+    """Devernay and Faugeras 2001: r_d = atan(2 r tan(omega / 2)) / omega, from the radius r to the distorted r_d."""
     omega, r = p["omega"], np.sqrt(x * x + y * y)
     if abs(omega) < 1e-6:
         return x, y
@@ -278,7 +278,7 @@ def _fov(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
 
 
 def _division(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
-    """Fitzgibbon 2001: r = r_d / (1 + k r_d^2), solved for r_d."""
+    """Fitzgibbon 2001: r = r_d / (1 + k r_d^2), solved for r_d; r and r_d are the undistorted and distorted radius."""
     ratio = 2.0 / (1.0 + np.sqrt(1.0 - 4.0 * p["k"] * (x * x + y * y)))
     return x * ratio, y * ratio
 

@@ -82,8 +82,9 @@ class LightExtent:
     """An extent around a light's position; see the module's head. Make one with `rectangle`, `ellipse`, `sphere`,
     `of_points`, or `read`.
 
-    axes (2, 3): of a rectangle or ellipse. points (n, 3): of points, neighbours beside each other. factors (n, 3):
-    None, or linear RGB of each point, each of which is a cell then and has a whole flare.
+    axes (2, 3): half axes of a rectangle or ellipse. radius: of a sphere. points (n, 3): offsets of the points, ordered
+    so that neighbours are beside each other. factors (n, 3): None, or linear RGB of each point; each point is then a
+    cell of its own, with a whole flare.
     """
 
     shape: Shape
@@ -111,7 +112,8 @@ class LightExtent:
     @classmethod
     def of_points(cls, points: ArrayLike, factors: ArrayLike | None = None) -> LightExtent:
         """Return points of equal strength; points (n, 3): offsets from the light's position, neighbours beside each
-        other, as `sample_surface` and `sample_curve` return them. factors (n, 3): of lights of their own."""
+        other, as `sample_surface` and `sample_curve` return them. factors (n, 3): linear RGB, which makes each point a
+        light of its own."""
         return cls("points", points=np.array(points, np.float64),
                    factors=None if factors is None else np.array(factors, np.float64))._checked()
 
@@ -148,8 +150,8 @@ class LightExtent:
     def transformed(self, matrix: ArrayLike) -> LightExtent:
         """Return the extent under a linear map (3, 3), such as the rotation and scale of another world.
 
-        A sphere stays one: its radius grows by the map's mean scale. A one-sided extent emits to the image of its side.
-        Under a map that mirrors, its samples are in another order, so visible shares must be those of the result.
+        A sphere stays a sphere: its radius grows by the map's mean scale. The side that a one-sided extent emits to is
+        mapped too. A map that mirrors reorders the samples: visible shares of the original do not hold afterwards.
         """
         linear = np.asarray(matrix, np.float64)
         determinant = float(np.linalg.det(linear))
@@ -203,9 +205,10 @@ def sample_surface(vertices: ArrayLike, triangles: ArrayLike, count: int = SAMPL
                    reference: ArrayLike | None = None) -> Floats:
     """Return points (count, 3) spread evenly over a surface, for `LightExtent.of_points`.
 
-    vertices (v, 3), triangles (t, 3): indices of vertices. reference (v, 3): the vertices at rest, whose areas and
-    places choose the points, so that these stay on a surface that bends or moves; by default the vertices themselves.
-    Raises ValueError for a surface without area.
+    Triangles are drawn in proportion to their areas, and Halton's sequence places a point in each. vertices (v, 3),
+    triangles (t, 3): indices of vertices. reference (v, 3): the vertices at rest, by default the vertices; the points
+    are chosen there, so that each stays in its place on a surface that bends or moves. Raises ValueError for a surface
+    without area.
     """
     positions, indices = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64).reshape(-1, 3)
     rest_positions = positions if reference is None else np.asarray(reference, np.float64)  # the vertices at rest
@@ -239,7 +242,8 @@ def sample_curve(points: ArrayLike, count: int = SAMPLES) -> Floats:
 
 
 def _morton_order(points: Floats) -> NDArray[np.int64]:
-    """Return an order of points (n, 3) in which neighbours are near each other: that of Morton codes."""
+    """Return indices (n,) that sort points (n, 3) by Morton code (bits of x, y, z interleaved), so that neighbours
+    are near each other."""
     low, size = points.min(0), float(np.ptp(points, axis=0).max()) or 1.0
     grid = np.minimum((points - low) / size * 1024, 1023).astype(np.int64)
     morton_code = np.zeros(len(points), np.int64)

@@ -99,9 +99,9 @@ class Light:
 class LightState:
     """A light in one view.
 
-    xyz: (3,) world; of a light on the picture, on its ray. camera_xyz: (3,) the same in the camera's axes (x right, y
-    down, z forward). xy: (2,) pixels, NaN behind the camera. on: 0..1 or None where it is unknown. interpolated: the
-    file has no entry for the place in this view.
+    xyz: (3,) world; for a light known on the picture alone, a point on the ray through its pixel. camera_xyz: (3,) the
+    same point in the camera's axes (x right, y down, z forward). xy: (2,) pixels, NaN behind the camera. on: brightness
+    0..1, or None where it is unknown. interpolated: lights.json has no entry for the place in this view.
     """
 
     name: str
@@ -192,7 +192,7 @@ class LightPath:
     """The keys of one light over the frames of a capture, interpolated. `state` evaluates it in a view."""
 
     def __init__(self, light: Light, names: Sequence[str]) -> None:
-        """names: of the capture's views."""
+        """names: the names of the capture's views."""
         self.light = light
         self._times = _frame_times(names)
         views_by_name = {_canonical(name): name for name in names}
@@ -278,7 +278,8 @@ def light_paths(lights: Iterable[Light], names: Sequence[str]) -> dict[str, Ligh
 
 
 def check_places(lights: Iterable[Light], path: Path, names: Sequence[str], has_cameras: bool) -> None:
-    """Raise CaptureError for lights of the file `path` whose places a capture cannot have. names: of its views."""
+    """Raise CaptureError for a light none of whose frames is in the capture, and for a place in the world where the
+    frames have no cameras. path: lights.json, for the message. names: the names of the capture's views."""
     for light in lights:
         if not LightPath(light, names).has_place:
             raise CaptureError(f"{path}, {light.name!r}: none of its frames is in the capture, such as {names[0]}; "
@@ -297,7 +298,8 @@ def check_standing(lights: Iterable[Light], purpose: str) -> None:
 
 
 def _frame_times(names: Sequence[str]) -> dict[str, float]:
-    """Return the time of each frame: its number where the names of one folder have them, else its index."""
+    """Return the time of each frame: the number in its name, if all names lie in one folder and have one; else its
+    index."""
     folders = {PurePosixPath(name).parent for name in names}
     if len(folders) == 1:
         try:

@@ -47,10 +47,10 @@ Curve = Mapping[int, float]
 
 @dataclass(frozen=True)
 class NukeCamera:
-    """A camera of frames by their numbers.
+    """A camera's pose and focal length by frame number.
 
     poses: camera to world (4, 4), in Nuke's axes. focal: focal length relative to the width of the frame, or to its
-    height where `by_height`. is_still: nothing of it is animated, and it has one frame, 0, that stands for all.
+    height where `by_height`. is_still: nothing is animated; the only entry, of frame 0, holds for every frame.
     """
 
     poses: Mapping[int, Floats]
@@ -174,7 +174,8 @@ class _CameraNode:
         return any("curve" in value for value in self.knobs.values())
 
     def to_camera(self) -> NukeCamera:
-        """Return the camera at the frames that have keys. Raises CaptureError for knobs that are not read."""
+        """Return the camera at the frames that have keys. Raises CaptureError for values of knobs
+        that are not supported."""
         for name, neutral in _NEUTRAL.items():
             curves = self._read_curves(name) if name in self.knobs else []
             if any(value != neutral for curve in curves for value in curve.values()):
@@ -224,7 +225,8 @@ class _CameraNode:
     def _parse_curve(self, name: str, text: str) -> Curve:
         """Parse a number, or an animation curve such as "curve i x1001 1.5 1.6 x1010 2.0".
 
-        x1001 states the frame of the next value; a value without one is of the next frame. Raises CaptureError.
+        x1001 states the frame of the value after it; a value without such a statement belongs to the frame after that
+        of the last value. Raises CaptureError.
         """
         tokens = text.split()
         is_curve = tokens[:1] == ["curve"]
@@ -237,7 +239,7 @@ class _CameraNode:
                     stated_frame = int(token[1:])
                 elif not (is_curve and token[0].isalpha()):  # letters are interpolation and slopes
                     if stated_frame is None and len(keys) > 1 and keys[-1] - keys[-2] != 1:
-                        raise ValueError  # a value without a frame, behind keys that are not consecutive
+                        raise ValueError  # ambiguous: a value without a frame, after keys with gaps
                     keys.append(stated_frame if stated_frame is not None else keys[-1] + 1 if keys else 1)
                     values[keys[-1]], stated_frame = _parse_finite(token), None
         except (ValueError, OverflowError) as problem:
@@ -275,7 +277,7 @@ def _parse_finite(text: str) -> float:
 
 
 def _common_frames(*curves: Curve) -> tuple[set[int], bool]:
-    """Return the frames that all animated curves have a key at, and whether none is animated: then frame 0 alone."""
+    """Return the frames at which all animated curves have a key, and False; ({0}, True) where none is animated."""
     animated = [set(curve) for curve in curves if len(curve) > 1]
     return (set.intersection(*animated), False) if animated else ({0}, True)
 

@@ -27,8 +27,8 @@ MAX_CACHED_MAPS = 4
 
 
 def read_mask(path: Path) -> Picture:
-    """Read a mask as 0 and 1: 1 where it is light and opaque; one that is painted in black on transparent ground is 1
-    where it is transparent. Raises FrameError."""
+    """Read a mask as 0 and 1: 1 where it is light and opaque. A mask painted in black on transparent ground is 1 where
+    it is transparent. Raises FrameError."""
     values = read_picture(path).display()
     alpha = None if is_exr(path) else read_plate(path).straight_alpha
     if alpha is not None:
@@ -51,7 +51,7 @@ class PictureCache:
     def get(self, path: Path, view: View, size: tuple[int, int], space: ColourSpace | None = None) -> Picture:
         """Return a view's picture at `size` (width, height), over black where it is transparent; read-only pixels.
 
-        space: in place of what the file declares. Raises FrameError.
+        space: colour space in which the file is read, in place of the one that it declares. Raises FrameError.
         """
         key = (path, size)
         with self._lock:
@@ -81,9 +81,9 @@ class PictureCache:
                 self._used -= old.pixels.nbytes
 
     def undistorted(self, picture: Picture, view: View, path: Path) -> Picture:
-        """Undistort a picture of a view's file, whose lens is distorted. Raises FrameError.
+        """Undistort a picture of a view whose lens has distortion. Raises FrameError for another aspect.
 
-        The maps of the last MAX_CACHED_MAPS lenses and sizes are cached: the frames of a capture share few.
+        The maps of the last MAX_CACHED_MAPS lenses and sizes are cached: most frames of a capture share a lens.
         """
         assert view.lens is not None
         if not same_aspect(picture.size, view.camera.size):

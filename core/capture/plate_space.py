@@ -14,7 +14,7 @@ from ..system.files import read_json, write_json
 
 FILE = "plate_space.json"
 AUTO = "auto"
-"""The name that leaves it to the files."""
+"""The name for reading each frame as its file declares."""
 
 
 def read_plate_space(folder: Path) -> ColourSpace | None:
@@ -27,7 +27,7 @@ def read_plate_space(folder: Path) -> ColourSpace | None:
 
 
 def recorded_name(folder: Path) -> str:
-    """Return the name of the space of a capture's frames, without a look at OpenColorIO; "" where their files decide,
+    """Return the name of the space of a capture's frames, without loading OpenColorIO; "" where their files decide,
     or where the record is damaged."""
     try:
         record = _read(folder / FILE)
@@ -48,9 +48,10 @@ def _read(path: Path) -> tuple[str, str | None] | None:
 
 
 def record_plate_space(folder: Path, name: str, config: str | None) -> None:
-    """Record the space of a capture's frames; AUTO removes the record.
+    """Write the space of a capture's frames to its plate_space.json; AUTO removes the file.
 
-    Raises CaptureError where the folder cannot be written, SettingsError for an unknown space.
+    config: the OpenColorIO configuration that defines the space; None for the usual one. A missing folder is left
+    missing. Raises CaptureError where the folder cannot be written, SettingsError for an unknown space.
     """
     path = folder / FILE
     try:

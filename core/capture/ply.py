@@ -78,7 +78,8 @@ def _read_colours(table: NDArray[Any], kinds: dict[str, str], number: int) -> ND
     """Return colours (n, 3) of 8 bits; grey where the file has none.
 
     Whole numbers of 16 bits are divided by 257, of 32 bits by 257 * 65537. Where none is above 255 they are of 8 bits,
-    whatever their type. Floats are 0..1, or 0..255 where one is above 1. Gaussians have harmonics of degree 0.
+    whatever their type. Floats are 0..1, or 0..255 where one is above 1. Gaussian splats have the coefficients f of the
+    spherical harmonic of degree 0: colour = 0.5 + HARMONIC_0 f.
     """
     names = next((names for names in COLOURS if set(names) <= set(kinds)), None)
     if names is None or not number:

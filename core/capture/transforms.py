@@ -46,8 +46,8 @@ _EQUIVALENT_KEYS = ((("fl_x",), ("camera_angle_x",)), (("fl_y",), ("camera_angle
 class Transforms:
     """Poses and points of a capture with transforms.json; the names are paths below its folder.
 
-    masks: files of the frames' masks, by the frames' names. training, held_out: names in the file's lists of both, None
-    without a list. warnings: sentences for the user.
+    masks: files of the frames' masks, by the frames' names. training, held_out: names of the frames that the file
+    lists for training and for evaluation; None without such a list. warnings: sentences for the user.
     """
 
     frames: list[PosedFrame]
@@ -95,7 +95,8 @@ def _read_frame(path: Path, number: int, meta: dict[str, Any], frame: Any, lense
                 result: Transforms) -> str:
     """Read a frame's lens, pose and mask into `result`; return its name.
 
-    number: of the frame in the file, for messages. meta: the whole file. lenses: the lenses so far, which frames share.
+    number: index of the frame in the file, for messages. meta: the whole file. lenses: the lenses so far, by their
+    values; an equal one is shared, a new one is added.
     """
     name = frame.get("file_path") if isinstance(frame, dict) else None
     if not isinstance(name, str):
@@ -118,8 +119,8 @@ def _read_frame(path: Path, number: int, meta: dict[str, Any], frame: Any, lense
 def _merge_lens_values(meta: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
     """Return the values of a frame's lens: its own, else those of the file.
 
-    What a frame says in one form replaces what the file says in another: an angle for a focal length, one list for
-    single coefficients.
+    A frame's value also replaces the file's value of the same quantity in another form: camera_angle_x replaces fl_x,
+    distortion_params replaces k1, k2, ...
     """
     shared = dict(meta)
     for forms in _EQUIVALENT_KEYS:
@@ -154,7 +155,8 @@ def _read_split_lists(path: Path, meta: dict[str, Any], result: Transforms) -> N
 
 
 def _with_suffix(folder: Path, name: str) -> str:
-    """Return the path of a frame below the folder; NeRF's synthetic scenes leave its suffix out."""
+    """Return the path of a frame below the folder, with the suffix of its picture where the file leaves it out, as in
+    NeRF's synthetic scenes."""
     name = Path(name_below(folder, name).replace("\\", "/")).as_posix()  # drops a leading "./"
     path = safe_join(folder, name, CaptureError)
     if path.suffix.lower() not in SUFFIXES:
@@ -256,7 +258,8 @@ def _read_pose(frame: dict[str, Any], where: str) -> Floats:
 
 
 def _read_points(path: Path, meta: dict[str, Any], result: Transforms) -> PointCloud:
-    """Return the points that a transforms.json names, else those of a COLMAP model beside it, moved to its world."""
+    """Return the points that a transforms.json names, else those of a COLMAP model beside it, moved to the
+    file's world. Adds warnings to `result`."""
     folder, name = path.parent, meta.get("ply_file_path")
     if isinstance(name, str):
         file = safe_join(folder, Path(name_below(folder, name)).as_posix(), CaptureError)

@@ -57,7 +57,8 @@ def cameras_without_solve(folder: Path, focal: float | None = None) -> tuple[Cam
 def _focal_multiple(folder: Path, first: Path, size: tuple[int, int], focal: float | None) -> tuple[float, str]:
     """Return the focal length as a multiple of the longer side, and its source.
 
-    first, size: file of the first frame and its (width, height). focal: as of `cameras_without_solve`.
+    Taken from `focal` (pixels) if given, else from camera.json, else from Exif data, else USUAL_FOCAL. first: file
+    of the first frame. size: its (width, height).
     """
     record_path = find_entry(folder, CAMERA)
     if focal is not None:

@@ -23,7 +23,10 @@ Box = tuple[int, int, int, int]
 
 
 def cutoff_radii(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
-    """Return the Mahalanobis radius (n,) of each Gaussian beyond which it is not drawn."""
+    """Return the Mahalanobis radius (n,) of each Gaussian beyond which it is not drawn.
+
+    There its profile falls below PROFILE_MIN (blend "add"), or its alpha below ALPHA_MIN ("over").
+    """
     if blend == "add":
         radius = np.full(len(gaussians), math.sqrt(-2 * math.log(PROFILE_MIN)), np.float32)
     else:
@@ -31,7 +34,7 @@ def cutoff_radii(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
         radius = np.sqrt(2 * np.log(np.maximum(peak_opacities / ALPHA_MIN, 1)))
     if gaussians.rings is not None:
         r0, w = gaussians.rings.T
-        # The last term is how far an arc moves the peak outwards.
+        # A ring of radius r0 and width w; the last term is how far an arc moves its peak outwards.
         radius = np.maximum(r0 + w * radius + w * w * gaussians.arc_strengths, 0)
     return np.asarray(radius, np.float32)
 
@@ -40,7 +43,8 @@ def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, he
          blend: Blend = "add", pixel_grid: PixelGrid | None = None) -> Floats:
     """Draw flares to a picture (height, width, 3) with intrinsics (3, 3), pixel centres at + 0.5.
 
-    blend "add": scene-linear light; "over": display colour, premultiplied, over black. pixel_grid: of the fit.
+    blend "add": scene-linear light; "over": display colour, premultiplied, over black. pixel_grid: that of
+    the fit, which sets the low-pass filter; None for the default filter.
     """
     return draw_with_transmittance(flares, intrinsics, width, height, blend, pixel_grid)[0]
 
@@ -78,7 +82,7 @@ def draw_with_transmittance(flares: Iterable[PlaneGaussians], intrinsics: ArrayL
 def bounding_box(centre: Floats, covariance: Floats, radius: float, width: int, height: int) -> Box | None:
     """Return the bounding box of a Gaussian in the picture; None if it is outside, or flat, or not finite.
 
-    centre (2,), px; covariance (3,), px²; radius: Mahalanobis, see `extent`."""
+    centre (2,), px; covariance (3,), px²; radius: Mahalanobis radius to which it is drawn."""
     xx, xy, yy = (float(value) for value in covariance)
     if not xx * yy - xy * xy > 0:
         return None
@@ -95,7 +99,8 @@ def profile_in_box(box: Box, centre: Floats, covariance: Floats, ring: NDArray[A
                    ) -> Floats:
     """Return the profile (rows, columns) of a Gaussian in a box of pixels, 1 at its peak.
 
-    centre (2,), px; covariance (3,), px²; ring (2,): r0 and w, or None; pixel_arc (2,): see `arcs_to_pixels`."""
+    centre (2,), px. covariance (3,), px². ring (2,): radius r0 and width w of the profile exp(-(r - r0)²/(2 w²)), r the
+    Mahalanobis distance; None for exp(-r²/2). pixel_arc (2,): px, towards the brighter side of a ring; 0 for none."""
     xx, xy, yy = covariance
     left, top, right, bottom = box
     dx = np.arange(left, right, dtype=np.float32) + 0.5 - centre[0]
@@ -107,6 +112,7 @@ def profile_in_box(box: Box, centre: Floats, covariance: Floats, ring: NDArray[A
     exponent = (np.sqrt(np.maximum(squared_distance, 1e-12)) - r0) ** 2 / (2 * w * w)
     if pixel_arc.any():
         arc_x, arc_y = pixel_arc
+        # An arc multiplies the profile by exp(slope . d), d the offset from the centre; its peak is scaled to 1.
         slope = np.array([yy * arc_x - xy * arc_y, xx * arc_y - xy * arc_x]) / (xx * yy - xy * xy)
         log_peak = arc_log_peak(arc_strengths(pixel_arc[None], covariance[None])[0], ring)
         exponent = exponent - (slope[0] * dx + slope[1] * dy - log_peak)

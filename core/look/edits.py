@@ -164,7 +164,7 @@ class LookEdits:
         """
         edits_by_target: dict[tuple[str, str], Edit] = {}
         for text in edits:
-            name, equals, value = text.rpartition("=")  # a light's name may hold one itself
+            name, equals, value = text.rpartition("=")  # a light's name may hold an equals sign
             address, dot, property_name = name.rpartition(".")
             if not (equals and dot and address.strip()):
                 raise SettingsError(f"The edit {text!r} is not of the form light.intensity=2 or light.tint=1,0.5,0.2.")
@@ -205,8 +205,8 @@ def _parse_targets(text: str, address: str, lights: Sequence[str],
                    elements: Mapping[str, Sequence[str]] | None) -> list[tuple[str, str]]:
     """Return the (light, element or "") pairs that an edit applies to.
 
-    text: the whole edit, for the SettingsError. address: its `light` or `light/element`. lights, elements: see
-    `LookEdits.parse`. Raises SettingsError for an unknown light or element."""
+    text: the whole edit, for the SettingsError. address: its `light` or `light/element`. lights: known names.
+    elements: known names by light; None accepts any name. Raises SettingsError for an unknown light or element."""
     if not any(address == light or address.startswith(f"{light}/") for light in lights):
         address = address.lstrip()  # only here, since a light's name may begin with a blank
     if address in lights:
@@ -274,8 +274,8 @@ def apply_edits(gaussians: PlaneGaussians, light: str, light_position: NDArray[A
                 edits: LookEdits, blend: Blend) -> PlaneGaussians:
     """Apply the edits of one light to its Gaussians; preserves their order, drops those of hidden elements.
 
-    light_position: (2,) on the normalised plane, delta_l included. elements: groups of the rows.
-    blend: "add" for colours in linear light, "over" for display values.
+    light_position: (2,) on the normalised plane, with the learned correction delta_l. elements: those of the light,
+    each with the rows of its Gaussians. blend: "add" for colours in linear light, "over" for display values.
     """
     light_edit = edits.light_edit(light)
     hidden = edits.hidden_elements(light, elements)
@@ -321,8 +321,8 @@ def _apply_shape(gaussians: PlaneGaussians, edit: Edit, light_position: NDArray[
                  ) -> PlaneGaussians:
     """Transform an element as a whole: x' = c' + A (x - c), covariance' = A covariance A^T, arc' = A arc.
 
-    c: the element's centre. c' = l + spread (c - l), l the light. A: streak along the long axis, then scale and
-    rotation. is_streak: whether the element is a streak."""
+    c is the element's centre, weighted by energy; c' = l + spread (c - l), with l the light. A stretches a streak along
+    its long axis, then scales and rotates. is_streak: whether the element is a streak."""
     stretch = edit.streak if is_streak else 1.0
     if (edit.scale, edit.spread, edit.rotation, stretch) == (1.0, 1.0, 0.0, 1.0):
         return gaussians
@@ -346,7 +346,7 @@ def _apply_shape(gaussians: PlaneGaussians, edit: Edit, light_position: NDArray[
 
 
 def _long_axis(gaussians: PlaneGaussians, weights: Floats | NDArray[Any], centre: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the unit vector along the longest extent of the Gaussians as a whole."""
+    """Return the unit vector (2,) along the longest extent of the Gaussians as a whole: their first principal axis."""
     xx, xy, yy = np.average(gaussians.covariances, axis=0, weights=weights)
     offsets = gaussians.means - centre
     centre_covariance = (offsets * np.asarray(weights)[:, None]).T @ offsets / np.sum(weights)

@@ -54,8 +54,8 @@ class Element:
 def read_elements(entries: Sequence[Mapping[str, Any]], light: str, count: int) -> list[Element]:
     """Return the elements of `light` that a .flare's description lists; [] if it lists none.
 
-    entries: see `Element.to_json`; "light" and "members" are required. Gaussians without an entry form the element
-    "rest". Raises ValueError for invalid members.
+    entries: as `Element.to_json` makes them; "light" and "members" are required. count: number of the light's
+    Gaussians; those without an entry form the element "rest". Raises ValueError for invalid members.
     """
     elements: list[Element] = []
     is_unassigned = np.ones(count, bool)
@@ -80,7 +80,8 @@ def read_elements(entries: Sequence[Mapping[str, Any]], light: str, count: int) 
 def group_elements(gaussians: PlaneGaussians, mu: Floats | None) -> list[Element]:
     """Group a light's Gaussians, as evaluated for one view, into elements, brightest first.
 
-    mu: (n,) positions on the line; None for a form without the line, which gets one element for each kind.
+    mu: (n,) positions on the line, 0 at the principal point, 1 at the light; None for a form without the line, which
+    gets one element for each kind.
     """
     energy = gaussians.energy + 1e-12
     kinds = _classify(gaussians)
@@ -104,11 +105,14 @@ def group_elements(gaussians: PlaneGaussians, mu: Floats | None) -> list[Element
 
 
 def _extent_and_colour(gaussians: PlaneGaussians, energy: Floats) -> tuple[float, tuple[float, float, float]]:
-    """Return extent and colour of a group of Gaussians, as in `Element`; energy (n,): of each Gaussian."""
+    """Return the root mean square distance of a group's light from its centre, and its mean colour, largest channel 1.
+
+    energy (n,): light of each Gaussian of the group.
+    """
     weights = energy / energy.sum()
     offsets = gaussians.means - weights @ gaussians.means
     spread = gaussians.covariances[:, 0] + gaussians.covariances[:, 2]
-    if gaussians.rings is not None:  # the mean of r² over a ring, that of the plain profile for r0 = 0
+    if gaussians.rings is not None:  # about the mean of r² over a ring; exact for r0 = 0
         r0, w = np.maximum(gaussians.rings[:, 0], 0), gaussians.rings[:, 1]
         spread = spread * (r0 * r0 + 2 * w * w) / 2
     extent = float(np.sqrt(weights @ ((offsets * offsets).sum(-1) + spread)))
@@ -137,7 +141,8 @@ def _classify(gaussians: PlaneGaussians) -> NDArray[np.str_]:
 def _split_at_valleys(mu: Floats, energy: Floats) -> list[NDArray[np.int64]]:
     """Split Gaussians at the valleys of their energy along the line; return the indices of each part.
 
-    mu (n,): positions on the line. energy (n,): of each."""
+    mu (n,): positions on the line. energy (n,): light of each Gaussian. The energy is summed in bins along the line and
+    blurred; a valley is a minimum below VALLEY_RATIO times the peaks on both sides."""
     low, high = float(mu.min()), float(mu.max())
     if high - low < 2 * DENSITY_SIGMA:
         return [np.arange(len(mu))]
@@ -163,10 +168,10 @@ def _split_at_valleys(mu: Floats, energy: Floats) -> list[NDArray[np.int64]]:
 
 def _merge_faint(groups: list[tuple[str, NDArray[np.int64]]], energy: Floats,
                  mu: Floats | None) -> list[tuple[str, NDArray[np.int64]]]:
-    """Merge the faintest groups into the nearest of their kind, or of any kind where there is no other of theirs.
+    """Merge the faintest group, again and again, into the nearest of its kind, or of any kind if it is the last of its.
 
-    groups: (kind, rows) of each. energy, mu (n,): of the Gaussians. Ends with at most MAX_ELEMENTS groups, each with
-    MIN_ELEMENT_ENERGY of the light's energy or more."""
+    groups: kind and rows of each. energy, mu (n,): light of each Gaussian, and place on the line. Ends with at most
+    MAX_ELEMENTS groups, each with MIN_ELEMENT_ENERGY of the light's energy or more."""
     groups = list(groups)
 
     def position(rows: NDArray[np.int64]) -> float:

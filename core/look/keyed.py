@@ -58,8 +58,11 @@ class KeyedEdits:
 
     def edits_at(self, frame: int, lights: Sequence[str],
                  elements: Mapping[str, Sequence[str]] | None = None) -> LookEdits:
-        """Return the edits of a frame, interpolated between keyframes; lights, elements, errors: see
-        `LookEdits.parse`."""
+        """Return the edits of a frame, interpolated between keyframes.
+
+        lights: known names. elements: known names by light; None accepts any name. Raises SettingsError for an invalid
+        edit.
+        """
         def parse_keyframe(number: int) -> LookEdits:
             return LookEdits.parse((*self.always, *self.frames[number]), lights, elements)
 

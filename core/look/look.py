@@ -79,10 +79,10 @@ class LightLook:
     def __init__(self, name: str, xyz: NDArray[np.float64], form: FlareForm, query_range: QueryRange,
                  rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: Blend,
                  stored_elements: list[Element], clear_visibility: float = 1.0) -> None:
-        """rows: parameters of the canonical Gaussians, (n, width) each, by name; tensors: the light's in the file, the
-        network's among them; stored_elements: those in the file, or [].
-        clear_visibility: visibility of the unoccluded light through the scene of its fit, 0..1
-        (`core.flare.model.FlareModel`)."""
+        """rows: parameters of the canonical Gaussians, (n, width) each, by name. tensors: all tensors of this light in
+        the file, those of the network among them. stored_elements: the elements in the file, or []. clear_visibility:
+        visibility, 0..1, that the scene of the fit gives the light where nothing hides it. Raises ValueError and
+        KeyError for tensors that do not fit."""
         self.name, self.xyz, self.form, self.query_range, self.blend = name, xyz, form, query_range, blend
         self.clear_visibility = clear_visibility
         self._canonical, self._stored_elements = rows, stored_elements
@@ -102,7 +102,8 @@ class LightLook:
         """The elements in the file, or else those that `group_elements` makes of the canonical Gaussians."""
         if self._stored_elements:
             return self._stored_elements
-        # A light off both axes, at 0.65 of its largest distance in training: elements lie apart along the line.
+        # Grouped as seen with a light off both axes, at 0.65 of its largest distance in training: there elements lie
+        # apart.
         light = self.query_range.light_high[2] * np.array([0.55, 0.35], np.float32)
         camera = (self.query_range.camera_low + self.query_range.camera_high) / 2
         view = ViewOfLight(camera, np.eye(3, dtype=np.float32), np.asarray(light, np.float32), 1.0)
@@ -116,7 +117,8 @@ class LightLook:
 
         query: camera and light at which the network is evaluated, by default the view's: appearance follows it,
         placement follows the view. visibility: 0..1, scales the opacities. name: of the light whose edits are applied,
-        by default this light's. budget: see `Look.evaluate_lights`.
+        by default this light's. budget: bounds the time for the network, so that offsets may be those of an earlier
+        view; None for exact ones.
         """
         if view.depth <= 0:
             return None
@@ -129,9 +131,10 @@ class LightLook:
 
     def _evaluate_on_plane(self, view: ViewOfLight, query: ViewOfLight | None, budget: OffsetsBudget | None = None,
                            name: str = "") -> tuple[PlaneGaussians, Floats]:
-        """Return Gaussians on the plane (paper, eq. 1 to 3), and the light's position (2,) with delta_l.
+        """Return Gaussians on the plane (paper, eq. 1 to 3), and the light's position (2,), corrected by delta_l.
 
-        query, budget: see `evaluate`. name: of the placed light."""
+        query: camera and light for the network; None for the view's. budget: bounds the time for the network. name: of
+        the placed light, for the budget."""
         form, rows, queried = self.form, self._canonical, query or view  # the rows are canonical, before deformation
         features = self._network.view_features(queried.camera, queried.light)
         offsets = self._network.offsets(features, budget, name)
@@ -209,8 +212,8 @@ class Look:
         """Return the plane Gaussians of each visible light in front of the camera, by name, in the file's order.
 
         world_to_camera: (4, 4), x right, y down, z forward. lights: positions (3,) by name, by default the file's;
-        lights that are missing in it are omitted. visibilities: 0..1, by name, by default 1.
-        edits, query: see `evaluate_lights`.
+        names that the file lacks are omitted. visibilities: 0..1, by name, by default 1. edits: by the names of lights.
+        query: the view at which the network is evaluated, by default this one; `evaluate_lights` lists the others.
         """
         positions = {light.name: light.xyz for light in self.lights} if lights is None else lights
         names = sorted(positions, key=lambda name: self.names.index(name) if name in self.names else len(self.names))
@@ -226,8 +229,8 @@ class Look:
         edits: by the names of the placed lights; lights that mute and solo turn off are omitted.
         query: the view at which the network is evaluated: "target" the view itself; "trained" camera and light, clipped
         to the range of the training views; "source" the middle of the range of cameras, and the clipped light.
-        Placement always follows the view. budget: bounds the time for the network, for an interactive drawing; lights
-        with an extent do not count. None for exact flares.
+        Placement always follows the view. budget: bounds the time for the network in an interactive drawing; lights
+        with an extent are exact in any case. None for exact flares.
         """
         flares: dict[str, PlaneGaussians] = {}
         for light, source in self.visible_lights(lights, edits):
@@ -343,8 +346,8 @@ def parse_description(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]
 def _check_light(path: Path, entry: Mapping[str, Any], element_entries: Any) -> str:
     """Validate the description of a light, and return its name.
 
-    entry: of the light. element_entries: the elements of all lights. Raises FlareFileError, and what the caller
-    converts to it.
+    entry: the light's description. element_entries: the elements of all lights. Raises FlareFileError for a form of a
+    newer version; for invalid values ValueError, KeyError or TypeError, which the caller turns into FlareFileError.
     """
     unknown = set(entry["form"]) - {field.name for field in fields(FlareForm)}
     if unknown:
@@ -399,7 +402,7 @@ def _read_light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDA
 
 
 def _row_widths(form: FlareForm) -> dict[str, int]:
-    """Return the number of columns of the canonical Gaussians by name (core.flare.model.LightFlare)."""
+    """Return the number of columns of each parameter of the canonical Gaussians, by its name in the .flare."""
     widths = {"positions": 1 if form.line else 2, "log_scales": 3 if form.solid else 2,
               "rotations": 4 if form.solid else 2, "opacity_logits": 1, "sh": 3 * (form.sh_degree + 1) ** 2}
     extra = {"offsets": (form.static_offset, 2), "rings": (form.rings, 2), "arcs": (form.arcs, 2),

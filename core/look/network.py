@@ -78,11 +78,11 @@ class OffsetsBudget:
     """
 
     def __init__(self, seconds: float, seconds_at_rest: float = 0.0) -> None:
-        """seconds: for the network in one drawing. seconds_at_rest: the same where view and lights are those of the
-        last two drawings, if that is more."""
+        """seconds: for the network in one drawing. seconds_at_rest: the same while view and lights are those of the
+        last two drawings; the larger of both holds then."""
         self._seconds, self._seconds_at_rest = seconds, max(seconds, seconds_at_rest)
         self._seconds_per_light = 0.0
-        # Cache key and offsets of each light, by number of its network and its name; that which waited longest first.
+        # Cache key and offsets of each light, by number of its network and its name; the longest waiting first.
         self._offsets: OrderedDict[tuple[int, str], tuple[tuple[int, bytes], Floats]] = OrderedDict()
         # Cache key of each light in the drawing since `begin`, and in the one before.
         self._drawn: dict[tuple[int, str], tuple[int, bytes]] = {}
@@ -100,21 +100,24 @@ class OffsetsBudget:
         self._drawn, self._drawn_before = {}, self._drawn
 
     def get(self, light: tuple[int, str], key: tuple[int, bytes], compute: Callable[[], Floats]) -> Floats:
-        """Return the offsets of a light: those of the key if it is the light's turn, else its last ones."""
-        if not self._drawn:
+        """Return the offsets of a light: exact ones if it is new, unchanged or due in this drawing, else its last ones.
+
+        light: number of its network, and its name. key: of its exact offsets in the cache. compute: computes these.
+        """
+        if not self._drawn:  # the first light of this drawing: now it is known whether the view rests
             self._choose_due(self._rested and self._drawn_before.get(light) == key)
         self._drawn[light] = key
         known = self._offsets.get(light)
         if known is None or (known[0] != key and light in self._due):
             known = self._offsets[light] = key, _cache.get(key, lambda: self._measure(compute))
         if known[0] == key:
-            self._offsets.move_to_end(light)
+            self._offsets.move_to_end(light)  # it has exact offsets: behind all that wait
         else:
             self.is_complete = False
         return known[1]
 
     def _choose_due(self, is_at_rest: bool) -> None:
-        """Choose the lights whose turn it is in this drawing."""
+        """Choose the lights that get exact offsets in this drawing: the longest waiting, as many as its time allows."""
         seconds = self._seconds_at_rest if is_at_rest else self._seconds
         count = max(int(seconds / self._seconds_per_light), 1) if self._seconds_per_light else len(self._offsets)
         self._due = set(itertools.islice(self._offsets, count))
@@ -133,8 +136,9 @@ class HashGrid:
 
     def __init__(self, bits: int, growth: float, levels: int, base: int, rows: NDArray[Any],
                  values: NDArray[Any]) -> None:
-        """bits, growth: see `LIGHT_BITS`. levels, base: see `FlareForm`. rows (k,): ascending indices of the stored
-        table rows, the others are zero. values (k, features): the stored rows."""
+        """bits: log2 of the most rows of a level's table. growth: factor of the resolution from level to level. levels:
+        their number. base: resolution of the coarsest. rows (k,): ascending indices of the stored table rows; all
+        others are zero. values (k, features): the stored rows."""
         size = 1 << bits
         self._resolutions = np.array([math.floor(base * growth**level) for level in range(levels)], np.int64)
         self._sizes = np.minimum((self._resolutions + 1) ** 3, size)
@@ -216,8 +220,9 @@ class Network:
 
     def __init__(self, tensors: Mapping[str, NDArray[Any]], heads: Mapping[str, int], levels: int, base: int,
                  query_range: QueryRange, encoded: Floats) -> None:
-        """tensors: by their names in the file, without the light's number. heads: width of each offset by name.
-        levels, base: see `FlareForm`. encoded: (n, d) frequency-encoded canonical positions, then latent codes."""
+        """tensors: by their names in the file, without the light's number. heads: width of each offset by name. levels,
+        base: number of levels of the hash grids, and resolution of the coarsest. encoded: (n, d) frequency-encoded
+        canonical positions, then latent codes."""
         self._tensors = {name: np.asarray(tensor, np.float32) for name, tensor in tensors.items()
                          if not name.endswith(".rows")}
         self._heads, self._range = dict(heads), query_range
@@ -285,7 +290,10 @@ class Network:
         return np.asarray(encoded @ self._tensors["network.gaussian_layer.weight"].T, np.float32)
 
     def _concatenated_offsets(self, gaussian_features: Floats, features: Floats) -> Floats:
-        """Return the offsets of all heads, (n, sum of their widths); see `_encode_gaussians` and `view_features`."""
+        """Return the offsets of all heads, (n, sum of their widths).
+
+        gaussian_features (n, width): contribution of each Gaussian to the first layer. features: those of the view.
+        """
         from_view = self._linear("network.view_layer", features[None])
         result = np.empty((len(gaussian_features), len(self._tensors["network.head.weight"])), np.float32)
         x, y = np.empty((2, min(ROWS_PER_BLOCK, len(result)), from_view.shape[1]), np.float32)
@@ -295,7 +303,7 @@ class Network:
             np.add(gaussian_features[rows], from_view, out=x)
             np.maximum(x, 0, out=x)
             for name in self._hidden_layers:
-                x, y = self._linear(name, x, y), x
+                x, y = self._linear(name, x, y), x  # two buffers, in turn input and output
                 np.maximum(x, 0, out=x)
             self._linear("network.head", x, result[rows])
         return result

@@ -25,7 +25,8 @@ def light_at(gaussians: PlaneGaussians, intrinsics: ArrayLike, point: ArrayLike,
              pixel_grid: PixelGrid | None = None) -> Floats:
     """Return the luminance (n,) that each Gaussian adds at a point (2,) of the picture, px, pixel centres at + 0.5.
 
-    With the blend "over", that is what the Gaussians in front of it leave. intrinsics, pixel_grid: see `drawing.draw`.
+    With the blend "over", only what the Gaussians in front of it let through counts. intrinsics (3, 3). pixel_grid:
+    that of the fit, which sets the low-pass filter; None for the default filter.
     """
     centres, covariances = to_pixels(gaussians, intrinsics, pixel_grid)
     profiles = _profiles(gaussians, np.asarray(point, np.float64) - centres, covariances,
@@ -42,13 +43,14 @@ def light_at(gaussians: PlaneGaussians, intrinsics: ArrayLike, point: ArrayLike,
 
 def _profiles(gaussians: PlaneGaussians, offsets: NDArray[np.float64], covariances: Floats, pixel_arcs: Floats
               ) -> NDArray[np.float64]:
-    """Return the profiles (n,) at offsets (n, 2) px from the centres, 1 at a peak, as `drawing.profile_in_box`.
+    """Return the profile of each Gaussian (n,) at an offset (n, 2), px, from its centre, 1 at the peak.
 
-    0 for degenerate Gaussians. covariances (n, 3), px². pixel_arcs (n, 2): see `arcs_to_pixels`."""
+    0 for degenerate Gaussians. covariances (n, 3), px². pixel_arcs (n, 2): px, towards the brighter side of a ring."""
     xx, xy, yy = covariances.T.astype(np.float64)
     dx, dy = offsets.T
     with np.errstate(all="ignore"):
         determinant = xx * yy - xy * xy
+        # Squared Mahalanobis distance.
         q = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant
         if gaussians.rings is None:
             exponents = q / 2

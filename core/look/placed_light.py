@@ -119,7 +119,8 @@ def _sum_over_cells(light: PlacedLight, extent: LightExtent, pose: NDArray[np.fl
                     blend: Blend, evaluate: Evaluate, low_pass: float) -> PlaneGaussians | None:
     """Return the flare of a light with an extent: the sum over its cells; None if none is lit and in front.
 
-    pose (4, 4): world to camera. eye (3,): position of the camera. low_pass: see `_low_pass_variance`."""
+    pose (4, 4): world to camera. eye (3,): position of the camera. low_pass: variance that the rasterizer adds to each
+    Gaussian, normalised coordinates."""
     sampled = extent.sampled(light.xyz, pose)
     shares = np.ones(sampled.count) if light.shares is None else np.asarray(light.shares, np.float64)
     strengths = sampled.weights * shares * sampled.emission
@@ -174,8 +175,8 @@ def multiply_light(gaussians: PlaneGaussians, factor: ArrayLike, blend: Blend) -
 def _fit_motions(parts: Sequence[PlaneGaussians], positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how each Gaussian moves with the light (n, 2, 2), by least squares over the cells.
 
-    parts: the flare of each cell. places (k, 2): of the cells on the plane.
-    Element [i, a, b] is the motion of coordinate a by coordinate b."""
+    parts: the flare of each cell. positions (k, 2): of the cells on the plane. Element [i, a, b] is the derivative of
+    coordinate a of Gaussian i by coordinate b of the light."""
     means = np.stack([part.means for part in parts]).astype(np.float64)
     offsets = positions - positions.mean(0)
     # The cut-off leaves out the direction across a light that is seen as a line: there is no motion to measure.
@@ -185,10 +186,11 @@ def _fit_motions(parts: Sequence[PlaneGaussians], positions: NDArray[np.float64]
 
 def _blur(gaussians: PlaneGaussians, motions: NDArray[np.float64], spread: NDArray[np.float64], low_pass: float
              ) -> PlaneGaussians:
-    """Return the Gaussians convolved with a light of the covariance `spread` (2, 2), with the same drawn light.
+    """Return the Gaussians blurred by a light of the covariance `spread` (2, 2); the light that they draw stays the
+    same.
 
-    motions: see `_fit_motions`. low_pass: see `_low_pass_variance`.
-    A ring is widened by the mean of the blur in its own coordinates, since its ellipse is not the shape of its line.
+    motions (n, 2, 2): derivative of each Gaussian's centre by the light's position. low_pass: variance that the
+    rasterizer adds. A ring keeps its ellipse; its width w grows by the blur's mean variance relative to the ellipse.
     """
     xx, xy, yy = gaussians.covariances.T.astype(np.float64)
     blur = motions @ spread @ motions.transpose(0, 2, 1)
@@ -214,7 +216,7 @@ def _blur(gaussians: PlaneGaussians, motions: NDArray[np.float64], spread: NDArr
 def _profile_integrals(gaussians: PlaneGaussians, low_pass: float) -> NDArray[np.float64]:
     """Return the integrals (n,) of the profiles as they are drawn, but for their arcs, which a blur hardly changes.
 
-    low_pass: added to the variances. The integral of exp(-(r - r0)^2 / (2 w^2)) over the plane is 2 pi times
+    low_pass: variance that the rasterizer adds. The integral of exp(-(r - r0)^2 / (2 w^2)) over the plane is 2 pi times
     w^2 exp(-r0^2 / (2 w^2)) + r0 w sqrt(pi / 2) (1 + erf(r0 / (w sqrt 2)))."""
     xx, xy, yy = gaussians.covariances.T.astype(np.float64)
     areas = 2 * np.pi * np.sqrt(np.maximum((xx + low_pass) * (yy + low_pass) - xy * xy, 1e-30))

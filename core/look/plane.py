@@ -83,7 +83,7 @@ class PlaneGaussians:
 
 def project_covariances(means: Floats, log_scales: Floats, quaternions: Floats) -> Floats:
     """Return (n, 3) covariances xx, xy, yy on the plane of 3D Gaussians at depth PLANE_DEPTH, projected to first order
-    (Zwicker et al. 2002).
+    (EWA splatting, Zwicker et al. 2002).
 
     means: (n, 2) on the plane. log_scales: (n, 3), world units. quaternions: (n, 4) wxyz, of any length but zero."""
     q = quaternions / np.maximum(np.linalg.norm(quaternions, axis=-1, keepdims=True), 1e-12)
@@ -112,18 +112,20 @@ def arcs_of_ellipse(arcs: Floats, log_scales: Floats, directions: Floats) -> Flo
 
 
 def opacity_gain(arcs: Floats, rings: Floats) -> Floats:
-    """Return (n,) factors of the opacities; arcs (n, 2) in standard deviations along the axes, rings (n, 2).
+    """Return (n,) factors of the opacities; arcs (n, 2) in standard deviations along the axes, rings (n, 2)
+    of r0 and w.
 
-    A profile is divided by its peak, whose logarithm has a kink where the arc's strength is 0. The factor replaces the
-    strength by one that is quadratic there, so that the profile changes smoothly."""
+    A profile is drawn divided by its peak, whose logarithm, about r0 |arc|, has a kink at arc 0. The factor replaces
+    |arc| by a softened length that is quadratic there, so that the profile changes smoothly."""
     squared = (arcs * arcs).sum(-1)
     softened = squared / np.sqrt(squared + ARC_SOFTNESS**2)
     return np.asarray(np.exp(rings[:, 0] * (np.sqrt(squared) - softened)), np.float32)
 
 
 def arc_strengths(arcs: Floats, covariances: Floats) -> Floats:
-    """Return (n,) lengths of arcs (n, 2) in standard deviations of covariances (n, 3); in double precision, for
-    needles."""
+    """Return (n,) lengths of arcs (n, 2) in standard deviations of covariances (n, 3).
+
+    Computed in float64, since the determinant of a very thin Gaussian would cancel in float32."""
     xx, xy, yy = covariances.T.astype(np.float64)
     x, y = arcs.T.astype(np.float64)
     squared = (yy * x * x - 2 * xy * x * y + xx * y * y) / np.maximum(xx * yy - xy * xy, 1e-30)
@@ -169,16 +171,15 @@ def arcs_to_pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike) -> Floats:
 
 
 def arc_log_peak(strength: Any, ring: Any) -> Any:
-    """Return m, the logarithm of the peak that an arc gives a profile; see `normalise_arcs` in
-    core/gaussians/rendering.py.
+    """Return (n,) logarithms of the peak of exp(s r - (r - r0)² / (2 w²)): a ring along its arc, which is at r0 + s w².
 
-    strength (n,): see `arc_strengths`. ring (n, 2), or (2,) for one."""
+    strength (n,): s, the arc's length in standard deviations. ring (n, 2), or (2,) for one: r0 and w."""
     r0, w = np.asarray(ring).T
     return strength * (r0 + strength * w * w / 2)
 
 
 def concatenate(sets: Sequence[PlaneGaussians]) -> PlaneGaussians | None:
-    """Concatenate several sets; None for no sets. Sets without rings or arcs get plain ones if other sets have them."""
+    """Concatenate several sets; None for no sets. If only some sets have rings or arcs, the others get neutral ones."""
     if not sets:
         return None
 

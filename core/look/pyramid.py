@@ -39,7 +39,8 @@ def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, 
                   min_texels: float = MIN_TEXELS) -> NDArray[np.int64]:
     """Return the index in `levels` (n,) of the grid for each Gaussian; covariances (n, 3) in px².
 
-    It is the coarsest grid on which the Gaussian's narrow side deviates by `min_texels` or more, else the finest.
+    It is the coarsest grid on which the standard deviation of the Gaussian's narrow side is `min_texels` or more, else
+    the finest. rings (n, 2): r0 and w, or None.
     """
     xx, xy, yy = covariances.T
     # The variances along the axes are the mean plus and minus half their difference.
@@ -51,7 +52,7 @@ def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, 
 
 
 def draw_added(gaussians: PlaneGaussians, look: Look, intrinsics: ArrayLike, width: int, height: int) -> Floats:
-    """Return the scene-linear light (height, width, 3) of Gaussians of a look whose light adds."""
+    """Return the scene-linear light (height, width, 3) of Gaussians of a look with the blend "add"."""
     centres, covariances = to_pixels(gaussians, intrinsics, look.pixel_grid)
     arcs, radii = arcs_to_pixels(gaussians, intrinsics), cutoff_radii(gaussians)
     indices = level_indices(covariances, gaussians.rings)
@@ -77,7 +78,8 @@ def _add_gaussian(grid: Floats, centre: Floats, covariance: Floats, radius: floa
                   light: Floats) -> None:
     """Add one Gaussian to a grid (rows, columns, 3). Lengths are in texels of the grid.
 
-    radius: see `drawing.cutoff_radii`. arc: see `arcs_to_pixels`. light: RGB at the peak."""
+    radius: Mahalanobis radius to which it is drawn. ring (2,): r0 and w, or None. arc (2,): towards the brighter side
+    of a ring. light: RGB at the peak."""
     box = bounding_box(centre, covariance, radius, grid.shape[1], grid.shape[0])
     for band in () if box is None else _bands(box, centre, covariance, radius):
         left, top, right, bottom = band

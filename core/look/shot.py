@@ -94,8 +94,8 @@ class Shot:
         return folder_by_name if len(folder_by_name) > 1 or self.own_folder else dict.fromkeys(folder_by_name, "")
 
     def fingerprint(self, run: str = "") -> str:
-        """Return a hash that changes whenever all pictures would; `ShotFrame.cache_key` covers the single frames. run:
-        fingerprint of the fit whose scene is behind the flare."""
+        """Return a hash of what all frames share: the .flare, the lights' names, the query, and `run`, the fingerprint
+        of the fit whose scene is behind the flare. `ShotFrame.cache_key` covers the rest."""
         digest = hashlib.sha256(read_bytes(self.flare))
         digest.update(repr((self.query, self.live, self.lights)).encode())
         digest.update(run.encode())
@@ -113,7 +113,8 @@ class Shot:
 
     @classmethod
     def read(cls, path: Path | str) -> Shot:
-        """Read a shot. Raises SettingsError for a missing or invalid file."""
+        """Read a shot; its relative paths start at the file's folder. Raises SettingsError for a missing or invalid
+        file."""
         data = read_json(path, SettingsError)
         try:
             if data["version"] != VERSION:

@@ -100,7 +100,7 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
         progress.say(f"{out} is solved already.")
         shutil.rmtree(out / WORK_FOLDER, ignore_errors=True)
         return finished
-    with folder_lock(out):  # two in one database would be the end of both
+    with folder_lock(out):  # two solves at once would damage the database
         return _solve(source, out, request, settings, progress)
 
 

@@ -102,8 +102,8 @@ def solve(sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, v
           progress: Progress) -> Solved:
     """Reconstruct the largest model from small pictures and masks below `work`, where a stopped solve resumes.
 
-    video: the frames are of a video, which decides which of them are matched. Raises what `core.capture.solve.solve`
-    raises.
+    video: True for frames of a video, whose neighbours are matched. Raises CaptureError where nothing can be
+    reconstructed, EngineError without pycolmap, Cancelled on a stop request.
     """
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
@@ -212,6 +212,7 @@ def _group_frames(pycolmap: Any, db: Any, sources: Sequence[SourceFrame], extrac
     extracted: names of the frames with features.
     """
     camera_by_format: dict[tuple[int, int, float | None], int] = {}
+    # The first parameter of a camera is its focal length, in every model to solve with.
     camera_ids = {(c.width, c.height, round(c.params[0], 6)): c.camera_id for c in db.read_all_cameras()}
     names_by_group: dict[tuple[int, bool], list[str]] = {}
     for source in sources:
@@ -229,7 +230,7 @@ def _group_frames(pycolmap: Any, db: Any, sources: Sequence[SourceFrame], extrac
 
 def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, database: Path,
                       settings: SolveSettings, progress: Progress) -> None:
-    """Extract features of every frame that has none in the database."""
+    """Extract SIFT features of every frame that has none in the database, and store them there."""
     with _open_database(pycolmap, database) as db:
         extracted = {image.name for image in db.read_all_images()
                      if db.num_keypoints_for_image(image.image_id) or db.exists_descriptors(image.image_id)}
@@ -281,7 +282,10 @@ def _make_camera(pycolmap: Any, size: tuple[int, int], focal: float | None, mode
 
 def _match_frames(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, database: Path, matching: Any,
                   settings: SolveSettings, progress: Progress) -> int:
-    """Match and verify the chosen pairs that are missing in the database; return the number of chosen pairs."""
+    """Match and verify (RANSAC) the chosen pairs that the database lacks, and store the matches there.
+
+    Returns the number of chosen pairs, old ones included.
+    """
     with _open_database(pycolmap, database) as db:
         ids = [db.read_image_with_name(source.name).image_id for source in sources]
         pairs = choose_pairs(matching, len(sources), lambda i: np.asarray(db.read_descriptors(ids[i]).data),

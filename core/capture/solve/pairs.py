@@ -106,7 +106,7 @@ def _sum_by_group(rows: NDArray[np.float32], group: NDArray[np.intp], groups: in
 
 
 def _k_means(rows: NDArray[np.float32], number: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return centres (number, d) of rows (n, d) by Lloyd's algorithm; one without rows stays in place."""
+    """Return centres (number, d) of rows (n, d) by Lloyd's algorithm; a centre without rows stays in place."""
     centres = _random_rows(rows, number, rng).copy()
     for _ in range(K_MEANS_ROUNDS):
         nearest = _nearest_centre(rows, centres)

@@ -42,7 +42,8 @@ def make_report(sources: Sequence[SourceFrame], solved: Solved, left_out: list[s
 
 
 def draw_model(solved: Solved, path: Path) -> None:
-    """Draw points in their colours, cameras as dots with a line ahead, and their path, from above and from the front.
+    """Write a picture of points in their colours, cameras as dots with a line ahead, and their path, from above and
+    from the front.
 
     The world is aligned: x to the right, y ahead, z up.
     """

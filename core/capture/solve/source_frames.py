@@ -155,7 +155,7 @@ def _to_upright(picture: Picture, orientation: int) -> Picture:
 
 def _prepare_folder(source: Path, work: Path, number: int, size: int,
                     progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
-    """Prepare the frames of a folder; see `prepare_frames`."""
+    """Prepare the frames of a folder, as `prepare_frames` describes; return them, and why others were left out."""
     named_space = colour_space(*space) if space[0] else None
     files = pictures_in(source)
     if not files:
@@ -201,9 +201,9 @@ def _prepare_folder(source: Path, work: Path, number: int, size: int,
 
 def _prepare_video(source: Path, work: Path, number: int, size: int,
                    progress: Progress, space: tuple[str, str | None]) -> tuple[list[SourceFrame], list[str]]:
-    """Prepare the frames of a video; see `prepare_frames`. None is reported as left out.
+    """Prepare the frames of a video, as `prepare_frames` describes; the list of frames left out is empty.
 
-    It is read twice: for the sharpness of every frame, then for the chosen ones.
+    The video is read twice: for the sharpness of every frame, then for the chosen ones.
     """
     named_space = colour_space(*space) if space[0] else None
     with Video(source) as video:
@@ -279,7 +279,8 @@ def feature_mask(picture: Picture) -> NDArray[np.bool_]:
 def _ghost_lines(clipped: NDArray[np.uint8], thickness: int) -> NDArray[np.bool_]:
     """Return the mask (h, w) of lines through the frame's centre and the largest compact spots of a mask (h, w).
 
-    Ghosts lie on these lines. thickness: of the lines, pixels.
+    The ghosts of a light lie on the line through it and the centre. clipped: the mask, 1 where a pixel is clipped.
+    thickness: width of the lines, pixels.
     """
     import cv2
 

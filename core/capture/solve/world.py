@@ -21,8 +21,8 @@ MEDIAN_DISTANCE = 5.0
 def up_direction(rotations: Sequence[Floats]) -> Floats:
     """Return the unit up vector (3,) of the world, from world-to-camera rotations (3, 3).
 
-    Minimises sum (x_i . u)^2 - n/5 (y . u)^2, with y the mean of the frames' up: where all cameras look one way their x
-    axes alone leave up undecided.
+    The unit vector u minimises sum (x_i . u)^2 - n/5 (y . u)^2 over n cameras, with x_i their x axes and y the mean of
+    their up axes: where all cameras look one way, the x axes alone leave u undecided.
     """
     stack = np.asarray(rotations)
     right, mean_up = stack[:, 0], -stack[:, 1].mean(axis=0)

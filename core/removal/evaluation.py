@@ -91,8 +91,8 @@ def _find_folder(root: Path, names: Sequence[str]) -> Path | None:
 
 
 def _index_by_key(folder: Path) -> dict[str, Path]:
-    """Return a folder's pictures by name without prefix, or by the whole name if that is ambiguous. Raises
-    SettingsError where one name has two suffixes."""
+    """Return a folder's pictures by the stem of their names without a prefix such as "gt_", or by the whole stem if two
+    pictures would get one key. Raises SettingsError where one stem has two suffixes."""
     paths = pictures_in(folder)
     duplicates = [stem for stem, count in Counter(path.stem for path in paths).items() if count > 1]
     if duplicates:
@@ -121,12 +121,14 @@ def _case_reader(path: Path, truth: Path, mask: Path | None) -> Callable[[], tup
 
 def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress: Progress | None = None, *,
              lpips: Perceptual | None = None) -> dict[str, Any]:
-    """Return scores of every case, means by category and of all; JSON-able.
+    """Return the scores of every case, and their means by category and over all; JSON-able.
 
-    clean: removes the flare from display values (height, width, 3). gain_db: PSNR minus that of the untouched input;
-    where two pictures are identical, IDENTICAL_PSNR counts, in means too. made_worse: share of pictures with a gain
-    below -WORSE_BY_DB. failed: messages about pairs that cannot be read, which are left out. masked_psnr: over the
-    pixels of the mask. lpips is null without weights for it. Raises FrameError where no pair can be read.
+    clean: removes the flare from display values (height, width, 3). lpips: the metric; None leaves its score null.
+
+    Keys of the result: gain_db is PSNR minus that of the untouched input; the PSNR of identical pictures counts as
+    IDENTICAL_PSNR, in means too. made_worse is the share of pictures with a gain below -WORSE_BY_DB. failed holds
+    messages about pairs that cannot be read, which are left out. masked_psnr is over the pixels of the mask. Raises
+    FrameError where no pair can be read.
     """
     progress = progress or Progress()
     progress.stage("eval-removal", len(cases))
@@ -170,9 +172,9 @@ def _score_picture(picture: Pixels, truth: Pixels, mask: Pixels | None,
 
 
 def _summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return means over the cases, and the share that became worse by more than WORSE_BY_DB.
+    """Return means over the cases, and the share of cases that became worse by more than WORSE_BY_DB.
 
-    rows: of `evaluate`, one dictionary per case.
+    rows: one dictionary per case, as `evaluate` makes them.
     """
     gains = [row["gain_db"] for row in rows]
     summary: dict[str, Any] = {"count": len(rows), "gain_db": _mean(gains),
@@ -213,7 +215,7 @@ def draw_worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], s
     """Return a sheet (rows, 4 * width, 3) of the pictures with the lowest gain, worst first: input | result | truth |
     removed flare times 2, display values.
 
-    clean: as for `evaluate`. scores: what `evaluate` returned. width: of one tile, pixels.
+    clean: removes the flare from display values. scores: what `evaluate` returned. width: of one tile, pixels.
     """
     import cv2
 

@@ -60,8 +60,8 @@ class Architecture(NamedTuple):
 
 
 def read_architecture(path: Path | str, metadata: Mapping[str, str]) -> Architecture:
-    """Return the architecture in the recipe of a file's header. It does not need the recipe's other settings, which may
-    be those of another version. Raises RunError."""
+    """Return the architecture from the recipe in a file's header. The recipe's other settings, which may be those of
+    another version, are not read. Raises RunError."""
     try:
         recipe = parse_json(metadata["recipe"])
         if not all(_is_size_list(recipe.get(name, [0])) for name in Architecture._fields):
@@ -73,7 +73,7 @@ def read_architecture(path: Path | str, metadata: Mapping[str, str]) -> Architec
 
 
 def _is_size_list(sizes: object) -> bool:
-    """True for a list of whole numbers as networks have them."""
+    """True for a list of 1 to _MAX_LEVELS whole numbers of 0 to _MAX_SIZE."""
     return (isinstance(sizes, list) and 0 < len(sizes) <= _MAX_LEVELS
             and all(type(size) is int and 0 <= size <= _MAX_SIZE for size in sizes))
 

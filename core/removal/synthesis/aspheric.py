@@ -28,9 +28,12 @@ MAX_CAUSTIC = 6.0
 
 
 class Aberrations(NamedTuple):
-    """The map from the stop (1 at its edge) to the sensor, relative to the ghost's radius; the first axis points away
-    from the middle of the frame. scale: of the ghost by channel, (3,). third: spherical aberration of third order by
-    channel, (3,). fifth: that of fifth order."""
+    """The map from points of the stop, in radii of the stop, to the sensor, in radii of the ghost. The first axis
+    points away from the middle of the frame.
+
+    scale: size of the ghost by channel, (3,). third: spherical aberration of third order by channel, (3,). fifth:
+    spherical aberration of fifth order.
+    """
 
     scale: Array
     third: Array
@@ -58,11 +61,11 @@ def draw_ghosts(seed: Sequence[int], lights: Sequence[Point], size: int) -> Arra
 def draw_light_ghosts(random: Random, light: Point, size: int) -> Array:
     """Return (size, size, 3), the ghosts of one light; evenly lit ones have a brightness of 0.1 to 1.
 
-    random: determines the lens; each light of a picture has one of the same seed.
+    random: draws the lens; all lights of a picture get a generator of the same seed, so that they share one lens.
     """
     layer = np.zeros((size, size, 3), np.float32)
     texture = _draw_texture(random)
-    contrast = log_uniform(random, 0.1, 1.0)  # of the texture, about
+    contrast = log_uniform(random, 0.1, 1.0)  # contrast of the texture in most ghosts
     for _ in range(int(random.integers(1, 6))):
         # On the line through the light (1) and the middle (0): most ghosts lie opposite to the light.
         line_position = -random.uniform(0.1, 1.4) if random.random() < 0.75 else random.uniform(0.2, 1.2)
@@ -76,9 +79,10 @@ def draw_light_ghosts(random: Random, light: Point, size: int) -> Array:
 
 
 def _draw_ghost(random: Random, centre: Array, radius: float, texture: Array, size: int) -> Array:
-    """Return (size, size, 3), one ghost of a stop with that texture, 1 where it is evenly lit.
+    """Return (size, size, 3), one ghost with random aberrations: samples of the stop, splatted where they map to. An
+    evenly lit ghost is 1.
 
-    centre, radius: of the ghost, in canvas coordinates.
+    centre, radius: of the ghost, in canvas coordinates. texture: transmission of the stop.
     """
     import cv2
 
@@ -128,8 +132,8 @@ def _draw_pupil(random: Random, u: Array, v: Array) -> Array:
 
 
 def _splat(positions: Array, weights: Array, size: int) -> Array:
-    """Return the picture (size, size) of weights (n, n) at positions (2, n, n), px, each split bilinearly on 4 pixels.
-    """
+    """Bilinear splat: return the picture (size, size) of weights (n, n) at positions (2, n, n) in pixels, each weight
+    shared by the four nearest pixels."""
     low = np.floor(positions)
     fraction, low = positions - low, low.astype(np.int64)
     total = np.zeros(size * size)
@@ -143,7 +147,8 @@ def _splat(positions: Array, weights: Array, size: int) -> Array:
 
 
 def _draw_texture(random: Random) -> Array:
-    """Return (TEXTURE_SIZE, TEXTURE_SIZE) of mean about 1: what lies in the path of all of a lens's ghosts."""
+    """Return the transmission of a lens's stop, (TEXTURE_SIZE, TEXTURE_SIZE), mean about 1: the rings, smears, dust and
+    fringes that show in all ghosts of the lens."""
     import cv2
 
     u, v = canvas_grid(TEXTURE_SIZE)

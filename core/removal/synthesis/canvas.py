@@ -25,7 +25,7 @@ def canvas_grid(size: int) -> tuple[Array, Array]:
 
 
 def spectral_colour(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (n, 3), about linear RGB of spectral light of wavelengths (n,) of 0.4..0.7 micrometres.
+    """Return the approximate linear RGB (n, 3) of monochromatic light of wavelengths (n,), 0.4..0.7 micrometres.
 
     Gaussian lobes stand in for the eye's curves: smooth and never negative. Red has a second lobe in the violet.
     """
@@ -59,13 +59,14 @@ def log_uniform(random: Random, low: float, high: float) -> float:
 def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, clip_radius: Array,
                second_centre: Array, second_radius: Array, weight: Array, blades: int, rotation: float,
                roundness: float, softness: float, rim: float, rim_width: float, hollow: float, slope: float) -> None:
-    """Add a ghost to `layer` (n, n, 3), channel by channel, in canvas coordinates: the part that three images share.
+    """Add a ghost to `layer` (n, n, 3), channel by channel: the overlap of three images of the lens's apertures.
 
-    centre, clip_centre, second_centre: (3, 2) by channel, of the images of the stop, of the entrance, and of the stop
-    at the light's last passage. radius, clip_radius, second_radius: of the same, (3,). weight: brightness by channel,
-    (3,). blades: number of the stop's blades, turned by `rotation` radians, from straight (roundness 0) to a circle
-    (1). softness: width of the edge. rim: brightness added within rim_width (relative to the radius) of the edge.
-    hollow: share removed from the middle. slope: by how much the side away from the canvas' middle is brighter.
+    Positions and lengths are in canvas coordinates; centres are (3, 2) and radii (3,), by channel. centre, radius:
+    image of the stop. clip_centre, clip_radius: image of the entrance. second_centre, second_radius: image of the stop
+    at the light's last passage through it. weight: brightness by channel, (3,). blades: number of the stop's blades,
+    turned by `rotation` radians, from straight (roundness 0) to a circle (1). softness: width of the edge. rim:
+    brightness added within rim_width (relative to the radius) of the edge. hollow: share removed from the middle.
+    slope: by how much the side away from the canvas' middle is brighter.
     """
     size = layer.shape[0]
     sector = 2 * math.pi / blades

@@ -118,7 +118,7 @@ def _draw_light_flare(random: Random, lens_seed: int, kind: str, position: Point
         elif part == "shimmer":
             rest += _normalise_exposure(random, scatter.draw_shimmer(lens_random, position, x, y), 0.05, 1.5)
         elif part == "rings":
-            # The paper draws rings in display values; the power takes them to linear light.
+            # The rings are drawn in display values; the power converts them to linear light.
             rest += shapes.draw_rings(random, x, y) ** np.float32(random.uniform(1, 2.2))
         elif part == "glow":
             glow += scatter.draw_glow(random, position, x, y) * log_uniform(random, 0.1, 6)

@@ -32,9 +32,8 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
 
     light: on the canvas, where radius 1 is the corner of the sensor.
 
-    Random are the stop's blades and opening, the coatings' colours, how many weak ghosts are visible and how bright
-    they are. The lens determines where ghosts lie, how large they are, how they are clipped and how their colours
-    separate.
+    The lens determines where ghosts lie, how large they are, how they are clipped and how their colours separate. The
+    stop's blades and opening, the coatings' colours, and the number and brightness of weak ghosts are random.
     """
     layer = np.zeros((size, size, 3), np.float32)
     crop = random.uniform(0.6, 1.3)  # the sensor may be smaller or larger than the lens was made for
@@ -77,8 +76,12 @@ def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> 
 
 
 class _ApertureImages(NamedTuple):
-    """The images on the canvas that bound a ghost, by channel: centres (3, 2) and radii (3,), as `draw_ghost` takes
-    them. They are of the stop, of the entrance, and of the stop at the light's last passage."""
+    """The images of apertures that bound a ghost on the canvas, by channel: centres (3, 2) and radii (3,), for
+    `draw_ghost`.
+
+    centre, radius: image of the stop. clip_centre, clip_radius: image of the entrance. second_centre, second_radius:
+    image of the stop at the light's last passage through it.
+    """
 
     centre: NDArray[np.float64]
     radius: NDArray[np.float64]
@@ -90,10 +93,10 @@ class _ApertureImages(NamedTuple):
 
 def _project_apertures(ghost: GhostPath, slopes: NDArray[np.float64], stop: float, entrance: float,
                        unit: float) -> _ApertureImages:
-    """Return the images of a lens's apertures along a ghost path.
+    """Return the images of a lens's apertures along a ghost path, by paraxial optics.
 
-    slopes: of the light's rays, (2,). stop, entrance: radii of the stop and of the front surface, mm. unit: length of 1
-    on the canvas, mm.
+    slopes: slopes of the light's rays in x and y, (2,). stop, entrance: radii of the stop and of the front surface, mm.
+    unit: length of 1 on the canvas, mm.
     """
     # A ray of height h and slope u meets the stop at a h + b u, and the sensor at s h + t u. The one through the
     # stop's centre has h = -b u / a, which gives the ghost's centre; its radius is the stop's times |s / a|.
@@ -123,14 +126,14 @@ def _draw_coatings(random: Random, lens: Prescription) -> NDArray[np.float64]:
 
 def _brightness_and_radius(ghost: GhostPath, coating_wavelengths: NDArray[np.float64], stop: float,
                            entrance: float) -> tuple[NDArray[np.float64], float]:
-    """Return the light (3,) of a ghost by channel, before any exposure, and its radius on the sensor, mm.
+    """Return (light of a ghost by channel (3,), before any exposure; its radius on the sensor, mm).
 
-    stop, entrance: radii of the stop and of the front surface, mm. Light is what both surfaces reflect, spread over the
-    area that a bundle of rays has on the sensor.
+    The light is what both surfaces reflect, divided by the area over which the sensor gets it. stop, entrance: radii of
+    the stop and of the front surface, mm.
     """
     i, j = ghost.surfaces
     wavelengths = np.array(CHANNEL_WAVELENGTHS)
-    indices = ghost.contrast
+    indices = ghost.contrast  # (3, 4) refractive indices: before and behind surface i, then surface j
     reflected = (reflectance(indices[:, 0], indices[:, 1], wavelengths, float(coating_wavelengths[i]))
                  * reflectance(indices[:, 2], indices[:, 3], wavelengths, float(coating_wavelengths[j])))
     stop_heights = np.maximum(np.abs(ghost.stop[:, 0]), 1e-4)
@@ -202,7 +205,7 @@ def draw_mirrored_light(random: Random, source: Array, light: Point) -> Array:
 
 def draw_arc(random: Random, light: Point, size: int, x: Array, y: Array) -> Array:
     """Return a caustic near the frame's edge, linear light (size, size, 3): a rainbow arc about the middle, opposite to
-    the light, in three of ten on its side. x, y: `canvas_grid`."""
+    the light in seven of ten cases, else on the light's side. x, y: `canvas_grid`."""
     light_radius = math.hypot(*light)
     radius, width = random.uniform(0.5, 1.3), log_uniform(random, 0.01, 0.12)
     direction = math.atan2(-light[1], -light[0]) + (math.pi if random.random() < 0.3 else 0)

@@ -68,7 +68,7 @@ def _draw_stop(random: Random, dirt: float) -> Array:
 
 
 def _add_dirt(random: Random, stop: Array, dirt: float) -> Array:
-    """Return a stop (STOP_SAMPLES, STOP_SAMPLES) with dust and scratches. dirt: as for `_draw_stop`."""
+    """Return a stop (STOP_SAMPLES, STOP_SAMPLES) with dust and scratches. dirt: amount, 0 (clean) to 1."""
     import cv2
 
     mask = stop
@@ -107,13 +107,13 @@ def _draw_phase(random: Random) -> Array:
 
 
 def draw_shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return (size, size, 3), many fine rays round the light, of uneven strength and length; `_normalise_exposure` in
-    `flare` sets their brightness. x, y: `canvas_grid`."""
+    """Return (size, size, 3), many fine rays round the light, of uneven strength and length, of any brightness (the
+    caller normalises it). x, y: `canvas_grid`."""
     dx, dy = x - light[0], y - light[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
     direction_count = 2048  # over the whole circle
     strength = _draw_ray_strengths(random, direction_count)
-    # Strong rays are long too; the small random turn loosens that.
+    # Strong rays are long too; the random shift by a few directions loosens that relation.
     reach = log_uniform(random, 0.08, 0.8) * (0.5 + 0.5 * np.roll(strength, int(random.integers(20))))
     position = ((angle / (2 * math.pi)) % 1) * direction_count
     low = position.astype(int) % direction_count  # each pixel lies between directions low and low + 1

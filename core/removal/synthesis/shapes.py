@@ -52,8 +52,8 @@ def draw_smear(random: Random, light: Point, x: Array, y: Array) -> Array:
 def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Array:
     """Return (size, size, 3), one beam of a smear.
 
-    r, angle: each pixel's polar coordinates about the light. fainter: a beam beside the first, of a tenth of its
-    brightness or more.
+    r, angle: each pixel's polar coordinates about the light. fainter: draw the beam's brightness from 0.1 to 1; else it
+    is 1.
     """
     direction = random.uniform(-math.pi, math.pi)
     bend = random.normal(0, 0.12) if random.random() < 0.3 else 0.0
@@ -92,7 +92,7 @@ def _draw_ray_profile(random: Random) -> Callable[[Array], Array]:
 def draw_halo(random: Random, light: Point, x: Array, y: Array) -> Array:
     """Return (size, size, 3), maximum 1: one or two rings, white or in the colours of diffraction, whole or partial.
 
-    They lie about the light; in three of ten flares about another point on the line through the light and the middle.
+    They are centred on the light, in three of ten flares on another point of the line through the light and the middle.
     x, y: `canvas_grid`.
     """
     centre = np.array(light) * (random.uniform(-0.5, 1) if random.random() < 0.3 else 1)
@@ -124,8 +124,9 @@ def draw_halo(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def draw_rings(random: Random, x: Array, y: Array) -> Array:
-    """Return the paper's procedural rings, display values (size, size, 3): one to three of any centre, radius and
-    colour, opacity below 0.7, times a mask that is 0 at the middle of the frame. x, y: `canvas_grid`."""
+    """Return the procedural rings of Yenamandra et al., display values (size, size, 3): one to three with random
+    centre, radius and colour, and opacity below 0.7, times a mask that is 0 at the middle of the frame. x, y:
+    `canvas_grid`."""
     layer = np.zeros((*x.shape, 3), np.float32)
     for _ in range(int(random.integers(1, 4))):
         centre, radius = random.uniform(-1, 1, 2), random.uniform(0.1, 1.2)
@@ -143,7 +144,7 @@ def draw_light(random: Random, light: Point, x: Array, y: Array) -> Array:
     Linear light (size, size, 3), 0 elsewhere. x, y: `canvas_grid`.
     """
     layer = np.zeros((*x.shape, 3), np.float32)
-    # kind_draw: below 0.65 discs about one centre; then rectangles, from tubes to windows; above 0.85 scattered ones.
+    # kind_draw: below 0.65 concentric discs; up to 0.85 concentric rectangles (tubes, windows); above scattered ones.
     kind_draw, colour = random.random(), random_tint(random, 0.15)
     level = log_uniform(random, 1.2, 12)
     edge = 2.0 / x.shape[0]  # one pixel

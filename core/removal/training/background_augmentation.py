@@ -38,8 +38,8 @@ def require_ximgproc() -> None:
 
 
 def augment(random: Random, draw_view: DrawView, width: int, height: int) -> Pixels:
-    """Return (height, width, 3) linear light: a view in a random pose, in four of five cases with some of the changes
-    below."""
+    """Return (height, width, 3) linear light: a view in a random pose, in four of five cases changed by defocus, dead
+    leaves, a second scene, a grade, haze or bright objects."""
     scene = _random_pose(random, draw_view, width, height)
     if random.random() < 0.12:
         scene = _random_defocus(random, scene)
@@ -194,7 +194,7 @@ def _combine_scenes(random: Random, scene: Pixels, second: Pixels) -> Pixels:
 
 
 def _add_haze(random: Random, scene: Pixels) -> Pixels:
-    """Add haze, lit by a low sun in half of the cases: bright and soft as a veil, but behind what is near.
+    """Add haze, lit by a low sun in half of the cases: bright and soft like a veil, but absent where the scene is near.
 
     Koschmieder's law; He, Sun and Tang 2009, "Single image haze removal using dark channel prior", invert it.
     """
@@ -205,7 +205,7 @@ def _add_haze(random: Random, scene: Pixels) -> Pixels:
                        np.arange(height, dtype=np.float32) - random.uniform(0, 0.7) * height)
     opacity = np.float32(1) - np.exp(-_optical_depth(random, scene, y / height))[..., None]
     colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
-    # The light that distance fades to: bright, but as a part of this scene may be.
+    # The light that distant parts fade to, about as bright as the brightest tenth of the scene.
     airlight = np.float32(np.quantile(scene.mean(-1), 0.9) * log_uniform(random, 0.5, 1.5)) * colour
     if random.random() < 0.5:
         warm = np.exp(random.normal((0.2, 0, -0.3), 0.2)).astype(np.float32)

@@ -57,8 +57,8 @@ class Backgrounds:
     def draw(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
         """Return (height, width, 3) linear light: a random crop of a random picture, at a random scale.
 
-        One in eight is out of focus, so that being bright and soft does not make something a flare. gamma: of the
-        photographs' display values.
+        One in eight is out of focus, so that the network does not take everything bright and soft for flare. gamma: the
+        gamma of the photographs' display values.
         """
         def draw_view(random: Random, width: int, height: int) -> Pixels:
             return self._draw_view(random, width, height, gamma)
@@ -68,8 +68,8 @@ class Backgrounds:
         return _defocus_by_disc(random, scene) if random.random() < 0.125 else scene
 
     def _draw_view(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
-        """Return a view of a random picture, as for `draw`. A map counts as three photographs: it has views all round.
-        """
+        """Return (height, width, 3) linear light: a view of a random picture. A map is drawn as often as three
+        photographs, since it has views all round. gamma: the gamma of the photographs' display values."""
         photos = len(self.photos)
         share = len(self.maps) * 3 / (photos + len(self.maps) * 3)
         if random.random() < share:
@@ -89,7 +89,8 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", max_side
                      augmented: bool = False) -> Backgrounds:
     """Read every photograph and environment map below the folders.
 
-    part: which pictures, by name. max_side: long side in pixels that larger photographs are reduced to. Environment
+    part: pictures for training, held-out ones or all (`is_held_out`). max_side: long side in pixels that larger
+    photographs are reduced to. Environment
     maps are .hdr, or .exr twice as wide as high. Pictures that cannot be used are listed in `unusable`.
 
     Raises SettingsError for a path that is no folder and where no picture is found; EngineError where `augmented` is
@@ -191,12 +192,13 @@ def _read_environment_map(path: Path) -> NDArray[np.float16] | None:
 
 
 def _crop_photo(random: Random, photo: NDArray[np.uint8], width: int, height: int, gamma: float) -> Pixels:
-    """Return a random crop of a photograph, (height, width, 3) linear light, mirrored in half of the cases. gamma: of
-    the photograph's display values."""
+    """Return a random crop of a photograph, (height, width, 3) linear light, mirrored in half of the cases. gamma:
+    the gamma of the photograph's display values."""
     import cv2
 
     photo_height, photo_width = photo.shape[:2]
-    # scale: pixels of the photograph for each of the result. One that is much too small is not cropped further.
+    # scale: pixels of the photograph per pixel of the result. A photograph that is much too small is not cropped
+    # further.
     fit = min(photo_width / width, photo_height / height)
     scale = fit * random.uniform(0.3, 1.0) if fit > 0.7 else fit
     crop_width, crop_height = min(int(width * scale), photo_width), min(int(height * scale), photo_height)

@@ -49,8 +49,8 @@ class SynthesisBank:
                  aspheric_share: float = 0, part_count: int = 1) -> None:
         """count: number of flares. size: side of the canvas, pixels. part_count: number of parts of the bank.
 
-        coloured_share: of the flares, those of lights of a saturated colour (traffic lights, tail lamps, neon).
-        aspheric_share: those that have the ghosts of moulded lenses too. No flare class has either.
+        coloured_share: share of flares whose lights have a saturated colour (traffic lights, tail lamps, neon).
+        aspheric_share: share of flares that also get the ghosts of moulded lenses. Both apply to every flare class.
         """
         self._seed, self._size, self._lenses = seed, size, lenses
         self._coloured_share, self._aspheric_share = coloured_share, aspheric_share
@@ -61,8 +61,8 @@ class SynthesisBank:
         return len(self._entries)
 
     def renew(self, end_serial: int, part: int = 0) -> None:
-        """Hold the flares of the `count` serial numbers below `end_serial`, and draw from `part` (modulo the number of
-        parts)."""
+        """Make the bank hold the flares of the `count` serial numbers below `end_serial`, and draw from `part` (modulo
+        the number of parts)."""
         self._end_serial, self._part = end_serial, part % self._part_count
 
     def draw(self, random: Random) -> FlareLayers:
@@ -123,7 +123,7 @@ class UserFlares:
         """size: side of the canvas, pixels. Raises SettingsError where the folder holds neither pictures nor videos, or
         none that can be read."""
         folder = Path(folder)
-        # By the folder beside it, as in Flare7K++: another set may have flares of the same names.
+        # Keyed by the parent of Light_Source/ too: another set of flares may have the same names.
         light_paths = {(path.parent.parent, path.stem): path for path in folder.glob("**/Light_Source/*")
                        if path.suffix.lower() in SUFFIXES}
         self._size = size
@@ -186,7 +186,8 @@ class UserFlares:
 
     @staticmethod
     def _read(file: tuple[Path, Path | None], random: Random) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return linear light of a flare, or of a random frame of its video, and of its light. Raises FrameError."""
+        """Return the linear light (h, w, 3) of a flare, or of a random frame if it is a video, and that of the light
+        alone, 0 without a picture of it. Raises FrameError."""
         path, light_path = file
         flare = _read_random_frame(path, random)
         return flare, np.zeros_like(flare) if light_path is None else _read_linear(light_path)

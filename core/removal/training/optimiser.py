@@ -86,7 +86,7 @@ class MuonAdamW:
                 continue
             if moment == "momentum":
                 self._momenta[name].copy_(value)
-            elif name not in self._matrices:  # some checkpoints have AdamW's moments of all of them
+            elif name not in self._matrices:  # some checkpoints have AdamW's moments of all parameters
                 parameter = self._parameters[name]
                 # In the parameter's memory layout: a fused step walks through both in memory order.
                 self._adam.state[parameter][moment] = (
@@ -95,8 +95,8 @@ class MuonAdamW:
 
 
 def _group_same_shapes(matrices: Sequence[Tensor], numbers: Iterable[int]) -> Iterable[list[int]]:
-    """Group the numbers of the matrices to compute together: each alone on a CPU; on a GPU, which a single matrix does
-    not keep busy, those of the same shape."""
+    """Group the matrices that are orthogonalised together; return lists of their indices, out of `numbers`. On a CPU
+    each is alone; on a GPU, which a single matrix does not keep busy, matrices of the same shape form a group."""
     groups: dict[object, list[int]] = {}
     for number in numbers:
         matrix = matrices[number]
@@ -105,7 +105,8 @@ def _group_same_shapes(matrices: Sequence[Tensor], numbers: Iterable[int]) -> It
 
 
 def orthogonalise(matrices: Tensor) -> Tensor:
-    """Return matrices (k, n, m), float32, with the same singular vectors and singular values between about 0.7 and 1.2.
+    """Return matrices (k, n, m), float32, with the same singular vectors and singular values between about 0.7 and 1.2,
+    by the Newton-Schulz iteration.
 
     Each step multiplies a matrix by a polynomial of its square x x^T, and the polynomials of all steps commute. So they
     are multiplied with each other first, as matrices of the shorter side alone, and the matrix itself is multiplied

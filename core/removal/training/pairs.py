@@ -33,8 +33,12 @@ WHITE: NDArray[np.float32] = np.ones(3, np.float32)
 
 
 class FlareLayers(NamedTuple):
-    """A flare on the square canvas, as `synthesis.flare.SynthesisedFlare` has it, float32 when drawn. colour: (3,), a
-    factor of all layers that is still to be applied."""
+    """A flare on the square canvas.
+
+    rest, glow, light: layers (size, size, 3), linear light, float32 when drawn: what is always removed, the glow round
+    the light, and the light itself. lights: positions on the canvas, -1..1. colour: (3,), a factor of all layers that
+    is still to be applied.
+    """
 
     rest: NDArray[Any]
     glow: NDArray[Any]
@@ -69,10 +73,10 @@ def make_pair(random: Random, bank: FlareSource, backgrounds: Backgrounds, width
               lifted_black_share: float = 0.0) -> Pair:
     """Return one frame of that size with and without flare.
 
-    The shares, 0..1, are of all frames. clean_share: without flare. against_light_share: with the lights where the
-    scene is bright, as the sun in its sky; in the others they are anywhere. shoulder_share: of cameras whose curve
-    bends towards white. lifted_black_share: graded so that black is grey and white dimmer, as flat or logarithmic
-    footage looks.
+    Each share, 0..1, is the probability of a kind of frame. clean_share: without flare. against_light_share: with the
+    lights where the scene is bright, like the sun in its sky, instead of anywhere. shoulder_share: filmed by a camera
+    whose curve bends towards white. lifted_black_share: graded so that black is grey and white dimmer, like flat or
+    logarithmic footage.
     """
     gamma = float(random.uniform(*GAMMA_RANGE))
     scene: Pixels = backgrounds.draw(random, width, height, gamma) * random_cameras.draw_exposure(random)
@@ -104,7 +108,7 @@ def _draw_flares(random: Random, bank: FlareSource, scene: Pixels, *,
                  faces_light: bool) -> tuple[Pixels, Pixels, Pixels, Pixels]:
     """Return the scene, then rest, glow and light of the one or two flares of a frame, (height, width, 3) each.
 
-    faces_light: put the lights where the scene is bright, and in half of the cases expose the scene by its light there.
+    faces_light: put the lights where the scene is bright, and in half of the cases expose the scene for that place.
     """
     height, width = scene.shape[:2]
     rest, glow, light = (np.zeros_like(scene) for _ in range(3))
@@ -141,8 +145,9 @@ def to_grey(pair: Pair, channel: int) -> Pair:
 
 def _place_against_bright_scene(random: Random, layers: FlareLayers, matrix: NDArray[Any],
                                 scene: Pixels) -> tuple[NDArray[Any], float]:
-    """Return, of `matrix` and some more placements, the one that puts the first light where the scene is brightest, and
-    the light there; for a light outside the frame at the frame's edge."""
+    """Return (placement, brightness of the scene at the light): out of `matrix` and PLACEMENTS - 1 random placements,
+    the one that puts the flare's first light where the scene is brightest. A light outside the frame counts as at the
+    nearest edge."""
     import cv2
 
     height, width = scene.shape[:2]
@@ -167,8 +172,8 @@ def _canvas_to_frame(matrix: NDArray[Any], layers: FlareLayers, position: tuple[
 
 def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearance, matrix: NDArray[Any], width: int,
                    height: int) -> tuple[Pixels, Pixels, Pixels]:
-    """Return rest, glow and light, (height, width, 3) each, warped from canvas to frame and coloured; what the glow
-    saturates near a light is added to the light. matrix: (2, 3), from canvas to frame, pixels."""
+    """Return rest, glow and light, (height, width, 3) each, warped from canvas to frame and coloured. Near a light,
+    flare that is bright enough to clip is moved into the light layer. matrix: (2, 3), from canvas to frame, pixels."""
     import cv2
 
     half_diagonal = math.hypot(width, height) / 2
@@ -190,7 +195,7 @@ def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearan
         light_proximity = np.maximum(light_proximity, falloff)
     red, green, blue = np.moveaxis(rest + glow, -1, 0)
     min_channel = np.minimum(np.minimum(red, green), blue)
-    # What a camera clips, even in one channel of a coloured light, is clipped with flare and without.
+    # Flare that the camera clips near a light belongs to the light: no removal can restore what lies under it.
     clipped = np.clip((min_channel * light_proximity - CLIP_START) / CLIP_RANGE, 0, 1)[..., None]
     clipped = clipped * clipped * (3 - 2 * clipped)  # smoothstep
     clipped_light: Pixels = np.maximum(light, (rest + glow) * clipped)

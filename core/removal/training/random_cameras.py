@@ -113,9 +113,9 @@ def draw_placement(random: Random, canvas_size: int, width: int, height: int,
     """Draw affine matrices (*count_shape, 2, 3) from a square canvas with sides of `canvas_size` pixels to a frame in
     pixels.
 
-    The canvas is rotated, mirrored, sheared a little, and scaled by 0.85 to 1.5 times what lets its inner circle pass
-    through the frame's corners. Its middle is within about a hundredth of the half diagonal of the frame's in four of
-    five, and within about a quarter in the others.
+    The canvas is rotated, mirrored, sheared a little, and scaled to 0.85 to 1.5 times the size at which its inscribed
+    circle passes through the frame's corners. Its middle is shifted from the frame's by a random distance: in four of
+    five draws about a hundredth of the frame's half diagonal, else about a quarter of it.
     """
     half_diagonal = math.hypot(width, height) / 2
     zoom, roll = random.uniform(0.85, 1.5, count_shape), random.uniform(0, 2 * math.pi, count_shape)

@@ -79,12 +79,12 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
           progress: Progress | None = None) -> Path:
     """Train in `folder` and return the path of the weights (safetensors, fp16).
 
-    validation: backgrounds and lenses kept out of training; with them the log has validation gains, and the weights are
-    those of the best gain. They are the last ones without `validation`, and with user_flares, which no validation
-    shows. resume: continue the training in the folder, by the given recipe from there on. start: weights to begin with,
-    in a network of their widths and with as many blocks as they or the recipe have, whichever are more. processes: how
-    many share the work, this one included; on a CPU the pictures are the same for any number, the weights but for
-    rounding.
+    validation: backgrounds and lenses kept out of training; with them the log has validation gains, and the weights
+    with the best gain are written. The last weights are written without `validation`, and with user_flares, which the
+    validation pairs do not show. resume: continue the training in the folder, by the given recipe from there on. start:
+    file of weights to begin with; the network gets their widths, and on each level the greater of their and the
+    recipe's number of blocks. save_every_s: seconds between checkpoints. processes: how many processes share the work,
+    this one included; on a CPU any number trains on the same pictures, to the same weights but for rounding.
 
     Raises RunError, SettingsError, and Cancelled after a checkpoint.
     """
@@ -109,7 +109,7 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
 
 
 class TrainingSetup(NamedTuple):
-    """What every worker begins with."""
+    """Everything from which a worker starts its training."""
 
     recipe: Recipe
     source: Path | None  # weights, or the checkpoint of the same training
@@ -119,8 +119,8 @@ class TrainingSetup(NamedTuple):
     user_flares: UserFlares | None
 
     def create_trainer(self, worker: Worker) -> RemovalTrainer:
-        """Return the trainer of a worker: its network is as wide as the weights' and at least as deep. Raises RunError.
-        """
+        """Return the trainer of a worker. Its network has the widths of the source's network and at least as many
+        blocks. Raises RunError."""
         if self.source is None:
             return RemovalTrainer(self.recipe, worker)
         state, metadata = weights.read_weights(self.source)
@@ -129,7 +129,7 @@ class TrainingSetup(NamedTuple):
                          blocks=tuple(map(max, self.recipe.blocks, architecture.blocks)),
                          attention=tuple(map(max, self.recipe.attention, architecture.attention)))
         iteration = 0
-        if self.resumes:  # the state fits this architecture alone, and the flares follow from its seed
+        if self.resumes:  # the checkpoint fits only its own architecture, and its seed determines the flares
             recipe = replace(recipe, **architecture._asdict(), seed=parse_json(metadata["recipe"])["seed"])
             iteration = int(metadata["iteration"])
         trainer = RemovalTrainer(recipe, worker)
@@ -138,8 +138,8 @@ class TrainingSetup(NamedTuple):
 
     @contextmanager
     def open_batches(self, trainer: RemovalTrainer, drawing_processes: int = 0) -> Iterator[Iterator[Batch]]:
-        """Yield the batches of the trainer's worker from its iteration on; on a GPU, `drawing_processes` draw what they
-        are composed of."""
+        """Yield the batches of the trainer's worker from its iteration on. On a GPU, `drawing_processes` processes draw
+        the scenes and flares."""
         if trainer.device.type == "cpu":
             all_batches = Batches(trainer.recipe, self.backgrounds, self.lenses, self.user_flares, trainer.worker)
             yield (all_batches[iteration] for iteration in range(trainer.iteration, trainer.recipe.iterations))
@@ -160,10 +160,10 @@ def _run_worker(worker: Worker, setup: TrainingSetup) -> None:
 def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
                 pairs: Mapping[str, Sequence[Pair]], keeps_best: bool, save_every_s: float,
                 progress: Progress) -> None:
-    """Train to the recipe's end, with log and checkpoints.
+    """Train to the recipe's end; write log, checkpoints and weights into `folder`.
 
-    pairs: for the validation, by flare class; empty for none. keeps_best: write the weights of the best validation, not
-    the last.
+    pairs: validation pairs by flare class; empty for no validation. keeps_best: write the weights of the best
+    validation, not the last.
     """
     iterations = trainer.recipe.iterations
     progress.stage("train", iterations, trainer.iteration)
@@ -203,8 +203,8 @@ def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
 
 
 def _save_checkpoint(trainer: RemovalTrainer, folder: Path, best: float | None) -> None:
-    """Write the checkpoint, and the weights too unless a validation has chosen some: those are better than the last
-    when a training begins to overfit."""
+    """Write the checkpoint and, unless a validation has chosen weights (`best` is its gain, dB), the present
+    weights."""
     weights.write_weights(folder / CHECKPOINT, trainer.state(), _metadata(trainer))
     if best is None:
         _write_weights(trainer, folder, _metadata(trainer))
@@ -219,8 +219,8 @@ def _write_weights_if_better(trainer: RemovalTrainer, folder: Path, gain: float,
 
 
 def _read_log(path: Path, iteration: int) -> list[dict[str, Any]]:
-    """Return the lines of a log up to an iteration; later ones are of a training that was killed after its last
-    checkpoint and are logged again."""
+    """Return the lines of a log up to an iteration, that of the checkpoint. Later lines were logged between the
+    checkpoint and a kill; the resumed training logs them again."""
     lines: list[Any] = []
     for text in read_text(path, errors="replace").splitlines() if path.is_file() else ():
         with contextlib.suppress(ValueError):  # truncated by an earlier program

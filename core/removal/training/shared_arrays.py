@@ -24,7 +24,7 @@ class SharedArrays(Sequence[NDArray[Any]]):
     """Arrays in a file. A process that receives this object maps the file: the arrays are in memory once, and sending
     them takes no time.
 
-    Whoever writes the file keeps it for as long as anyone reads.
+    The process that writes the file must keep it for as long as any process reads.
     """
 
     def __init__(self, path: Path, arrays: Iterable[NDArray[Any]]) -> None:

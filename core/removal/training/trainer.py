@@ -71,7 +71,7 @@ class RemovalTrainer:
         metrics = self._backward(batch)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimiser.step(recipe.learning_rate_at(self.iteration), self.worker)
-        # The weights of the first steps leave the average sooner.
+        # The average forgets faster at first, so that it does not keep the random weights of the start.
         decay = min(recipe.ema_decay, (self.iteration + 1) / (self.iteration + 10))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.averaged_weights.values()), list(self.network.state_dict().values()),
@@ -80,7 +80,7 @@ class RemovalTrainer:
         return metrics
 
     def _backward(self, batch: Batch) -> dict[str, float]:
-        """Set the gradients and return the metrics, of all workers' frames together."""
+        """Compute the gradients and return the metrics, both over all workers' frames together."""
         if self.device.type != "cpu":
             return self._backward_on_gpu(batch)
         metrics = dict.fromkeys(METRICS, 0.0)
@@ -99,8 +99,8 @@ class RemovalTrainer:
         return metrics
 
     def _backward_on_gpu(self, batch: Batch) -> dict[str, float]:
-        """Set the gradients by the captured graph; the metrics are those of the iteration before, so that the CPU does
-        not wait for the GPU."""
+        """Compute the gradients by the captured CUDA graph. Return the metrics of the previous iteration (of this one
+        if it is the first), so that the CPU does not wait for the GPU."""
         psnr_phase, schedule = self._loss_schedule()
         schedule = schedule.pin_memory().to(self.device, non_blocking=True)
         *gradients, metrics = self._graphed_gradients[psnr_phase](batch.frame, batch.scene, batch.scene_with_glow,
@@ -138,12 +138,11 @@ class RemovalTrainer:
                       schedule: Tensor) -> tuple[Tensor, Tensor]:
         """Return the loss and the metrics.
 
-        At first, the loss of a picture is its squared error, divided by its flare's mean square to a power that rises
-        from 0.5 to 1. So strong flares, which are learned sooner, count more at the start; at the end faint ones count
-        as much. In the PSNR phase, the loss is the log of the squared error divided by the flare's mean square, which
-        is the negative of the picture's gain in PSNR but for a factor; pictures that get worse count twice. The recipe
-        mixes it with the mean of the same over patches. The prediction without the glow has half the weight of the
-        whole one.
+        Before the PSNR phase, the loss of a picture is its mean squared error, divided by its flare's mean square to a
+        power that rises from 0.5 to 1. So strong flares, which are learned sooner, count more at the start; at the end
+        faint ones count as much. In the PSNR phase, the loss is the log of (mean squared error / flare's mean square),
+        proportional to the negative gain in PSNR; pictures that get worse count twice. The recipe's patch_loss_share
+        mixes this loss with its mean over patches. The prediction without glow has half the weight of the whole one.
 
         psnr_phase, schedule: the results of `_loss_schedule`, passed in so that one captured graph serves every
         iteration.
@@ -210,11 +209,11 @@ class RemovalTrainer:
         return {name: value.detach().cpu().contiguous() for name, value in state.items()}
 
     def load_state(self, state: Mapping[str, Tensor], iteration: int) -> None:
-        """Load what `state` returned, or weights alone; the moments then begin at zero. The network of weights alone
-        may have fewer blocks and attention layers; the added ones begin as the identity.
+        """Load what `state` returned, or the weights of a network, which may have fewer blocks and attention layers
+        than this one: the added ones begin as the identity, and the optimiser's moments at zero.
 
-        iteration: that of the state; 0 for a training that begins, whose initial weights are these. Raises RunError
-        where the weights do not fit.
+        iteration: the iteration of the state; 0 for a new training, whose `initial_weights` become the loaded ones.
+        Raises RunError where the weights do not fit.
         """
         self.iteration = iteration
         added: dict[str, Tensor] = {}
@@ -243,8 +242,10 @@ class RemovalTrainer:
 
 
 def _log_error_ratio(error: Tensor, flare_error: Tensor, error_floor: Tensor) -> Tensor:
-    """Return the log of squared errors relative to those of the untouched frame, `flare_error`; where it is above 0, so
-    the frame got worse, it counts twice. error_floor: added to both."""
+    """Return the log of (error / flare_error), doubled where it is above 0, which means that the frame got worse.
+
+    error, flare_error: mean squared errors of the result and of the untouched frame. error_floor: added to both.
+    """
     log_ratio = torch.log((error + error_floor) / (flare_error + error_floor))
     return log_ratio + log_ratio.clamp(min=0)
 

@@ -44,13 +44,13 @@ class SharedBuffers:
         self._mapped: dict[tuple[int, int], Tensor] = {}
 
     def shared_rows(self, count: int, length: int) -> Tensor:
-        """Return (count, length) float32, the same memory in all workers for the same arguments: later calls return it
-        again, with what it holds."""
+        """Return a (count, length) float32 tensor in memory that all workers share. Later calls with the same arguments
+        return the same tensor with its content."""
         if (count, length) not in self._mapped:
             path = Path(self._folder) / f"{count}x{length}"
             path.touch()
             with open(path, "r+b") as file:
-                # Every worker opens it: never shorten a file that another has mapped, which Windows refuses.
+                # Every worker runs this. Only lengthen the file: Windows refuses to truncate one that is mapped.
                 if os.fstat(file.fileno()).st_size < 4 * count * length:
                     file.truncate(4 * count * length)
             memory = np.memmap(path, np.float32, "r+", shape=(count, length))
@@ -99,8 +99,8 @@ class Worker:
         return number % self.count == self.rank
 
     def all_gather(self, tensors: Sequence[Tensor]) -> None:
-        """Replace those tensors that another worker is responsible for, by their place in `tensors`, by its values.
-        Raises RunError."""
+        """Replace each tensor by that of the worker that is responsible for its index in `tensors`
+        (`is_responsible_for`). Raises RunError."""
         if self.buffers is None:
             return
         row = self.buffers.shared_rows(1, sum(tensor.numel() for tensor in tensors))[0]
@@ -118,7 +118,8 @@ SINGLE_WORKER = Worker(0, 1)
 
 
 def _buffer_slices(tensors: Sequence[Tensor], row: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield each tensor, with its dimensions in memory order so that copies are contiguous, and its slice of a row."""
+    """Yield (tensor, its slice of the buffer `row`) for each tensor, with dimensions in memory order, so that copies
+    are contiguous."""
     first = 0
     for tensor in tensors:
         in_memory_order = tensor.permute(sorted(range(tensor.ndim), key=tensor.stride, reverse=True))
@@ -128,8 +129,8 @@ def _buffer_slices(tensors: Sequence[Tensor], row: Tensor) -> Iterator[tuple[Ten
 
 @contextmanager
 def worker_group(count: int, run_worker: Callable[..., None], *args: Any) -> Iterator[Worker]:
-    """Run this process as the first of `count` workers; the others call `run_worker(worker, *args)` until this one
-    leaves. Collective operations raise RunError where one of them has ended."""
+    """Yield this process's worker, the first of `count`. The others, in new processes, call `run_worker(worker, *args)`
+    and are killed when the context ends. Collective operations raise RunError where a worker has ended."""
     if count == 1:
         yield SINGLE_WORKER
         return
@@ -162,8 +163,8 @@ def kill_processes(processes: Iterable[BaseProcess]) -> None:
 
 
 def initialise_process() -> None:
-    """Prepare a process other than the first, which trains or draws: signals to stop are for the first alone, which
-    ends the others."""
+    """Prepare a child process that trains or draws: one OpenCV thread, and signals to stop are ignored, since the first
+    process ends the others."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -180,7 +181,7 @@ def _worker_main(rank: int, count: int, folder: str, barrier: Barrier, threads: 
         _abort_when_any_ends([first.sentinel], barrier)
     _limit_threads(threads, count)
     run_worker(Worker(rank, count, SharedBuffers(folder, barrier)), *args)
-    if first is not None:  # it may still be in their last barrier, which an exit here would break
+    if first is not None:  # the first worker may still be in the last barrier, which an exit here would break
         wait([first.sentinel], EXIT_GRACE_S)
 
 

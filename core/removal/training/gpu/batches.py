@@ -25,8 +25,8 @@ def open_gpu_batches(recipe: Recipe, start_iteration: int, backgrounds: Backgrou
                      process_count: int) -> Iterator[Iterator[Batch]]:
     """Yield endless batches from `start_iteration` on; `process_count` processes draw the scenes and flares.
 
-    Unlike those on a CPU they are no function of the recipe: what is in the pools depends on how fast it was drawn.
-    Raises RunError where nothing is drawn.
+    Unlike the batches on a CPU they are not determined by the recipe: what the pools hold depends on how fast the
+    processes draw. Raises RunError where nothing is drawn.
     """
     shapes = frame_shapes(recipe, SIZE_MULTIPLE)
     sizes = pool_sizes(torch.cuda.mem_get_info(device)[0], shapes, recipe.canvas_size)
@@ -36,8 +36,8 @@ def open_gpu_batches(recipe: Recipe, start_iteration: int, backgrounds: Backgrou
 
 
 def compose_batches(pools: Pools, recipe: Recipe, random: np.random.Generator) -> Iterator[Batch]:
-    """Yield batches without end: scenes of one shape of the pools each, with flares of the pools. The first frames of a
-    batch, SECOND_FLARE_SHARE of them, get a second flare."""
+    """Yield batches without end, each of scenes of one frame shape under flares, all sampled from the pools. The first
+    frames of a batch, SECOND_FLARE_SHARE of them, get a second flare."""
     while True:
         shape_index = int(random.choice(len(pools.shapes), p=[shape.share for shape in pools.shapes]))
         width, height, count, _ = pools.shapes[shape_index]

@@ -138,8 +138,8 @@ def compose(scene: Tensor, gamma: Tensor, frames: FrameParameters,
             flares_and_placements: Sequence[tuple[FlareBatch, FlarePlacements]]) -> tuple[Tensor, Tensor, Tensor]:
     """Return display values 0..1, each (n, 3, h, w): frame, scene and scene with glow, as in `pairs.Pair`.
 
-    scene: linear light (n, 3, h, w), h and w multiples of 16. gamma: (n,) of the display values. flares_and_placements:
-    the flares of all frames, then second flares of the first of them.
+    scene: linear light (n, 3, h, w), h and w multiples of 16. gamma: gamma of each frame's display values, (n,).
+    flares_and_placements: first for a flare of every frame, then for the second flares of the batch's first frames.
     """
     scene = torch.where(frames.mirrored > 0, scene.flip(3), scene).float() * frames.exposure
     rest, glow, light = (torch.zeros_like(scene) for _ in range(3))
@@ -147,7 +147,7 @@ def compose(scene: Tensor, gamma: Tensor, frames: FrameParameters,
         flared_frames = slice(0, len(flares.layers))  # the frames that get this flare
         matrix, light_level = _choose_placement(flares, placement.matrices, scene[flared_frames],
                                                 frames.faces_light[flared_frames] > 0)
-        if number == 0:
+        if number == 0:  # expose some scenes for their brightness at the light of the first flare
             exposure = (frames.target_light / light_level.clamp(min=1e-3)).clamp(*random_cameras.EXPOSURE_LIMITS)
             keeps_exposure = (frames.target_light == 0) | ~flares.is_light[:, 0]
             scene = scene * exposure.masked_fill(keeps_exposure, 1)[:, None, None, None]
@@ -211,11 +211,11 @@ def _canvas_to_frame(matrices: Tensor, canvas_positions: Tensor, size: int) -> T
 
 def _choose_placement(flares: FlareBatch, matrices: Tensor, scene: Tensor,
                       faces_light: Tensor) -> tuple[Tensor, Tensor]:
-    """Return each frame's matrix (n, 2, 3), and the scene's light where it puts the first light (n,).
+    """Return each frame's matrix (n, 2, 3), and the scene's brightness where this puts the flare's first light (n,).
 
-    It is the first of the frame's matrices; where the frame `faces_light` (n,), it is the one that puts the light where
-    the scene is brightest. For a light outside the frame the frame's edge counts. matrices: (n, PLACEMENTS, 2, 3).
-    scene: linear light (n, 3, h, w).
+    matrices: candidates (n, PLACEMENTS, 2, 3). scene: linear light (n, 3, h, w). faces_light: (n,), frames for which
+    the candidate is chosen that puts the light where the scene is brightest; the others get their first candidate. A
+    light outside the frame counts as at the nearest edge.
     """
     n, _, height, width = scene.shape
     rows, columns = max(height // BRIGHTNESS_CELL, 1), max(width // BRIGHTNESS_CELL, 1)
@@ -231,8 +231,8 @@ def _choose_placement(flares: FlareBatch, matrices: Tensor, scene: Tensor,
 
 def _warp_to_frame(flares: FlareBatch, placement: FlarePlacements, matrix: Tensor, height: int,
                    width: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return rest, glow and light, (n, 3, height, width) each, warped from canvas to frame and coloured; what the glow
-    saturates near a light is added to the light."""
+    """Return rest, glow and light, (n, 3, height, width) each, warped from canvas to frame and coloured. Near a light,
+    flare that is bright enough to clip is moved into the light layer."""
     grid = _canvas_grid(matrix, height, width, flares.size)
     layers = F.grid_sample(flares.layers.float(), grid, "bilinear", "zeros", align_corners=True)
     rest, glow, light = layers.split(FLARE_CHANNELS // 3, 1)
@@ -259,8 +259,8 @@ def _pixel_coordinates(height: int, width: int, like: Tensor) -> Tensor:
 
 
 def _canvas_grid(matrix: Tensor, height: int, width: int, size: int) -> Tensor:
-    """Return where on the canvas the frame's pixels lie, (n, height, width, 2): -1..1 from the middle of the first
-    canvas pixel to that of the last."""
+    """Return where on the canvas the frame's pixels lie, (n, height, width, 2), in the coordinates of `grid_sample`
+    with align_corners: -1 and 1 are the middles of the first and the last canvas pixel."""
     a, b, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1]
     inverse = torch.stack([d, -b, -c, a], -1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]
     offset = _pixel_coordinates(height, width, matrix) - matrix[:, None, None, :, 2]

@@ -53,7 +53,7 @@ class GraphedFunction:
         torch.cuda.current_stream().wait_stream(side_stream)
         graph = torch.cuda.CUDAGraph()
         pool = next(iter(self._graphs.values())).graph.pool() if self._graphs else None
-        # Other threads continue their own copies meanwhile.
+        # thread_local: other threads may continue their copies to the GPU during the capture.
         with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
             outputs = list(self._function(*inputs))
         return _CapturedGraph(graph, inputs, outputs)

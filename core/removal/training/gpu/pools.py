@@ -63,9 +63,10 @@ class FrameShape(NamedTuple):
 
 
 class DrawnItem(NamedTuple):
-    """What a process has drawn into a slot of its kind's file: a block of scenes of one shape, or a flare.
+    """A block of scenes of one shape, or a flare, that a process has drawn into a slot of its kind's file.
 
-    metadata: the scenes' gammas, or METADATA_SIZE numbers of the flare.
+    kind: SCENE or FLARE. slot: row of the file. shape: index of the scenes' frame shape; 0 for a flare. metadata: the
+    scenes' gammas, or METADATA_SIZE numbers of the flare.
     """
 
     kind: int
@@ -103,7 +104,7 @@ class Pools:
 
     def __init__(self, shapes: Sequence[FrameShape], canvas_size: int, device: torch.device, scene_count: int,
                  flare_count: int) -> None:
-        """scene_count, flare_count: how many to hold. Of the scenes each shape has its share, in whole blocks.
+        """scene_count, flare_count: how many to hold. Each frame shape has its share of the scenes, in whole blocks.
 
         A flare has FLARE_CHANNELS planes of canvas_size x canvas_size pixels and METADATA_SIZE numbers.
         """
@@ -122,8 +123,8 @@ class Pools:
     def store(self, item: DrawnItem, values: NDArray[np.float16]) -> None:
         """Copy an item to the GPU in place of the oldest, on a stream of its own.
 
-        values: the item's slot of its kind's file. An iteration that samples the place at that moment sees parts of
-        both items.
+        values: the numbers in the item's slot. An iteration that samples this place during the copy sees parts of both
+        items.
         """
         with torch.cuda.stream(self._stream):  # a no-op for None
             tensor = torch.from_numpy(values)
@@ -182,7 +183,7 @@ def keep_pools_filled(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, le
     lengths = (SCENES_PER_BLOCK * 3 * max(shape.width * shape.height for shape in pools.shapes),
                FLARE_CHANNELS * recipe.canvas_size**2)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        # Files, since containers often have little memory to share; and no pickles, which would cost a copy.
+        # Items pass through mapped files: containers often have little shared memory, and pickling would cost a copy.
         files = [Path(folder) / str(kind) for kind in (SCENE, FLARE)]
         memories = [np.memmap(path, np.float16, "w+", shape=(SLOTS_PER_PROCESS * count, length))
                     for path, count, length in zip(files, process_counts, lengths, strict=True)]
@@ -271,7 +272,10 @@ def _draw_scenes(seed: tuple[int, int], path: Path, memory_shape: tuple[int, int
 
 def _draw_flares(seed: tuple[int, int], path: Path, memory_shape: tuple[int, int], free_slots: Any, drawn: Any,
                  recipe: Recipe, lenses: Sequence[Prescription], user_flares: UserFlares | None) -> None:
-    """Draw flares without end, in a process of its own. path, memory_shape, free_slots, drawn: as for `_draw_scenes`.
+    """Draw flares without end; runs in a process of its own.
+
+    path, memory_shape: file and shape of the memory, a row for each slot. free_slots: queue of slots to draw into.
+    drawn: queue of DrawnItems.
     """
     _initialise_drawing()
     memory = np.memmap(path, np.float16, "r+", shape=memory_shape)

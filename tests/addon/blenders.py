@@ -42,6 +42,8 @@ class Program(Blender):
     words: tuple[str, ...] = ()
 
     def run(self, script: Path, *args: object, user: Path) -> Any:
+        """Run a script in this Blender and return the JSON that it prints last. user: folder of Blender's user
+        resources."""
         argv = [str(script), *map(str, args)]
         code = f"import runpy, sys; sys.argv = {argv!r}; runpy.run_path({str(script)!r}, run_name='__main__')"
         command = [*self.words, "-b", "--python-exit-code", "1", "--python-expr", code]

@@ -23,7 +23,10 @@ _NAMED = re.compile(r"Blocks? of (\w+\.py): (.+?)\.$", re.MULTILINE | re.DOTALL)
 
 
 def _key(node: ast.AST) -> str | None:
-    """Return the key of `facts["key"]`, `facts.get("key")` or `made.facts["key"]`, with * for computed parts."""
+    """Return the key where a node is `facts["key"]`, `facts.get("key")` or `made.facts["key"]`, else None.
+
+    Computed parts of a key become *; a key in a variable becomes "*" and the variable's name.
+    """
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "get" and node.args:
         holder, index = node.func.value, node.args[0]
     elif isinstance(node, ast.Subscript):
@@ -51,7 +54,7 @@ def _keys(tree: ast.AST) -> Iterator[tuple[str, int]]:
 
 
 def _parameters(test: ast.FunctionDef) -> dict[str, list[str]]:
-    """Return the values of a test's parameters that are texts."""
+    """Return the text values that `parametrize` gives a test's parameters, by parameter."""
     values: dict[str, list[str]] = {}
     for decorator in test.decorator_list:
         if not (isinstance(decorator, ast.Call) and getattr(decorator.func, "attr", "") == "parametrize"):

@@ -23,7 +23,8 @@ def blender(request: pytest.FixtureRequest) -> Blender:
 
 @pytest.fixture(scope="session")
 def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A static repository of the extension, with its weights."""
+    """Build a static repository of the extension, with its weights; return its folder. Skips without Blender's
+    packer."""
     if newer() is None:
         pytest.skip("Blender's packer comes with the bpy package (`make setup`)")
     out = tmp_path_factory.mktemp("repository")
@@ -44,7 +45,8 @@ def package(repository: Path) -> Path:
 def run_script(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, int], Any]:
     """Return a function that runs a script of `scripts` in Blender and returns its facts.
 
-    The script gets the package, a capture of so many frames, a .flare of the capture's light, and a folder.
+    The function takes the script's name and a number of frames. The script gets the package, a capture of so many
+    frames, a .flare of the capture's light, and an empty folder for its output.
     """
     from test_work import a_flare
 

@@ -46,6 +46,7 @@ def random_layers(seed: int, lights: tuple[str, ...] = ("lamp", "key light")) ->
 
 @pytest.fixture(scope="session")
 def made(blender: Blender, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Write layers of several kinds and run composite.py on them in Blender; return its facts and the folders."""
     base = tmp_path_factory.mktemp("composite")
     layers, out, user = base / "layers", base / "out", base / "user"
     for number in NUMBERS:

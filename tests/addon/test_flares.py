@@ -20,6 +20,7 @@ SCENE, PLATE, LAMP, KEY, RIM = 0.125, 0.5, 0.25, 0.5, 1.0
 
 @pytest.fixture(scope="session")
 def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Write layers of two and of three lights and run the script on them in Blender; return its facts."""
     base = tmp_path_factory.mktemp("flares")
     layers, more = base / "layers", base / "more"
     scene, lamp, key, rim = (np.full((8, 16, 3), value, np.float32) for value in (SCENE, LAMP, KEY, RIM))

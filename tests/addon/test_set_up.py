@@ -20,7 +20,7 @@ SCRIPT = ROOT / "headless" / "set_up.py"
 
 
 def wheel(folder: Path, name: str) -> Path:
-    """A package that holds one empty module."""
+    """Write a wheel of one empty module; return its path."""
     path = folder / f"{name}-1.0-py3-none-any.whl"
     info = f"{name}-1.0.dist-info"
     with zipfile.ZipFile(path, "w") as archive:

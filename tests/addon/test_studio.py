@@ -51,7 +51,10 @@ RED_IN_ACESCG = 0.61310, 0.07019, 0.02062  # of linear Rec. 709, by ACES' own ma
 
 
 def run(blender: Blender, package: Path, base: Path, configuration: str, *space: str) -> tuple[Any, np.ndarray]:
-    """Return the facts of the script, and the picture that a render shows. configuration: "" for Blender's own."""
+    """Run the script with an OpenColorIO configuration; return its facts and the picture (h, w, 3) that a render shows.
+
+    configuration: text of a config.ocio, "" for Blender's own. space: arguments that the script gets besides.
+    """
     black = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     red = black + np.array([1, 0, 0], np.float32)
     write_layers(base / "layers" / "layers.0001.exr", FrameLayers(black, {"lamp": red}, black[..., 0]))

@@ -21,6 +21,7 @@ SCENE, FLARE = np.full((8, 16, 3), 0.125, np.float32), np.full((8, 16, 3), 0.25,
 
 @pytest.fixture(scope="session")
 def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Write layers of one light and of sixty, and run wired.py on them in Blender; return its facts."""
     base = tmp_path_factory.mktemp("wired")
     layers = base / "layers"
     for number in range(1, 6):

@@ -26,8 +26,10 @@ SCRIPTS = Path(__file__).parent / "scripts"
 
 
 def a_flare(path: Path, *names: str) -> Path:
-    """A flare of the light of `flared_capture`, its Gaussians spread and coloured at random; one for each of several
-    names."""
+    """Write a .flare of the light of `flared_capture`, its Gaussians spread and coloured at random; return the path.
+
+    names: its lights' names, all with the same flare; "lamp" alone by default.
+    """
     generator = torch.Generator().manual_seed(4)
     place = cameras(5)
     seen = torch.tensor(np.array([camera.normalised(LIGHT)[0][0] for camera in place])).float()

@@ -17,7 +17,7 @@ SIZE = (64, 48)
 
 
 def look_at(position: Sequence[float], target: Sequence[float] = (0.0, 0.0, 0.0)) -> NDArray[np.float64]:
-    """world_to_camera (4, 4) of a camera at `position`; the world's y points down."""
+    """Return world_to_camera (4, 4) of a camera at `position` that looks at `target`; the world's y points down."""
     forward = np.subtract(target, position)
     forward = forward / np.linalg.norm(forward)
     right = np.cross((0.0, 1.0, 0.0), forward)
@@ -29,7 +29,7 @@ def look_at(position: Sequence[float], target: Sequence[float] = (0.0, 0.0, 0.0)
 
 
 def orbit(number: int, radius: float = 4.0, size: tuple[int, int] = SIZE, arc: float = 1.2) -> list[Camera]:
-    """Cameras on an arc about the origin that look at it."""
+    """Return cameras on an arc about the origin, which they look at. arc: radians."""
     cameras = []
     for i in range(number):
         angle = arc * (i / max(number - 1, 1) - 0.5)
@@ -48,7 +48,8 @@ def picture(seed: int, size: tuple[int, int] = SIZE, depth: type = np.uint8) -> 
 
 def make_capture(folder: Path, views: int = 4, *, size: tuple[int, int] = SIZE, model: str = "PINHOLE",
                  params: Sequence[float] | None = None, suffix: str = ".png", points: int = 20) -> Path:
-    """Write a capture with a text model; every frame is a smooth random picture."""
+    """Write a capture with a COLMAP text model; every frame is a smooth random picture. params: of the lens `model`; by
+    default those of a pinhole."""
     width, height = size
     params = params or (0.9 * width, 0.9 * width, width / 2, height / 2)
     sparse = folder / "sparse" / "0"
@@ -72,7 +73,7 @@ def make_capture(folder: Path, views: int = 4, *, size: tuple[int, int] = SIZE, 
 
 
 def make_transforms(folder: Path, views: int = 3, **extra: object) -> Path:
-    """Write a capture with a transforms.json, poses in OpenGL axes."""
+    """Write a capture with a transforms.json, whose poses have OpenGL axes. extra: further entries of that file."""
     (folder / "images").mkdir(parents=True)
     frames = []
     for i, camera in enumerate(orbit(views)):

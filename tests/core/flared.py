@@ -24,7 +24,7 @@ GHOSTS = ((1.0, 0.10, (0.9, 0.8, 0.6)), (0.45, 0.05, (0.1, 0.3, 0.1)), (-0.6, 0.
 
 
 def cameras(count: int) -> list[Camera]:
-    """Cameras on a short path that looks at the origin from 4 units away."""
+    """Return cameras on a short path 4 units from the origin, which they look at."""
     result = []
     for step in np.linspace(-1, 1, count):
         position = np.array([1.2 * step, 0.4 * step * step - 0.1, -4.0])
@@ -39,7 +39,8 @@ def cameras(count: int) -> list[Camera]:
 
 
 def flare(camera: Camera) -> NDArray[np.float32]:
-    """(height, width, 3) linear light."""
+    """Return the flare of LIGHT as a camera sees it, (height, width, 3) linear: soft discs on the line from the light
+    through the optical axis."""
     plane, depth = camera.normalised(LIGHT)
     if depth[0] <= 0:
         return np.zeros((HEIGHT, WIDTH, 3), np.float32)
@@ -53,8 +54,12 @@ def flare(camera: Camera) -> NDArray[np.float32]:
 
 
 def flared_capture(folder: Path, count: int = 12, dots: int = 150, *, float_gain: float | None = None) -> Path:
-    """A whole capture folder, with removed/, truth/ and lights.json. float_gain: of scene and flare, of which frames
-    and removed/ are EXR files then, and keep what is above white."""
+    """Write a whole capture, with removed/, truth/ and lights.json; return its folder. dots: number of the scene's
+    Gaussians.
+
+    float_gain: None for PNG frames; else frames and removed/ are EXR files that keep light above white, and scene and
+    flare are multiplied by this gain.
+    """
     random = np.random.default_rng(0)
     xyz = random.uniform(-1.2, 1.2, (dots, 3)).astype(np.float32)
     rgb = random.uniform(0.1, 0.9, (dots, 3)).astype(np.float32)

@@ -48,7 +48,10 @@ SCENES = (
 
 
 def scene_case(seed: int) -> Case:
-    """Return a random scene; its kind cycles with the seed."""
+    """Return a random scene of the kind that is the seed's turn in SCENES.
+
+    No Gaussian is close to a step, where float32 and float64 may decide differently.
+    """
     rng = np.random.default_rng(seed)
     kind = SCENES[seed % len(SCENES)]
     n = int(rng.integers(150, 300)) if kind == "layers" else int(rng.integers(1, 40))
@@ -107,7 +110,11 @@ def scene_case(seed: int) -> Case:
 
 
 def splat_case(seed: int) -> Case:
-    """Return random 2D Gaussians: plain, rings, arcs of both, with the blend "over" or "add"."""
+    """Return random 2D Gaussians of the kind that is the seed's turn: plain, rings, arcs, both, faint and large.
+
+    The blend is "over" or "add" in turn. No Gaussian is close to a step, where float32 and float64 may decide
+    differently.
+    """
     rng = np.random.default_rng(10_000 + seed)
     kind = ("plain", "rings", "arcs", "rings and arcs", "faint and large")[seed % 5]
     blend = ("over", "add")[seed // 5 % 2]
@@ -155,8 +162,11 @@ def _in_front(close: Tensor, alpha: Tensor) -> Tensor:
 
 
 def scene_steps(case: Case) -> tuple[Tensor, Tensor]:
-    """Return masks (n,) of the Gaussians with a contribution close to a step of blending, and of those with a position
-    close to a step of projection or colour."""
+    """Return two masks (n,): Gaussians that contribute close to a step of blending, and Gaussians whose position is
+    close to a step of projection, depth order or colour.
+
+    At a step (a threshold, a clip, a tie) results jump, so float32 cannot be compared with float64.
+    """
     width, height = case.size
     i = {name: value.double() for name, value in case.inputs.items()}
     n = len(i["means"])
@@ -188,7 +198,8 @@ def scene_steps(case: Case) -> tuple[Tensor, Tensor]:
 
 
 def splat_steps(case: Case) -> tuple[Tensor, Tensor]:
-    """Return the masks of `scene_steps` for 2D Gaussians."""
+    """Return two masks (n,) of 2D Gaussians close to a step: of blending over, and of the profile when light is
+    added."""
     width, height = case.size
     i = {name: value.double() for name, value in case.inputs.items()}
     pixels = r.pixel_centres(width, height, i["centres"])
@@ -205,6 +216,10 @@ def splat_steps(case: Case) -> tuple[Tensor, Tensor]:
 def _move_off_steps(
     case: Case, steps: Callable[[Case], tuple[Tensor, Tensor]], rng: np.random.Generator
 ) -> Case:
+    """Return the case with its Gaussians moved at random until `steps` finds none close to a step.
+
+    Opacities are lowered where blending is close, places shifted where a position is.
+    """
     place = "means" if "means" in case.inputs else "centres"
     for _ in range(100):
         by_opacity, by_position = steps(case)
@@ -223,8 +238,10 @@ def _move_off_steps(
 def render(
     case: Case, kernels: str, dtype: torch.dtype, device: str = "cpu"
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Render a case on a device; return pictures, and gradients of every input for a random weighting of all pixels, on
-    the CPU."""
+    """Render a case on a device; return its pictures by name, and the gradients of its inputs by name, on the CPU.
+
+    The gradients are of a sum of all pixels with fixed random weights.
+    """
     inputs = {name: value.to(device, dtype, copy=True).requires_grad_() for name, value in case.inputs.items()}
     options = {name: value.to(device) if isinstance(value, Tensor) else value for name, value in case.options.items()}
     arguments = {**inputs, **options, "kernels": kernels}
@@ -254,7 +271,7 @@ def render(
 
 
 def differences(case: Case, kernels: str, device: str = "cpu") -> list[str]:
-    """Return the differences of a kernel set in float32 on a device from the definition in float64, a line each."""
+    """Compare a kernel set in float32 on a device with the definition in float64; return a line for each difference."""
     pictures, gradients = render(case, "torch", torch.float64)
     tried, tried_gradients = render(case, kernels, torch.float32, device)
     wrong = []

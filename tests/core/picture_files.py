@@ -28,7 +28,7 @@ def scene(width: int = 96, height: int = 64, level: float = 0.7) -> NDArray[np.f
 
 
 def profile(chromaticities: Chromaticities, gamma: float | None = None) -> bytes:
-    """An ICC profile of version 4 with these primaries and a power, or sRGB's curve."""
+    """Return an ICC profile (version 4) of these primaries with a power of `gamma` as its curve; None: sRGB's curve."""
     columns = _to_d50(matrix_to_xyz(chromaticities)).T
     curve = (struct.pack(">4sIHH5i", b"para", 0, 3, 0, *(round(n * 65536) for n in (
         2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045))) if gamma is None
@@ -61,7 +61,7 @@ def by_oiio(path: Path, values: NDArray[Any], kind: Any, attributes: dict[str, A
 
 
 def luminance_and_chroma(path: Path, light: NDArray[np.float32]) -> None:
-    """Write an EXR of BY, RY and Y as 16 bit floats without compression, the chroma at half resolution."""
+    """Write light (h, w, 3) as an uncompressed half-float EXR of Y, and RY and BY at half resolution."""
     def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:
         return name + b"\0" + kind + b"\0" + struct.pack("<i", len(value)) + value
 

@@ -19,7 +19,8 @@ TINY = Recipe(widths=(8, 8, 8, 8, 8))
 
 
 def network_file(path: Path, seed: int = 0, bias: float = 0.0) -> Path:
-    """A small network of random weights; `bias` makes it see flare flare_everywhere (> 0) or no_flare (< 0)."""
+    """Write a small network of random weights; return its path. `bias` makes it see flare everywhere (> 0) or nowhere
+    (< 0)."""
     torch.manual_seed(seed)
     network = RemovalNetwork(TINY.widths, TINY.blocks, TINY.attention)
     with torch.no_grad():
@@ -48,8 +49,11 @@ def with_no_glow(flare: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def lit_street(size: int, level: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(160, 240, 3) each: a dark street with a white light disc of `size` pixels a side in a glow; and the flare, which
-    is the glow and what leaves the disc at the display value `level`, its rim of one pixel at a third of that."""
+    """Return a dark street with a white square lamp in a glow, and the flare in it, each (160, 240, 3) display values.
+
+    The flare is the glow, and what leaves the lamp, `size` pixels a side, at the value `level`, and its rim of one
+    pixel at a third of that.
+    """
     display, flare = np.full((160, 240, 3), 0.1, np.float32), np.zeros((160, 240, 3), np.float32)
     first = 60
     glow, rim = slice(first - 12, first + size + 12), slice(first, first + size)

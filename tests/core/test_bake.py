@@ -47,6 +47,8 @@ class FakeRenderer:
         self.edits: list[LookEdits | None] = []
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> FakeRendering:
+        """Note camera and edits in `rendered` and `edits`; return random layers, which depend on the focal length
+        alone."""
         self.rendered.append(round(camera.fx))
         self.edits.append(edits)
         random = np.random.default_rng(round(camera.fx))

@@ -103,7 +103,7 @@ def test_a_plate_with_borders_is_cleaned_as_the_picture_inside(tmp_path: Path, k
 
 @pytest.fixture(scope="module")
 def boxed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """The flared capture with black over its first and last six rows."""
+    """A capture with a flare whose frames are black in their first and last six rows."""
     folder = flared_capture(tmp_path_factory.mktemp("boxed") / "capture")
     for kind in ("images", "removed"):
         for path in (folder / kind).iterdir():

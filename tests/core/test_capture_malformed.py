@@ -42,7 +42,7 @@ def drop(name: str) -> Damage:
 
 
 def binary(folder: Path) -> Path:
-    """Make the model binary."""
+    """Rewrite the capture's text model as a binary one; return the model's folder."""
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
@@ -277,6 +277,7 @@ for name, ply in {
 
 
 def check(folder: Path, error: type[FitFlareError], says: str) -> None:
+    """Assert that the capture is refused by an error in one sentence that contains `says`, and that no file changed."""
     def state() -> dict[Path, int]:
         return {path: path.lstat().st_mtime_ns for path in sorted(folder.parent.rglob("*"))}
 

@@ -300,7 +300,11 @@ OLD = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 
 
 def nerfstudio(folder: Path, applied: np.ndarray, scale: float, **declared: Any) -> np.ndarray:
-    """Write a capture whose poses nerfstudio moved, beside its COLMAP model; return the points in the file's world."""
+    """Write a transforms.json as nerfstudio does, poses moved and scaled, beside the COLMAP model.
+
+    applied: (3, 4) rotation and shift of nerfstudio's world. declared: further entries of the file. Returns the model's
+    points in the file's world.
+    """
     model = make_capture(folder.with_name("model"))
     make_transforms(folder, 4)
     (folder / "colmap" / "sparse").mkdir(parents=True)
@@ -466,6 +470,8 @@ def test_a_missing_mask_is_refused(tmp_path: Path) -> None:
 # Points.
 
 def ply(path: Path, names: tuple[str, ...], kind: str, values: list[float]) -> Path:
+    """Write a binary PLY of two points with these properties of one kind besides x, y, z; the first has these
+    values."""
     types = {"uchar": "u1", "ushort": "<u2", "uint": "<u4", "int": "<i4", "float": "<f4", "double": "<f8"}
     properties = [f"property float {axis}" for axis in "xyz"] + [f"property {kind} {name}" for name in names]
     row = np.zeros(2, [*((axis, "<f4") for axis in "xyz"), *((name, types[kind]) for name in names)])
@@ -523,7 +529,11 @@ def test_an_implausible_focal_length_is_reported(tmp_path: Path, focal: float, i
 # Exif orientation.
 
 def turned_capture(folder: Path, orientation: int, *, coloured: bool = True) -> Path:
-    """Write a capture that was solved from pictures as shown, whose files hold them turned by an orientation."""
+    """Write a capture whose JPEG files hold turned pictures with an Exif orientation, solved from the pictures as
+    shown.
+
+    coloured: give the points the colours of the frames.
+    """
     make_capture(folder, points=300)
     shown = [picture(i) for i in range(4)]
     cloud = np.random.default_rng(1).uniform(-0.6, 0.6, (300, 3))

@@ -70,7 +70,7 @@ def test_an_unknown_space_is_refused_with_the_known_names(monkeypatch: pytest.Mo
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    """A small studio configuration: a linear space, a log one, and roles."""
+    """Write a small OpenColorIO configuration of linear spaces, a log space and a role; return its path."""
     library = pytest.importorskip("PyOpenColorIO", reason="the package opencolorio is not installed")
     made = library.Config()
     made.addColorSpace(library.ColorSpace(name="Linear Rec.709", encoding="scene-linear"))

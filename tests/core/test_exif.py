@@ -20,7 +20,7 @@ from core.images.video import Video
 
 
 def exif_segment(order: str, orientation: int, focal: int) -> bytes:
-    """A JPEG's Exif segment with orientation and 35 mm focal length."""
+    """Return a JPEG's Exif segment with an orientation and a 35 mm focal length. order: of bytes, "II" or "MM"."""
     sign = "little" if order == "II" else "big"
 
     def number(value: int, size: int) -> bytes:

@@ -102,7 +102,7 @@ def tensors_of(run: Run) -> dict[str, torch.Tensor]:
 
 
 def flare_psnr(run: Run, capture: Capture) -> tuple[float, float]:
-    """Of the linear flare on held-out views, and of an empty one."""
+    """Return the PSNR, dB, of the linear flare over the held-out views, and that of an empty flare."""
     _, views = capture.split(run.settings.holdout)
     errors, empty = [], []
     for view in views:
@@ -285,7 +285,10 @@ def test_the_excess_ratio_is_high_where_residuals_are_mostly_flare() -> None:
 
 def test_far_flare_light_falls_where_the_scene_has_not_converged(capture: Capture) -> None:
     def away(found: float) -> float:
-        """Light of the flare away from the lights, of a fit that was stopped and went on."""
+        """Fit, interrupt and go on; return the light of the flare that is away from the lights, summed over the views.
+
+        found: ratio at which the scene counts as converged.
+        """
         settings = override_settings(quick(120), {"mode": "split", "split.scene_only_rounds": 1,
                                                   "split.converged_ratio": found, "split.far_flare_penalty": 3.0})
         trainer = Trainer(capture, settings)

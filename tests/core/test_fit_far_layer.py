@@ -40,7 +40,8 @@ def texture(points: Floats, seed: int) -> Floats:
 
 
 def picture(camera: Camera, radius: float) -> NDArray[np.float32]:
-    """Return a textured board about the origin before a textured sphere of a radius about it, (height, width, 3)."""
+    """Return what a camera sees, (height, width, 3): a textured board at the origin, inside a textured sphere of
+    `radius`."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = camera.rays(np.stack([x.ravel(), y.ravel()], 1))
     middle = camera.position @ rays.T
@@ -146,7 +147,7 @@ def test_a_resumed_fit_with_a_far_layer_equals_an_uninterrupted_one(tmp_path: Pa
 
 
 def with_far_layer(opacity: float = 0.9) -> SceneGaussians:
-    """Two near Gaussians, and one far one on +z."""
+    """Return a scene of two near Gaussians with a far layer of two on +z. opacity: of the far layer."""
     points = PointCloud(np.array([[0, 0, 5], [1, 0, 5]], np.float32), np.full((2, 3), 128, np.uint8),
                         np.zeros(2, np.float32))
     far = PointCloud(np.array([[0, 0, 1000], [9, 0, 1000]], np.float32), np.full((2, 3), 90, np.uint8),

@@ -35,8 +35,11 @@ SCALE, SIDE, COUNT = 3, 20, 12
 
 
 def wall(folder: Path, filmed: Callable[[int, Light], Light]) -> Capture:
-    """A capture of a wall of tiles, each with a point, at the origin. filmed: the light of a frame, by its number and
-    what comes from the wall, (height, width, 3) scene-linear."""
+    """Write and open a capture of a wall of tiles at the origin, with a point at each tile.
+
+    filmed: returns a frame's light from its number and the light of the wall, each light (height, width, 3)
+    scene-linear.
+    """
     tiles = np.random.default_rng(3).uniform(0.05, 0.6, (SIDE, SIDE, 3)).astype(np.float32)
     across = (np.arange(SIDE) + 0.5) / SIDE * 4 - 2
     xyz = np.stack([*np.meshgrid(across, across, indexing="ij"), np.zeros((SIDE, SIDE))], -1).reshape(-1, 3)
@@ -118,6 +121,8 @@ def test_frames_without_points_take_the_nearest_exposure(tmp_path: Path) -> None
 @pytest.mark.parametrize("why", ["few points are lit", "something else lies over it"])
 def test_a_frame_with_an_uncertain_exposure_takes_the_nearest(tmp_path: Path, why: str) -> None:
     def filmed(number: int, light: Light) -> Light:
+        """Film frames 0 to 5 at twice the light of the later ones; frame 4 gives no reliable exposure, for the reason
+        `why`."""
         if number != 4:
             return light * (2.0 if number < 6 else 1.0)
         if why == "few points are lit":
@@ -171,7 +176,8 @@ STOPS = 0.7
 
 @pytest.fixture(scope="module")
 def drifting(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, dict[str, float]]:
-    """A capture with a flare, every other frame brighter and the others as much darker; and how much."""
+    """A capture with a flare whose exposure alternates, two frames up and two down, by STOPS; and the exposures by
+    frame."""
     folder = tmp_path_factory.mktemp("drifting") / "capture"
     capture, exposures = Capture.open(flared_capture(folder)), {}
     shutil.rmtree(folder / "truth")
@@ -185,7 +191,7 @@ def drifting(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, dict[st
 
 
 def flare_error(capture: Capture, run: Run) -> float:
-    """Mean square over the views, display values."""
+    """Return the mean square difference, display values, of the frames from the clean frames plus the fitted flare."""
     errors = []
     for view in run.open_capture().views:
         layers = run.render(view.camera)

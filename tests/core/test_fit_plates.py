@@ -42,7 +42,10 @@ def _flare(place: np.ndarray, colour: tuple[float, float, float]) -> np.ndarray:
 
 
 def make_shot(folder: Path, *, second_lamp: bool = False, count: int = FRAMES) -> Path:
-    """Write a shot of a lamp that moves and goes out, with exact clean frames and its path, without brightness."""
+    """Write a shot of a lamp that moves and goes out, with exact clean frames, and the lamp's path without brightness.
+
+    second_lamp: add a light to lights.json that never shines.
+    """
     random = np.random.default_rng(0)
     background = random.uniform(0.05, 0.3, (9, 16, 3)).repeat(6, 0).repeat(6, 1).astype(np.float32)
     keys = {}

@@ -41,7 +41,7 @@ def random_(seed: int) -> torch.Generator:
 
 
 def some_flare(form: FlareForm = PAPER, count: int = 40, lights: int = 1, seed: int = 0) -> FlareModel:
-    """A flare whose network has been shaken, so that every deformation does something."""
+    """Return an untrained flare whose weights are changed at random, so that every deformation does something."""
     generator = random_(seed)
     with torch.random.fork_rng():  # the networks draw their weights from torch's global generator
         torch.manual_seed(seed)

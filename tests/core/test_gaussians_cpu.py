@@ -63,7 +63,7 @@ def _threads() -> Iterator[None]:
 
 
 def gradients(count: int, **changes: object) -> list[Tensor]:
-    """Picture, alpha and the gradients of all inputs, on this many threads."""
+    """Render the scene on this many threads; return colour, alpha and the gradients of all inputs."""
     torch.set_num_threads(count)
     arguments = {**scene(), **changes}  # type: ignore[operator]
     inputs = {k: v.requires_grad_() for k, v in arguments.items() if isinstance(v, Tensor)}
@@ -126,6 +126,7 @@ def test_splats_with_a_nan_centre_are_not_drawn() -> None:
 
 def test_splats_give_the_same_bits_on_all_thread_counts() -> None:
     def draw(count: int) -> list[Tensor]:
+        """Splat random rings on this many threads; return the picture and the gradients of all inputs."""
         torch.set_num_threads(count)
         g = torch.Generator().manual_seed(2)
         inputs = [
@@ -375,6 +376,8 @@ def test_ellipses_far_larger_than_the_picture_are_listed_within_their_rows(monke
     records, met = np.empty(0), np.empty(0, int)
 
     def listed(*given: Any) -> Any:
+        """Call `bin_gaussians` as the kernels do; check its packed rows and bounds, and keep its inputs for the
+        test."""
         nonlocal records, met
         records, tiles, rows, bounds, grid = (given[0].reshape(-1, layout.RECORD).astype(float), given[2], given[3],
                                               given[4].copy(), given[-1])

@@ -28,6 +28,7 @@ def run(body: Callable[..., Any], *arrays: np.ndarray, size: int = 16) -> np.nda
 
 def test_operators_equal_numpy() -> None:
     def body(out, a, b):  # type: ignore[no-untyped-def]
+        """Store the results of the operators on the first vectors of a and b, 16 values each."""
         x, y = v.load(a, 0), v.load(b, 0)
         v.store(out, 0, x + y * 2 - 1)
         v.store(out, 16, -x / y)
@@ -44,6 +45,7 @@ def test_operators_equal_numpy() -> None:
 
 def test_comparisons_and_selects_equal_numpy() -> None:
     def body(out, a, b):  # type: ignore[no-untyped-def]
+        """Store the results of comparisons and selections, 16 values each, and of two reductions."""
         x, y = v.load(a, 0), v.load(b, 0)
         v.store(out, 0, v.where((x < y) & (x > -1), x, 7))
         v.store(out, 16, v.where((x >= y) | (y <= 0), 1, y))

@@ -15,7 +15,10 @@ SIZE = (150, 110)
 
 
 def ellipses(n: int, smallest: float, largest: float, seed: int) -> tuple[Tensor, Tensor]:
-    """Centres about the middle of the picture, and covariances."""
+    """Return random centres (n, 2) in the middle of the picture, and covariances (n, 3), xx, xy, yy.
+
+    smallest, largest: of the standard deviations, pixels.
+    """
     generator = torch.Generator().manual_seed(seed)
     sigma = smallest * (largest / smallest) ** torch.rand(n, 2, generator=generator)
     theta = math.pi * torch.rand(n, generator=generator)

@@ -111,6 +111,7 @@ def test_unknown_properties_and_elements_are_ignored(tmp_path: Path) -> None:
 
 
 def broken() -> list[tuple[str, bytes, str]]:
+    """Return broken PLY files: name, content, and words of the message that refuses the file."""
     body = np.zeros((2, 62), "<f4")
     good = "\n".join(header("", 2)) + "\n"
 

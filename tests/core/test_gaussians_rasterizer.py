@@ -26,7 +26,11 @@ SIZE = (20, 16)
 
 
 def scene(n: int = 3, **changes: Tensor) -> dict[str, Tensor]:
-    """Round Gaussians one behind the other on the axis, from z = 2 on, one unit apart, of one colour each."""
+    """Return inputs of `rasterization`: round Gaussians of different colours one behind the other, from z = 2 on, one
+    apart.
+
+    changes: inputs to replace.
+    """
     z = torch.arange(n) + 2.0
     sh = torch.zeros(n, 1, 3)
     sh[torch.arange(n), 0, torch.arange(n) % 3] = 0.5 / 0.28209479177387814  # 1 there, 1/2 elsewhere

@@ -113,6 +113,7 @@ def test_adam_selects_rows_with_their_moments() -> None:
     start, gradients = torch.randn(6, 2, generator=generator), torch.randn(10, 6, 2, generator=generator)
 
     def run(order: Tensor | None) -> Tensor:
+        """Make all steps, with the rows re-ordered at the sixth unless `order` is None; return the rows."""
         rows = torch.nn.Parameter(start.clone())
         optimiser = Adam({"rows": rows}, 0.1)
         for step, gradient in enumerate(gradients):
@@ -222,6 +223,7 @@ def test_steps_in_backward_equal_separate_steps(n: int) -> None:
     target = torch.rand(28, 36, 3, generator=torch.Generator().manual_seed(1))
 
     def trained(early: bool) -> tuple[SceneGaussians, Adam]:
+        """Make three iterations, with Adam's steps inside the backward pass if `early`; return scene and optimiser."""
         scene, optimiser = some_scene(n)
         optimiser.zero_grad()
         for degree in (1, 3, 3):
@@ -259,6 +261,7 @@ def test_a_gradient_after_its_step_raises() -> None:
 
 
 def some_scene(n: int = 60, seed: int = 0) -> tuple[SceneGaussians, Adam]:
+    """Return a random scene and its optimiser after one step, so that Adam has moments."""
     generator = torch.Generator().manual_seed(seed)
     scene = SceneGaussians(
         torch.randn(n, 3, generator=generator),
@@ -398,6 +401,8 @@ def test_mcmc_injects_noise_into_faint_gaussians_only() -> None:
 @pytest.mark.parametrize("kind", ["classic", "mcmc"])
 def test_a_run_is_determined_by_its_seed(kind: str) -> None:
     def run(seed: int, interrupted: bool) -> Tensor:
+        """Change the density for eight iterations, through a saved state at the fifth if `interrupted`; return the
+        means."""
         scene, optimiser = some_scene()
         generator = torch.Generator().manual_seed(seed)
 

@@ -106,7 +106,7 @@ def test_a_transfer_to_a_stereo_picture_is_refused_by_name(tmp_path: Path) -> No
 
 
 def write_parts(path: Path, parts: list[tuple[dict[str, Any], list[str]]], size: tuple[int, int] = (64, 48)) -> Path:
-    """Write parts, each of a header and the names of its channels."""
+    """Write a multi-part EXR of random pixels; each part is a header and the names of its channels."""
     random = np.random.default_rng(0)
     whole = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File([OpenEXR.Part({**whole, **header}, {

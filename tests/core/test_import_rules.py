@@ -49,7 +49,7 @@ def layer_of(module: str) -> int:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Names that a file imports, at its head or in a function; our own by their full names from the root."""
+    """Yield the names that a file imports, at its head or in a function; our own by their full names from the root."""
     package = path.relative_to(ROOT).parts[:-1]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -66,7 +66,7 @@ def importers(library: str, files: Iterable[Path]) -> list[str]:
 
 
 def package_imports(files: Iterable[Path]) -> dict[str, set[str]]:
-    """The packages that each package imports, itself left out."""
+    """Return the packages that each package imports, without itself and without packages that it contains or is in."""
     files = list(files)
     packages = {module_of(path) for path in files if path.name == "__init__.py"}
 
@@ -87,10 +87,11 @@ def package_imports(files: Iterable[Path]) -> dict[str, set[str]]:
 
 
 def find_circle(graph: Mapping[str, set[str]]) -> list[str]:
-    """A circle of a graph as the list of its nodes, the first repeated at the end; empty where there is none."""
+    """Return a circle of a graph as the list of its nodes, the first repeated at the end; [] where there is none."""
     finished: set[str] = set()
 
     def search(node: str, path: list[str]) -> list[str]:
+        """Search depth-first from `node`, reached by `path`; return a circle or []."""
         if node in path:
             return [*path[path.index(node):], node]
         if node in finished:

@@ -53,7 +53,7 @@ def plate(scene: bpy.types.Scene) -> tuple[bpy.types.NodeTree, bpy.types.Node]:
 
 
 def grade(tree: bpy.types.NodeTree, name: str = "Grade") -> bpy.types.Node:
-    """A stop more, between what feeds the output and the output."""
+    """Insert an exposure node of one stop before the compositor's output; return the node."""
     node = tree.nodes.new("CompositorNodeExposure")
     node.name = name
     node.inputs["Exposure"].default_value = 1
@@ -64,7 +64,7 @@ def grade(tree: bpy.types.NodeTree, name: str = "Grade") -> bpy.types.Node:
 
 
 def shown(scene: bpy.types.Scene) -> float | None:
-    """The middle of the picture; None for a cycle, of which Blender may crash."""
+    """Render and return the red of the first pixel; None if the tree has a cycle, of which Blender may crash."""
     tree = flare_node.tree_of(scene)
     if tree is None or not all(link.is_valid for link in tree.links):
         return None

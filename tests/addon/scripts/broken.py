@@ -67,7 +67,7 @@ class Drawn:
 
 
 def shown(name: str) -> str:
-    """What a panel says at the moment."""
+    """Return the labels that a panel draws at the moment, as one text."""
     cls = getattr(part("flare_addon.panels"), f"FITFLARE_PT_{name}")
     layout = Drawn()
     own = {key: value for key, value in vars(cls).items() if callable(value)}
@@ -353,7 +353,7 @@ def slide() -> set[str]:
 
 
 def prepare(name: str) -> None:
-    """What an operator needs, done before its undo step."""
+    """Set up what an operator needs. It runs before the operator's undo step begins."""
     state = bpy.context.scene.fit_flare
     if name == "lights_from_selected":
         cube = bpy.data.objects.new("Bulb", None)

@@ -147,7 +147,7 @@ if facts["reports drops"]:
 
 # ---- bake without an engine -----------------------------------------------------------------------------
 def rendered(scene):
-    """The picture that a render gives, scene-linear, row 0 on top."""
+    """Render the current frame; return the picture (h, w, 3), scene-linear, row 0 on top."""
     files = {}
     render_settings.render_frames(scene, [scene.frame_current],
                                   lambda _number, suffix: files.setdefault(suffix, Path(out) / f"rendered{suffix}"))
@@ -215,7 +215,7 @@ facts["left alone"] = flare_node.find_node(scene) is None
 
 # ---- a stack of effects ---------------------------------------------------------------------------------
 def effect(scene, name, factor):
-    """An effect that multiplies the picture before it."""
+    """Add a compositor effect that multiplies the picture by a factor; return it."""
     tree = bpy.data.node_groups.new(name, "CompositorNodeTree")
     for direction in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Image", in_out=direction, socket_type="NodeSocketColor")

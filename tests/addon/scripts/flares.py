@@ -27,7 +27,8 @@ facts: dict[str, object] = {}
 
 
 def shot(lamps, *, over="scene"):
-    """A scene with a flare at each of these lamps, and their layers in the compositor."""
+    """Make a scene with a flare at each of these lamps and their baked layers; return it. over: what flares lie
+    over."""
     scene = empty()
     scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.collection.objects.link(scene.camera)
@@ -329,7 +330,7 @@ scene = shot(["lamp"])
 
 
 def drawn(name, space):
-    """Whether a panel is shown beside a scene with a flare, and the operators that it draws."""
+    """Return the operators that a panel draws beside a scene with a flare; [] where the panel is not shown."""
     cls, layout = getattr(editors, f"FITFLARE_PT_{name}"), MagicMock()
     context = SimpleNamespace(scene=scene, space_data=space)
     if not cls.poll(context):

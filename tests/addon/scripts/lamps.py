@@ -83,7 +83,7 @@ SWITCHES = ("follow_power", "follow_visibility", "follow_direction", "follow_dis
 
 
 def baked(scene, numbers):
-    """The sum of the flare in each frame, as a bake of the scene has it."""
+    """Return the sum of the flare in each of these frames, computed as a bake of the scene does."""
     look, sums = looks.look_of(scene), []
     k = np.array([[48.0, 0, 24], [0, 48.0, 13.5], [0, 0, 1]])
     for frame in shots.scene_shot(scene, [], numbers, look.path, None).frames:
@@ -101,7 +101,8 @@ def keyed(item, path, *keys):
 
 
 def over(scene, numbers):
-    """The sum of the flare in each frame relative to the first, in the camera view and in a bake."""
+    """Return two lists, from the camera view and from a bake: the sum of the flare in each frame, relative to the
+    first."""
     seen = []
     for number in numbers:
         scene.frame_set(number)

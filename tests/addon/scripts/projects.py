@@ -31,7 +31,7 @@ def plates_in(folder: Path) -> Path:
 
 
 def filmed(first: Path | str, frame_start: int = 1) -> object:
-    """A scene with a mesh, and with the sequence as a clip behind its camera."""
+    """Make a scene with a mesh, and with the sequence of pictures as a clip behind its camera; return it."""
     scene = empty()
     mesh = bpy.data.meshes.new("Set")
     mesh.from_pydata([(0, 0, -5), (1, 0, -5), (0, 1, -5)], [], [(0, 1, 2)])

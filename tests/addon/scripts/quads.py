@@ -6,7 +6,11 @@ import numpy as np
 
 
 def drawn_levels(overlay, gaussians, window, look):
-    """The picture (h, w, 3), scene-linear: the sum of the levels, as the last shader makes it."""
+    """Draw the overlay's quads with numpy, as its shaders do; return the picture (h, w, 3), scene-linear.
+
+    Each level is a picture of 1 / divisor of the size, in which a quad adds its Gaussian, ring or arc; the levels are
+    enlarged and added.
+    """
     total = np.zeros((window.height, window.width, 3), np.float32)
     for divisor, quads in overlay.quads_by_level(gaussians, window, look).items():
         size = -(-window.height // divisor), -(-window.width // divisor)
@@ -29,7 +33,7 @@ def drawn_levels(overlay, gaussians, window, look):
 
 
 def enlarged(level, divisor, window):
-    """Bilinear, rows counted from the top."""
+    """Enlarge a level bilinearly by `divisor` to the size of the window; rows are counted from the top."""
     def places(length, most):
         where = (np.arange(length) + 0.5) / divisor - 0.5
         low = np.floor(where).astype(int)

@@ -23,7 +23,7 @@ facts: dict[str, object] = {}
 
 
 def recorded(shot: object, numbers: range) -> None:
-    """What the engine writes down of a shot that it has baked."""
+    """Write bake.json for these frames of a shot, as the engine does after it has baked them."""
     made = part("core.bake.bake")
     names = part("core.bake.layers").layer_names(shot.lights)
     write_json(folder / "bake.json", {

@@ -58,7 +58,8 @@ def object_in(scene: Any, name: str, data: Any, place: Any) -> Any:
 
 
 def scene_with(*lamps: Any) -> tuple[Any, list[Any]]:
-    """An empty file with a camera that looks along +y, and lamps at these places."""
+    """Make an empty file with a camera that looks along +y, and lamps at these places; return the scene and the
+    lamps."""
     scene = empty()
     scene.camera = object_in(scene, "Camera", bpy.data.cameras.new("Camera"), (0, 0, 0))
     scene.camera.rotation_euler = (math.pi / 2, 0, 0)
@@ -74,7 +75,7 @@ def select(scene: Any, *objects: Any) -> None:
 
 
 def artists_tree(scene: Any) -> Any:
-    """A compositor of the scene's own, without nodes."""
+    """Give the scene a compositor tree of its own, without nodes; return the tree."""
     if bpy.app.version >= (5, 0, 0):
         tree = scene.compositing_node_group = bpy.data.node_groups.new("Mine", "CompositorNodeTree")
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
@@ -86,7 +87,8 @@ def artists_tree(scene: Any) -> Any:
 
 
 def refusal(call: Callable[[], Any]) -> str:
-    """The error report of an operator that refuses; "" where it did not. A traceback fails the script."""
+    """Call an operator; return the error report with which it refuses, "" if it finishes. A traceback fails the
+    script."""
     with contextlib.redirect_stderr(io.StringIO()) as noise:
         try:
             result = call()

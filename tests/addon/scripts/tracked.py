@@ -73,7 +73,10 @@ back.source, back.clip = "MOVIE_CLIP", clip
 
 
 def tracks_missed_by(folder: Path) -> float:
-    """Greatest distance, pixels of the distorted frames, of the capture's points from the tracks they are of."""
+    """Export the scene as a capture; return how far its points, projected into its frames, are from their tracks.
+
+    The greatest distance over all frames, pixels of the distorted frames; infinite if a point is behind a camera.
+    """
     bpy.context.view_layer.update()
     exporter.export_capture(scene, folder)
     entries = json.loads((folder / "transforms.json").read_text())["frames"]

@@ -21,7 +21,8 @@ GROUPS = bpy.app.version >= (5, 0, 0)
 
 
 def dump(scene):
-    """Everything that a trace could be left in."""
+    """Return everything of a file in which the extension could leave a trace: nodes, links, groups, images,
+    properties."""
     tree = scene.compositing_node_group if GROUPS else scene.node_tree
     whole = {"use_nodes": True if GROUPS else scene.use_nodes, "actions": len(bpy.data.actions),
              "groups": sorted(one.name for one in bpy.data.node_groups),
@@ -40,7 +41,7 @@ def bare(_scene):
 
 
 def grey(scene):
-    """A colour through a blur to the output, animated."""
+    """Build an artist's compositor: an animated colour through a blur to the output."""
     tree = artists_tree(scene)
     colour = tree.nodes.new("CompositorNodeRGB")
     colour.outputs[0].default_value = (0.25, 0.5, 0.75, 1)
@@ -73,7 +74,7 @@ for make in (bare, grey, unused):
 
 # ---- driven: the panel's sliders, animated too, in rendered pixels --------------------------------
 def shot():
-    """A scene with a camera and the flare, that renders as many pixels as the layers have."""
+    """Make a scene with a camera and the flare, whose render has as many pixels as the layers; return it."""
     scene = empty()
     camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.collection.objects.link(camera)

@@ -31,7 +31,7 @@ original = core_capture.Capture.open(capture)
 
 
 def blenders_own(scene, camera, points):
-    """Pixels of world points by the matrices that Blender renders with."""
+    """Return the pixels (n, 2) of world points (n, 3), by the matrices that Blender itself renders with."""
     render = scene.render
     depsgraph = bpy.context.evaluated_depsgraph_get()
     evaluated = camera.evaluated_get(depsgraph)

@@ -48,7 +48,7 @@ class Borders(NamedTuple):
     def area(self, width: int, height: int, margin: int = 0) -> PictureArea:
         """Return the area inside the borders of a picture of this size, less `margin` lines next to each border.
 
-        Facing borders count by the narrower one: a night sky makes one of them wider, and is no border by itself.
+        If two facing borders differ, the narrower width counts for both: a night sky can widen one, and is no border.
         An area with a side below MIN_AREA_SIDE becomes the whole picture.
         """
         top, bottom = _match_facing(self.top, self.bottom)
@@ -93,16 +93,17 @@ def _match_facing(first: int, last: int) -> tuple[int, int]:
 
 
 def _count_border_lines(read_line: Callable[[int], NDArray[Any]], count: int) -> tuple[int, int]:
-    """Count the black lines at both ends; none in a picture that is black all over. read_line: as for
-    `_count_leading_lines`. count: number of lines."""
+    """Count the black lines at both ends; none in a picture that is black all over. read_line: returns the pixels
+    (length, 3) of a line, as display values. count: number of lines."""
     first, last = (_count_leading_lines(read_line, order) for order in (range(count), range(count - 1, -1, -1)))
     return (first, last) if first + last < count else (0, 0)
 
 
 def _count_leading_lines(read_line: Callable[[int], NDArray[Any]], positions: Iterable[int]) -> int:
-    """Count the even, black lines in this order, up to the first other one.
+    """Count the even, black lines at `positions`, in their order, up to the first line that is not.
 
-    read_line: returns the pixels (length, 3) at a position, as display values. All must have the first one's colour.
+    read_line: returns the pixels (length, 3) of the line at a position, as display values. All lines must have the
+    colour of the first.
     """
     colour, index = None, -1
     for index, position in enumerate(positions):

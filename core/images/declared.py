@@ -27,7 +27,7 @@ _SRGB_GAMMAS = (44000, 47000)
 
 
 def declared_space(path: Path) -> ColourSpace | None:
-    """Return the space that a file declares; None where it declares none. An EXR's is with its pixels.
+    """Return the space that a file declares; None where it declares none, and for an EXR (`exr.py` reads its space).
 
     Raises OSError, and FrameError for a profile that cannot be honoured.
     """

@@ -59,8 +59,9 @@ _DPX_TRANSFERS = {"linear": "linear", "printing density": "cineon", "logarithmic
 
 
 class Description(NamedTuple):
-    """Size, colour space (None where the file names none), Exif orientation, ICC profile, code points, Exif block and
-    XMP of a picture, by its header. The last two are those of formats whose clean plate is a PNG."""
+    """Size, colour space (None where the file names none), Exif orientation, ICC profile, code points (primaries and
+    transfer function), Exif block and XMP of a picture, by its header. The last two are read only from formats whose
+    clean plates are PNGs."""
 
     width: int
     height: int
@@ -135,8 +136,8 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
 
 
 def _read_av1_frame(path: Path) -> VideoFrame | None:
-    """Return the picture of an AVIF by PyAV, which knows its code points and more than the 8 bits of Pillow; None where
-    it cannot be read so."""
+    """Decode the picture of an AVIF with PyAV, which gives its code points and all of its bits, where Pillow gives 8;
+    None where PyAV cannot read it."""
     from .video import Video
 
     try:
@@ -147,8 +148,8 @@ def _read_av1_frame(path: Path) -> VideoFrame | None:
 
 
 def _avif_orientation(picture: Any) -> int:
-    """Return the orientation of an AVIF as Exif numbers it: Pillow states its rotation and mirroring so, and does not
-    apply them."""
+    """Return the Exif orientation that stands for an AVIF's rotation and mirroring, which Pillow reports in this form
+    and does not apply."""
     try:
         orientation = int(picture.getexif().get(tiff.ORIENTATION, 1))
     except Exception:  # a damaged block
@@ -223,7 +224,7 @@ def _describe_by_oiio(path: Path, kind: Kind) -> Description:
 
 
 def _oiio_space(spec: Any, kind: Kind) -> ColourSpace | None:
-    """Return the space that a header without a profile names; None for the usual one of its pixels."""
+    """Return the space that a header without a profile names; None for the default of its pixel type."""
     if kind == "cineon":
         return colour_space("cineon")
     if kind == "hdr":
@@ -257,7 +258,7 @@ def _check_stated_size(path: Path) -> None:
 def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
     """Raise FrameError for a file that cannot hold the pixels that its header claims: their memory may be gigabytes.
 
-    Only formats without compression, or of runs of equal pixels, have a bound; others pass.
+    Only formats without compression or with run-length encoding have a bound; others pass.
     """
     size = path.stat().st_size
     bits = spec.get_int_attribute("oiio:BitsPerSample", 0) or 8 * spec.format.size()
@@ -273,8 +274,8 @@ def _check_claimed_pixels(path: Path, kind: Kind, spec: Any) -> None:
 
 
 def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
-    """Decode a file with OpenImageIO; see `decode_foreign`. Of more than four channels, the colours are kept, and alpha
-    where it is the fourth. Raises FrameError."""
+    """Decode a file with OpenImageIO to (height, width), or B G R with alpha last. Of more than four channels, the
+    colours are kept, and alpha where it is the fourth. Raises FrameError."""
     image_input = open_oiio(path)
     try:
         spec = image_input.spec()
@@ -282,7 +283,7 @@ def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
         if kind == "psd" and spec.get_string_attribute("psd:ColorMode") in ("CMYK", "Lab", "Multichannel"):
             raise FrameError(f"{path} is in {spec.get_string_attribute('psd:ColorMode')} colours; convert it to RGB.")
         if kind == "tiff" and spec.get_int_attribute("tiff:PhotometricInterpretation", 2) not in (0, 1, 2, 3, 6):
-            # Read are 0 or 1 for white, R G B, palettes, and Y Cb Cr.
+            # Readable are grey with white as 0 or as the maximum, R G B, palettes, and Y Cb Cr.
             raise FrameError(f"{path} is in colours for print or measurement (CMYK or Lab); convert it to RGB.")
         if channels > 4:
             channels = 4 if spec.alpha_channel == 3 else 3
@@ -309,7 +310,7 @@ def _decode_by_oiio(path: Path, kind: Kind) -> NDArray[Any]:
 
 
 def _decode_in_child(decode: Callable[..., NDArray[Any]], path: Path) -> NDArray[Any]:
-    """Decode in a child process, since a damaged file ends the process of this library. Raises FrameError."""
+    """Decode in a child process, since a damaged file can crash the library. Raises FrameError."""
     try:
         return np.asarray(run_in_child(decode, path, progress=Progress()))
     except ChildDied as problem:
@@ -317,7 +318,7 @@ def _decode_in_child(decode: Callable[..., NDArray[Any]], path: Path) -> NDArray
 
 
 def _decode_by_opencv(path: Path, _progress: Progress | None = None) -> NDArray[Any]:
-    """Decode a file with OpenCV; see `decode_foreign`. Raises FrameError."""
+    """Decode a file with OpenCV to (height, width), or B G R with alpha last. Raises FrameError."""
     import cv2
 
     data = np.frombuffer(read_bytes(path, MAX_BYTES), np.uint8)

@@ -47,7 +47,7 @@ def channel_names(path: Path | str) -> list[str]:
 
 
 def exr_colour_space(path: Path | str) -> str:
-    """Return the name of the built-in linear space of an EXR by its chromaticities; "" if they are those of none.
+    """Return the name of the built-in linear space that has an EXR's chromaticities; "" if there is none.
 
     Without chromaticities it is "linear", Rec. 709, as the format defines. Raises OSError where the file is missing.
     """
@@ -221,8 +221,8 @@ _Part = TypeVar("_Part")
 def main_part(parts: Sequence[tuple[_Part, Container[str]]]) -> _Part:
     """Return the first part of an EXR with R, G and B; else the first with Y; else the first of all.
 
-    parts: of each part, what stands for it (its number or header, say) and the names of its channels. Other parts hold
-    depth or a render pass, with windows of their own.
+    parts: for each part, a value that stands for it (such as its number or header), and the names of its channels. The
+    other parts hold depth or a render pass, with windows of their own.
     """
     for channels in ("RGB", "Y"):
         for part, part_channels in parts:

@@ -43,9 +43,9 @@ def views_of_file(path: Path) -> list[StereoView]:
 
 
 def views_of_parts(parts: _Parts) -> list[StereoView]:
-    """Return the views of an EXR's parts, that of the main part first; empty for a picture of one view.
+    """Return the views of an EXR's parts, the main part's first; empty for a picture of one view.
 
-    They are the views inside the main part, else the parts that name their view.
+    If the main part holds several views, these are returned; else one for each part that names its view.
     """
     main = main_part([(number, names) for number, (_, names) in enumerate(parts)])
     if main_views := stereo_views(*parts[main]):
@@ -59,7 +59,8 @@ def views_of_parts(parts: _Parts) -> list[StereoView]:
 
 
 def _view_of_part(header: Mapping[str, Any]) -> str:
-    """Return the view that a part is of: by its attribute, else by its name, such as "rgba.left"; "" for none."""
+    """Return the name of the view that a part holds, from its attribute, else from its name, such as "rgba.left"; ""
+    for none."""
     if isinstance(view := header.get("view"), str) and view:
         return view
     last = str(header.get("name", "")).rpartition(".")[2]
@@ -94,8 +95,8 @@ def _colour_channels(names: Collection[str], prefix: str) -> tuple[str, str, str
 
 
 def check_parts(path: Path, parts: _Parts) -> None:
-    """Raise FrameError for an EXR with several pictures of which only one would be changed: parts that are not of its
-    views, or views of other windows."""
+    """Raise FrameError for an EXR with several pictures of which only one would be changed: parts that are no views of
+    the picture, or views with different windows."""
     pictures = [number for number, (_, names) in enumerate(parts) if _colour_channels(names, "")]
     views = views_of_parts(parts)
     if len(pictures) > 1 and sorted(view.part for view in views) != pictures:

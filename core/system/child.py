@@ -41,8 +41,8 @@ class ChildDied(Exception):
 def run_in_child(function: Callable[..., Any], *args: Any, progress: Progress) -> Any:
     """Return `function(*args, progress)`, called in a child process.
 
-    function: of a module, so that the child finds it by name. Raises what it raises, what `progress` raises, and
-    ChildDied where the child ends by itself, for instance by a library that aborts it.
+    function: defined at the top level of a module, so that the child can import it. Raises what the function and
+    `progress` raise, and ChildDied where the child dies, for instance because a library aborts it.
     """
     search_path = [*([] if _PACKAGE else [str(_ROOT)]), *filter(None, sys.path)]  # "" would be the working folder
     code = _START.format(path=search_path, package=_PACKAGE, root=str(_ROOT), module=__name__)
@@ -63,10 +63,10 @@ def run_in_child(function: Callable[..., Any], *args: Any, progress: Progress) -
 
 def _exchange_messages(to_child: IO[bytes], from_child: IO[bytes], call: tuple[Callable[..., Any], tuple[Any, ...]],
                        progress: Progress) -> Any:
-    """Send a call to the child, call `progress` as the child asks, and return or raise what the call does.
+    """Send a call to the child, repeat its calls of `progress` here, and return or raise what the call does.
 
-    The reply to each message is whether to continue; what `progress` raises is raised when the child has ended its
-    work."""
+    Each message of the child gets a reply: True to continue, False to stop. An exception of `progress` makes the reply
+    False, and is raised here when the child has ended its work."""
     _send(to_child, call)
     progress_error: BaseException | None = None
     while True:

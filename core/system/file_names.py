@@ -42,7 +42,7 @@ def canonical_name(name: PurePath | str) -> str:
 
 
 def name_below(folder: Path, name: str) -> str:
-    """Return the part of an absolute path of another machine that lies below `folder`; other names as they are.
+    """Return the end of an absolute path, made on any machine, that is found below `folder`; other names unchanged.
 
     "D:/shots/one/images/1.png" is images/1.png if the folder has images/.
     """

@@ -68,7 +68,7 @@ def atomic_path(target: Path | str,
         _apply_umask(temporary, 0o666)
         with commit_lock or contextlib.nullcontext():
             retry_while_locked(temporary.replace, target)
-    except OSError as problem:  # a write to an open file does not say which
+    except OSError as problem:  # name the target: a failed write names no file, a failed rename the temporary one
         if problem.filename is None or _PARTIAL in str(problem.filename):
             problem.filename = str(target)
         raise
@@ -135,17 +135,18 @@ def remove_folder(folder: Path) -> None:
 
 
 def _apply_umask(temporary: Path, mode: int) -> None:
-    """Give a file or folder of tempfile, which is private, the permissions of any new one, where the disk has them.
+    """Give a file or folder that tempfile made, which only its owner may use, the permissions of any new one.
 
-    mode: before the umask. Windows' disks in WSL and some network shares refuse to change permissions.
+    mode: permissions before the umask. A refusal is ignored: Windows' disks in WSL and some network shares keep no
+    permissions.
     """
     with contextlib.suppress(PermissionError):
         temporary.chmod(mode & ~_umask())
 
 
 def _partial_prefix(target: Path) -> str:
-    """Start of the names of temporary files for `target`; for one that is temporary itself, of those for its final
-    name, so that they are found there after a kill."""
+    """Return the start of the names of all temporary files for `target`. If `target` is temporary itself, return that
+    of its final name, so that the next write of the final name removes what a kill left."""
     if target.name.startswith(_PARTIAL) and (writer := _WRITER_TAG.search(target.name)):
         return target.name[:writer.start() + 1]
     # File systems limit a name to 255 bytes.
@@ -163,8 +164,8 @@ def _machine_hash() -> str:
 
 
 def _is_being_written(partial: Path) -> bool:
-    """True if the process that a temporary file is named for still runs; for one of another machine, if the file is
-    younger than an hour."""
+    """True if the process in the name of a temporary file still runs or, for a process of another machine, if the file
+    is younger than an hour."""
     writer = _WRITER_TAG.search(partial.name)
     if writer is None:
         return False
@@ -219,7 +220,7 @@ def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
                 if status.st_mtime_ns != last_mtime:
                     last_mtime, unchanged_since = status.st_mtime_ns, time.monotonic()
                 if max(time.time() - status.st_mtime, time.monotonic() - unchanged_since) > stale_s:
-                    with file_lock(lock.with_name(lock.name + ".taken_over"), stale_s):  # others may want to as well
+                    with file_lock(lock.with_name(lock.name + ".taken_over"), stale_s):  # one process takes it over
                         _remove_lock(lock, status.st_mtime_ns)
             except FileNotFoundError:
                 # Windows refuses while another process removes it; a folder that is not writable refuses for ever.
@@ -237,8 +238,7 @@ def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
 
 
 def _remove_lock(lock: Path, created_ns: int) -> None:
-    """Remove the lock that was created at that time; a process that was slow enough to lose its lock leaves the new
-    one."""
+    """Remove the lock if it was created at that time; a lock of another time belongs to a process that took over."""
     with contextlib.suppress(FileNotFoundError):
         if lock.stat().st_mtime_ns == created_ns:
             lock.unlink()

@@ -24,7 +24,7 @@ _ALREADY_LOCKED = (errno.EACCES, errno.EAGAIN, errno.EWOULDBLOCK, errno.EDEADLK)
 def folder_lock(folder: Path | str) -> Iterator[None]:
     """Lock a folder. It is created where it is missing, and removed at the end if nothing was put into it.
 
-    Raises RunError where another process has it. On a disk without locks every process gets it.
+    Raises RunError where another process has it. On a disk that supports no locks, no process is refused.
     """
     folder = Path(folder)
     is_new = not folder.exists()
@@ -76,7 +76,7 @@ def _lock(descriptor: int) -> None:
 
 
 def _remove_lock_file(lock: Path, descriptor: int) -> None:
-    """Remove the lock file while it is locked, or another process could lock it and a third one a new file.
+    """Remove the lock file while it is locked: after unlocking, a second process could lock it and a third a new file.
 
     Windows removes no open file, so there it is closed first.
     """

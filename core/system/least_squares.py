@@ -34,10 +34,10 @@ def robust_bounded_fit(columns: Floats, values: Floats, initial: Floats, low: Ar
 
 def bounded_least_squares(normal_matrix: Floats, normal_vector: Floats, initial: Floats, lower: Floats,
                           upper: Floats) -> Floats:
-    """Return x (n,) between bounds (n,) that solves least squares by coordinate descent from `initial` (n,).
+    """Minimise x^T A x / 2 - b^T x over x (n,) within bounds, by coordinate descent; return x.
 
-    normal_matrix (n, n), normal_vector (n,): of the normal equations matrix x = vector, which x solves where no bound
-    holds; it minimises x^T matrix x / 2 - vector^T x.
+    normal_matrix (n, n), normal_vector (n,): A and b of the normal equations A x = b, which x solves where no bound is
+    reached. initial: where to start, (n,). lower, upper: the bounds, (n,).
     """
     solution = initial.copy()
     for _ in range(DESCENT_SWEEPS):

@@ -30,10 +30,10 @@ CENTURY_S = 36525 * DAY_S
 
 
 def find_python(path: Path) -> Path | None:
-    """Return the Python interpreter at a path: the file itself, or that of the virtual environment or (Windows) conda
-    environment in that folder.
+    """Return the Python interpreter at a path: the file itself, or the python of a virtual environment or (Windows)
+    conda environment in that folder.
 
-    None as well where the Python that the environment was made from is gone.
+    None if there is none, or if the Python that a virtual environment was made from is gone.
     """
     for python in (path, path / "Scripts" / "python.exe", path / "bin" / "python", path / "python.exe"):
         if os.path.isfile(python) and not (WINDOWS and _is_base_missing(python)):  # noqa: PTH113 - pathlib's may raise
@@ -68,10 +68,10 @@ def new_process_group() -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def machine_id() -> str:
-    """Return a lasting name of this machine, different from others that see the same folders.
+    """Return a name of this machine that never changes and differs from those of other machines with the same folders.
 
-    The host name of a Mac changes with the network, so there it is a random name, stored for the user; elsewhere a
-    user's folder may be the same on many machines.
+    It is the host name; on a Mac, whose host name changes with the network, a random name in a file of the user. Other
+    systems get no such file, since their machines may share a user's folder.
     """
     if sys.platform == "darwin":
         with contextlib.suppress(OSError, RuntimeError, ValueError):  # of a user without a home, too
@@ -110,7 +110,7 @@ def is_same_process(pid: int, started: float) -> bool:
 
 def is_running(pid: int) -> bool:
     """True if a process of that id exists."""
-    if WINDOWS or PROC.is_dir():  # on Windows os.kill would end it; /proc tells processes that ended from others
+    if WINDOWS or PROC.is_dir():  # on Windows os.kill would end it; /proc also shows which have ended
         return _start_time(pid) is not None
     try:
         os.kill(pid, 0)
@@ -160,9 +160,10 @@ def _start_time_proc(pid: int) -> float | None:
 
 
 def _start_time_ps(pid: int) -> float | None:
-    """Start time by the age that ps prints, [[days-]hours:]minutes:seconds.
+    """Return the start time of a running process by the age that ps prints, [[days-]hours:]minutes:seconds; None where
+    there is none.
 
-    For a process that has just begun, procps sometimes prints 441077234 days.
+    An age above CENTURY_S counts as 0: for a process that has just begun, procps sometimes prints 441077234 days.
     """
     listing = subprocess.run(["ps", "-o", "etime=", "-p", str(pid)], capture_output=True, text=True, check=False)
     days, _, clock = listing.stdout.strip().rpartition("-")

@@ -110,8 +110,8 @@ class Progress:
         return elapsed_s / (self._done - sample_done) * (self._total - self._done)
 
     def _sample_pace(self) -> None:
-        """Add the steps done by now to the samples, and drop those older than the window, but for the one at its start.
-        """
+        """Once a second, add the steps done by now to the samples; drop samples from before the pace window, except the
+        last of them, at which the window starts."""
         now, samples = time.monotonic(), self._samples
         if not samples or now - samples[-1][0] >= MIN_PACE_WINDOW_S:
             samples.append((now, self._done))
@@ -146,7 +146,7 @@ def flush_or_drop(stream: TextIO) -> None:
     except OSError as problem:
         if problem.errno not in _STREAM_GONE:
             raise
-        # Flush what is left into nowhere, and give the stream its file back.
+        # Point the stream's descriptor at the null device, flush what is left there, and restore the descriptor.
         descriptor, null = stream.fileno(), os.open(os.devnull, os.O_WRONLY)
         saved_descriptor = os.dup(descriptor)
         os.dup2(null, descriptor)
@@ -309,7 +309,7 @@ def stop_on_request(progress: Progress) -> Iterator[Progress]:
 
 @contextlib.contextmanager
 def _stop_on_file(progress: Progress) -> Iterator[Progress]:
-    """Watch for the file that STOP_FILE names, in a thread, for the length of the block."""
+    """Request a stop when the file that STOP_FILE names exists: a thread watches for it during the block."""
     path = os.environ.get(STOP_FILE)
     if not path:
         yield progress

@@ -67,8 +67,8 @@ def append_text(path: Path | str, text: str) -> None:
 
 
 def read_bytes(path: Path | str, limit: int | None = None) -> bytes:
-    """Read a regular file whole. limit: in bytes; None for no bound on a file that states its size. Raises OSError,
-    also for a file of more bytes, and for one that grows by more than _MAX_UNSIZED_BYTES while it is read."""
+    """Read a regular file whole. limit: largest size, bytes; None for the size that the file states. Raises OSError,
+    also for a file above the limit, and for one that grows by more than _MAX_UNSIZED_BYTES while it is read."""
     with open_regular(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         if limit is None:
@@ -90,10 +90,10 @@ def read_text(path: Path | str, limit: int = MAX_TEXT_BYTES, encoding: str = "ut
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON. Raises ValueError for what no code can use: a key that occurs twice, of which json would keep the
-    last; text with a NUL or half a surrogate pair; nesting of thousands.
+    """Parse JSON. Raises ValueError also for what no code can use: a key that occurs twice in an object, a string with
+    a NUL or half a surrogate pair, and nesting of thousands of levels.
 
-    A whole number that no float holds becomes infinity.
+    A whole number that is too large for a float becomes infinity.
     """
     if isinstance(text, bytes):
         text = text.decode("utf-8")
@@ -125,9 +125,10 @@ def is_finite_number(value: object) -> bool:
 
 
 def _open_regular(name: str, flags: int) -> int:
-    """Open for `open`: look at the path first, since opening some devices acts on them, and at the descriptor after.
+    """Open a file as an `opener` of `open`, without waiting; raise SpecialFileError for a pipe, a socket or a device.
 
-    A folder passes; `open` itself refuses it.
+    The path is checked first, since opening some devices acts on them; the descriptor after, in case the path has
+    changed. A folder passes; `open` itself refuses it.
     """
     check_regular(name)
     descriptor = os.open(name, flags | getattr(os, "O_NONBLOCK", 0), 0o666)

@@ -195,7 +195,8 @@ def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearan
         light_proximity = np.maximum(light_proximity, falloff)
     red, green, blue = np.moveaxis(rest + glow, -1, 0)
     min_channel = np.minimum(np.minimum(red, green), blue)
-    # Flare that the camera clips near a light belongs to the light: no removal can restore what lies under it.
+    # Clipped flare joins the light, with flare and without. It is found before the light's colour is applied, so that
+    # a coloured light clips as a white one would.
     clipped = np.clip((min_channel * light_proximity - CLIP_START) / CLIP_RANGE, 0, 1)[..., None]
     clipped = clipped * clipped * (3 - 2 * clipped)  # smoothstep
     clipped_light: Pixels = np.maximum(light, (rest + glow) * clipped)

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,16 +51,27 @@ DISPLAY_SLOPE = 2.4
 WINDOW_SAMPLES, TEXTURE_TOLERANCE, MAX_DEVIATION = 20.0, 0.25, 2.0
 """Independent pixels of the window of texture; error of the local gain where the fit is exact; and deviations below 1
 at which the local gain says that the background's texture is absent."""
-MAX_DEFICIT = 0.25
-"""Mean relative deficit of a channel at which the background counts as half hidden."""
 MAX_GAIN = 2.2
 """Gain, or its inverse, at which the background counts as half hidden."""
 GHOST_RADIUS = 0.06
 """Half the side of the window, as a share of the frame's width, about which missed flare is smaller."""
 MAX_MISSED_FLARE = 0.6
 """Difference of display values that the network does not miss: a larger one counts as half hidden."""
-CLOSING, GROWTH = 0.02, 0.012
-"""Radii by which hidden areas are closed and grown, as shares of the frame's width."""
+GROWTH = 0.012
+"""Radius by which hidden areas are grown, as a share of the frame's width."""
+
+
+class HidingTest(NamedTuple):
+    """What counts as hidden: the mean relative deficit of a channel at which the background is half hidden, and the
+    radius by which hidden areas are closed, as a share of the frame's width."""
+
+    max_deficit: float
+    closing: float
+
+
+STANDING_TEST, MOVING_TEST = HidingTest(0.25, 0.02), HidingTest(0.08, 0.05)
+"""The tests for a camera that stands and for one that moves. Where it stands, deficits come mostly from the gain, and a
+thing that keeps its place in the picture belongs to the background. Where it moves, such a thing looks like a flare."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +109,8 @@ class PlateEstimator:
         gain_source = frame if alignment.stands else network_plate
         gain = smooth_gain(gain_source, background, usable)
         gain = gain * local_gain(gain_source, gain * background)
-        hidden = hidden_share(frame, gain * background, gain)
+        test = STANDING_TEST if alignment.stands else MOVING_TEST
+        hidden = hidden_share(frame, gain * background, gain, test)
         confidence = ((1 - hidden) * np.clip(count / MIN_NEIGHBOURS, 0, 1))[..., None]
         expected = np.minimum(gain * background, frame)  # a flare only adds light: no plate is brighter than its frame
         if alignment.stands:
@@ -155,12 +168,12 @@ def smooth_gain(picture: Pixels, background: Pixels, usable: Pixels) -> Pixels:
     return np.asarray(gain, np.float32)
 
 
-def hidden_share(frame: Pixels, expected: Pixels, gain: Pixels) -> NDArray[np.float32]:
+def hidden_share(frame: Pixels, expected: Pixels, gain: Pixels, test: HidingTest) -> NDArray[np.float32]:
     """Return (height, width), 0..1, how likely something hides the background of a frame.
 
     Three things show it: a channel darker than expected, the texture of the background absent, or a gain far from 1;
-    the likeliest counts. frame, expected: (height, width, 3), linear light, the expected frame without flare. gain: of
-    the background, `smooth_gain` times `local_gain`.
+    the likeliest counts. frame: (height, width, 3), linear light. expected: the background times the gain, likewise.
+    gain: `smooth_gain` times `local_gain`. test: for the camera's motion.
     """
     import cv2
 
@@ -169,14 +182,14 @@ def hidden_share(frame: Pixels, expected: Pixels, gain: Pixels) -> NDArray[np.fl
     deficit = _blur(np.maximum(-((frame - expected) / (expected + DARK)).min(-1), 0).clip(0, 1), sigma)
     visible = expected.mean(-1) > NOISE
     change = np.abs(np.log(np.maximum(gain.mean(-1), 1e-3)))
-    hidden = np.maximum(_logistic(deficit, MAX_DEFICIT, 60),
+    hidden = np.maximum(_logistic(deficit, test.max_deficit, 60),
                         _logistic(_texture_deviation(frame, expected, sigma), MAX_DEVIATION, 4))
     hidden = np.maximum(hidden, visible * _logistic(change, np.log(MAX_GAIN), 8)).astype(np.float32)
 
     def disc(share: float) -> NDArray[np.uint8]:
         return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(share * width) + 1,) * 2), np.uint8)
 
-    hidden = cv2.dilate(cv2.morphologyEx(hidden, cv2.MORPH_CLOSE, disc(CLOSING)), disc(GROWTH))
+    hidden = cv2.dilate(cv2.morphologyEx(hidden, cv2.MORPH_CLOSE, disc(test.closing)), disc(GROWTH))
     return _blur(np.asarray(hidden, np.float32), max(GROWTH * width / 2, 0.5))
 
 

@@ -125,9 +125,9 @@ def _parse_event(line: str) -> Event:
 def combined_error(failed: Sequence[Child], count: int, step: str) -> FitFlareError:
     """Return one error for the processes that failed, out of `count` of a step, with the message of each.
 
-    step: the step's name. The error has the type that all errors share, else it is a FitFlareError. Where processes
-    ended without a message it is an EngineError that counts them, and the end of the first one's log goes to standard
-    error.
+    step: the step's name. The error has the type that all their errors share, else it is a FitFlareError. Where some
+    processes ended without a message it is an EngineError that counts them, and the end of one's log is written to
+    standard error.
     """
     problems = [child.to_error() for child in failed if child.error_text]
     messages = list(dict.fromkeys(map(str, problems)))

@@ -170,7 +170,7 @@ def _run_command(argv: Sequence[str], progress: Progress) -> int:
     except Exception as problem:
         context = problem.__context__
         if isinstance(problem, RuntimeError) and isinstance(context, OSError) and context.errno == errno.ELOOP:
-            progress.error(os_error_message(context))  # how pathlib reports it before Python 3.13
+            progress.error(os_error_message(context))  # a loop of links, as pathlib reports it before Python 3.13
             return FAILED
         if is_out_of_memory(problem):
             progress.error(f"This machine has not enough memory for it; {_memory_advice(arguments)}.")
@@ -191,7 +191,7 @@ def _memory_advice(arguments: argparse.Namespace) -> str:
 def _open_progress(argv: Sequence[str]) -> Iterator[Progress]:
     """Open the progress output that --progress names, before the other arguments are parsed.
 
-    So invalid arguments are reported in the same format.
+    Thus invalid arguments are reported in the chosen format too.
     """
     # As in argparse, the last --progress counts.
     values = " ".join(argv).replace("--progress=", "--progress ").split("--progress ")[1:]
@@ -243,7 +243,7 @@ def _report_torch_load_errors() -> Iterator[None]:
     try:
         yield
     except OSError as problem:
-        # Only an error from within the import of torch, which runs its module's own code, is meant.
+        # Only an error during the import of torch counts: then torch's own module code is on the stack.
         if not any(frame.f_code.co_name == "<module>" and frame.f_globals.get("__name__") == "torch"
                    for frame, _ in traceback.walk_tb(problem.__traceback__)):
             raise

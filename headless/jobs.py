@@ -53,8 +53,9 @@ def run_jobs(args: argparse.Namespace, step: str, numbers: Sequence[int], progre
              extra: Sequence[str] = (), *, continue_on_failure: bool = False) -> None:
     """Run a step of the command in `args.jobs` processes at once, each with a part of the frames.
 
-    extra: more arguments for each process. continue_on_failure, and what is raised: see `run_parts`. The results of the
-    processes are dropped: a caller that needs one runs the step itself afterwards, which keeps the finished frames.
+    extra: more arguments for each process. continue_on_failure: a process that fails does not stop the others. The
+    results of the processes are dropped: a caller that needs one runs the step itself afterwards, which keeps the
+    finished frames. Raises what `run_parts` raises.
     """
     parts = [[*extra, "--jobs", "1", "--frames", frames] for frames in split_frames(numbers, args.jobs)]
     run_parts(args, step, parts, args.jobs, len(numbers), progress, continue_on_failure=continue_on_failure)
@@ -104,8 +105,8 @@ def _run_all(commands: Sequence[Sequence[str]], jobs: int, counter: _JointProgre
              continue_on_failure: bool) -> list[Child]:
     """Run the processes, `jobs` at once; return those that failed. counter: gets their events.
 
-    Those that still run at an early exit are stopped; without continue_on_failure the first failure is one. Raises
-    Cancelled and EngineError.
+    A stop, an error or, without `continue_on_failure`, the first failure ends the loop early; processes that still run
+    are then stopped. Raises Cancelled and EngineError.
     """
     event_queue: EventQueue = queue.Queue()
     variables = _child_environment(min(jobs, len(commands)))

@@ -36,7 +36,7 @@ def find_packer() -> list[str]:
 def build(packer: list[str], out: Path) -> int:
     """Build the extension into a folder, check it, and print its size; return the exit status.
 
-    packer: of `find_packer`.
+    packer: the command that starts Blender's packer.
     """
     out.mkdir(parents=True, exist_ok=True)
     status = subprocess.run([*packer, "build", "--source-dir", str(ROOT), "--output-dir", str(out)],
@@ -59,7 +59,7 @@ def add_handbook(package: Path) -> None:
 
 
 def copy_weights(folder: Path) -> str:
-    """Copy the weights and their model card to a repository; return why they are not there, "" after a success."""
+    """Copy the weights and their model card to a repository; return why that failed, "" after a success."""
     sys.path.insert(0, str(ROOT))
     from core.removal.model.weights_file import DIGEST_FILE, IN_THE_BOX, published_digest, published_name
 
@@ -73,7 +73,7 @@ def copy_weights(folder: Path) -> str:
 
 
 def publish(packer: list[str], folder: Path) -> int:
-    """Write a static repository of the extension into a folder; return the exit status."""
+    """Write a static repository of the extension into a folder, and print its address; return the exit status."""
     status = build(packer, folder)
     if status == 0 and (problem := copy_weights(folder)):
         print(f"error: {problem}.", file=sys.stderr)

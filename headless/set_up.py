@@ -70,8 +70,8 @@ def environment_python(folder: Path) -> Path:
 def run_logged(command: list[str]) -> str:
     """Run a command; return "" on success, else the reason of the failure.
 
-    Its output goes to the log, and the lines that name a download also to the events. The reason is its first line that
-    begins with "ERROR:", as pip and `--fetch` write one, else its last line.
+    Its output goes to standard error, the log; lines that name a download are emitted as events too. The reason is its
+    first line that begins with "ERROR:", as pip and `--fetch` write one, else its last line.
     """
     reason, is_unreachable = "", False
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -98,8 +98,9 @@ def run_logged(command: list[str]) -> str:
 
 @contextlib.contextmanager
 def _kill_on_stop_file(process: subprocess.Popen[str]) -> Iterator[None]:
-    """Kill the process when the file that FIT_FLARE_STOP names appears (core/system/progress.py); raise
-    KeyboardInterrupt then. On Windows the panel cannot send a signal."""
+    """Kill the process when the file that FIT_FLARE_STOP names appears, and raise KeyboardInterrupt then.
+
+    The add-on's panel creates the file to stop the set-up, since on Windows it cannot send a signal."""
     stop_file, ended = os.environ.get("FIT_FLARE_STOP"), threading.Event()
     if not stop_file:
         yield
@@ -256,7 +257,7 @@ def set_up_weights(url: str, file: Path, digest: str) -> int:
 
 
 def main(argv: list[str]) -> int:
-    """Set the engine up, download the weights, or both; return the exit status."""
+    """Set the engine up, download the weights, or both, as the arguments say; return the exit status."""
     parser = argparse.ArgumentParser(description="Installs the engine and the weights of the removal network.")
     parser.add_argument("folder", nargs="?", type=Path, help="folder of the virtual environment")
     parser.add_argument("packages", nargs="*", help="packages instead of those of the engine")
@@ -282,9 +283,10 @@ def main(argv: list[str]) -> int:
 
 
 def set_up_engine(folder: Path, packages: list[str], weights: list[str] | None = None) -> int:
-    """Set the engine up in a folder, and with weights (URL, FILE, SHA256); return the exit status.
+    """Set the engine up in a folder, and emit events; return the exit status.
 
-    packages: to install in place of the engine's, and without the test of the engine; [] for the engine's.
+    packages: to install in place of the engine's, without a test of the engine; [] for the engine's. weights: URL, FILE
+    and SHA256 of the weights to download; a failure of theirs is reported, and leaves the engine.
     """
     names = packages or engine_packages()
     if not packages and unsupported_reason():
@@ -323,9 +325,9 @@ def set_up_engine(folder: Path, packages: list[str], weights: list[str] | None =
 
 
 def _run_steps(steps: list[Step], folder: Path, total: int) -> str:
-    """Run the steps of a set-up in `folder`, `total` with that of the weights; return "" on success.
+    """Run the steps of a set-up in `folder`, and emit their events; return "" on success, else a sentence.
 
-    After a failure, or a stop, the environment is discarded; a failure is returned as a sentence.
+    After a failure or a stop the environment is discarded. total: number of steps, with that of the weights.
     """
     for number, step in enumerate(steps):
         emit(type="say", text=step.message)

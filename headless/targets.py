@@ -183,8 +183,8 @@ def open_target(options: TargetOptions, flare: Path, training: list[Floats] | No
 
 def _open_pictures(options: TargetOptions, paths: list[Path], look: Look, sources: Mapping[str, str],
                    training: list[Floats] | None) -> Target:
-    """Return the target of pictures. sources: light of the flare by light of the target, from --use. training: as of
-    `open_target`. Raises SettingsError."""
+    """Return the target of pictures. sources: light of the flare by light of the target, from --use. training: poses of
+    training views, for a .flare that does not store its own. Raises SettingsError."""
     from ..core.colour import colour_space
     from ..core.lights.detection import Detector
     from ..core.lights.exposure import ExposureDetector
@@ -206,7 +206,7 @@ def _open_pictures(options: TargetOptions, paths: list[Path], look: Look, source
 
 
 def _open_shot(options: TargetOptions, path: Path, look: Look, sources: Mapping[str, str]) -> Target:
-    """Return the target of a shot file. sources: see `_open_pictures`. Raises SettingsError."""
+    """Return the target of a shot file. sources: light of the flare by light of the target. Raises SettingsError."""
     from ..core.conventions.frame_numbers import NumberedFrame, select_task_frames
     from ..core.look.shot import Shot
     from ..core.transfer.target import shot_target

@@ -136,8 +136,8 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
     cameras: by the view's name, at the size of the frames. renderer_for: returns the renderer of a frame.
 
     Frames that an earlier bake with the same settings finished are kept, and stay in the manifest. Raises RunError if
-    `out` holds layers made with other settings, unless `overwrite`, or another bake starts to write such there;
-    SettingsError for invalid edits; Cancelled.
+    `out` holds layers made with other settings, unless `overwrite`, or a bake with other settings takes the folder over
+    meanwhile; SettingsError for invalid edits; Cancelled on a stop request.
     """
     settings, progress, out = settings or BakeSettings(), progress or Progress(), Path(out)
     keyed, lights, elements = settings.keyed.with_always(settings.edits), source.lights, source.elements
@@ -162,8 +162,8 @@ def bake_frames(source: SequenceSource, frames: Sequence[NumberedFrame], cameras
 class _FrameWriter:
     """Renders and writes the frames of one bake into its folder `out`.
 
-    space: of the layers. cameras, renderer_for: as of `bake_frames`. cache_key, layer_by_light: see `_cache_key` and
-    `layer_names`.
+    space: of the layers. cameras: by the view's name. renderer_for: returns the renderer of a frame. cache_key: what
+    the layers were made from. layer_by_light: name of each light's layer.
     """
 
     out: Path
@@ -210,8 +210,8 @@ class _FrameWriter:
 
     @contextlib.contextmanager
     def _commit_lock(self) -> Iterator[None]:
-        """Hold the lock under which a frame takes its name: nobody else writes here, and the folder is still this
-        bake's."""
+        """Hold the folder's lock while a finished file takes its name. Raises RunError if another bake has taken the
+        folder."""
         with file_lock(self.out / LOCK):
             _check_is_current(self.out, self.cache_key, self.layer_by_light)
             yield
@@ -251,8 +251,8 @@ def frames_to_delete(out: Path | str, fingerprint: Callable[[], str], lights: It
     """Return the numbers of the frames that a bake of `files` with default settings and `overwrite` would delete from
     `out`.
 
-    They were made differently, and are not baked again. fingerprint: returns that of the renderer; it takes time for a
-    large scene. Raises RunError if bake.json is damaged.
+    They were made with other settings, and `files` does not replace them. fingerprint: computes that of the renderer;
+    called only where needed, since it takes time for a large scene. Raises RunError if bake.json is damaged.
     """
     if not (Path(out) / MANIFEST).exists():
         return []
@@ -278,7 +278,7 @@ def _claim_folder(out: Path, cache_key: dict[str, Any], layer_by_light: dict[str
                                "Give all frames at once, or another folder, or overwrite them (--overwrite).")
             raise RunError(f"{out} holds layers that were baked from another fit or with other settings; "
                            "choose another folder, or overwrite them (--overwrite).")
-        for entry in manifest["frames"] if manifest is not None else ():  # a mixture would pass for one sequence
+        for entry in manifest["frames"] if manifest is not None else ():  # else both bakes would look like one sequence
             for file in (entry["file"], *entry.get("rest", ())):
                 remove_file(out / file)
         write_json(out / MANIFEST, {"version": VERSION, "made_from": cache_key, "layers": layer_by_light, "frames": []})

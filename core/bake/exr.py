@@ -32,7 +32,7 @@ def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
     """Write a frame's layers atomically, ZIP compressed; depth stays 32 bit when the rest is `half`.
 
     notes: JSON-able entries for the header (view, frame, ...). chromaticities: of the layers' linear space.
-    pixel_aspect: as `Camera.pixel_aspect`. commit_lock: see `atomic_path`.
+    pixel_aspect: width of a pixel over its height. commit_lock: held while the finished file takes its name.
     """
     lights = {layer: light for light, layer in layer_names(layers.flares).items()}
     description = json.dumps({"version": VERSION, "lights": lights, **(notes or {})})

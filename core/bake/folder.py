@@ -26,12 +26,11 @@ class LayerFolder:
 
     @classmethod
     def open(cls, folder: Path | str) -> LayerFolder:
-        """Open a folder. Raises FrameError without numbered EXR files, for more than one sequence, and for frames that
-        differ in layers.
+        """Open a folder. Raises FrameError for what Blender cannot show: no numbered EXR files, more than one sequence,
+        a truncated file, and frames that differ in their layers or data windows.
 
-        Blender takes the layers of the first frame, and would show the others without theirs. It ignores data windows:
-        frames with other ones, or with a part of the frame, would lie elsewhere. Also raised for a truncated file, of
-        which Blender would show the part that exists.
+        Blender reads the names of the layers from the first frame alone. It ignores data windows, so it would show a
+        frame with another window, or with a part of the picture, in the wrong place.
         """
         folder = Path(folder).resolve()
         sequences: dict[str, dict[int, Path]] = {}
@@ -62,7 +61,7 @@ class LayerFolder:
         return folder_layers
 
     def _check_windows(self) -> None:
-        """Raise FrameError for layers that the compositor cannot show in their place."""
+        """Raise FrameError for data windows by which the compositor would show layers in the wrong place."""
         windows = {path: self.window(number) for number, path in self.files.items()}
         partial = next((path for path, window in windows.items() if not window.holds_frame), None)
         if partial is not None:

@@ -89,10 +89,10 @@ def _add_channels(channels: dict[str, Pixels], prefix: str, colour: Pixels, alph
 
 
 def _apply_colour(layer: Pixels, matrix: Any) -> Pixels:
-    """Return a layer (h, w, 3) under a colour matrix (3, 3); a pixel that is nowhere negative stays so."""
+    """Return a layer (h, w, 3) under a colour matrix (3, 3); a pixel without negative channels gets none."""
     matrix = np.asarray(matrix, np.float32)
     factors = matrix.diagonal()
-    # What is negative, as differences of layers are where a flare covers what is brighter, stays so.
+    # A flare that covers something brighter has negative light, which is kept.
     if np.array_equal(matrix, np.diag(factors)):
         return np.asarray(layer * factors, np.float32)
     mixed = layer @ matrix.T
@@ -105,7 +105,8 @@ def flare_alpha(flare: Pixels) -> Pixels:
 
 
 def layer_names(lights: Iterable[str]) -> dict[str, str]:
-    """Return the layer of each light: `flare_<light>` in letters, digits, `_` and `-`, unique whatever the case."""
+    """Return the layer of each light: `flare_<light>` in letters, digits, `_` and `-`, unique also without regard to
+    case."""
     names: dict[str, str] = {}
     used: set[str] = set()
     for light in lights:

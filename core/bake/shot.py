@@ -62,10 +62,10 @@ class ShotRenderer(ShotSource):
                           depth.detach().numpy())
 
     def _occlude(self, light: PlacedLight, camera: Camera) -> PlacedLight:
-        """Return the light with its visibility behind the fitted scene, as in the fit.
+        """Return the light with its visibility behind the fitted scene, computed as in the fit.
 
-        Over any other scene a visibility near 0 or 1 is rounded (`core.transfer.transfer.VISIBILITY_MARGIN`); here the
-        flare has learned what a few hundredths of a light show.
+        A transfer to another scene rounds visibilities near 0 or 1. Here they stay as they are, since the flare was
+        fitted with the visibilities of this very scene.
         """
         settings = self.run.settings.flare.active_visibility if self.run is not None else None
         if self.run is None or settings is None:
@@ -80,8 +80,8 @@ def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool
               config: str | None = None) -> dict[str, Any]:
     """Write the layers of a shot's frames under `out`: `layers.0001.exr` for one camera, a folder for each of several.
 
-    frame_numbers: None for all. space, config: see `BakeSettings`. Returns the content of bake.json. Raises what `bake`
-    raises, and FlareFileError.
+    frame_numbers: None for all. space: linear colour space of the layers; config: the OpenColorIO configuration that
+    defines it. Returns the content of bake.json. Raises what `bake` raises, and FlareFileError.
     """
     return bake_shot_frames(ShotRenderer(shot), out, half=half, overwrite=overwrite, progress=progress,
                             frame_numbers=frame_numbers, space=space, config=config)

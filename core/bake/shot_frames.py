@@ -110,8 +110,8 @@ def bake_shot_frames(renderer: ShotSource, out: Path | str, *, half: bool = True
                      space: str = "linear", config: str | None = None) -> dict[str, Any]:
     """Write the layers of a shot's frames under `out`: `layers.0001.exr` for one camera, a folder for each of several.
 
-    frame_numbers: None for all. space, config: see `BakeSettings`. Returns the content of bake.json. Raises what `bake`
-    raises, and FlareFileError.
+    frame_numbers: None for all. space: linear colour space of the layers; config: the OpenColorIO configuration that
+    defines it. Returns the content of bake.json. Raises what `bake` raises, and FlareFileError.
     """
     shot = renderer.shot
     folders = shot.folders

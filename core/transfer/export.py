@@ -32,10 +32,10 @@ def flare_scene(
 ) -> tuple[SceneGaussians, dict[str, NDArray[np.float32]]]:
     """Convert one frame's flare to 3D Gaussians in the world, just before the camera (paper, "Flare Representation").
 
-    They are flat, face the camera at depth 0.21, and project to the look's plane Gaussians, with the low-pass filter
-    that other programs add. The filter of the fit's `pixel_grid` is larger in a finer picture; the difference is added
-    to the covariances. Also returns properties beyond 3DGS, (n,) each: ring_r0 and ring_w, 0 and 1 for a plain
-    Gaussian; with arcs also arc_0 and arc_1, in standard deviations along the first and second axis.
+    They are flat, face the camera at depth 0.21, and project to the look's plane Gaussians. Other programs add a
+    low-pass filter when they draw; where that of the fit's `pixel_grid` is larger, as in a finer picture, the
+    difference is added to the covariances. Also returns properties beyond 3DGS, (n,) each: ring_r0 and ring_w, 0 and 1
+    for a plain Gaussian; with arcs also arc_0 and arc_1, in standard deviations along the first and second axis.
     """
     gaussians = concatenate(list(flares.values())) or _no_gaussians()
     count = len(gaussians)
@@ -144,7 +144,8 @@ def _visible_elements(light: LightLook, edits: LookEdits | None, count: int) -> 
 def _element_part(gaussians: PlaneGaussians, row: int, light: NDArray[np.float64], width: float) -> dict[str, Any]:
     """Return one Gaussian as a part of a preset's element, as `make_preset` describes it.
 
-    row: its number. light (2,): position of the light; width: of the picture; both on the normalised plane."""
+    row: index of the Gaussian. light (2,): position of the light; width: of the picture; both on the normalised
+    plane."""
     distance = max(float(np.linalg.norm(light)), 1e-6)
     axis = light / distance
     mean = gaussians.means[row].astype(np.float64)

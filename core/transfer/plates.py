@@ -78,8 +78,8 @@ class ColouredPlate:
     def codes_with_light(self, light: Pixels) -> tuple[NDArray[Any], NDArray[Any] | None]:
         """Return codes and alpha as stored, of the plate with light (height, width, 3) in linear Rec. 709.
 
-        The light is added to the picture over black (premultiplied). Where it exceeds what an integer plate can show
-        at its alpha, the alpha grows as far as it must. An EXR's alpha stays, so the light covers nothing.
+        The light is added to the picture over black (premultiplied). Where a PNG or TIFF cannot show the sum at its
+        alpha, the alpha grows as far as needed. An EXR keeps its alpha, so that the light covers nothing.
         """
         light = self.plate.to_plate_channels(light)
         is_lit = undo_orientation((light != 0).any(-1, keepdims=True), self.orientation)
@@ -92,7 +92,7 @@ class ColouredPlate:
                 # A rounding error must not add a code.
                 lit_alpha = np.ceil(lit_alpha * max_value - np.float32(1e-3)) / max_value
             values = self.space.from_linear(lit_picture / np.maximum(lit_alpha, 1e-6)[..., None])
-            if self.plate.straight_alpha is None:  # the file's colours are multiplied by it
+            if self.plate.straight_alpha is None:  # the file's colours are multiplied by its alpha
                 values = values * lit_alpha[..., None]
             new_alpha = undo_orientation(lit_alpha, self.orientation) * max_value
             new_alpha = np.round(new_alpha) if max_value > 1 else new_alpha

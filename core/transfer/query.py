@@ -104,7 +104,8 @@ def fixed_view(light: LightLook, views: Sequence[ViewOfLight], distances: Sequen
                training: TrainingViews | None) -> ViewOfLight | None:
     """Return the training view for the query `source`, for a shot with these views of the light.
 
-    It is the most similar one to the shot's median view; None if the light is never in front of the camera.
+    It is the most similar one to the shot's median view; None if the light is never in front of the camera. distances:
+    of the camera from the light, units of the source's world.
     """
     in_front = [(view, distance) for view, distance in zip(views, distances, strict=True) if view.depth > 0]
     if not in_front:
@@ -121,7 +122,7 @@ def fixed_view(light: LightLook, views: Sequence[ViewOfLight], distances: Sequen
 def extrapolation_fade(light: LightLook, view: ViewOfLight) -> float:
     """Return 1 for a light no further from the principal point than in training, falling to 0 at twice that distance.
 
-    Nothing is known there, and a light that goes behind the camera passes through it."""
+    The network has learned nothing farther out, and a light that goes behind the camera passes through there."""
     trained_distance = float(light.query_range.light_high[2])
     t = min(max(2 - float(np.linalg.norm(view.light)) / max(trained_distance, 1e-6), 0.0), 1.0)
     return t * t * (3 - 2 * t)
@@ -129,7 +130,12 @@ def extrapolation_fade(light: LightLook, view: ViewOfLight) -> float:
 
 def _weighted_queries(light: LightLook, view: ViewOfLight, xyz: Floats, query: Follows, training: TrainingViews | None,
                       scale: float, fixed: ViewOfLight | None) -> list[tuple[float, ViewOfLight]]:
-    """Return the views at which the network is evaluated, with weights that sum to 1; arguments as of `evaluate`."""
+    """Return (weight, view) of each view at which the network is evaluated; the weights sum to 1.
+
+    For "blend" these are the NEIGHBOURS most similar training views, or the target's view where both worlds are the
+    same or the training views are unknown. xyz (3,): the target's light. scale: units of its world for one of the
+    source's. fixed: view for "source".
+    """
     offset = (view.camera - xyz) / scale
     distance = float(np.linalg.norm(offset))
     is_same_world = scale == 1 and np.linalg.norm(xyz - light.xyz) <= SAME_WORLD_TOLERANCE * distance

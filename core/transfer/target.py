@@ -50,9 +50,9 @@ class TargetFrame:
     or None.
 
     undistorted: reads the plate's undistorted picture, if the file is distorted; its argument is the space to read it
-    in, None for the capture's. window: where the layers lie on the plate's frame, which they hold all of; None if the
-    camera has another size than the plate. orientation: the plate's in Exif, by which the camera and the layers are
-    upright. space: the plate's, where its capture names one (`plate_space.json`).
+    in, None for the capture's. window: where the layers' pixels lie on the plate's frame, all of which they hold; None if
+    the camera has another size than the plate. orientation: Exif orientation of the plate; camera and layers are those
+    of the upright picture. space: the plate's, where its capture names one (`plate_space.json`).
     """
 
     frame: NumberedFrame
@@ -164,7 +164,8 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
 
 def _picture_camera(look: Look, window: DataWindow, focal: float | None,
                     centre: tuple[float, float] | None) -> Camera:
-    """Return the camera of a picture's frame, at the origin. focal, centre: as of `picture_target`."""
+    """Return the camera of a picture's frame, at the origin. focal: px, None for the training camera's field of view;
+    centre: principal point, px, None for the middle."""
     width, height = window.frame
     pixel_ratio = look.camera.pixel_ratio(width, height)
     fx = focal or look.camera.fx * pixel_ratio
@@ -175,7 +176,10 @@ def _picture_camera(look: Look, window: DataWindow, focal: float | None,
 
 def _detect_positions(path: Path, detector: Detector | None, orientation: int,
                       space: ColourSpace | None) -> dict[str, tuple[float, float]]:
-    """Return the position, px, of each light that the detector finds in a picture, by name; {} without a detector."""
+    """Return the position, px, of each light that the detector finds in a picture, by name; {} without a detector.
+
+    space: colour space of the picture, None for what its file declares.
+    """
     if detector is None:
         return {}
     detections = detector.detect(upright_picture(path, orientation, space))
@@ -188,7 +192,7 @@ def _most_similar_sources(
 ) -> dict[str, str]:
     """Return for each light, by its position on the plane, the source with the nearest light in a training view.
 
-    Uses each source once if there are enough."""
+    Greedy: the most similar pair first, and each source once if there are enough."""
     chosen: dict[str, str] = {}
     # Every light with every source, the most similar first.
     ranked = sorted((float(np.linalg.norm(views.lights - position, axis=1).min()), name, source)
@@ -207,7 +211,8 @@ def _most_similar_sources(
 def capture_target(capture: Capture, look: Look, requested: SourceNames, *, lights: Path | None = None,
                    scene: Path | None = None, scene_is_background: bool = False) -> Target:
     """Return a target of a capture's views. lights: a lights.json instead of the capture's. scene: a 3DGS PLY in its
-    world, which hides lights. scene_is_background: it stands in for the frames. requested: source by light.
+    world, which hides lights. scene_is_background: the scene is rendered in place of the frames. requested: source by
+    light.
 
     Raises CaptureError without lights.
     """
@@ -336,7 +341,7 @@ def camera_window(camera: Camera, plate: Path) -> DataWindow | None:
 def _share_windows(frames: Sequence[TargetFrame]) -> tuple[TargetFrame, ...]:
     """Give all frames of a folder of layers one window that holds the frame and the pixels of every plate.
 
-    Compositors that know no data windows, as Blender's, show such layers in their place, and all alike.
+    Then a compositor that ignores data windows, as Blender's does, shows all layers in the right place.
     """
     windows: dict[tuple[str, tuple[int, int]], list[DataWindow]] = {}
     for frame in frames:
@@ -362,7 +367,8 @@ def _plates_by_number(folder: Path) -> dict[int, Path]:
 
 
 def resized(target: Target, width: int | None, height: int | None) -> Target:
-    """Return the target at another size of its frame, px; without a height the aspect ratio is preserved."""
+    """Return the target at another size of its frames, px, without the plates' overscan; without a height the aspect
+    ratio is preserved."""
     if not width:
         return target
     frames = []

@@ -106,7 +106,7 @@ class Transfer:
 
     def frame_fingerprint(self, index: int) -> str:
         """Return a hash of a frame and of the neighbours that the visibility of its lights depends on."""
-        radius = 2 * self.settings.smooth  # see `smooth_visibility`
+        radius = 2 * self.settings.smooth  # smoothing reaches so many frames
         neighbours = self.target.frames[max(index - radius, 0):index + radius + 1]
         fixed_views = [(name, view.camera.tolist(), view.light.tolist())
                        for name, view in self._fixed_views_by_light.items()]
@@ -132,7 +132,8 @@ class Transfer:
                ) -> dict[str, Splats]:
         """Return the splats of each light with a flare in a frame, for a camera, by the light's name.
 
-        scene (height, width, 3): linear light of the frame at the camera's size, in which highlights are found."""
+        scene (height, width, 3): linear light of the frame at the camera's size, in which highlights are found; None
+        to use the target's lights."""
         lights: Sequence[PlacedLight] = self.target.frames[index].shot.lights
         if self.settings.highlights is not None and scene is not None:
             highlights = find_highlights(scene, self.settings.highlights, self.settings.highlight_gain)
@@ -162,8 +163,8 @@ class Transfer:
                                  lambda neighbour: self._frame_visibility(neighbour, light)[0])
 
     def _frame_visibility(self, index: int, light: str) -> tuple[float, tuple[float, ...] | None]:
-        """Return the visibility in the frame alone, that of the shot times that through the target's scene, and the
-        visible shares of the cells of an extent."""
+        """Return a light's visibility in one frame, not smoothed: the shot's times that through the target's scene; and
+        the visible shares of the cells of its extent. Results are cached."""
         key = (index, light)
         if key not in self._visibilities:
             shot = self.target.frames[index].shot
@@ -171,7 +172,8 @@ class Transfer:
             visibility, shares = (0.0, None) if placed is None else (placed.visibility, placed.shares)
             if placed is not None and visibility > 0 and self.target.scene is not None:
                 source = self.sources[placed.source]
-                is_fit_scene = np.allclose(placed.xyz, source.xyz, rtol=1e-6, atol=1e-9)  # the scene of the fit
+                # A light in the very place that it had in the fit: the scene is taken for that of the fit.
+                is_fit_scene = np.allclose(placed.xyz, source.xyz, rtol=1e-6, atol=1e-9)
                 scene_visibility, shares = visibility_behind(self.target.scene, shot.camera.world_to_camera, placed,
                                                              self.settings.visibility,
                                                              source.clear_visibility if is_fit_scene else 1.0)
@@ -371,7 +373,7 @@ class _FrameRenderer:
     def _with_plate_window(self, plate: ColouredPlate, layers: FrameLayers, window: DataWindow,
                            stored_window: DataWindow) -> FrameLayers:
         """Return the layers with their window, with the plate's alpha, and with its values as scene where both have one
-        colour space. window, stored_window: as for `_write_plate`."""
+        colour space. window: of the layers. stored_window: of the plate's file."""
         layers = replace(layers, window=window)
         plate_matrix, matrix = plate.space.matrix, self._space.matrix  # None for a space that is not linear
         if plate_matrix is not None and matrix is not None and np.allclose(plate_matrix, matrix, atol=1e-9)\

@@ -30,8 +30,9 @@ def smooth_visibility(frames: Sequence[ShotFrame], index: int, light: str, radiu
                       visibility_of: Callable[[int], float]) -> float:
     """Return the light's smoothed visibility in frame `index`, from neighbours up to 2 `radius` away on the same path.
 
-    Takes the minimum over the neighbours within `radius`, then the mean of the minima with binomial weights: a frame in
-    which the light is hidden stays exactly 0, with a ramp on both sides. visibility_of: by index, 0..1.
+    Takes the minimum over the neighbours within `radius` of each frame, then the mean of the minima with binomial
+    weights: a frame in which the light is hidden stays exactly 0, with a ramp on both sides. visibility_of: returns the
+    visibility, 0..1, in the frame of an index.
     """
     if radius <= 0:
         return visibility_of(index)
@@ -50,7 +51,7 @@ def smooth_visibility(frames: Sequence[ShotFrame], index: int, light: str, radiu
         weights = np.convolve(weights, [0.5, 0.5])
     weight_sum = weighted_sum = 0.0
     for offset in range(-radius, radius + 1):
-        if offset in values:  # 0 always is
+        if offset in values:  # offset 0 always is
             window = range(offset - radius, offset + radius + 1)
             minimum = min(values[other] for other in window if other in values)
             weighted_sum += weights[offset + radius] * minimum

@@ -56,7 +56,7 @@ def draw_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Bake by the kind of input: a run here, a shot or a .flare by the functions below."""
+    """Engine step: bake a run, a .flare or a shot, whichever the argument names; return the command's result."""
     from ...core.bake.bake import bake
     from ...core.conventions.frame_numbers import number_views
     from ...core.fit.run import Run

@@ -34,7 +34,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Compose the layers as the arguments say."""
+    """Blender step: write the compositor, and the frames that --frames selects, into the folder of --out."""
     from ...core.bake.folder import LayerFolder
     from ...core.conventions.frame_numbers import NumberedFrame
 

@@ -46,7 +46,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Score the remover on all cases. Raises FrameError where some could not be read, after the others are scored."""
+    """Score the remover on all pairs, and write the scores and the sheet.
+
+    Raises FrameError where some pairs could not be read, after the others are scored.
+    """
     from ...core.images.write import write_png
     from ...core.removal import evaluation
     from ...core.removal.inference.remover import WORKING_SIZE, Remover

@@ -24,7 +24,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Score the run as the arguments say."""
+    """Score the run, and write its eval.json."""
     if args.plate_space is not None:
         from ...core.fit.run import Run
 

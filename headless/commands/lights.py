@@ -53,7 +53,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Find the lights as the arguments say. Raises SettingsError and CaptureError."""
+    """Find the lights of the capture, and write lights.json and the sheets. Raises SettingsError and CaptureError."""
     from ...core.capture import Capture
     from ...core.lights import TriangulationSettings, make_detector
     from ...core.lights.file import check_replaceable

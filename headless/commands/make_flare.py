@@ -64,7 +64,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Make the flare. Raises SettingsError."""
+    """Trace a flare, fit a model to it and write the .flare; or, with --list, list the lenses. Raises SettingsError."""
     from ...core.optics.lenses import lens_names
 
     if args.list_lenses:

@@ -106,7 +106,8 @@ def _open_capture(args: argparse.Namespace, progress: Progress) -> tuple[Capture
 
 
 def _try_solve(args: argparse.Namespace, progress: Progress) -> tuple[Capture | None, str]:
-    """Return the source as a capture with cameras, and ""; or None, and the reason as a sentence."""
+    """Return the source as a capture with cameras, solved if necessary, and ""; or None, and the reason as a
+    sentence."""
     from ...core.capture import Capture
     from ...core.capture.solve import SolveSettings, solve
 

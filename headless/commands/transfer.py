@@ -159,7 +159,8 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     """Render the layers of a flare for a target, as a step of `transfer` or `bake`.
 
     args: of the command, with the options of layers, --frames, --size and --jobs. step: its name, for --jobs. flare:
-    the .flare. training: see `targets.open_target`. Returns the command's result.
+    the .flare. training: poses of training views, for a .flare that does not store its own. Returns the command's
+    result.
     """
     from ...core.transfer.target import resized
     from ...core.transfer.transfer import Transfer, TransferSettings

@@ -50,9 +50,9 @@ class TargetFrame:
     or None.
 
     undistorted: reads the plate's undistorted picture, if the file is distorted; its argument is the space to read it
-    in, None for the capture's. window: where the layers' pixels lie on the plate's frame, all of which they hold; None if
-    the camera has another size than the plate. orientation: Exif orientation of the plate; camera and layers are those
-    of the upright picture. space: the plate's, where its capture names one (`plate_space.json`).
+    in, None for the capture's. window: where the layers' pixels lie on the plate's frame, all of which they hold; None
+    if the camera has another size than the plate. orientation: Exif orientation of the plate; camera and layers are
+    those of the upright picture. space: the plate's, where its capture names one (`plate_space.json`).
     """
 
     frame: NumberedFrame

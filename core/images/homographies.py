@@ -54,7 +54,7 @@ class HomographyMatcher:
         self._matches: dict[tuple[str, str], FrameMatch] = {}
 
     def match(self, source: str, target: str) -> FrameMatch:
-        """Return the match from a frame's pixels to another's; that of the reverse is its inverse."""
+        """Return the match from a frame's pixels to another's. The reverse match is its inverse. Both are cached."""
         if (source, target) not in self._matches:
             match = self._find_match(source, target)
             self._matches[source, target] = match
@@ -63,8 +63,8 @@ class HomographyMatcher:
         return self._matches[source, target]
 
     def _find_match(self, source: str, target: str) -> FrameMatch:
-        """Compute the homography from a frame's pixels to another's by matched features; the identity if the camera
-        stands."""
+        """Compute the homography from a frame's pixels to another's by SIFT, ratio test and RANSAC; the identity if the
+        camera stands."""
         import cv2
 
         first, second = self._sift_features(source), self._sift_features(target)

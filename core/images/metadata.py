@@ -102,8 +102,8 @@ def with_colour_chunks(encoded: bytes, profile: bytes, code_points: tuple[int, i
 
 
 def with_description(encoded: bytes, exif: bytes, xmp: bytes) -> bytes:
-    """Return an encoded PNG with the Exif block and the XMP of the picture of another format that it was made from;
-    without the claims of what the PNG does not hold. exif, xmp: empty for none."""
+    """Return an encoded PNG with the Exif block and the XMP of the picture that it was made from, without the XMP's
+    claims of parts that the PNG does not hold, such as a gain map. exif, xmp: empty for none."""
     chunks = png.make_chunk(png.EXIF, without_thumbnail(exif)) if exif else b""
     if packet := _without_claims(jpeg.XMP + xmp).removeprefix(jpeg.XMP) if xmp else b"":
         # The zeros: end of the keyword, not compressed, no method, no language, no translation of the keyword.
@@ -183,7 +183,7 @@ def _without_claims(segment: bytes) -> bytes:
     """Return an XMP segment without thumbnails, and without the properties that announce parts (gain map, clip) which
     are not kept.
 
-    A segment with none of these stays byte for byte; one with some that cannot be parsed is left out (empty).
+    A segment with none of these stays byte for byte. One that has some, but cannot be parsed, becomes empty.
     """
     if not _has_claims(segment) and _THUMBNAILS.encode() not in segment:
         return segment

@@ -54,7 +54,7 @@ class Picture:
 def same_aspect(size: tuple[int, int], other_size: tuple[int, int]) -> bool:
     """True if one size (width, height) is the other, scaled and rounded to whole pixels.
 
-    The sides of the scaled smaller one may differ from the larger one's by one pixel of the smaller (`scale`).
+    Each side of the smaller size, scaled to the larger, may differ from it by one pixel of the smaller (`scale`).
     """
     small, large = sorted((size, other_size))
     scale = max(large[0] / small[0], large[1] / small[1])

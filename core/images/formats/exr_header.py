@@ -28,7 +28,7 @@ def windows(stream: BinaryIO) -> dict[str, tuple[int, int]]:
 
 
 def window_corners(stream: BinaryIO) -> dict[str, tuple[int, int, int, int]]:
-    """Return the first and last (x, y) of the "dataWindow" and the "displayWindow", where present."""
+    """Return (left, top, right, bottom), the last two inclusive, of the "dataWindow" and "displayWindow" that exist."""
     attributes = _read_attributes(stream, {b"dataWindow": b"box2i", b"displayWindow": b"box2i"})
     return {name.decode(): tuple(np.frombuffer(value, "<i4").tolist()) for name, value in attributes.items()
             if len(value) == 16}
@@ -79,14 +79,15 @@ def is_truncated(stream: BinaryIO) -> bool:
     if compression[0] >= len(_LINES_PER_CHUNK):
         return False
     _, top, _, bottom = np.frombuffer(window, "<i4").tolist()
-    # The header is followed by the offsets of the chunks, 8 bytes each. A chunk is its line, its length, and its data.
+    # The header is followed by the offsets of the chunks, 8 bytes each. A chunk has the number of its first line and
+    # the length of its data, 4 bytes each, then the data.
     start, end = stream.tell(), stream.seek(0, os.SEEK_END)
     chunks = -(-(bottom + 1 - top) // _LINES_PER_CHUNK[compression[0]])
     if chunks <= 0 or start + 8 * chunks > end:
         return True
     stream.seek(start)
     offsets = np.frombuffer(stream.read(8 * chunks), "<u8")
-    if not offsets.all():  # not written yet
+    if not offsets.all():  # 0: that chunk was never written
         return True
     last_offset = int(offsets.max())
     stream.seek(min(last_offset + 4, end))
@@ -96,8 +97,8 @@ def is_truncated(stream: BinaryIO) -> bool:
 def locate_strings(stream: BinaryIO) -> dict[str, tuple[int, bytes]]:
     """Return the offset and the bytes of each text of all headers, by the name of its attribute.
 
-    Texts of a list have their number in the name, such as "tags[1]"; those of parts behind the first the part's number,
-    such as "owner, part 1".
+    A text of a list has its index in the name, such as "tags[1]"; a text of a part after the first has the part's
+    number, such as "owner, part 1".
     """
     texts = {}
     for part, _, name, kind, length in _iterate_attributes(stream):

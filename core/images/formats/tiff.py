@@ -51,15 +51,17 @@ _MAX_PAGES = 1000
 
 
 class _Layout(NamedTuple):
-    """Byte order, and struct's formats of numbers. length: of a directory's number of entries. offset: of an offset,
-    and of an entry's number of values."""
+    """How a TIFF stores numbers: the byte order, and the format characters of struct.
+
+    length: format of a directory's number of entries. offset: format of offsets, and of an entry's number of values.
+    """
 
     order: _Order
     length: str
     offset: str
 
     def number(self, raw: bytes, kind: str = "") -> int:
-        """Return the number at the start of some bytes. kind: its format; "" for an offset's."""
+        """Decode the number at the start of `raw`. kind: its format character; "" for that of offsets."""
         return int(struct.unpack_from(self.order + (kind or self.offset), raw)[0])
 
     @property
@@ -130,7 +132,7 @@ def page_count(stream: BinaryIO) -> int:
     """Count the pages, without the thumbnails that some programs add."""
     count = 0
     for layout, entries in _directories(stream):
-        # The numbers of 32 bits of the tag SUBFILE, of which a page has one at most.
+        # The values (32 bits) of the tag SUBFILE; a page has at most one.
         subfile_types = [layout.number(entry[layout.value_position:], "I") for entry in entries
                          if layout.number(entry, "H") == SUBFILE]
         count += not any(subfile_type & 1 for subfile_type in subfile_types)  # bit 0: a reduced copy of another page
@@ -141,7 +143,7 @@ def has_corrupt_data(stream: BinaryIO) -> bool:
     """True if strips or tiles of ZIP compression do not match their checksums, which the library of the format does not
     compare.
 
-    Checks at most as many bytes as the pixels can have (8 each channel), and some more, since hostile data
+    Checks at most as many bytes as the pixels can have (8 for each channel) and _BYTES_BEYOND more, since hostile data
     uncompress to any length.
     """
     tags = read_tags(stream, (WIDTH, HEIGHT, BITS, SAMPLES, COMPRESSION, *_STRIPS, *_TILES))
@@ -173,8 +175,8 @@ def _inflated_size(data: bytes, limit: int) -> int:
 
 
 def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
-    """Return a TIFF with these tags in its first page, instead of its own of the same numbers; a BigTIFF and other data
-    unchanged.
+    """Return a TIFF with these tags added to its first page, in place of tags of the same numbers; a BigTIFF and other
+    data unchanged.
 
     The values and a new directory are appended; the old directory stays in the file, but nothing points to it.
     """

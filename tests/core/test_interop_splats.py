@@ -17,7 +17,7 @@ from core.gaussians.ply import read_ply
 
 
 def scene(n: int = 400, seed: int = 0) -> SceneGaussians:
-    """A cloud in front of the camera of `camera`."""
+    """Return a random cloud of Gaussians, with spherical harmonics, before the camera of `camera`."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -42,7 +42,11 @@ def packed(shares: torch.Tensor, *bits: int) -> torch.Tensor:
 
 
 def write_compressed(path: Path, scene: SceneGaussians) -> None:
-    """PlayCanvas's layout, chunk by chunk, as its description has it."""
+    """Write a scene in PlayCanvas's compressed PLY, from that format's description.
+
+    Each chunk of 256 Gaussians stores the ranges of its values; positions, scales and colours are packed as shares of
+    these, rotations as the three smaller components, further harmonics as bytes.
+    """
     parts = {name: part.detach() for name, part in scene.named_parameters()}
     colours = parts["sh"][:, 0] * 0.28209479177387814 + 0.5
     ranges, rows = [], []

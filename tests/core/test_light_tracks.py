@@ -31,7 +31,8 @@ Lamp = tuple[float, float, float]
 
 def lit(lamps: Sequence[Lamp], radius: float = 4.0, boxes: Sequence[tuple[int, int, int, int]] = ()
         ) -> NDArray[np.float64]:
-    """Linear light of lamps with their glow before a dim wall; boxes (left, top, right, bottom) are white."""
+    """Return linear light (h, w, 3) of lamps with their glow before a dim wall. boxes: (left, top, right, bottom),
+    white."""
     light = np.full((SIZE[1], SIZE[0], 3), 0.06)
     light += 0.03 * np.sin(np.arange(SIZE[0]) / 9)[None, :, None] ** 2
     for left, top, right, bottom in boxes:

@@ -166,7 +166,11 @@ def spot(xy: NDArray[np.float64], radius: float = 3.0, score: float = 1.0) -> De
 
 def scene(lights: list[tuple[float, float, float]], cameras: list[Camera], noise: float = 0.4, clutter: int = 2,
           hidden: float = 0.0, seed: int = 0) -> list[list[Detection]]:
-    """Detections of lights in every view that has them in frame, with noise, misses and clutter."""
+    """Return the detections of lights in every view that has them in frame.
+
+    noise: standard deviation of their places, pixels. clutter: false detections in each view. hidden: probability that
+    a light is missed.
+    """
     rng = np.random.default_rng(seed)
     all_views = []
     for camera in cameras:
@@ -321,7 +325,8 @@ class TestGhosts:
     light = np.array([0.5, -2.6, 1.0])
 
     def frames(self, cameras: list[Camera], share: float) -> list[Picture]:
-        """Pictures with a ghost of the light, and some static bright points of the scene."""
+        """Return pictures of bright static points and of a ghost of the light; share: the ghost's place on the line
+        from the centre to the light, 0 for no ghost."""
         static = np.random.default_rng(0).uniform((-1, -0.8, -0.5), (1, 0.8, 1), (6, 3))
         made = []
         for camera in cameras:
@@ -444,7 +449,7 @@ class TestFile:
 
 
 def lit_capture(folder: Path, views: int, places: list[tuple[float, float, float]]) -> Path:
-    """A capture whose frames show lamps at these places."""
+    """Write a capture whose frames show lamps at these places in the world; return its folder."""
     make_capture(folder, views=views, size=SIZE)
     for i, camera in enumerate(orbit(views, size=SIZE)):
         light = backdrop(i)

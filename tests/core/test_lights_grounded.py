@@ -12,7 +12,7 @@ from core.lights.grounded import GroundedDetector, keep_smallest, refine_detecti
 
 
 def frame(*boxes: tuple[int, int, int, int], values: tuple[int, ...]) -> tuple[np.ndarray, list, np.ndarray]:
-    """Boxes, full masks of them, and a picture with that HSV value (of 255) in each."""
+    """Return boxes (n, 4), their masks, and a picture whose boxes have these HSV values (of 255)."""
     display = np.full((100, 120, 3), 0.2, np.float32)
     masks = []
     for (left, top, right, bottom), value in zip(boxes, values, strict=True):
@@ -60,7 +60,7 @@ def test_an_empty_mask_is_dropped() -> None:
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A tiny GroundingDINO and a tiny SAM 2, random, saved as transformers saves its models."""
+    """Folders of a tiny random GroundingDINO and a tiny random SAM 2, as transformers saves them."""
     transformers = pytest.importorskip("transformers")
     import torch
 

@@ -18,7 +18,8 @@ SCALE = 3
 
 
 def glow(small: Camera, lights: Sequence[tuple[NDArray[np.float64], float]]) -> FlareView:
-    """Glow about each (place, strength) with a clipped core, a ghost on the other side, before a grey scene."""
+    """Return a view of a grey scene with, for each (place, strength), a clipped core in its glow, and a ghost
+    opposite."""
     camera = small.scaled(SCALE * WIDTH, SCALE * HEIGHT)
     across, down = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
     scene = np.full((camera.height, camera.width), 0.1)
@@ -43,7 +44,7 @@ def seen_by(camera: Camera, scene: NDArray[np.float64], flare: NDArray[np.float6
 
 
 def ghosts_alone(small: Camera, light: NDArray[np.float64]) -> FlareView:
-    """What a light out of the frame leaves in it: ghosts on the line through it, soft and brightest in the middle."""
+    """Return a view of what a light outside the frame leaves in it: two soft ghosts on its line through the centre."""
     camera = small.scaled(SCALE * WIDTH, SCALE * HEIGHT)
     across, down = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
     (pixel,), _ = camera.project(light)
@@ -83,7 +84,8 @@ def test_an_accurate_light_is_unchanged_beside_a_brighter_one() -> None:
 
 
 def sun(small: Camera, light: NDArray[np.float64]) -> FlareView:
-    """A sun in a clipped part of the sky, whose middle is beside it, with glow and a ghost."""
+    """Return a view of a sun in a clipped part of the sky with its middle to the right of the sun, with glow and a
+    ghost."""
     camera = small.scaled(SCALE * WIDTH, SCALE * HEIGHT)
     across, down = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
     (pixel,), _ = camera.project(light)

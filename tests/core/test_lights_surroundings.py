@@ -21,8 +21,11 @@ GAP = np.array([0.1, -0.1, 0.0])
 
 
 def seen_through(camera: Camera, lamp: bool) -> NDArray[np.float32]:
-    """Return a frame (height, width, 3): a board with a hole in the plane z = 0 before a bright band of the far sky;
-    with `lamp`, a lamp on the closed board, and no band."""
+    """Return a frame (height, width, 3) of a board in the plane z = 0.
+
+    Without `lamp` the board has a hole, through which a bright band of the far sky shows; with it there is a bright
+    lamp in place of the hole, and no band.
+    """
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = camera.rays(np.stack([x.ravel(), y.ravel()], 1))
     wall = camera.position - camera.position[2] / rays[:, 2:] * rays

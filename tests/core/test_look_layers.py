@@ -35,7 +35,8 @@ def a_look(path: Path, blend: Blend) -> Path:
 
 
 def gaussians(count: int = 300) -> PlaneGaussians:
-    """Needles, discs and rings from a third of a pixel to the whole picture, some of them arcs, some outside."""
+    """Return random needles, discs and rings, from a third of a pixel to the whole picture, some of them arcs, some
+    outside."""
     random = np.random.default_rng(3)
     long, turn = 10 ** random.uniform(-3, -0.2, count), random.uniform(0, np.pi, count)
     short = np.maximum(long * 10 ** random.uniform(-2, 0, count), 0.0006)

@@ -31,7 +31,7 @@ def test_the_light_at_a_point_is_that_of_the_drawn_picture(blend: Blend) -> None
 
 
 def drawn_elements(look: Look, lights: tuple[PlacedLight, ...], edits: LookEdits) -> dict[tuple[str, str], np.ndarray]:
-    """The luminance of each visible element, drawn by itself."""
+    """Return the luminance (h, w) of each visible element drawn alone, by names of light and element."""
     pictures = {}
     for light in lights:
         names = look.element_names[light.source]

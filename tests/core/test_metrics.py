@@ -66,7 +66,7 @@ def test_pictures_of_different_sizes_are_not_compared() -> None:
 
 
 def by_definition(x: np.ndarray, y: np.ndarray) -> float:
-    """Wang et al. 2004, eq. 13 to 16, window by window over one channel."""
+    """Return the SSIM of one channel, window by window: Wang et al. 2004, eq. 13 to 16."""
     at = np.arange(11) - 5
     window = np.exp(-(at[:, None] ** 2 + at[None] ** 2) / (2 * 1.5 ** 2))
     window /= window.sum()

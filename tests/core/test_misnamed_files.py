@@ -27,7 +27,7 @@ from tests.core.videos import stripes, write_video
 
 
 def write_files(folder: Path) -> dict[str, Path]:
-    """A picture of each kind, by the kind."""
+    """Write the same picture as PNG, JPEG, TIFF, WebP and EXR; return the paths by kind."""
     light = scene(48, 32)
     codes = (np.clip(colour_space("srgb").from_linear(light), 0, 1) * 255 + 0.5).astype(np.uint8)
     cv2.imwrite(str(folder / "a.png"), codes[..., ::-1])

@@ -43,7 +43,7 @@ def turn(axis: int, degrees: float) -> np.ndarray:
 
 def in_frame(point: np.ndarray, number: int, order: str = "ZXY", size: tuple[int, int] = (64, 48),
              aspect: float = 1.0) -> np.ndarray:
-    """Pixel of a point of Nuke's world in a frame."""
+    """Return the pixel of a point of Nuke's world in frame `number`. order: in which Nuke applies the rotations."""
     rotation = np.eye(3)
     for axis in order:
         rotation = turn("XYZ".index(axis), ROTATE[number - 1001]["XYZ".index(axis)]) @ rotation

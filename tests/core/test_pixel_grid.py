@@ -53,7 +53,7 @@ def same_places(picture: Any, times: int) -> Any:
 
 
 def fine_scene(count: int = 400) -> SceneGaussians:
-    """Gaussians of which many are thinner than a pixel, about the origin, none of them bright or dark in full."""
+    """Return a random scene about the origin with many Gaussians thinner than a pixel, none fully bright or dark."""
     generator = torch.Generator().manual_seed(0)
     scene = SceneGaussians.empty(count)
     with torch.no_grad():

@@ -36,8 +36,11 @@ def _ghost(number: int) -> Pixels:
 
 @pytest.fixture(scope="module")
 def standing() -> tuple[ShotFrames, dict[str, Pixels]]:
-    """Frames of a standing camera whose plates hold the whole ghost, and the exact plates, under light that changes,
-    with a box that crosses."""
+    """Frames of a standing camera with a ghost, whose estimated plates still hold all of the ghost; and the exact
+    plates.
+
+    The light on the wall changes, and a box crosses.
+    """
     wall, frames, exact = _wall(), {}, {}
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     for number, name in enumerate(NAMES):

@@ -17,7 +17,7 @@ from core.system import processes
 @pytest.fixture(params=["this system's way", "by ps"])
 def sleeper(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch,
             tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], float]]:
-    """A process, and when it was started."""
+    """A process that sleeps, and when it was started; once with /proc, once without, as on macOS."""
     if request.param == "by ps":
         if os.name == "nt":
             pytest.skip("Windows has no ps")

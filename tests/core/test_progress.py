@@ -191,6 +191,7 @@ def test_a_stop_file_ends_the_work(of_main_thread: bool, tmp_path: Path, monkeyp
     stopped: list[str] = []
 
     def work() -> None:
+        """Work with a stop file in place; note the message of the cancellation in `stopped`."""
         progress = Progress()
         try:
             with stop_on_request(progress):

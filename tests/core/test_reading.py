@@ -35,7 +35,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no 
 
 
 def outcome(action: Callable[[], Any]) -> BaseException | None:
-    """Return what a call raises; fails where the call still waits after `TIME_LIMIT_S`."""
+    """Return what a call raises, or None; fails if the call still waits after `TIME_LIMIT_S`."""
     raised: list[BaseException | None] = []
 
     def call() -> None:
@@ -53,7 +53,7 @@ def outcome(action: Callable[[], Any]) -> BaseException | None:
 
 
 def special(path: Path, kind: str) -> Path:
-    """Put a special file of a kind at the path."""
+    """Put a pipe, a socket or a link to an endless device at the path; return the path."""
     path.unlink(missing_ok=True)
     if kind == "pipe":
         os.mkfifo(path)

@@ -27,6 +27,7 @@ from tests.core.removal_cases import picture, write_codes
 
 
 def write_bad_files(folder: Path) -> list[Path]:
+    """Write files that are no pictures, are cut off, or have no colour; return their paths."""
     folder.mkdir(parents=True)
     (folder / "text.png").write_text("not a picture")
     (folder / "empty.jpg").write_bytes(b"")

@@ -20,7 +20,7 @@ needs = pytest.mark.skipif(not HERE, reason="diffusers, transformers or peft is 
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A pipeline of the classes that SD-Turbo has, small, random, written as diffusers writes it."""
+    """Folder of a small random pipeline of SD-Turbo's classes, as diffusers writes it."""
     from diffusers import AutoencoderKL, DDPMScheduler, UNet2DConditionModel
     from transformers import CLIPTextConfig, CLIPTextModel
 

@@ -256,7 +256,7 @@ def test_impossible_jobs_are_refused_before_anything_is_written(capture: Capture
 
 
 def _as_exr(capture: Capture, folder: Path, space: ColourSpace) -> Capture:
-    """The capture with its frames as EXR in that space, and no clean ones."""
+    """Copy a capture with its frames as EXR of a colour space, without clean frames; return the copy."""
     shutil.copytree(capture.folder, folder)
     for path in sorted((folder / "images").iterdir()):
         light = space.from_linear(linear_from_srgb(read_picture(path).pixels))

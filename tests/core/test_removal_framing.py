@@ -36,7 +36,10 @@ FULL = 'GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="128"'
 
 
 def with_hidden(path: Path, hidden: int | None, dtype: type = np.uint8) -> Path:
-    """Write a picture whose outside is transparent, with its own or with one code there."""
+    """Write a picture that is transparent outside an ellipse; return its path.
+
+    hidden: code of the transparent pixels' colour, 0..255; None keeps the picture there.
+    """
     top = np.iinfo(dtype).max
     codes = picture(96, 144, top, dtype)
     rows, columns = np.mgrid[:96, :144]
@@ -79,6 +82,7 @@ def test_hidden_parts_continue_the_picture(tmp_path: Path) -> None:
 
 
 def write_png(path: Path, codes: NDArray[Any], chunk: tuple[bytes, bytes] | None = None) -> Path:
+    """Write a PNG with a further chunk (name, body) after its header, if one is given; return the path."""
     done, data = cv2.imencode(".png", codes)
     assert done
     content = data.tobytes()

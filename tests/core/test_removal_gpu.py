@@ -42,6 +42,7 @@ def made(seed: int, kind: str | None = None) -> pairs.FlareLayers:
 
 
 def together(some: list[pairs.FlareLayers]) -> composition.FlareBatch:
+    """Return flares of single pictures as one batch of the GPU's composition."""
     count = len(some)
     lights = torch.zeros(count, composition.MAX_LIGHTS, 2)
     is_light = torch.zeros(count, composition.MAX_LIGHTS, dtype=torch.bool)

@@ -46,7 +46,10 @@ def psnr(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
 
 
 def straight(name: str, x: float, slope: float) -> tuple[float, float]:
-    """(sensor x, focal length) of a ray that no surface reflects."""
+    """Trace a ray that no surface reflects; return its x on the sensor and the lens's focal length.
+
+    x, slope: of the ray before the lens.
+    """
     lens = read_prescription(LENS_FOLDER / f"{name}.lens")
     focal, back = lens.focal_length(), lens.back_focus()
     out = np.zeros(FIELDS)

@@ -62,7 +62,7 @@ WALLS = [(texture(i), corner, right, down) for i, (corner, right, down) in enume
 
 
 def render(camera: Camera) -> NDArray[np.uint8]:
-    """Three textured walls, (h, w, 3) B G R."""
+    """Return a camera's picture of three textured walls, (h, w, 3) B G R."""
     frame = np.full((camera.height, camera.width, 3), 60, np.uint8)
     for wall, corner, right, down in WALLS:
         across = np.stack([*np.array([right, down]) / 512, corner], axis=1)
@@ -85,7 +85,8 @@ def shoot(folder: Path, cameras: list[Camera], suffix: str = ".png") -> Path:
 
 @pytest.fixture(scope="module")
 def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Camera], dict[str, Any]]:
-    """One solved shot, of frames through a lens with distortion."""
+    """A shot filmed through a lens with distortion, one frame broken, and solved: its folder, true cameras, and
+    report."""
     folder = tmp_path_factory.mktemp("solve")
     cameras = orbit(10, size=SIZE, arc=0.9)
     frames = shoot(folder / "frames", cameras)

@@ -52,7 +52,7 @@ LIGHT = np.array([0.3, -0.6, 1.5])
 
 @pytest.fixture(scope="module")
 def flare(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One light, small bright Gaussians, so that most of a picture is out of the flare's reach."""
+    """A .flare of one light, whose small bright Gaussians leave most of a picture out of its reach."""
     path = tmp_path_factory.mktemp("flare") / "lamp.flare"
     model = saved(path, lights=1, count=12)
     with torch.no_grad():

@@ -40,7 +40,7 @@ print(json.dumps([peak, rows]))
 
 
 def damaged(data: bytes, random: np.random.Generator) -> bytes:
-    """Cut the file off, turn bits over, or let a size lie."""
+    """Return a damaged copy: cut off, with bits turned over, with bytes of the header replaced, or with false sizes."""
     kind, content = random.integers(4), bytearray(data)
     if kind == 0:
         return bytes(content[:random.integers(len(content))])

@@ -27,7 +27,10 @@ def stripes(height: int, width: int = 6 * STRIPE, colours: NDArray[Any] = PATCHE
 
 def frame_of(signal: NDArray[Any], pixels: str, matrix: int = 1, full: bool = False,
              alpha: NDArray[Any] | None = None) -> av.VideoFrame:
-    """A frame of a planar format with the codes that a signal R G B of 0..1 has by ITU-T H.273."""
+    """Return a video frame of a planar pixel format, with the codes of a signal R G B, 0..1, by ITU-T H.273.
+
+    matrix: H.273's number of the conversion to luma and chroma. full: full range of codes.
+    """
     height, width = signal.shape[:2]
     frame = av.VideoFrame(width, height, pixels)
     bits = frame.format.components[0].bits
@@ -57,8 +60,11 @@ def write_video(path: Path, codec: str, pixels: str, frames: Sequence[NDArray[An
                 tags: tuple[int, int, int] | None = None, full: bool = False, options: dict[str, str] | None = None,
                 aspect: Fraction | None = None, rotation: int | None = None, alpha: NDArray[Any] | None = None,
                 sound: str = "", metadata: dict[str, str] | None = None, rate: int = 25) -> Path:
-    """Write signals R G B of 0..1 as a video. matrix: by which codes are made. tags: matrix, transfer and primaries
-    that the file names; None for none. sound: the codec of a second of it. rotation: degrees, of the display matrix.
+    """Write signals R G B of 0..1 as a video; return its path.
+
+    matrix: H.273's number of the conversion by which codes are made. tags: H.273's numbers of matrix, transfer and
+    primaries that the file names; None for none. full: full range of codes. sound: codec of a sound track of one
+    second, "" for none. rotation: degrees, in the display matrix.
     """
     with av.open(str(path), "w") as container:
         container.metadata.update(metadata or {})

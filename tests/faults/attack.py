@@ -58,7 +58,10 @@ next process locks again."""
 
 
 def make_inputs(folder: Path, injector: Injector, names: Iterable[str]) -> None:
-    """Make what the commands read, by names of INPUTS, unless an earlier attack in the same folder has made it."""
+    """Make the inputs of these names (keys of INPUTS), unless an earlier attack in the same folder has made them.
+
+    A file NAME.whole marks an input as complete.
+    """
     from core.images.write import write_png
     from tests.core.captures import orbit
     from tests.core.flared import flared_capture
@@ -134,6 +137,11 @@ class Attack:
     """The attempts on one command, below `folder`."""
 
     def __init__(self, case: Case, inputs: Path, folder: Path, injector: Injector, journal: Journal) -> None:
+        """Run the command twice without a fault, unless unbroken.json is there, to learn its files and how many calls
+        it makes.
+
+        Files that differ between the two runs count as varying: their content is not compared.
+        """
         self.case, self._inputs, self._injector, self._journal = case, inputs, injector, journal
         self.out = folder / "out"
         self._failures: list[str] = []
@@ -151,7 +159,10 @@ class Attack:
         self._calls: dict[str, int] = read["calls"]
 
     def faults(self, number: int, kill: bool) -> list[Fault]:
-        """Spread `number` different faults evenly over the kinds of calls and over the calls of each kind."""
+        """Return `number` different faults, spread evenly over the kinds of calls and over the calls of each kind.
+
+        The choice depends on the command's name alone. kill: the faults end the process in place of an error.
+        """
         chance = random.Random(f"{self.case.name} {kill}")
         used = [call for call in CALLS if self._calls[call]]
         faults: dict[Fault, None] = {}
@@ -167,7 +178,7 @@ class Attack:
         return list(faults)
 
     def try_one(self, fault: Fault) -> None:
-        """Run with the fault, then without; note what does not hold."""
+        """Run the command with the fault, then without; write into the journal what does not hold."""
         self._failures = []
         self._reset()
         outcome = "hangs"
@@ -178,7 +189,7 @@ class Attack:
         self._journal.add(self.case.name, fault, outcome, self._failures)
 
     def _run_twice(self, fault: Fault) -> str:
-        """Return how the run with the fault ended."""
+        """Run with the fault and again without, and check both; return how the run with the fault ended."""
         argv = self.case.argv(self._inputs, self.out)
         ending = self._check_broken(fault, self._injector.run(argv, self.out, fault, LIMIT_S))
         again = self._injector.run(argv, self.out, UNBROKEN, LIMIT_S)
@@ -192,6 +203,7 @@ class Attack:
         return ending
 
     def _check_broken(self, fault: Fault, outcome: Outcome) -> str:
+        """Check a run with a fault: an honest ending, and only whole files. Return how it ended, in words."""
         killed = fault.error == "kill"
         ending = "other"
         if outcome.status == 0:
@@ -237,7 +249,12 @@ class Attack:
 
 
 def attack(folder: Path, faults: int, kills: int, only: list[str], limit_s: float) -> int:
-    """Attack the commands in a preloaded process, for at most `limit_s`; return the exit status."""
+    """Attack the commands from this process, which has the library preloaded, for at most `limit_s`; return the exit
+    status.
+
+    faults, kills: numbers over all commands. only: names of commands, all if empty. Attempts that passed before are not
+    repeated.
+    """
     import torch
 
     end = time.monotonic() + limit_s
@@ -286,7 +303,7 @@ def _shuffled(plan: list[Fault]) -> list[Fault]:
 
 
 def _print_table(attacks: list[Attack], plans: dict[str, list[Fault]], journal: Journal) -> bool:
-    """Print the attempts by command; return whether any failed."""
+    """Print the attempts by command as a Markdown table; return whether any failed."""
     columns = ("faults", "kills", "refused in a sentence", "harmless", "killed", "failed")
     print(f"| command | {' | '.join(columns)} | files that vary |\n|{' --- |' * (len(columns) + 2)}")
     total: Counter[str] = Counter()
@@ -305,7 +322,7 @@ def _print_table(attacks: list[Attack], plans: dict[str, list[Fault]], journal: 
 
 
 def main(argv: list[str]) -> int:
-    """Start the attack in a preloaded process, or carry it out there."""
+    """Start this script again with the library preloaded; there, carry out the attack. Return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--faults", type=int, default=200)
     parser.add_argument("--kills", type=int, default=100)

@@ -110,7 +110,7 @@ def is_hidden(path: Path) -> bool:
 
 
 def why_not_whole(path: Path) -> str:
-    """Return why a file is not whole by its format, or "". Logs, which are appended to, may end in half a line."""
+    """Return why a file is incomplete or invalid by its format, or "". The last line of a log may be cut off."""
     try:
         match path.suffix:
             case ".json":

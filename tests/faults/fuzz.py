@@ -99,7 +99,7 @@ class Format(NamedTuple):
 
 
 def formats(base: Path) -> list[Format]:
-    """Write a valid file of every format below `base`."""
+    """Write a valid file of every format below `base`, and return the formats with their readers."""
     from tests.core.test_interop_splats import write_compressed
 
     found: list[Format] = []
@@ -267,7 +267,7 @@ def read_both(path: Path) -> None:
 
 
 def mutate(data: bytes, chance: random.Random) -> bytes:
-    """Return a damaged copy of a file."""
+    """Return a damaged copy of a file: changed bytes, words or JSON values, or a false header with a right checksum."""
     head = int.from_bytes(data[:8], "little") if len(data) > 16 and data[8:9] == b"{" else 0
     kind = chance.random()
     if data[:4] == b"\x89PNG" and kind < 0.5:  # a wrong header with a right checksum
@@ -289,6 +289,7 @@ def _is_text(data: bytes) -> bool:
 
 
 def _mutate_bytes(data: bytes, chance: random.Random) -> bytes:
+    """Return the bytes with 1 to 20 changes: bytes or numbers overwritten, deleted, repeated or inserted."""
     changed = bytearray(data)
     for _ in range(chance.choice([1, 1, 2, 5, 20])):
         at = int(len(changed) * chance.random() ** chance.choice([1, 3]))  # more often near the beginning
@@ -309,6 +310,7 @@ def _mutate_bytes(data: bytes, chance: random.Random) -> bytes:
 
 
 def _mutate_text(data: bytes, chance: random.Random) -> bytes:
+    """Return the text with 1 to 4 words or numbers replaced by awkward ones."""
     text = data.decode("latin-1")
     for _ in range(chance.choice([1, 1, 2, 4])):
         words = list(_tokens(text))
@@ -327,6 +329,11 @@ def _tokens(text: str) -> Iterator[tuple[int, int]]:
 
 
 def _mutate_json(data: bytes, chance: random.Random) -> bytes:
+    """Return the JSON with 1 to 3 values deleted, repeated or replaced; in a .flare, values of the JSON in its
+    metadata.
+
+    Text that is no JSON is changed byte by byte.
+    """
     try:
         tree = json.loads(data)
     except ValueError:
@@ -368,7 +375,10 @@ class Result(NamedTuple):
 
 
 def fuzz(one: Format, count: int, seed: int, keep: Path | None = None) -> Result:
-    """Read `count` mutated files of a format. keep: folder for the files that fail."""
+    """Read `count` mutated files of a format and count how that ends; the valid file is restored.
+
+    keep: folder for the files that fail: by another error than a refusal, or by taking too long.
+    """
     path = one.folder / one.file
     valid = path.read_bytes()
     one.read(one.folder)  # the valid file
@@ -402,7 +412,7 @@ def fuzz(one: Format, count: int, seed: int, keep: Path | None = None) -> Result
 
 
 def _attempt(one: Format) -> BaseException | None:
-    """Return what reading raises; TimeoutError after TIME_LIMIT_S."""
+    """Read the file; return what that raises, TimeoutError after TIME_LIMIT_S, or None. Uses SIGALRM."""
     def ring(*_: object) -> None:
         raise TimeoutError(f"it takes more than {TIME_LIMIT_S} s")
 
@@ -421,7 +431,7 @@ def _attempt(one: Format) -> BaseException | None:
 
 
 def _fuzz_in_fork(one: Format, count: int, seed: int, keep: Path) -> Result:
-    """Call `fuzz` in a forked process; its death is a failure."""
+    """Call `fuzz` in a forked process and return its result; the death of the process counts as a failure."""
     reading, writing = os.pipe()
     pid = os.fork()
     if not pid:
@@ -446,7 +456,7 @@ def _fuzz_in_fork(one: Format, count: int, seed: int, keep: Path) -> Result:
 
 
 def main(argv: list[str]) -> int:
-    """Fuzz every format, print the table, return the exit status."""
+    """Fuzz every format and print a table; return the exit status, 1 if anything failed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--count", type=int, default=10_000, help="files, over all formats")
     parser.add_argument("--seed", type=int, default=0)

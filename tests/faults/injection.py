@@ -59,7 +59,7 @@ def reason_to_skip() -> str:
 
 
 def start_preloaded(script: Path, argv: Sequence[str], folder: Path) -> int:
-    """Run a Python script with the library preloaded; compile it into `folder`. Return the exit status."""
+    """Compile the fault library into `folder` and run a Python script with it preloaded; return the exit status."""
     library, counter = folder / "inject.so", folder / "counter"
     subprocess.run(["cc", "-O1", "-Wall", "-shared", "-fPIC", str(SOURCE), "-o", str(library), "-ldl"], check=True)
     counter.write_bytes(bytes(8 * len(CALLS)))
@@ -85,7 +85,10 @@ class Injector:
             self._counter = mmap.mmap(stream.fileno(), 8 * len(CALLS))
 
     def run(self, argv: Sequence[str], folder: Path, fault: Fault, limit_s: float = 120.0) -> Outcome:
-        """Run a command with one fault below `folder`. Raises TimeoutError where it takes longer than the limit."""
+        """Run a command in a fork, with one fault in its calls on files below `folder`; return how it ended.
+
+        Raises TimeoutError, and kills the fork, where it takes longer than `limit_s`.
+        """
         self._counter[:] = bytes(8 * len(CALLS))
         sys.stdout.flush()
         pid = os.fork()
@@ -105,7 +108,8 @@ class Injector:
         return Outcome(status, self._log.read_text(errors="replace"), dict(zip(CALLS, counts, strict=True)))
 
     def _run_in_fork(self, argv: Sequence[str], folder: Path, fault: Fault) -> None:
-        """Run a command in the child of the fork, which it ends."""
+        """Run a command in the child of a fork, its output going to the log, and end the child with the command's
+        status."""
         from fit_flare.headless import cli
 
         status = 99

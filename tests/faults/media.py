@@ -37,8 +37,10 @@ class Medium(NamedTuple):
 
 
 def media() -> Iterator[Medium]:
-    """Yield the formats for which no library here writes files, videos of further codecs, and plates whose clean plates
-    are written."""
+    """Yield pictures of formats that no library here writes, videos of further codecs, and plates to clean.
+
+    The plates carry tags, parts or channels that writing their clean plates has to keep.
+    """
     for file, write, library in (("a.psd", _write_psd, "OpenImageIO"), ("a.cin", _write_cineon, "OpenImageIO"),
                                  ("a.dng", _write_dng, "rawpy"), ("a.jxl", _write_jxl, "pillow_jxl")):
         if importlib.util.find_spec(library):  # the last two are optional
@@ -69,7 +71,7 @@ def _clean_plate(path: Path) -> None:
 
 
 def _write_tagged_jpeg(path: Path) -> None:
-    """Write a JPEG with Exif data, a profile, image resources and XMP that claims a gain map."""
+    """Write a JPEG with Exif data, an ICC profile, Photoshop resources and XMP that claims a gain map."""
     encoded = io.BytesIO()
     exif = Image.Exif()
     exif[0x112], exif[0x13b] = 6, "Ada"
@@ -98,7 +100,7 @@ def _write_tagged_png(path: Path) -> None:
 
 
 def _write_eyes(path: Path) -> None:
-    """Write an EXR with a part for each eye, and one of depth."""
+    """Write an EXR of three parts: the left eye, the right eye, and depth."""
     import OpenEXR
 
     light = scene(WIDTH, HEIGHT).astype(np.float16)
@@ -144,7 +146,7 @@ def _write_psd(path: Path) -> None:
 
 
 def _write_cineon(path: Path) -> None:
-    """Write a Cineon file of 10 bits, SMPTE-like layout of Kodak's version 4.5."""
+    """Write a Cineon file of 10 bits, version 4.5: file, picture and layout headers, then packed words."""
     words = (_codes().astype(np.uint32) << 2).reshape(-1, 3)
     pixels = (words[:, 0] << 22 | words[:, 1] << 12 | words[:, 2] << 2).astype(">u4").tobytes()
     head = struct.pack(">IIIIII8s", 0x802A5FD7, 1024, 1024, 0, 0, 1024 + len(pixels), b"V4.5").ljust(192, b"\0")
@@ -155,7 +157,7 @@ def _write_cineon(path: Path) -> None:
 
 
 def _write_dng(path: Path) -> None:
-    """Write a raw file of a Bayer sensor: a TIFF with the tags of DNG."""
+    """Write a DNG, the raw file of a Bayer sensor: a TIFF with DNG's tags."""
     mosaic = np.round(np.clip(scene(WIDTH * 2, HEIGHT * 2)[..., 1], 0, 1) * 60000).astype("<u2").tobytes()
     long, short, byte, text, signed, ratio = 4, 3, 1, 2, 10, 5
     matrix = [number for value in np.diag([10000, 10000, 10000]).ravel().tolist() for number in (value, 10000)]

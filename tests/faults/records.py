@@ -35,7 +35,7 @@ FRAMES = {"stills": [{"name": "0001.png", "file": "/f/0001.png", "width": 64, "h
 
 
 def records() -> Iterator[Medium]:
-    """Yield every format."""
+    """Yield the formats of small text files: records that the program writes, settings, lenses and cameras."""
     def text(content: object) -> str:
         return content if isinstance(content, str) else json.dumps(content)
 
@@ -67,7 +67,7 @@ def _write_lights_again(path: Path) -> None:
 
 
 def _read_settings(path: Path) -> None:
-    """Read as --settings does."""
+    """Read a TOML file of settings and apply them, as `make-flare --settings` does."""
     try:
         tables = parse_toml(read_text(path))
     except ValueError as problem:

@@ -34,7 +34,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_with_fault(library: Path, folder: Path, call: str, number: int, error: str) -> subprocess.CompletedProcess[str]:
-    """Write two files in a Python with a fault."""
+    """Run a Python that writes and renames two files, with an error at call `number`; return how it ended."""
     counter = library.with_name("counter")
     counter.write_bytes(bytes(8 * len(injection.CALLS)))
     code = ("import os\nfor name in 'ab':\n with open(name, 'w') as file: file.write('whole')\n"

@@ -36,7 +36,10 @@ sys.exit(max(cli.main(argv) for argv in json.loads(sys.argv[2])))"""
 
 def results(out: Path, capture: Path, weights: Path, backgrounds: Path, working_folder: Path,
             **environment: str) -> Snapshot:
-    """Fit, bake, export, transfer, clean and train in one process; return the hashes of all files."""
+    """Fit, bake, export, transfer, clean and train in one process; return the hashes of all files but those that vary.
+
+    working_folder: the process's. environment: variables of the process to set.
+    """
     import json
 
     run = f"{out}/run"

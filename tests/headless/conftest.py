@@ -31,7 +31,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(capfd: pytest.CaptureFixture[str]) -> Callable[..., list[dict[str, Any]]]:
-    """Runs a command in this process and returns its events; `status` is the exit status that is expected."""
+    """A function that runs a command in this process and returns its events; `status` is the exit status it expects."""
     from fit_flare.headless import cli  # after the tree has its name
 
     def go(*args: object, status: int = 0) -> list[dict[str, Any]]:

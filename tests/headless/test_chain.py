@@ -53,7 +53,10 @@ class Ended(NamedTuple):
 
 
 def run(command: Sequence[str], *args: object, stop_at: str = "", **variables: str) -> Ended:
-    """Run to the end; `stop_at` interrupts at the first progress of that stage."""
+    """Run a command to its end and return its status and events.
+
+    stop_at: a stage, at whose first progress the command is interrupted. variables: of the environment.
+    """
     whole = [*command, *map(str, args), "--progress", "json"]
     child = subprocess.Popen(whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                              env={**os.environ, **variables}, start_new_session=True)
@@ -137,7 +140,7 @@ def test_layers_add_up_to_the_fitted_picture(blend: Any, out: Path, capture: Pat
 
 
 def assert_composited(out: Path) -> None:
-    """The frames that Blender made are the composites of the layers."""
+    """Assert that the frames that Blender rendered are the composites of the baked layers."""
     layers = sorted((out / "layers").glob("layers.*.exr"))
     frames = sorted((out / "frames").glob("frame.*.exr"))
     assert len(frames) == len(layers) > 0

@@ -203,7 +203,7 @@ def _is_refused(words: list[str], status: int, capture: Path, tmp_path: Path,
 
 def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch, options: Sequence[str] = (),
                 resume_rule: ResumeRule = "starts over") -> None:
-    """Register a command "try" with these options, which ends with this problem."""
+    """Register a command "try" that raises `problem`, or succeeds if None. options: its arguments."""
     def run(_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         print("a library prints")
         progress.say("working")

@@ -25,7 +25,8 @@ TIMES = 1.6
 
 @pytest.fixture(scope="module")
 def runs(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A run of a capture whose second frame is darker, and the same with what a fit notes of that."""
+    """A run of a capture with one darker frame, and a copy of the run with that frame's exposure noted, as a fit
+    does."""
     base = tmp_path_factory.mktemp("exposed")
     shutil.copytree(capture, base / "capture", ignore=shutil.ignore_patterns("removed", "truth"))
     frame = base / "capture" / "images" / "0001.png"

@@ -49,7 +49,7 @@ def made(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def job(template: str, step: str, *options: str, **parameters: object) -> str:
-    """Run a step as `openjd run` does; its log."""
+    """Run a step of a job template by `openjd run`; return its log."""
     args = [sys.executable, "-m", "openjd", "run", str(ROOT / "headless" / "farm" / template), "--step", step]
     for name, value in {"RunScript": RUN, "Python": sys.executable, **parameters}.items():
         args += ["-p", f"{name}={value}"]

@@ -75,7 +75,7 @@ class Shot(NamedTuple):
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """Large soft Gaussians, and a lamp brighter than white."""
+    """A scene of large soft Gaussians and a lamp brighter than white: its cameras, linear light, and start splats."""
     random = np.random.default_rng(3)
     means = random.uniform((-2.6, -1.8, 0.5), (2.6, 1.8, 1.5), (GAUSSIANS, 3))
     scales, colours = np.full((GAUSSIANS, 3), 0.4), random.uniform(0.35, 0.8, (GAUSSIANS, 3))
@@ -113,7 +113,10 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def film(name: str, scene: Scene, folder: Path, run: Callable[..., Any], weights: Path) -> Shot:
-    """Write the scene as a capture whose frames are of a format; those of a video are extracted by `remove`."""
+    """Write the scene as a capture with frames of a format; return it.
+
+    name: of the format in VIDEOS or WRITERS. The frames of a video are those that `remove` extracts.
+    """
     images, space = folder / "images", None
     images.mkdir(parents=True)
     if name in VIDEOS:

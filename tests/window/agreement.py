@@ -32,6 +32,7 @@ NEIGHBOURS = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
 
 
 def steps():
+    """Compare view and render over each scene, with each engine, and write agreement.json."""
     settings = bpy.context.preferences
     settings.view.show_splash = False
     yield 1
@@ -51,8 +52,11 @@ def steps():
 
 
 def prepare(over: str):
-    """A scene of flat greys, one with an area light behind a fence, or a photograph, with a flare and its layers in the
-    compositor."""
+    """Make a scene with a flare, bake it, and let its layers into the compositor. Steps; their value is the scene.
+
+    over: what the flare lies over. "present": flat greys. "fence": greys, and an area light behind a fence. "plate": a
+    photograph.
+    """
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     yield 1
     scene = bpy.context.scene
@@ -88,7 +92,7 @@ def prepare(over: str):
 
 
 def add_grey(scene, x: float, value: float) -> None:
-    """A square of constant light before the camera."""
+    """Add a rectangle of constant light `value` before the camera; x: of its middle, in the camera's axes."""
     mesh = bpy.data.meshes.new("Grey")
     mesh.from_pydata([(-1, -9, -12), (1, -9, -12), (1, 9, -12), (-1, 9, -12)], [], [(0, 1, 2, 3)])
     item = bpy.data.objects.new("Grey", mesh)
@@ -107,7 +111,7 @@ def add_grey(scene, x: float, value: float) -> None:
 
 
 def add_fenced_lamp(scene) -> None:
-    """An area light of two by one units before the camera, behind planks that hide half of it."""
+    """Add an area light of two by one units before the camera, and planks that hide half of it; select the light."""
     lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "AREA"))
     lamp.data.shape, lamp.data.size, lamp.data.size_y = "RECTANGLE", 2.0, 1.0
     mesh = bpy.data.meshes.new("Fence")
@@ -124,7 +128,10 @@ def add_fenced_lamp(scene) -> None:
 
 
 def compare(scene, engine: str, over: str, results) -> None:
-    """The view and the render of one engine under each view transform."""
+    """Compare the rendered view with the render of one engine, under each view transform. Steps.
+
+    Differences go into `results` by scene, engine and transform. Left out are edges, clipped values and the margin.
+    """
     scene.render.engine = engine
     if engine == "CYCLES":
         scene.cycles.samples = scene.cycles.preview_samples = 8
@@ -187,7 +194,8 @@ def compare(scene, engine: str, over: str, results) -> None:
 
 
 def viewport_render(scene, rendered) -> dict[str, float]:
-    """The viewport render with the flare against the render."""
+    """Make a viewport render with the flare; return its differences from the render, without edges and clipped
+    values."""
     scene.render.filepath = str(flow.out / "viewport_####")
     bpy.ops.fit_flare.viewport_render("EXEC_DEFAULT")
     drawn = pixels(module("viewport_render").output_path(scene, scene.frame_current))
@@ -199,7 +207,7 @@ def viewport_render(scene, rendered) -> dict[str, float]:
 
 
 def align(scene) -> None:
-    """Move the camera's frame to whole pixels of the region."""
+    """Move the camera's frame to whole pixels of the region, by Newton's method with measured slopes."""
     view = ui.area().spaces.active.region_3d
 
     def corner():

@@ -18,6 +18,7 @@ from measure import NAME, module
 
 
 def steps():
+    """Show the looks in the asset browser, drag one into the view, and check that a lamp with its flare is there."""
     settings = bpy.context.preferences
     settings.view.show_splash = False
     yield 1

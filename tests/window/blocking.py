@@ -30,6 +30,7 @@ out = Path(OUT)
 
 
 def steps():
+    """Measure how long the window is blocked: imports, no fit, a fit, and the flare taken in at its end."""
     settings = bpy.context.preferences
     settings.view.show_splash = False
     settings.inputs.use_mouse_continuous = False
@@ -93,10 +94,11 @@ def steps():
 
 
 def time_steps(target, record: Times) -> None:
-    """Measure each step of the imports that the module `target` starts."""
+    """Replace `import_in_steps` of the module `target`, so that `record` gets the time of each step of an import."""
     inner = target.import_in_steps
 
     def import_in_steps(*words):
+        """Walk through the steps of an import and note the time of each."""
         walk = inner(*words)
         while True:
             with noted(record):
@@ -116,7 +118,10 @@ def save(figures: dict[str, object]) -> None:
 
 
 def measured(on):
-    """Gaps with the view left alone, and with the view turned again and again. Steps; their value is the figures."""
+    """Watch the window twice, left alone and with the view turned again and again. Steps; their value is the figures.
+
+    on: whether to go on watching.
+    """
     still, turning = Gaps(), None
     began = time.perf_counter()
     while on() and time.perf_counter() - began < WATCHED_S:

@@ -19,7 +19,7 @@ from measure import module
 
 
 def matte(name: str, white: slice) -> str:
-    """A picture that is white in some of its columns; where it lies."""
+    """Write a black picture that is white in some of its columns; return its path."""
     path = flow.out / name
     image = bpy.data.images.new(name, 96, 54)
     pixels = np.zeros((54, 96, 4), np.float32)
@@ -33,8 +33,10 @@ def matte(name: str, white: slice) -> str:
 
 
 def clean(capture: Path, where: str):
-    """The matte into its field, and the button; the columns in which the first frame was changed, as a share of its
-    width."""
+    """Type the matte's path into its field, press the button and wait. Steps.
+
+    Their value is the first and the last changed column of the first frame, as shares of its width; [] without change.
+    """
     x, y = yield from ui.find("fit_flare.matte", flow.panel(), path=True, across=0.65)
     yield from ui.fill(x, y, where)
     yield from ui.press_button("fit_flare.clean_frames", flow.panel(), below=y)
@@ -54,6 +56,7 @@ def clean(capture: Path, where: str):
 
 
 def steps():
+    """Clean a capture with a matte of its left half, then of its right half; check that only these are changed."""
     shutil.rmtree(Path(flow.CAPTURE) / "removed")
     yield from flow.begin()
     yield from flow.import_capture()

@@ -22,6 +22,7 @@ REPOSITORY = os.environ.get("FIT_FLARE_REPOSITORY", "")
 
 
 def steps():
+    """Go through the ways into the extension: preferences, weights, menus, and a flare for a selected spot."""
     os.environ.pop("FIT_FLARE_WEIGHTS", None)  # as in a Blender that has nothing but the extension
     bpy.context.preferences.view.show_splash = False
     yield 1
@@ -68,7 +69,7 @@ def steps():
 
 
 def add_repository():
-    """Add the repository by its address, and install from it."""
+    """Add the repository by its address, and install the extension from it. Steps."""
     repositories = bpy.context.preferences.extensions.repos
     repositories.new(name="Fit Flare", module="ours", remote_url=(Path(REPOSITORY) / "index.json").as_uri())
     number = next(place for place, item in enumerate(repositories) if item.module == "ours")

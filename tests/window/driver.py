@@ -76,6 +76,7 @@ def point(x: float, y: float) -> None:
 
 
 def click(x: float, y: float, ctrl: bool = False) -> None:
+    """Click with the left button, with Ctrl held if `ctrl`."""
     if real is not None:
         down, up = ([("keydown", "ctrl")], [("keyup", "ctrl")]) if ctrl else ([], [])
         real._send(*down)
@@ -88,6 +89,7 @@ def click(x: float, y: float, ctrl: bool = False) -> None:
 
 
 def drag(x0: float, y0: float, x1: float, y1: float, button: str = "LEFTMOUSE") -> None:
+    """Press a button at one point, move to another in six moves, and release."""
     if real is not None:
         top = window().height
         real.drag(x0, top - y0, x1, top - y1, button={"LEFTMOUSE": 1, "MIDDLEMOUSE": 2}[button])
@@ -118,7 +120,7 @@ KEYS = {**dict(zip("0123456789", ("ZERO", "ONE", "TWO", "THREE", "FOUR", "FIVE",
 
 
 def write(text: str) -> None:
-    """Type a text."""
+    """Type a text with the keyboard."""
     if real is not None:
         real.text(text)
         return
@@ -142,8 +144,11 @@ NOTHING = "nothing was copied"
 
 
 def copied(x: float, y: float, path: bool = False):
-    """What Ctrl-C copies from the button there: an operator's call, a field's value (`path`: with Shift, which
-    property it shows). Steps; their value is the text."""
+    """Press Ctrl-C over a button or field. Steps; their value is the copied text: an operator's call or a field's
+    value.
+
+    path: with Shift, which copies the path of the property that the field shows.
+    """
     manager = bpy.context.window_manager
     manager.clipboard = NOTHING
     point(x, y)
@@ -154,10 +159,11 @@ def copied(x: float, y: float, path: bool = False):
 
 def find(wanted: str | Callable[[str], bool], place, *, path: bool = False, across: float = 0.55,
          below: float | None = None, pages: int = 4):
-    """The place of the button whose operator is `wanted` (or whose copied text pleases it; `path`: whose property it
-    is), looked for by walking down a region with the mouse, page by page.
+    """Find a button or field by walking down a region with the mouse, page by page. Steps; their value is its place.
 
-    across: where in the region's width. below: start on the present page, under this height. Steps; raises LookupError.
+    wanted: the button's operator, the path of the field's property if `path`, or a test of the copied text. place: the
+    region. across: where to walk, a share of its width. below: height to begin at on the present page. Raises
+    LookupError.
     """
     def right(text: str) -> bool:
         if callable(wanted):
@@ -200,9 +206,10 @@ def fill(x: float, y: float, text: str):
 
 
 def fill_above(x: float, y: float, text: str, new: str):
-    """Type over the field with that text, in the dialog that has come under the mouse: it is looked for upwards. Steps.
+    """Find the field with the text `text` by walking upwards from a point in a dialog, and type `new` over it. Steps.
 
-    Outside a field a letter would be the key of a button."""
+    Fields are found first, since outside a field a letter would be the key of a button.
+    """
     for step in range(20):
         found = yield from copied(x, y + 8 * step)
         if found == text:
@@ -212,7 +219,7 @@ def fill_above(x: float, y: float, text: str, new: str):
 
 
 def choose_item(x: float, y: float, chosen: Callable[[], bool]):
-    """Choose from the menu that opens there, an entry further down each time, until it is the one. Steps."""
+    """Choose from the menu that a click opens, one entry further down each time, until `chosen` is true. Steps."""
     for down in range(8):
         click(x, y)
         yield 0.4
@@ -227,8 +234,10 @@ def choose_item(x: float, y: float, chosen: Callable[[], bool]):
 
 
 def show_editor(of, kind: str):
-    """The preferences or the 3D view in an area, by the button at the left end of its header: they are the menu's last
-    and first entry. Steps."""
+    """Turn an area into the preferences or the 3D view, by the button at the left end of its header. Steps.
+
+    The preferences are the last entry of that button's menu, the 3D view is the first.
+    """
     header = region("HEADER", of)
     click(header.x + 20 * bpy.context.preferences.system.ui_scale, header.y + header.height / 2)
     yield 0.5
@@ -242,7 +251,7 @@ def show_editor(of, kind: str):
 
 
 def go_to_section(of, section: str):
-    """A section of the preferences, by clicking down the list at their left. Steps."""
+    """Go to a section of the preferences, by clicking down the list at their left. Steps."""
     settings = bpy.context.preferences
     tabs = min((one for one in of.regions if one.type in ("UI", "NAVIGATION_BAR")), key=lambda one: one.x)
     y = tabs.y + tabs.height - 20
@@ -285,7 +294,7 @@ def _field(place, ending: str):
 
 
 def press_along(call: str, place, y: float):
-    """Find a button by walking along a row from the right, and click it. Steps."""
+    """Find the button of an operator by walking along a row from its right end, and click it. Steps."""
     x = place.x + place.width - 6
     while x > place.x:
         text = yield from copied(x, y)
@@ -312,7 +321,7 @@ def press_in_top_bar(menu: str):
 
 
 def open_tab(name: str):
-    """The sidebar of the 3D viewport with N, and its tab by clicking down the tabs. Steps."""
+    """Show the sidebar of the 3D viewport with N, and open a tab by clicking down the tabs. Steps."""
     view = region("WINDOW")
     if not area().spaces.active.show_region_ui:
         point(view.x + view.width * 0.4, view.y + view.height * 0.4)
@@ -334,11 +343,14 @@ def quit_(status: int = 0) -> None:
 
 
 def run(steps) -> None:
-    """Walk through the generator function `steps`; an exception ends Blender with status 1."""
+    """Walk through the steps of the generator function by a timer; an exception ends Blender with status 1, the end
+    with 0."""
     walk = steps()
     sent = False
 
     def step():
+        """Send the next simulated event, or go on with the next step once the events are handled; return the seconds to
+        wait."""
         nonlocal sent
         try:
             if real is not None and bpy.app.timers.is_registered(real._pump):

@@ -18,6 +18,7 @@ from measure import module
 
 
 def steps():
+    """Fit a capture without clean frames: the fit makes them first and then takes them as estimates."""
     capture = Path(flow.CAPTURE)
     for name in ("removed", "truth"):
         shutil.rmtree(capture / name)

@@ -20,6 +20,7 @@ from measure import module
 
 
 def steps():
+    """Install the extension without an engine, add a flare, change it, bake it and render."""
     settings = bpy.context.preferences
     settings.view.show_splash = False
     settings.inputs.use_mouse_continuous = False
@@ -43,7 +44,7 @@ def steps():
 
 
 def add():
-    """The tab, the button Add Flare, and the flare in the camera view."""
+    """Open the tab, press Add Flare, and see the flare in the camera view. Steps."""
     yield from ui.open_tab("Fit Flare")
     yield 1
     shot("02_library")
@@ -58,7 +59,7 @@ def add():
 
 
 def change():
-    """Another look from the previews, and a slider."""
+    """Choose another look from the previews, and drag the slider Intensity. Steps."""
     scene = bpy.context.scene
     view = ui.region("UI")
     ui.click(view.x + 0.45 * view.width, view.y + view.height - 110)
@@ -82,7 +83,7 @@ def change():
 
 
 def bake():
-    """The current frame into layers, without an engine."""
+    """Bake the current frame into layers, without an engine. Steps."""
     scene = bpy.context.scene
     state = scene.fit_flare
     scene.render.resolution_percentage = 50  # the time of a test
@@ -103,7 +104,7 @@ def bake():
 
 
 def render():
-    """Render > Render Image, with the flare in it."""
+    """Render by Render > Render Image, with the flare and at intensity 0, and check that the flare is in it. Steps."""
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.samples, scene.cycles.use_denoising = 4, False  # some builds have no denoiser

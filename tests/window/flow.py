@@ -56,7 +56,7 @@ def panel():
 
 
 def begin():
-    """From the empty profile to a 3D viewport, with the extension installed and its engine named."""
+    """Go from the empty profile to a 3D viewport, with the extension installed and its engine named. Steps."""
     settings = bpy.context.preferences
     settings.view.show_splash = False
     settings.inputs.use_mouse_continuous = False
@@ -71,6 +71,7 @@ def begin():
 
 
 def steps():
+    """Go the whole way of an artist: import, fit, overlay, bake, compositor, transfer."""
     yield from begin()
     yield from import_capture()
     yield from fit()
@@ -83,7 +84,7 @@ def steps():
 
 
 def install(area):
-    """Preferences > Get Extensions > the menu at the right > Install from Disk."""
+    """Install by Preferences > Get Extensions > the menu at the right > Install from Disk. Steps."""
     yield from ui.go_to_section(area, "EXTENSIONS")
     place = ui.region("WINDOW", area)
     top = place.y + place.height - 19
@@ -98,7 +99,7 @@ def install(area):
 
 
 def name_the_engine(area):
-    """Preferences > Add-ons > Fit Flare: a path into the field Engine, and Test."""
+    """In Preferences > Add-ons > Fit Flare type the engine's path into its field, and press Test. Steps."""
     yield from ui.go_to_section(area, "ADDONS")
     place = ui.region("WINDOW", area)
     yield from ui.fill(place.x + 0.2 * place.width, place.y + place.height - 19, "Fit Flare")
@@ -118,7 +119,7 @@ def name_the_engine(area):
 
 
 def import_capture():
-    """The start file's objects away with A and Delete; the button Import Capture and the file browser it opens."""
+    """Delete the start file's objects, press Import Capture and choose the folder in the file browser. Steps."""
     view = ui.region("WINDOW")
     ui.point(view.x + 0.4 * view.width, view.y + 0.5 * view.height)
     ui.press("A")
@@ -138,7 +139,7 @@ def import_capture():
 
 
 def fit():
-    """Limit Width and its field, a click on Fit, and the view turned while the engine works."""
+    """Limit the width, press Fit, and turn the view while the engine works; print the gaps of the window. Steps."""
     scene = bpy.context.scene
     state, fits = scene.fit_flare, module("fits")
     x, y = yield from ui.find("fit_flare.limits_width", panel(), path=True, across=0.47)
@@ -188,7 +189,7 @@ def fit():
 
 
 def brighten():
-    """Without Flare, the camera's view, and Intensity dragged: the overlay brightens."""
+    """Show the frames without flare in the camera's view and drag Intensity: the overlay brightens as much. Steps."""
     scene = bpy.context.scene
     state = scene.fit_flare
     x, y = yield from ui.find("fit_flare.footage", panel(), path=True, across=0.75)
@@ -217,7 +218,7 @@ def brighten():
 
 
 def bake():
-    """Three frames into a folder that is typed, by the panel's fields and Bake Layers."""
+    """Bake three frames into a folder that is typed, by the panel's fields and Bake Layers. Steps."""
     scene = bpy.context.scene
     state, now = scene.fit_flare, scene.frame_current
     x, y = yield from ui.find("fit_flare.bake_range", panel(), path=True, across=0.65)
@@ -237,7 +238,7 @@ def bake():
 
 
 def compositor_and_render():
-    """Over the Footage, Set Up Compositor, a render at three intensities, and the nodes away again."""
+    """Set up the compositor over the footage, render at three intensities, and remove the nodes again. Steps."""
     scene = bpy.context.scene
     state = scene.fit_flare
     x, y = yield from ui.find("fit_flare.over", panel(), path=True, across=0.65)
@@ -270,8 +271,10 @@ def compositor_and_render():
 
 
 def render(path: Path):
-    """Render > Render Image, a picture of the window, and Escape back. Steps; their value is the mean of the picture,
-    which is saved."""
+    """Render by Render > Render Image, photograph the window, return to the view and save the picture. Steps.
+
+    Their value is the picture's mean.
+    """
     finished: list[bool] = []
 
     def note(*_words: object) -> None:
@@ -299,7 +302,8 @@ def render(path: Path):
 
 
 def transfer():
-    """To the library, and on to another camera, first free, then with a wall before the lamp."""
+    """Save the flare to the library and add it to another shot, first in sight, then with a wall before the lamp.
+    Steps."""
     x, y = yield from ui.press_button("fit_flare.save_flare", panel())
     yield 1
     suggested = module("looks").path_of(bpy.context.scene).parent.name
@@ -334,7 +338,7 @@ def transfer():
 
 
 def another_shot():
-    """Another scene with a camera and a selected lamp, as an artist has it before a flare is laid over it."""
+    """Make and show another scene with a camera and a selected lamp; return scene and camera."""
     other = bpy.data.scenes.new("Another Shot")
     bpy.context.window.scene = other
     camera = bpy.data.objects.new("Second", bpy.data.cameras.new("Second"))
@@ -350,7 +354,7 @@ def another_shot():
 
 
 def speed_of(overlay, scene) -> dict[str, float]:
-    """Milliseconds of a frame at 1080p: what numpy takes, and what the GPU (or what stands in for it) takes."""
+    """Return milliseconds of the overlay of a frame at 1080p: of numpy's part, and of the drawing on the GPU."""
     looks, cameras = module("looks"), module("cameras")
     depsgraph = bpy.context.evaluated_depsgraph_get()
     camera = scene.camera.evaluated_get(depsgraph)

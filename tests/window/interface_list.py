@@ -63,7 +63,7 @@ def rows(title: str, classes: list[Any]) -> Iterator[str]:
 
 
 def panels_and_operators() -> Iterator[str]:
-    """Yield the texts of the extension in Blender."""
+    """Yield lines of Markdown with the extension's panels, operators, their options, and properties."""
     yield "## Panels\n"
     yield from (f"- {cls.bl_label} (`{cls.__name__}`)" for cls in classes_of(bpy.types.Panel))
     yield from ("\n## Operators\n", "| operator | label | tooltip |", "| --- | --- | --- |")

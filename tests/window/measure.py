@@ -40,6 +40,10 @@ class Gaps:
         self.paused = True
 
     def stop(self) -> dict[str, float]:
+        """Stop the timer; return the number of gaps, the longest, the 99th percentile and how many are over 100 ms.
+
+        The same for the work of the thread in each gap. The first two gaps are left out.
+        """
         self.on = False
         figures: dict[str, float] = {"gaps": len(self.gaps)}
         for name, times in zip(("gap", "work"), zip(*(self.gaps[2:] or [(0.0, 0.0)]), strict=True), strict=True):
@@ -92,6 +96,7 @@ class Ours:
     """Times of all that the extension does in the window's thread while the engine works."""
 
     def __init__(self) -> None:
+        """Wrap the extension's timers, panels and drawing so that each call is timed; drawing is registered anew."""
         self.times: dict[str, Times] = {}
         timed(module("jobs"), "_poll_jobs", self._of("look at the engine"))
         for panel in module("panels")._CLASSES:

@@ -22,6 +22,7 @@ FRAMES = 1000
 
 
 def steps():
+    """Bake a shot from the window and measure how long reading the scene, frame by frame, blocks it; stop the bake."""
     bpy.context.preferences.view.show_splash = False
     yield 1
     bpy.ops.extensions.package_install_files(filepath=flow.ZIP, repo="user_default", enable_on_install=True,

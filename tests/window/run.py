@@ -37,6 +37,8 @@ PICTURES = {
 
 
 def main() -> int:
+    """Run a script in a Blender with a window, on a fresh profile; return its exit status, LEFT_OUT without a
+    Blender."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--blender", default=os.environ.get("FIT_FLARE_BLENDER") or shutil.which("blender"))
@@ -80,7 +82,7 @@ def main() -> int:
 
 @contextlib.contextmanager
 def base_folder(plain: bool) -> Iterator[Path]:
-    """A temporary folder, of a plain name where it is to be seen in pictures."""
+    """Make a temporary folder for a run. plain: one of a plain name, for paths that pictures show."""
     with tempfile.TemporaryDirectory() as made:
         folder = Path(tempfile.gettempdir()) / "fit_flare" if plain else Path(made)
         folder.mkdir(exist_ok=True)
@@ -92,7 +94,7 @@ def base_folder(plain: bool) -> Iterator[Path]:
 
 
 def cut(shots: Path, pictures: Path) -> None:
-    """JPEG, 1200 pixels wide at most, of the screenshots that are there."""
+    """Cut the handbook's pictures out of the screenshots that exist: JPEG, at most 1200 pixels wide."""
     import cv2
 
     for name, (shot, (left, top, right, bottom)) in PICTURES.items():
@@ -106,7 +108,7 @@ def cut(shots: Path, pictures: Path) -> None:
 
 
 def agreement(out: Path) -> float:
-    """PSNR of what the GPU drew over the viewport against the flare layer that the engine baked, linear light."""
+    """Return the PSNR, dB in linear light, of the overlay that the GPU drew against the baked flare layer."""
     import numpy as np
 
     sys.path.insert(0, str(ROOT))

@@ -31,6 +31,7 @@ def shot(name: str) -> None:
 
 
 def steps():
+    """Set the engine up from the preferences, test it and remove it; write figures to set_up.json."""
     bpy.context.preferences.view.show_splash = False
     bpy.ops.extensions.package_install_files(filepath=ZIP, repo="user_default", enable_on_install=True, overwrite=True)
     yield 1

@@ -76,7 +76,7 @@ def write_assets() -> int:
     Raises FlareFileError where no look can be read.
     """
     library.menu_items()  # writes the missing thumbnails
-    # In reverse, so that of two looks with one name the user's replaces the extension's.
+    # Reversed, so that the user's look, which comes first, replaces the extension's of the same name.
     paths = {path.stem: path for path in reversed(library.files()) if _is_usable(path)}
     if not paths:
         raise FlareFileError("The library has no look that can be read; save one to it first.")
@@ -133,7 +133,10 @@ def _on_import(context: Any, *_: Any) -> None:
 
 
 def add_dropped() -> None:
-    """Show the flares of dropped assets in the scene of the window. An error is shown in the panel Look."""
+    """Show the flares of dropped assets in the scene of the window, each as an undo step.
+
+    An error is shown in the panel Look. A timer calls this once after a drop.
+    """
     scene, names = bpy.context.scene, tuple(_dropped)
     _dropped.clear()
     paths = {path.stem: path for path in reversed(library.files())}

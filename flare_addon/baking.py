@@ -36,7 +36,7 @@ class Preparation:
     """A scene that is being read for a bake."""
 
     def __init__(self, reading: ShotReading, own_folder: bool, folder: Path) -> None:
-        """own_folder: a single camera has a folder of its own too. folder: of the layers."""
+        """own_folder: the layers of a single camera have a subfolder too. folder: where the layers are written."""
         self.reading, self.error = reading, ""
         self._own_folder, self._folder = own_folder, folder
 
@@ -99,10 +99,11 @@ def why_not_bake(scene: Any) -> str:
 
 
 def start_bake(scene: Any, camera_objects: Sequence[Any], *, replace_others: bool = False) -> None:
-    """Start a bake of these camera objects, or of the scene's camera for []. Without a window it has ended on return.
+    """Start a bake of these camera objects, or of the scene's camera for [].
 
-    replace_others: delete layers that `shots.frames_to_replace` returns; without it they are an error. Raises
-    FitFlareError.
+    With a window, a timer reads the scene and then starts the process; without one, the bake has ended on return.
+    replace_others: delete layers in the folder that were baked from other flares, lights or colours; without it they
+    raise RunError. Raises FitFlareError.
     """
     global _preparation, _last_error, _last_scene
     shots.check_bake(scene, camera_objects)

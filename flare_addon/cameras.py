@@ -96,7 +96,8 @@ def core_camera(data: Any, matrix: Any, render: Any) -> Camera:
 def world_to_capture(root: Any, depsgraph: Any) -> Floats:
     """Return the matrix (4, 4) from Blender's world to the capture's, by the current transform of its root.
 
-    The identity without a root, and for a root that is scaled to zero. Raises CaptureError as `world_matrix` does.
+    The identity without a root, and for a root that is scaled to zero. Raises CaptureError for a disabled root whose
+    place is unknown.
     """
     if root is None:
         return np.eye(4)
@@ -115,7 +116,8 @@ def pose_in_capture(matrix: Any, root: Any, depsgraph: Any) -> Floats:
 
 
 def transformed_pose(matrix: Any, to_capture: Floats) -> Floats:
-    """Return world_to_camera (4, 4) for a camera's matrix_world, in coordinates to which `to_capture` (4, 4) leads."""
+    """Return world_to_camera (4, 4) for a camera's matrix_world, in the coordinates into which `to_capture` (4, 4)
+    transforms Blender's."""
     placed = to_capture @ camera_to_world(matrix)  # with the scale of the root
     placed[:3, :3] /= np.linalg.norm(placed[:3, :3], axis=0)
     return np.linalg.inv(placed)

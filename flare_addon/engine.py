@@ -51,8 +51,8 @@ def configured_engine() -> tuple[str, str]:
 def find_engine() -> Path | None:
     """Return the engine's Python: the configured one, else the installed one, else .venv in the extension's source.
 
-    None where there is none. The order is that of headless/hand_off.py. This only looks at the disk, so a panel can
-    call it; the commands also test for torch, and therefore may search .venv in the folder above as well.
+    None where there is none. It only looks at the disk and starts no Python, so that a panel can call it at each
+    redraw; unlike the commands it does not test for torch.
     """
     _, path = configured_engine()
     if path:

@@ -23,7 +23,8 @@ def fcurves_of(block: Any) -> list[Any]:
 def renumber(block: Any, path: str, new_index: Callable[[int], int | None]) -> None:
     """Update the indices in the paths of F-curves and drivers on the items of the collection at `path`.
 
-    new_index: the new index of an item by its old one, None for an item that was removed; its curves are removed too.
+    new_index: returns the new index of an item for its old one; None for an item that was removed, whose curves are
+    removed too.
     """
     pattern = re.compile(re.escape(path) + r"\[(\d+)\](.*)")
     drivers = [block.animation_data.drivers] if block.animation_data is not None else []

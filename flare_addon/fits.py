@@ -119,7 +119,7 @@ def start_fit(scene: Any) -> Job:
     lights.write_to_capture(scene, capture)
     folder, earlier_run = new_run_folder(scene), scene.fit_flare.run
     scene.fit_flare.run = blend_relative(folder)
-    folder = run_folder(scene) or folder  # as the stored path resolves
+    folder = run_folder(scene) or folder  # the path as it is read back from the .blend
     try:
         return _run_fit(scene, capture, folder)
     except FitFlareError:
@@ -142,7 +142,7 @@ def start_from_footage(scene: Any, source: Path) -> Job:
         number += 1
     state, earlier_run = scene.fit_flare, scene.fit_flare.run
     state.run = blend_relative(out / SHOT_RUN)
-    folder = run_folder(scene) or out / SHOT_RUN  # as the stored path resolves
+    folder = run_folder(scene) or out / SHOT_RUN  # the path as it is read back from the .blend
     args: list[object] = ["shot", footage.resolve(), "--out", folder.parent,
                           "--preset", state.preset if state.preset in OUR_PRESETS else "standard"]
     if state.width:
@@ -155,7 +155,10 @@ def start_from_footage(scene: Any, source: Path) -> Job:
 
 
 def resume_fit(scene: Any) -> Job:
-    """Resume the run of the scene, from the capture that it was started with. Raises as `start_fit` does."""
+    """Resume the run of the scene, from the capture that it was started with, or its present folder if it was moved.
+
+    Raises EngineError without an engine, CaptureError without the capture, RunError without a fit to resume.
+    """
     capture, folder = capture_folder(scene), run_folder(scene)
     stopped_job = fit_job(scene)
     if folder is not None and stopped_job is not None and stopped_job.args[:1] == ["shot"]:
@@ -195,7 +198,7 @@ def show_result(scene: Any, folder: Path) -> Look:
 
 
 def expose_cameras(scene: Any, folder: Path | None) -> None:
-    """Set the exposure of the imported cameras from a run, if the run names its capture and it may be this one.
+    """Set the exposure of the imported cameras from a run, if the run stores its capture and that may be the scene's.
 
     Raises RunError.
     """
@@ -216,8 +219,8 @@ def clear_other_run(scene: Any) -> None:
 def _may_belong_to(folder: Path, capture: Path) -> bool:
     """Return whether a run may be of this capture.
 
-    Where the run's capture is missing, one of the same name counts, since it may have been moved. A run that does not
-    store its capture may belong to any.
+    Where the folder of the run's capture is missing, a capture of the same name counts, since it may have been moved. A
+    run that does not store its capture may be of any.
     """
     recorded = _capture_of_run(folder)
     if recorded is None:
@@ -313,8 +316,8 @@ def _cleaning_folder(capture: Path) -> Path:
 
 
 def cleaning_args(scene: Any, capture: Path) -> list[object]:
-    """Return the arguments of the command `remove`: with the run where the fit of this capture is finished, else with
-    the network, the matte and the choice of glow."""
+    """Return the arguments of the command `remove`: to subtract the flare of the finished fit of this capture, or,
+    without one, to use the removal network with the matte and the choice of glow."""
     folder, space = run_folder(scene), plate_space.command_args(scene)
     if folder is not None and fit_state(scene) == "finished" and _may_belong_to(folder, capture):
         moved_capture = ["--capture", capture] if _capture_has_moved(folder, capture) else []

@@ -74,8 +74,8 @@ class Job:
     """One command of the engine.
 
     done, total: steps of `stage`. eta_s: remaining seconds, None where unknown. figures: numbers of its last progress
-    by name, such as losses. messages: sentences for the user. result: what its result events say. warnings: of what
-    was done with its result. args: without --overwrite, so that they are equal where the result is.
+    by name, such as losses. messages: sentences for the user. result: data of its result events. warnings: sentences on
+    what Blender did with the result. args: those that identify the job, without --overwrite, which changes no result.
     """
 
     def __init__(self, kind: str, folder: Path, origin: Origin, args: Sequence[str] = (),
@@ -107,11 +107,12 @@ class Job:
         return self.folder / LOG
 
     def poll(self) -> bool:
-        """Read new events; return whether there were any, or the job has ended."""
+        """Read new events, and at the end of the job call its function in ON_FINISHED; return whether anything
+        changed."""
         if not self.running:
             return False
         previous_offset = self._offset
-        alive = self._is_alive()  # before reading, so that the last events are read below
+        alive = self._is_alive()  # asked before reading, so that the last events of a process that ends are read
         self._read()
         if alive:
             self._was_seen_running = True
@@ -183,7 +184,7 @@ class Job:
             self.error = str(event["text"])
 
     def _is_alive(self) -> bool:
-        """Return whether the process of the job is running; of one on another machine, whether its events say so."""
+        """Return whether the process of the job is running; for another machine, whether its events let it seem so."""
         if self._process is not None:
             return self._process.poll() is None
         if self.origin.host != HOST:
@@ -217,7 +218,7 @@ class Job:
         elif _is_full(self.folder):  # the error event could not be written either
             self.state = "failed"
             self.error = f"The disk of {self.folder} is full; make room and start it again, what is finished is kept."
-        elif is_file(self.folder / STOP):  # before the process watched the file
+        elif is_file(self.folder / STOP):  # it stopped before it wrote any event
             self.state, self.error = "stopped", "Stopped before it began."
         else:
             self.state = "failed"
@@ -248,8 +249,9 @@ def start_job(kind: str, folder: Path, command: Sequence[str], environment: Mapp
               args: Sequence[object] = ()) -> Job:
     """Start a command whose events go to `folder`, and follow it.
 
-    args: the arguments that identify the job. Without a window this returns when the job has ended. Raises EngineError
-    where the command cannot be started, RunError where the folder cannot be written or a job runs in it.
+    args: the arguments that identify the job. environment: of the process; None for Blender's. Without a window this
+    waits for the end of the job. Raises EngineError where the command cannot be started, RunError where the folder
+    cannot be written or a job runs in it.
     """
     earlier_job = find_job(folder)
     if earlier_job is not None and earlier_job.running:

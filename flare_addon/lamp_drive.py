@@ -99,8 +99,8 @@ def rendered_collections(scene: Any) -> set[Any]:
 def is_visible(target: Any, depsgraph: Any, rendered: set[Any]) -> bool:
     """Return whether a light object shines at the current frame.
 
-    It does not if it is disabled in renders or in viewports, nor if no collection of it is rendered. Of an empty,
-    which no render shows, only Disable in Renders counts. rendered: the `rendered_collections`.
+    It does not if it is disabled in renders or in viewports, nor if no collection of it is rendered. For an empty,
+    which no render shows, only Disable in Renders counts. rendered: the collections that renders show.
     """
     evaluated = target.evaluated_get(depsgraph)
     if evaluated.hide_render or target.type == "EMPTY":
@@ -109,9 +109,10 @@ def is_visible(target: Any, depsgraph: Any, rendered: set[Any]) -> bool:
 
 
 def direction_factor(item: Any, depsgraph: Any, matrix: Any, eye: Any) -> float:
-    """Return the part of a lamp's light that goes to `eye`, 0..1: in the cone of a spot, in front of an area light.
+    """Return the part of a lamp's light that goes to `eye`, 0..1: 0 outside the cone of a spot and behind an area
+    light.
 
-    matrix: matrix_world of the lamp. An area light with an extent is left to the extent.
+    matrix: matrix_world of the lamp. It is 1 for an area light that flares as an area, whose extent computes it.
     """
     if not has_direction(item):
         return 1.0
@@ -170,10 +171,10 @@ def light_of(data: Any) -> NDArray[np.float64]:
 
 
 def keyed_reference(scene: Any, data: Any) -> NDArray[np.float64] | None:
-    """Return the light (3,) of a lamp in the first frame of the scene, by its curves; None for a lamp without curves,
-    and for one whose temperature they move.
+    """Return the light (3,) of a lamp in the first frame of the scene, by its curves; at the brightest key for a lamp
+    that is off in the first frame.
 
-    For a lamp that is off in the first frame it is its light at the brightest key.
+    None for a lamp without curves of power or colour, and for one whose temperature is animated.
     """
     curves = [curve for curve in _curves(data) if curve.data_path in _POWER_PATHS]
     if not curves or _has_moving_temperature(data):
@@ -219,10 +220,9 @@ def _has_moving_temperature(data: Any) -> bool:
 
 
 def measure_references(scene: Any, item: Any) -> None:
-    """Store the references of a flare: the distance of its light now, and the power of its lamp, in the first frame of
-    the scene for a driven lamp, else now.
+    """Store the references of a flare: the distance of its light and the power of its lamp at the current frame.
 
-    For a driven lamp this moves the timeline to the first frame and back.
+    The power of a driven lamp is that of the scene's first frame: the timeline moves there and back.
     """
     target = item.target
     item.reference_distance = _camera_distance(scene, target)

@@ -52,7 +52,7 @@ def _wrap(text: str, width: int) -> list[str]:
         if word and len(line) + len(word) + 1 <= width:
             line = f"{line} {word}".strip()
             continue
-        while len(line) > width + 4:  # a short rest stays on the line
+        while len(line) > width + 4:  # up to four letters too many stay on the line
             lines.append(line[:width])
             line = line[width:]
         lines += [line] if line else []

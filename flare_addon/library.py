@@ -127,7 +127,8 @@ def write_png(path: Path, display: NDArray[np.float32]) -> None:
 def menu_items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, int, int]]:
     """Return the items of the preview menu: file, name, notes, icon, number. They are cached until a file changes.
 
-    Writes the thumbnails that flares of the user lack.
+    Also writes the missing thumbnails of the user's flares. number: identifies the entry, whatever other files there
+    are.
     """
     global _previews, _items, _stamps
     stamps = []
@@ -145,7 +146,7 @@ def menu_items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, 
     _previews.clear()
     entries = []
     for name, _ in stamps:
-        number = zlib.crc32(name.encode("utf-8", "surrogateescape")) & 0x7FFFFFFF  # does not depend on the other files
+        number = zlib.crc32(name.encode("utf-8", "surrogateescape")) & 0x7FFFFFFF  # of the name alone, so it stays
         path = Path(name)
         try:
             look = read_look(path)

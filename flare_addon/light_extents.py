@@ -20,8 +20,8 @@ Floats = NDArray[np.float64]
 def extent_of(item: Any, depsgraph: Any, matrix: Any) -> LightExtent | None:
     """Return the extent of a flare's light object in Blender's world, about the object's origin; None for a point.
 
-    By default only area lights have one. matrix: matrix_world of the object. Raises CaptureError for an object whose
-    shape cannot be used.
+    Unless the artist chooses otherwise, only area lights have an extent. matrix: matrix_world of the object. Raises
+    CaptureError for an object whose shape cannot be used.
     """
     target = item.target
     if is_point(item):
@@ -48,7 +48,7 @@ def _extent_of_lamp(data: Any, linear: Floats) -> LightExtent | None:
     if data.type == "AREA":
         wide = data.size
         high = data.size_y if data.shape in ("RECTANGLE", "ELLIPSE") else wide
-        # Half axes in this order, since the core's light emits along their cross product, and Blender's along its -Z.
+        # The core's light emits along the cross product of its axes, Blender's along its -Z: hence the minus below.
         wide *= math.copysign(1, float(np.linalg.det(linear)))  # a mirrored lamp shines along its -Z, too
         axes = np.array([linear @ (wide / 2, 0, 0), linear @ (0, -high / 2, 0)])
         if not np.linalg.norm(axes, axis=1).all():
@@ -56,7 +56,7 @@ def _extent_of_lamp(data: Any, linear: Floats) -> LightExtent | None:
         make = LightExtent.rectangle if data.shape in ("SQUARE", "RECTANGLE") else LightExtent.ellipse
         return make(axes, one_sided=True)
     if data.type == "SUN":
-        return None  # its light comes from all of the sky's disc, which is smaller than a ghost
+        return None  # the sun's disc in the sky is smaller than any ghost
     radius = float(data.shadow_soft_size) * float(np.cbrt(abs(np.linalg.det(linear))))
     return LightExtent.sphere(radius) if radius > 0 and math.isfinite(radius) else None
 

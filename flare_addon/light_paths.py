@@ -55,10 +55,10 @@ def world_paths(scene: Any, items: Mapping[str, Any], numbers: Mapping[str, int]
                 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Return the keys of the lights that move or change, by name and by picture: {"xyz": [x, y, z], "on": 0..1}.
 
-    The scene goes to the frame of each picture, and back afterwards. "on" is the power relative to the light's largest
-    one. A light that stands has keys without xyz, one that does not change has keys without on. items: light objects by
-    name. numbers: frames of the scene by picture. position_of: returns the position (3,) of an object at the scene's
-    current frame, in the capture's coordinates.
+    The timeline moves to the frame of each picture, and back afterwards. "on" is the light's power relative to its
+    largest. A light that stands has keys without xyz, one that does not change has keys without on. items: light
+    objects by name. numbers: frames of the scene by picture. position_of: returns the position (3,) of an object at the
+    scene's current frame, in the capture's coordinates.
     """
     animated = {name: item for name, item in items.items()
                 if may_move(item, scene.fit_flare.root) or has_animated_light(item)}
@@ -91,7 +91,7 @@ def _power(item: Any) -> float:
 def _path_keys(names: Sequence[str], positions: Sequence[Any], powers: Sequence[float]) -> dict[str, dict[str, Any]]:
     """Return the keys of a light by picture; {} if it neither moves nor changes.
 
-    names: of the pictures. positions (3,), powers: of the light in each.
+    names: the pictures' names. positions (3,), powers: those of the light in each picture.
     """
     xyz = np.array(positions)
     is_standing = np.ptp(xyz, axis=0).max() <= MAX_STANDING_MOTION * max(1.0, float(np.abs(xyz).max()))
@@ -112,8 +112,8 @@ def merge_entry(known_entry: Mapping[str, Any], name: str, xyz: Sequence[float],
     """Return the entry of a light for lights.json.
 
     known_entry: its entry so far, whose other values stay. xyz: its place if it stands. keys: from `world_paths`.
-    Brightness and confidence of the entry stay where the scene does not animate them. A place that an artist corrected
-    is no longer doubtful.
+    Brightness and confidence of the entry stay where the scene does not animate them; but a place that was moved loses
+    its confidence, since an artist has corrected it.
     """
     known_frames = known_entry.get("frames") or {}
     has_path = any("xyz" in key for key in keys.values())
@@ -174,8 +174,8 @@ def clip_folder(clip: Any) -> Path:
 
 
 def _picture_names(clip: Any) -> dict[int, str]:
-    """Return the names of a clip's pictures by frame of the clip: frame 1 is the file that the clip names, moved on by
-    its frame offset."""
+    """Return the names of a clip's pictures by frame of the clip. Frame 1 is the file that the clip names, or, with a
+    frame offset, as many files after it. Raises CaptureError where that file is missing."""
     path = absolute(clip.filepath, clip.library)
     numbered = {frame.view: frame.number for frame in number_views(PictureIndex(path.parent).names)
                 if "/" not in frame.view}  # pictures of subfolders are not of the clip
@@ -220,9 +220,9 @@ def _track_frames(track: Any, names: Mapping[int, str], size: tuple[int, int],
                   known_frames: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return the keys of a track's markers by picture, without muted ones.
 
-    A marker that stays within MAX_UNMOVED_PX was not moved, and keeps place, brightness and confidence; another one
-    keeps its brightness. names: of the pictures, by frame of the clip. size: of the pictures, pixels. known_frames: the
-    keys of the light so far.
+    A marker within MAX_UNMOVED_PX of the known place was not moved: it keeps place, brightness and confidence. A marker
+    that was moved keeps its brightness alone. names: pictures by frame of the clip. size: (width, height) of the
+    pictures. known_frames: the keys of the light so far, by picture.
     """
     frames: dict[str, dict[str, Any]] = {}
     width, height = size

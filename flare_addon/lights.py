@@ -141,7 +141,7 @@ def write_to_capture(scene: Any, folder: Path) -> int:
 
 
 def remember_names(scene: Any) -> None:
-    """Store the names of the scene's lights, so that one that is missing later is known to have been removed."""
+    """Add the names of the scene's lights to those that it stores: a stored light that is missing later was removed."""
     state = scene.fit_flare
     names = {*state.known_lights.split("\n"), *map(light_name, scene_lights(scene))} - {""}
     if not state.is_property_set("known_lights") and state.capture:  # a .blend of an earlier version had all of them
@@ -206,9 +206,9 @@ def _move_to(light: Any, xyz: ArrayLike) -> None:
 def move_to_fit(scene: Any, fitted: Mapping[str, ArrayLike], capture: Path | None) -> None:
     """Move lights to their positions from a fit.
 
-    Only lights that are still at their position in the capture's lights.json, from which the fit started, are moved,
-    and none that is animated or has another parent than the root. fitted: positions (3,) by name, in the capture's
-    coordinates. capture: its folder; None moves nothing.
+    Only lights that are still where the capture's lights.json, from which the fit started, has them are moved; none
+    that is animated or has another parent than the root. fitted: positions (3,) by name, in the capture's coordinates.
+    capture: its folder; None moves nothing.
     """
     path = None if capture is None else capture / LIGHTS
     captured = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}

@@ -64,7 +64,7 @@ def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add:
 
     A light of the look without a flare gets one if a light object has its name, or if the scene had no flare at all.
     Flares without a light object are placed at the objects `targets`. add: each remaining target gets a flare of its
-    own. A target that has a flare gets no second one.
+    own. Targets that have a flare already are skipped.
     """
     path = Path(path)
     look = read_look(path)
@@ -157,7 +157,7 @@ def _new_flare(state: Any, look: Look, light: LightLook) -> Any:
 def edits_to_store(state: Any, look: Look) -> LookEdits:
     """Return the edits of the scene by the names of the look's lights, as a file of the library stores them.
 
-    Where several flares have the look of one light, those of the chosen flare count, else those of the first one.
+    Where several flares have the look of one light, the edits of the chosen flare are taken, else those of the first.
     """
     edits, sources = edits_of(state), {item.source: item.name for item in reversed(state.lights)}
     if 0 <= state.light < len(state.lights):
@@ -202,7 +202,7 @@ def _is_of_this_capture(look: Look, state: Any, objects: dict[str, Any], depsgra
         return all(
             np.linalg.norm(capture_position(objects[light.name], root, depsgraph) - light.xyz) < 0.05 * camera_span
             for light in shared)
-    except CaptureError:  # the position of one is unknown
+    except CaptureError:  # a light is disabled, so its position is unknown
         return False
 
 
@@ -277,7 +277,7 @@ def place_lights(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.fl
 def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.float64], item: Any, *,
                 hides: bool, rendered: set[Any]) -> PlacedLight:
     """Return the light of a flare as a camera sees it. Of a light with an extent, `shares` has the visible share of
-    each cell, and its visibility is 1.
+    each cell, and the visibility is 1.
 
     Raises CaptureError where the light's object is disabled, so that its place is unknown, unless its flare is dark.
     camera: matrix_world of the camera. to_capture: matrix (4, 4) from Blender's world to the coordinates of the result.
@@ -315,7 +315,7 @@ def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | 
                     budget: OffsetsBudget | None = None) -> dict[str, PlaneGaussians]:
     """Evaluate every flare of the scene for a camera object at the current frame; return the Gaussians by flare's name.
 
-    edits: in place of those of the scene's sliders. budget: see `Look.evaluate_lights`.
+    edits: in place of those of the scene's sliders. budget: bounds the time for the network; None for exact flares.
     Raises FlareFileError and CaptureError.
     """
     look = look_of(scene)

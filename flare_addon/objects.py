@@ -18,8 +18,8 @@ def world_matrix(obj: Any, depsgraph: Any) -> Any:
     """Return the current matrix_world of an object, also of a disabled one, which Blender does not update.
 
     Disabled means off in the viewport or in an excluded collection. For an object of another scene this is the matrix
-    of that scene's last update. Raises CaptureError for a disabled object of this scene that animation, constraints or
-    a parent other than an object move.
+    of that scene's last update. Raises CaptureError for a disabled object of this scene that is moved by animation,
+    by constraints, or by a parent other than an object.
     """
     if not _is_disabled(obj, depsgraph.view_layer):
         return obj.evaluated_get(depsgraph).matrix_world

@@ -100,11 +100,14 @@ def visible_points(scene: Any, depsgraph: Any, eye: Any, item: Any, points: NDAr
 
 def _is_clear(scene: Any, depsgraph: Any, eye: Any, direction: Any, distance: float, ignored: set[str],
               instances: Collection[tuple[str, Any]]) -> bool:
-    """Return whether nothing hides a light at this distance from `eye` in a direction; see `disc_visibility`."""
+    """Return whether nothing hides a light at this distance from `eye` in a direction (unit vector).
+
+    ignored: names of objects that hide nothing. instances: the same, by name and matrix_world.
+    """
     from mathutils import Vector
 
     start, remaining = Vector(eye), (1 - LIGHT_MARGIN) * distance
-    for _ in range(4):  # past the lamp's own meshes; after four of them the light counts as visible
+    for _ in range(4):  # passes up to four surfaces that hide nothing; after these the light counts as visible
         hit, hit_point, _normal, _index, obj, matrix = scene.ray_cast(depsgraph, start, direction, distance=remaining)
         if not hit:
             return True

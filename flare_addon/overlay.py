@@ -135,8 +135,8 @@ _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
 def make_quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ring: Floats, arcs: Floats) -> Quads:
     """Return a quad about each ellipse, in their order.
 
-    centres (n, 2) px, covariances (n, 3) xx, xy, yy in px², radii (n,) Mahalanobis, arcs (n, 2) px. light (n, 3) and
-    ring (n, 3): as in `Quads`.
+    centres (n, 2) px, covariances (n, 3) xx, xy, yy in px², radii (n,) Mahalanobis, arcs (n, 2) px. light (n, 3):
+    colour times opacity. ring (n, 3): r0, w and opacity.
     """
     centres, covariances, radii, arcs = (np.asarray(item, np.float32) for item in (centres, covariances, radii, arcs))
     xx, xy, yy = covariances.T
@@ -294,8 +294,8 @@ def composite_levels(buffers: list[Any], box: tuple[float, float, float, float],
                      space: NDArray[np.float64]) -> None:
     """Add rendered levels to the bound framebuffer, inside box (left, bottom, right, top; 0..1 of its size).
 
-    buffers: of `render_levels`. With the blend "over" they hold display values, which the shader converts to linear
-    light. space: matrix (3, 3) from linear Rec. 709 to the framebuffer's space.
+    buffers: one for each level, full size first. With the blend "over" they hold display values, which the shader
+    converts to linear light. space: matrix (3, 3) from linear Rec. 709 to the framebuffer's space.
     """
     import gpu
     from gpu_extras.batch import batch_for_shader
@@ -317,8 +317,8 @@ def composite_levels(buffers: list[Any], box: tuple[float, float, float, float],
 
 
 def _remember_buffer() -> None:
-    """Remember the framebuffer that Blender draws the scene of this region into; while it draws overlays, it is not
-    bound."""
+    """Remember the framebuffer into which Blender draws the scene of this region, since `_draw` is called with the
+    overlay's bound."""
     global _scene_buffer
     import gpu
 

@@ -44,8 +44,9 @@ def frames_to_bake(scene: Any) -> list[int]:
 class ShotReading:
     """Reads the cameras, lights and sliders of a scene as a shot, one frame a step; each step moves the timeline.
 
-    Without camera objects it reads the scene's camera, which markers on the timeline may change, under the name of the
-    first one. It refers to the scene and to the cameras by name, since an undo replaces them. total, done: frames.
+    Without camera objects it reads the scene's camera, which markers on the timeline may change; all frames then have
+    the name of the first one. Scene and cameras are referred to by name, since an undo replaces the objects. total,
+    done: numbers of frames.
     """
 
     def __init__(self, scene: Any, camera_objects: Sequence[Any], frames: Sequence[int]) -> None:

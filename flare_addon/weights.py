@@ -64,8 +64,9 @@ def environment() -> dict[str, str]:
 
 
 def source_url() -> str:
-    """Return the address of the weights in the repository that the extension was installed from; "" where it has none,
-    as Blender's own and one on disk."""
+    """Return the address of the weights in the repository that the extension was installed from.
+
+    "" for Blender's own repository and one on disk, which have no weights, and without a repository."""
     # The package of an installed extension is bl_ext.REPOSITORY.fit_flare.
     module = PACKAGE.split(".")[1] if PACKAGE.count(".") == 2 else ""
     for repository in bpy.context.preferences.extensions.repos:

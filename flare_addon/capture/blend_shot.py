@@ -44,10 +44,10 @@ def read_shot(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[in
               done: Callable[[], None] = lambda: None) -> Shot:
     """Return the shot of the scene's active camera at these frames, in the coordinates of Blender's world.
 
-    Markers may change the camera; the shot has the name of the scene. names: objects that are lights; without any, the
-    scene's lamps. radius: radius of the lights' discs for soft occlusion, world units; 0 for that of the flare or lamp,
-    else a part of the distance. done: called after each frame. Raises CaptureError for a scene without a camera, a
-    light or a named object.
+    Markers may change the camera; the frames are named after the scene. names: objects that are lights; without any,
+    the scene's lamps. radius: radius of the lights' discs for soft occlusion, world units; 0 for that of the flare or
+    lamp, else a part of the distance. done: called after each frame. Raises CaptureError for a scene without a camera,
+    a light or a named object.
     """
     light_objects = _light_objects(scene, names)
     if not light_objects:
@@ -162,7 +162,8 @@ def write_capture(scene: Any, plates: Mapping[int, Path], folder: Path, names: S
 
     lights.json is written where there are lights (`names`, or the scene's lamps): each at its place, or along its path
     where it moves, with its brightness by frame where that changes. plates: the picture of each frame. done: called
-    after each frame. Raises CaptureError where the scene has no camera, and as `exporter.write_frames` does.
+    after each frame. Raises CaptureError where the scene has no camera or no points, and where the folder or a plate
+    cannot be used.
     """
     _active_camera(scene)
     light_objects = _light_objects(scene, names)

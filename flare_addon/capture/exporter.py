@@ -29,7 +29,7 @@ from .. import cameras
 from ..paths import absolute, blend_relative
 
 MAX_POINTS = 100_000
-"""Points above whose double a cloud is thinned."""
+"""Most points of a cloud; a larger one is thinned to every second, third, ... point."""
 MAKER = "Fit Flare"
 """The value of made_by in a transforms.json from here; only such a file is overwritten."""
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")
@@ -58,7 +58,7 @@ def footage_of(camera: Any) -> Footage | None:
         if background.source == "IMAGE" and background.image is not None and background.image.source == "SEQUENCE":
             user, path = background.image_user, absolute(background.image.filepath, background.image.library)
             match = _NUMBER.search(path.stem)
-            # The sequence shows file number `frame - frame_start + 1 + frame_offset`; the number is this file's.
+            # Blender shows file number frame - frame_start + 1 + frame_offset: solved for the frame of this file.
             start_frame = user.frame_start - user.frame_offset - 1 + int(match[1]) if match else user.frame_start
             return Footage(path, start_frame)
         if background.source == "MOVIE_CLIP" and background.clip is not None and background.clip.source == "SEQUENCE":
@@ -245,7 +245,7 @@ def bundle_matrix(camera: Any) -> Any:
 def scene_points(scene: Any, camera: Any) -> np.ndarray[Any, Any]:
     """Return the points (n, 3) of the clip's solved tracks and of the scene's meshes, in Blender's world.
 
-    Of more than 2 MAX_POINTS, every second, third, ... is returned.
+    Of more than MAX_POINTS, every second, third, ... point is returned.
     """
     clouds: list[np.ndarray[Any, Any]] = []
     for background in camera.data.background_images:

@@ -122,7 +122,7 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
 def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) -> Steps[Imported]:
     """Import a capture as `import_capture` does, in steps.
 
-    What a generator that is closed or fails has added is removed.
+    If the generator fails or is closed early, all that it added is removed.
     """
     folder = find_capture(folder)
     capture = yield from Capture.open_in_steps(folder, need_frames=settings.frames)
@@ -215,7 +215,7 @@ def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, se
                  notes: list[str]) -> Steps[tuple[Any, ...]]:
     """Add the cameras, with animation and frames as the settings say, in steps; append warnings to `notes`.
 
-    extent: of the capture, world units; cameras are drawn at a part of it.
+    extent: size of the capture, world units, relative to which the cameras are drawn.
     """
     numbered_views = number_views(view.name for view in capture.views)
     frame_numbers = {frame.view: frame.number for frame in numbered_views}
@@ -272,7 +272,7 @@ def camera_differences(all_cameras: Sequence[Camera]) -> Iterator[str]:
 def _add_camera(collection: Any, root: Any, name: str, view: View, aspect: tuple[float, float], size: float) -> Any:
     """Add a camera object with the intrinsics and the pose of a view; return it.
 
-    aspect: the scene's pixel aspect. size: of the drawn camera, units of the capture.
+    aspect: the scene's pixel aspect (x, y). size: display size of the camera, units of the capture.
     """
     data = bpy.data.cameras.new(name)
     data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR

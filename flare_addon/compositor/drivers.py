@@ -157,8 +157,8 @@ def _slider(scene: Any, path: str) -> tuple[Any, str]:
 def _count_solos(scene: Any, node: Any, flare_indices: Sequence[int]) -> tuple[Any, str]:
     """Drive a property of the node by the number of solo flares; return its data block and path.
 
-    flare_indices: of the flares that have layers. The expression of each Gain could not hold all flares, since it is
-    limited to 255 characters.
+    flare_indices: indices of the flares that have layers. The sum is a property of its own, since an expression,
+    limited to 255 characters, could not name all flares.
     """
     node[SOLOS] = 0.0
     driver = node.driver_add(f'["{SOLOS}"]').driver
@@ -166,7 +166,7 @@ def _count_solos(scene: Any, node: Any, flare_indices: Sequence[int]) -> tuple[A
     for index in flare_indices:
         _add_variable(driver, f"s{index}", *_slider(scene, f"lights[{index}].solo"))
     path = f'nodes["{GROUP}"]["{SOLOS}"]'
-    return (node.id_data, path) if GROUPS_ARE_TREES else (scene, f"node_tree.{path}")  # which owns the tree
+    return (node.id_data, path) if GROUPS_ARE_TREES else (scene, f"node_tree.{path}")  # the scene owns its tree
 
 
 def _drive(node: Any, name: str, index: int, expression: str, variables: dict[str, tuple[Any, str]]) -> None:

@@ -92,7 +92,7 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
         tree.links.new(sockets[name], node.inputs[name])
     end = _final_input(tree)
     final_picture = _feeding_socket(end)
-    # Set up earlier, perhaps with nodes of the artist after it.
+    # Whether our node was set up earlier; the artist may have added nodes after it.
     is_set_up = final_picture is not None and _depends_on(final_picture.node, node)
     artists_picture = final_picture
     if is_set_up or final_picture is None or _is_ours(final_picture.node):
@@ -120,7 +120,7 @@ def _add_viewer(tree: Any, node: Any) -> None:
 
 
 def _change_inputs(tree: Any, node: Any, layer_names: Sequence[str]) -> None:
-    """Give our node the inputs of these layers. Inputs that stay keep values, links and animation."""
+    """Give our node the inputs of these layers. Inputs that stay keep values and animation, and sliders their links."""
     old_names = [socket.name for socket in node.inputs]
     sliders = {name: (_input_value(node, name), _feeding_socket(node.inputs[name])) for name in old_names
                if name in ("Intensity", "Tint") or layer_of_gain(name)}
@@ -266,10 +266,10 @@ def _image_under_flare(tree: Any, node: Any, state: Any) -> Any:
 
 def _undo_set_up(scene: Any, tree: Any, source: Any, node_settings: dict[str, Any] | None,
                  state: dict[str, Any]) -> None:
-    """Restore the scene after files without flare layers.
+    """Restore the compositor after the files turned out to hold no flare layers.
 
-    source: the node that shows the layers. node_settings: its previous settings, None where it is new. state: from
-    `_scene_state`.
+    source: the node that shows the layers. node_settings: its previous settings, None where it is new. state: the
+    compositor's state before, from `_scene_state`.
     """
     image = source.image
     if node_settings is not None:

@@ -116,9 +116,9 @@ def input_sockets(tree: Any) -> list[Any]:
 
 
 def incoming_picture(tree: Any, name: str) -> Any:
-    """Return the socket of the picture that comes into an effect's tree, of its Group Input node; None before 5.3.
+    """Return the output socket of an effect tree's Group Input node, which has the picture of the effects before it.
 
-    The tree's input and the node are added where they are missing. name: of a node that is added.
+    None before Blender 5.3. The tree's input and the node are added where they are missing; name: of an added node.
     """
     if not HAS_EFFECTS:
         return None

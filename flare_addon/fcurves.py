@@ -10,7 +10,8 @@ import bpy
 
 
 def fcurves_of(block: Any) -> list[Any]:
-    """Return the collections of F-curves that animate a data block; from 4.4 on those of its slot in the action."""
+    """Return the collections of F-curves that animate a data block; from Blender 4.4 on, of the block's slot in
+    the action."""
     data = block.animation_data
     if data is None or data.action is None:
         return []

@@ -80,6 +80,7 @@ class Job:
 
     def __init__(self, kind: str, folder: Path, origin: Origin, args: Sequence[str] = (),
                  process: subprocess.Popen[bytes] | None = None) -> None:
+        """process: the running process, if this Blender started it."""
         self.kind, self.folder, self.origin = kind, folder, origin
         self.args = [arg for arg in args if arg != "--overwrite"]
         self.state: State = "running"
@@ -249,9 +250,9 @@ def start_job(kind: str, folder: Path, command: Sequence[str], environment: Mapp
               args: Sequence[object] = ()) -> Job:
     """Start a command whose events go to `folder`, and follow it.
 
-    args: the arguments that identify the job. environment: of the process; None for Blender's. Without a window this
-    waits for the end of the job. Raises EngineError where the command cannot be started, RunError where the folder
-    cannot be written or a job runs in it.
+    args: the arguments that identify the job. environment: variables of the process; None for Blender's. Without a
+    window this waits for the end of the job. Raises EngineError where the command cannot be started, RunError where the
+    folder cannot be written or a job runs in it.
     """
     earlier_job = find_job(folder)
     if earlier_job is not None and earlier_job.running:

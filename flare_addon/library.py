@@ -185,6 +185,7 @@ def register() -> None:
 
 
 def unregister() -> None:
+    """Remove the menu's property, and free the thumbnails."""
     global _previews, _stamps
     del bpy.types.WindowManager.fit_flare_library
     if _previews is not None:

@@ -162,7 +162,7 @@ def capture_of_moving_lights(folder: Path, lights: Sequence[Light]) -> tuple[Cap
 
 
 def clip_folder(clip: Any) -> Path:
-    """Return the folder for the lights.json of a clip: that of the capture whose images/ it shows, or of the pictures.
+    """Return the folder for a clip's lights.json: the capture whose images/ it shows, else the folder of the pictures.
 
     Raises CaptureError for a video, whose frames have no names.
     """

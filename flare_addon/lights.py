@@ -63,7 +63,7 @@ def light_position(light: Any, matrix: Any, eye: Any) -> Any:
 
 
 def add_to_scene(scene: Any, position: Any, name: str = "") -> Any:
-    """Add a light at a point (3,) of Blender's world; return its object. Raises CaptureError as `world_matrix` does."""
+    """Add a light at a point (3,) of Blender's world; return its object. Raises CaptureError for a disabled root."""
     state = scene.fit_flare
     root = state.root
     used_names = {light_name(item) for item in scene_lights(scene)}

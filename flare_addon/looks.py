@@ -114,7 +114,7 @@ def _stored_edits(scene: Any) -> LookEdits:
 
 
 def _change_look(scene: Any, before: LookEdits, look: Look) -> None:
-    """Give each flare a light of the look: the one of the same name, else the one with the same number.
+    """Give each flare a light of the look: the light of the same name as before, else the light with the same number.
 
     before: the edits in the earlier file. Sliders that still have these values get the values of the look's file. A
     flare without a light object is removed where another flare has the look of its light.
@@ -315,7 +315,7 @@ def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | 
                     budget: OffsetsBudget | None = None) -> dict[str, PlaneGaussians]:
     """Evaluate every flare of the scene for a camera object at the current frame; return the Gaussians by flare's name.
 
-    edits: in place of those of the scene's sliders. budget: bounds the time for the network; None for exact flares.
+    edits: in place of the edits of the scene's sliders. budget: bounds the time for the network; None for exact flares.
     Raises FlareFileError and CaptureError.
     """
     look = look_of(scene)

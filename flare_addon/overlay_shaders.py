@@ -9,8 +9,8 @@ from typing import Any
 def gaussian_shader() -> Any:
     """Compile the shader that draws the quads of Gaussians (`overlay.Quads`).
 
-    size: of the level, pixels. is_over: 1 for the blend "over", else 0. Pixels below the rasterizer's thresholds
-    ALPHA_MIN and PROFILE_MIN (core/conventions/splatting.py) are discarded.
+    Its push constants are size, that of the level in pixels, and is_over, 1 for the blend "over", else 0. Pixels below
+    the rasterizer's thresholds ALPHA_MIN and PROFILE_MIN (core/conventions/splatting.py) are discarded.
     """
     import gpu
 
@@ -49,8 +49,9 @@ def gaussian_shader() -> Any:
 def sum_shader(levels: Sequence[int]) -> Any:
     """Compile the shader that adds up the buffers of levels, given by the divisors of their size.
 
-    box: where the sum is drawn, left, bottom, right, top, 0..1 of the framebuffer. extent: size of the drawn region,
-    pixels. is_display: 1 where the buffers hold display values. working_space: matrix from linear Rec. 709.
+    Its push constants are box, where the sum is drawn (left, bottom, right, top, 0..1 of the framebuffer); extent, the
+    size of the drawn region in pixels; is_display, 1 where the buffers hold display values; and working_space, the
+    matrix from linear Rec. 709.
     """
     import gpu
 

@@ -58,7 +58,7 @@ def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str
     """Render frames through the compositor, each to a half-float EXR and an 8 bit PNG, written atomically.
 
     path_of: the file for a frame's number and a suffix (".exr", ".png"). The EXR is scene-linear, the PNG is as the
-    scene's view transform shows it (see `set_plain_view`). done: called after each frame. Raises FrameError.
+    scene's view transform shows it. done: called after each frame. Raises FrameError.
     """
     if hasattr(scene.render, "compositor_device"):
         scene.render.compositor_device = "CPU"

@@ -145,7 +145,7 @@ def _edits_of_lights(edits: LookEdits, names: set[str]) -> LookEdits:
 def live_record(state: Any, names: Sequence[str]) -> dict[str, list[str]]:
     """Return the contents of LIVE_FILE: the names of the baked lights, and ids that stay when a flare is renamed.
 
-    A flare without an id gets one. state: the scene's properties. names: of the baked lights.
+    A flare without an id gets one. state: the scene's properties. names: the names of the baked lights.
     """
     identities = {}
     for item in state.lights:
@@ -157,7 +157,7 @@ def live_record(state: Any, names: Sequence[str]) -> dict[str, list[str]]:
 def live_layers(state: Any, folder: Path) -> dict[str, int] | None:
     """Return the index of the scene's flare for each layer that was baked without intensity and tint.
 
-    state: the scene's properties. folder: of the layers, or of those of one camera, whose parent has the LIVE_FILE.
+    state: the scene's properties. folder: the folder of a bake, or of one camera's layers in it.
     Layers of removed flares are left out. None where neither the folder nor its parent has a readable LIVE_FILE.
     """
     folder = next((candidate for candidate in (folder, folder.parent) if (candidate / LIVE_FILE).is_file()), folder)

@@ -52,7 +52,7 @@ def draw_frame(context: Any, space: Any, region: Any) -> NDArray[np.float32]:
     """Draw the present frame of the scene's camera with the shading of a 3D view; return pixels (height, width, 4),
     scene-linear, row 0 at the bottom.
 
-    space, region: of the 3D view. Needs a GPU context. Raises FitFlareError.
+    space, region: the 3D view's. Needs a GPU context. Raises FitFlareError.
     """
     import gpu
 

@@ -73,7 +73,8 @@ def _anchor(heading: str) -> str:
 
 
 def _link_to_pages(tokens: Sequence[Token]) -> list[Token]:
-    """Return inline tokens with links to the handbook's pages, without those that leave the handbook."""
+    """Return inline tokens with links to Markdown files turned into links to pages; links that leave the handbook
+    become plain text."""
     result, leaves_handbook = [], False
     for token in tokens:
         if token.type == "link_open":

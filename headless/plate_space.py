@@ -37,8 +37,8 @@ def named_space(args: argparse.Namespace) -> ColourSpace | None:
 
 
 def space_of_plates(args: argparse.Namespace, plates: Sequence[Path], progress: Progress) -> ColourSpace | None:
-    """Return the space to read plates in: the one that the option names, else that which their capture keeps; None for
-    what the files declare, as with auto.
+    """Return the space to read plates in: as the option names it, else as the plates' capture records it. None, also
+    with the option "auto", for what the files declare. Reports a recorded space.
 
     Raises SettingsError where plates belong to captures that keep different spaces, and CaptureError for a damaged
     record.

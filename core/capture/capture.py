@@ -125,7 +125,7 @@ class Capture:
     @classmethod
     def open_in_steps(cls, folder: Path | str, *, need_frames: bool = True, cache_bytes: int = 1 << 30,
                       need_cameras: bool = True, focal: float | None = None) -> Steps[Capture]:
-        """Read a capture as `open` does, in steps: camera solve, frames by their poses, views, lights, checks."""
+        """Read a capture as `open` does, as a generator that pauses between short steps and returns the capture."""
         folder = Path(folder)
         check_is_folder(folder)
         solve, focal_source = (yield from read_solve_in_steps(folder, required=need_cameras)), "solved"

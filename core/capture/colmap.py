@@ -76,7 +76,7 @@ def read_model(folder: Path) -> tuple[list[PosedFrame], PointCloud]:
 
 
 def read_model_in_steps(folder: Path) -> Steps[tuple[list[PosedFrame], PointCloud]]:
-    """Read a model as `read_model` does, in steps."""
+    """Read a model as `read_model` does, as a generator that pauses between short steps and returns the result."""
     lenses = yield from _read_file(folder, "cameras", _read_cameras_bin, _read_cameras_txt)
     images = yield from _read_file(folder, "images", _read_images_bin, _read_images_txt)
     points, point_ids = ((yield from _read_file(folder, "points3D", _read_points_bin, _read_points_txt))

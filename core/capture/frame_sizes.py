@@ -17,7 +17,7 @@ def checked_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> t
     """Return the size (width, height) of a frame's picture, turned as it was for the camera solve.
 
     turned: given where the solve saw the picture turned by its Exif orientation; None where it saw the stored pixels.
-    Raises FrameError where the aspect differs from that of `lens`, and for a kind of file that is not read.
+    Raises FrameError where its aspect is not the lens's, and for a kind of file that is not read.
     """
     size = turned.upright_size if turned else picture_size(path)
     if not same_aspect(size, (lens.width, lens.height)):

@@ -296,7 +296,7 @@ def _read_applied_transform(path: Path, meta: dict[str, Any]) -> Floats:
 
 
 def _fit_similarity(model: Sequence[PosedFrame], frames: Sequence[PosedFrame]) -> Floats | None:
-    """Return (4, 4), the similarity that takes the cameras of a COLMAP model to those of the same names in the file.
+    """Return (4, 4), the similarity from the cameras of a COLMAP model to the cameras of the same names in the file.
 
     None where fewer than three share a name, where all lie in one place, or where they do not match within
     MAX_MISMATCH of their extent.

@@ -259,7 +259,11 @@ class Look:
 
 
 def network_query(light: LightLook, view: ViewOfLight, query: Query) -> ViewOfLight | None:
-    """Return the view at which the network is evaluated, see `Look.evaluate_lights`; None for `view` itself."""
+    """Return the view at which the network is evaluated; None for `view` itself.
+
+    query: "target" for `view` itself; "trained" for its camera and light, clipped to the range of the training views;
+    "source" for the middle of the range of cameras, and the clipped light.
+    """
     if query == "target":
         return None
     query_range = light.query_range

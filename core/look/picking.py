@@ -69,7 +69,7 @@ def brightest_element(look: Look, lights: Sequence[PlacedLight], flares: Mapping
     """Return the names of the placed light and of its element that has most light at a point (2,), px; None where no
     element has MIN_LIGHT.
 
-    flares: of the placed lights with these edits, as `Look.evaluate_lights` returns them.
+    lights: the placed lights. flares: their Gaussians by name, as `Look.evaluate_lights` returns them with these edits.
     """
     gaussians_of_all = concatenate(list(flares.values()))
     if gaussians_of_all is None:

@@ -94,8 +94,8 @@ def evaluate_placed(light: PlacedLight, world_to_camera: ArrayLike, blend: Blend
                     pixel_grid: PixelGrid | None = None) -> PlaneGaussians | None:
     """Return the plane Gaussians of a placed light; None if it is hidden, dark or behind the camera.
 
-    evaluate: returns the flare of a point; None for no flare. pixel_grid: of the look's fit. The Gaussians of a light
-    with an extent are those of its visible cells, one cell after the other.
+    evaluate: returns the flare of a point; None for no flare. pixel_grid: the one of the look's fit. For a light with
+    an extent, the Gaussians of its visible cells follow each other, cell by cell.
     """
     if light.visibility <= 0 or not any(light.factor):
         return None
@@ -175,8 +175,8 @@ def multiply_light(gaussians: PlaneGaussians, factor: ArrayLike, blend: Blend) -
 def _fit_motions(parts: Sequence[PlaneGaussians], positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how each Gaussian moves with the light (n, 2, 2), by least squares over the cells.
 
-    parts: the flare of each cell. positions (k, 2): of the cells on the plane. Element [i, a, b] is the derivative of
-    coordinate a of Gaussian i by coordinate b of the light."""
+    parts: the flare of each cell. positions (k, 2): centres of the cells on the plane. Element [i, a, b] is the
+    derivative of coordinate a of Gaussian i by coordinate b of the light."""
     means = np.stack([part.means for part in parts]).astype(np.float64)
     offsets = positions - positions.mean(0)
     # The cut-off leaves out the direction across a light that is seen as a line: there is no motion to measure.

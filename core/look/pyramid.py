@@ -151,8 +151,8 @@ def draw_layers(look: Look, flares: Mapping[str, PlaneGaussians], intrinsics: Ar
                 height: int) -> dict[str, Floats]:
     """Return the scene-linear light (height, width, 3) of each light's flare over black; the layers add up.
 
-    With the blend "over" a light's layer is the increase of the picture when that light is put before those that follow
-    it, as in `core.flare.compositing.linear_layers`; it is negative where that light covers a brighter flare.
+    With the blend "over" a light's layer is the increase of the picture's light when its flare is drawn over the flares
+    of the lights after it; it is negative where that flare covers a brighter one.
     """
     if look.blend == "add":
         return {name: draw_added(gaussians, look, intrinsics, width, height) for name, gaussians in flares.items()}

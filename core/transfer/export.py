@@ -93,7 +93,7 @@ def make_preset(look: Look, views: Mapping[str, ViewOfLight], edits: LookEdits |
                 camera: Camera | None = None) -> dict[str, Any]:
     """Return the look as a preset of elements for procedural flare tools, for one view of each light.
 
-    views: by the light's name. camera: of the picture, by default the training camera. The parts of an element:
+    views: by the light's name. camera: the picture's, by default the training camera. A part of an element has:
 
     offset      along the axis: 0 at the light, 1 at the principal point, 2 at the mirror image (1 - mu)
     aside       across the axis, picture widths
@@ -144,7 +144,7 @@ def _visible_elements(light: LightLook, edits: LookEdits | None, count: int) -> 
 def _element_part(gaussians: PlaneGaussians, row: int, light: NDArray[np.float64], width: float) -> dict[str, Any]:
     """Return one Gaussian as a part of a preset's element, as `make_preset` describes it.
 
-    row: index of the Gaussian. light (2,): position of the light; width: of the picture; both on the normalised
+    row: index of the Gaussian. light (2,): position of the light; width: that of the picture; both on the normalised
     plane."""
     distance = max(float(np.linalg.norm(light)), 1e-6)
     axis = light / distance

@@ -62,7 +62,7 @@ class TrainingViews:
 
 def training_views(path: Path | str, lights: Sequence[LightLook],
                    poses: Sequence[ArrayLike] | None = None) -> dict[str, TrainingViews]:
-    """Return the training views of each light: those that the .flare lists, else from the training poses (4, 4).
+    """Return the training views of each light: as the .flare lists them, else computed from training poses (4, 4).
 
     Omits lights for which there is neither. Raises FlareFileError for an invalid file."""
     stored = read_description(path).get("seen", {})

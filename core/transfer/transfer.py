@@ -361,8 +361,8 @@ class _FrameRenderer:
 
     def _write_plate(self, plate: ColouredPlate, layers: FrameLayers, window: DataWindow,
                      stored_window: DataWindow) -> None:
-        """Write the plate with its flare, if the renderer has a folder for it. window: of the layers. stored_window: of
-        the plate's file."""
+        """Write the plate with its flare, if the renderer has a folder for it. window: data window of the layers.
+        stored_window: data window of the plate's file."""
         path = self._frame.plate_with_flare_path(self._out) if self._out is not None else None
         if path is None:
             return
@@ -373,7 +373,7 @@ class _FrameRenderer:
     def _with_plate_window(self, plate: ColouredPlate, layers: FrameLayers, window: DataWindow,
                            stored_window: DataWindow) -> FrameLayers:
         """Return the layers with their window, with the plate's alpha, and with its values as scene where both have one
-        colour space. window: of the layers. stored_window: of the plate's file."""
+        colour space. window: data window of the layers. stored_window: data window of the plate's file."""
         layers = replace(layers, window=window)
         plate_matrix, matrix = plate.space.matrix, self._space.matrix  # None for a space that is not linear
         if plate_matrix is not None and matrix is not None and np.allclose(plate_matrix, matrix, atol=1e-9)\

@@ -99,7 +99,7 @@ def _is_keyed(obj: Any, path: str) -> bool:
 
 
 def _flare_settings(scene: Any, obj: Any, radius: float) -> Any:
-    """Return the settings of a flare at a light: those of the scene's flare at this object, else the default ones.
+    """Return the settings of a flare at a light: copied from the scene's flare at this object, else the default ones.
 
     They have the attributes of a flare in `scene.fit_flare.lights` that `looks.place_light` reads. The scene is at its
     first frame, to which the power of lamps is relative by default. radius: world units; 0 for that of the flare, else
@@ -128,9 +128,10 @@ def _place_light(scene: Any, depsgraph: Any, item: Any, camera: Any, rendered: s
 
 
 def _light_entries(scene: Any, light_objects: Sequence[Any], numbers: Mapping[str, int]) -> list[dict[str, Any]]:
-    """Return the entries of lights.json for light objects, those that move as paths.
+    """Return the entries of lights.json for light objects; lights that move become paths.
 
-    numbers: frames of the scene by the name of the capture's picture. Raises CaptureError as `_light_position` does.
+    numbers: frames of the scene by the name of the capture's picture. Raises CaptureError for a position that is not
+    finite.
     """
     def position_of(obj: Any) -> cameras.Floats:
         return _light_position(bpy.context.evaluated_depsgraph_get(), obj, scene.camera.matrix_world.translation)

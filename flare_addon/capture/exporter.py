@@ -159,7 +159,7 @@ def write_cameras(folder: Path, entries: list[dict[str, Any]]) -> None:
 def write_frame(scene: Any, camera: Any, frame: int, plate: Path, folder: Path) -> dict[str, Any]:
     """Link or copy the picture of a frame into the capture; return the frame's entry for transforms.json.
 
-    The scene must be at this frame. plate: the picture. folder: of the capture. Raises CaptureError for a camera that
+    The scene must be at this frame. plate: the picture. folder: the capture's. Raises CaptureError for a camera that
     is mirrored or skewed.
     """
     depsgraph = bpy.context.evaluated_depsgraph_get()

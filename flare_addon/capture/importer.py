@@ -120,7 +120,7 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
 
 
 def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) -> Steps[Imported]:
-    """Import a capture as `import_capture` does, in steps.
+    """Import a capture as `import_capture` does, as a generator that pauses between short steps.
 
     If the generator fails or is closed early, all that it added is removed.
     """
@@ -183,7 +183,7 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
 
 
 def _assign_to_scene(scene: Any, folder: Path, settings: ImportSettings, capture: Capture, root: Any) -> None:
-    """Make an imported capture that of the scene: its root, its colour space, its lights, and the mode of a fit."""
+    """Make an imported capture the scene's own: set root, colour space, known lights, and the mode of a fit."""
     state = scene.fit_flare
     if state.root is not None:
         state.root.fit_flare.is_root = True  # earlier versions did not store it

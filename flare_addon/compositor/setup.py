@@ -445,8 +445,8 @@ def _final_input(tree: Any, add: bool = True) -> Any:
 def _is_active_output(tree: Any, end: Any) -> bool:
     """Return whether an output node is the one that Blender uses, where there are several.
 
-    4.x does not store it, but uses the one that was selected last. Where another node is selected now, it is the output
-    that shows our node, since that was linked to the active output.
+    Blender 4.x stores no active output: it uses the output that was selected last. Where another node is selected now,
+    that is the output that shows our node, since our node was linked to the active one.
     """
     if hasattr(end, "is_active_output"):
         return bool(end.is_active_output)

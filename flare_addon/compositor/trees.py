@@ -20,7 +20,7 @@ NODE = "Fit Flare"
 def tree_of(scene: Any) -> Any:
     """Return the compositor tree of the scene; None where it has none.
 
-    Of a stack of effects it is the tree with our node, else that of the last effect.
+    In a stack of effects it is the tree with our node, else the tree of the last effect.
     """
     if HAS_EFFECTS:
         effect = effect_of(scene)
@@ -47,7 +47,8 @@ def uses_tree(scene: Any, tree: Any) -> bool:
 
 
 def replace_tree(scene: Any, tree: Any) -> Any:
-    """Make the scene use `tree` in place of the one of `tree_of`, or as a new effect; return it. From 5.0 on."""
+    """Make the scene use `tree` in place of its present tree, or in a new effect; return it. For Blender 5.0 or
+    later."""
     if not HAS_EFFECTS:
         scene.compositing_node_group = tree
         return tree

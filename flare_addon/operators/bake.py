@@ -92,9 +92,9 @@ def set_up_compositor(operator: Any, scene: Any, folder: str, *, keep_image: boo
                       match: bool = False) -> None:
     """Set the compositor up for the layers in a folder, and report warnings to the operator.
 
-    folder: that of a bake or of one camera's layers, as the .blend stores it. The flare goes over the baked scene, the
-    compositor's present output (`keep_image`), or the footage behind the camera (`plate`). match: set the frames and
-    the size of the scene to the layers'. Raises FrameError.
+    folder: folder of a bake, or of one camera's layers in it, as the .blend stores it. The flare goes over the baked
+    scene, the compositor's present output (`keep_image`), or the footage behind the camera (`plate`). match: set the
+    frames and the size of the scene to the layers'. Raises FrameError.
     """
     layers = LayerFolder.open(shots.camera_folder(absolute(folder), scene.camera))
     footage = setup.footage_behind_camera(scene) if plate else None

@@ -147,7 +147,7 @@ class FITFLARE_OT_show_log(bpy.types.Operator):
     folder: bpy.props.StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Show the logs in `folder` one below the other: of the run, the events, and the other output of the engine."""
+        """Show the logs in `folder` one below the other: the run's log, the events, and the engine's other output."""
         parts = []
         for name in (LOG, jobs.EVENTS, jobs.LOG):
             path = Path(self.folder, name)

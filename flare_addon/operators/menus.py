@@ -49,6 +49,7 @@ class FITFLARE_MT_object(bpy.types.Menu):
     bl_label = "Fit Flare"
 
     def draw(self, _context: bpy.types.Context) -> None:
+        """Draw the main buttons; the menu Object of the 3D view shows this menu."""
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
         for name, icon in (("add_library_flare", "LIGHT_SUN"), ("open_flare", "FILE_FOLDER"),

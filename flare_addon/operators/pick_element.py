@@ -26,6 +26,7 @@ class FITFLARE_OT_pick_element(GuardedOperator, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
+        """Return why nothing can be picked now, for the tooltip; "" where it can."""
         state = context.scene.fit_flare
         if not state.flare or not state.lights:
             return NO_FLARE

@@ -151,7 +151,8 @@ def _prepare_frames_folder(args: argparse.Namespace, progress: Progress) -> Path
 
 
 def _fit_settings(args: argparse.Namespace, kind: str, capture: Capture, progress: Progress) -> Any:
-    """Return the settings of the fit: those of an existing run, which is resumed, else new ones. kind: of the scene."""
+    """Return the settings of the fit: of an existing run, which is then resumed, else new ones. kind: "plates" for a
+    scene of plates."""
     from ...core.conventions.run_files import CONFIG
     from ...core.fit import Run, preset
     from ...core.fit.settings import adapt_to_plates, override_settings

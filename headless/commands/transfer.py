@@ -94,7 +94,7 @@ def read_blend(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, progress: Progress) -> dict[str, Any]:
     """Write the cameras, the lights and their visibility of the target, a .blend, as a shot.
 
-    args: of the command, with --size and --jobs. flare: a .flare, or the folder of a run. Raises SettingsError.
+    args: the command's, with --size and --jobs. flare: a .flare, or the folder of a run. Raises SettingsError.
     """
     from ...core.conventions.frame_numbers import NumberedFrame, select_task_frames
     from ...core.conventions.run_files import FLARE
@@ -158,7 +158,7 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
                 training: list[Floats] | None, progress: Progress) -> dict[str, Any]:
     """Render the layers of a flare for a target, as a step of `transfer` or `bake`.
 
-    args: of the command, with the options of layers, --frames, --size and --jobs. step: its name, for --jobs. flare:
+    args: the command's, with the options of layers, --frames, --size and --jobs. step: its name, for --jobs. flare:
     the .flare. training: poses of training views, for a .flare that does not store its own. Returns the command's
     result.
     """

@@ -82,7 +82,7 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
           progress: Progress | None = None) -> dict[str, Any]:
     """Solve the frames of a folder or video and write the capture `out`; returns the report, also solve.json.
 
-    Frames that cannot be read, and those that the largest model does not register, are left out and named. An
+    Frames that cannot be read, and frames without a place in the largest model, are left out and named. An
     interrupted run with the same source and settings resumes.
 
     Raises CaptureError where there is nothing to solve or no parallax, FrameError for a video that cannot be read,

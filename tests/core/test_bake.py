@@ -151,6 +151,7 @@ def gains(edits: list[str], lights: list[str]) -> dict[str, list[float]]:
 
 
 def test_edits_multiply() -> None:
+    """Intensity, tint and mute of edits are factors on each light's flare; * stands for all lights."""
     assert gains(["lamp.intensity=2", "lamp.tint=1,0.5,0"], ["lamp", "key"]) == {"lamp": [2, 1, 0]}
     assert gains(["*.intensity=0.5"], ["lamp", "key"]) == {"lamp": [0.5] * 3, "key": [0.5] * 3}
     assert gains(["a.b.intensity=3"], ["a.b"]) == {"a.b": [3, 3, 3]}

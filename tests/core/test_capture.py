@@ -37,6 +37,7 @@ def test_a_text_model_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_errors_beyond_floats_are_clipped(tmp_path: Path) -> None:
+    """Reprojection errors of points that float32 cannot hold become large and finite."""
     folder = make_capture(tmp_path / "c")
     points = folder / "sparse/0/points3D.txt"
     points.write_text("".join(" ".join([*line.split()[:7], "1e200", *line.split()[8:]]) + "\n"
@@ -47,6 +48,7 @@ def test_errors_beyond_floats_are_clipped(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_nan_colours_are_black(tmp_path: Path) -> None:
+    """A NaN channel of a point's colour in a PLY is read as 0."""
     names = ("float x", "float y", "float z", "float red", "float green", "float blue")
     (tmp_path / "points.ply").write_text("\n".join([
         "ply", "format ascii 1.0", "element vertex 1", *(f"property {name}" for name in names), "end_header",
@@ -103,6 +105,7 @@ def test_transforms_points_of_a_colmap_model_follow_the_applied_transform(tmp_pa
 
 
 def test_transforms_per_frame_intrinsics_and_names_without_suffix(tmp_path: Path) -> None:
+    """Frames of transforms.json may have intrinsics of their own, lack a suffix, or leave sizes to the pictures."""
     folder = make_transforms(tmp_path / "t")
     meta = json.loads((folder / "transforms.json").read_text())
     meta["frames"][1].update(fl_x=70.0, cx=30.0)
@@ -118,6 +121,7 @@ def test_transforms_per_frame_intrinsics_and_names_without_suffix(tmp_path: Path
 
 
 def test_transforms_with_an_angle_and_a_fisheye(tmp_path: Path) -> None:
+    """A transforms.json with a field of view in place of focal lengths is read, and its fisheye lens too."""
     folder = make_transforms(tmp_path / "t", camera_angle_x=1.0, camera_model="OPENCV_FISHEYE", k1=0.01)
     meta = json.loads((folder / "transforms.json").read_text())
     del meta["fl_x"], meta["fl_y"]
@@ -295,6 +299,7 @@ def test_the_jacobian_is_the_derivative_of_the_projection() -> None:
 
 
 def test_extent_and_camera() -> None:
+    """A camera projects, casts rays, tests its frame and is scaled consistently."""
     camera = Camera(100, 50, 80, 90, 48, 26, look_at((1.0, 2.0, -3.0), (0.5, 0.0, 2.0)))
     np.testing.assert_allclose(camera.position, (1, 2, -3), atol=1e-12)
     np.testing.assert_allclose(camera.camera_to_world @ camera.world_to_camera, np.eye(4), atol=1e-12)

@@ -43,6 +43,7 @@ def test_every_model_of_the_installed_colmap_is_known() -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_equations_are_colmaps(model: str) -> None:
+    """Distortion and its inverse agree with pycolmap's for every lens model."""
     ours = lens(model)
     try:
         theirs = pycolmap.Camera(model=model, width=ours.width, height=ours.height, params=list(ours.params))

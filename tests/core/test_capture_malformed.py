@@ -293,6 +293,7 @@ def check(folder: Path, error: type[FitFlareError], says: str) -> None:
 
 @pytest.mark.parametrize("case", COLMAP_CASES)
 def test_malformed_colmap_capture(tmp_path: Path, case: str) -> None:
+    """A damaged COLMAP capture is refused with the message of its case."""
     damage, error, says = COLMAP_CASES[case]
     folder = make_capture(tmp_path / "c")
     damage(folder)
@@ -301,6 +302,7 @@ def test_malformed_colmap_capture(tmp_path: Path, case: str) -> None:
 
 @pytest.mark.parametrize("case", TRANSFORMS_CASES)
 def test_malformed_transforms_capture(tmp_path: Path, case: str) -> None:
+    """A capture with a damaged transforms.json is refused with the message of its case."""
     damage, error, says = TRANSFORMS_CASES[case]
     folder = make_transforms(tmp_path / "t")
     damage(folder)

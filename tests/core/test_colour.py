@@ -86,6 +86,7 @@ def config(tmp_path: Path) -> Path:
 
 
 def test_spaces_of_a_configuration(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spaces of an OpenColorIO configuration convert to linear light and back; an unknown one is refused."""
     half = colour_space("half light", config)
     assert half.is_linear
     np.testing.assert_allclose(half.to_linear(VALUES), VALUES / 2, rtol=1e-5)

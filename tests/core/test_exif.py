@@ -50,6 +50,7 @@ def test_exif_gives_orientation_and_focal_length(tmp_path: Path, order: str) -> 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_orientation_of_pngs_and_tiffs(suffix: str, tmp_path: Path) -> None:
+    """Orientation is read from the Exif chunk of a PNG and the tags of a TIFF, and a damaged file has none."""
     raw = cv2.imencode(suffix, np.zeros((8, 8, 3), np.uint8))[1].tobytes()
     (tmp_path / f"plain{suffix}").write_bytes(raw)
     assert read_exif(tmp_path / f"plain{suffix}") == (1, None)
@@ -143,6 +144,7 @@ def test_damaged_thumbnails_change_nothing() -> None:
 
 @pytest.mark.parametrize("endian", ["little", "big"])
 def test_the_orientation_of_a_big_tiff(endian: str, tmp_path: Path) -> None:
+    """The orientation of a BigTIFF is read in both byte orders; a cut-off file counts as upright."""
     sign: Any = endian
     raw = (b"II+\0" if endian == "little" else b"MM\0+") + (8).to_bytes(2, sign) + bytes(2) + (16).to_bytes(8, sign)
     raw += (1).to_bytes(8, sign) + (274).to_bytes(2, sign) + (3).to_bytes(2, sign) + (1).to_bytes(8, sign)

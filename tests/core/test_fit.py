@@ -408,6 +408,7 @@ def test_a_fully_hidden_light_has_no_flare(tmp_path: Path, capture: Capture, mod
 
 
 def test_ours_runs_in_linear_light(tmp_path: Path, capture: Capture) -> None:
+    """A fit of our form adds its flare in linear light (blend "add"), and no layer is negative."""
     settings = override_settings(preset("draft", model="ours", iterations=12), {"flare.count": 40, "holdout": 4})
     assert settings.blend == "add"
     run = fit(capture, settings, tmp_path / "run")

@@ -86,6 +86,7 @@ def test_exposures_are_not_measured_on_masked_points(tmp_path: Path) -> None:
 
 
 def test_another_mask_ends_a_resume(tmp_path: Path) -> None:
+    """A fit does not resume after a mask was changed."""
     folder = mask_left(flared_capture(tmp_path / "c", 6))
     settings = quick(exposure="fixed")
     state = Trainer(Capture.open(folder), settings).state()
@@ -153,6 +154,7 @@ def test_a_capture_with_points_keeps_them(tmp_path: Path) -> None:
 
 
 def test_a_pair_of_cameras_gives_the_points() -> None:
+    """Triangulation from two views finds the points, and rejects a too distant one and a false match."""
     first, second = (Camera(640, 480, 500, 500, 320, 240, look_at((x, 0, -4))) for x in (-0.5, 0.5))
     xyz = np.random.default_rng(0).uniform(-0.8, 0.8, (50, 3))
     xyz[0] = (0.0, 0.0, 4000.0)  # too far for the base

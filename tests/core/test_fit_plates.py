@@ -160,6 +160,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def test_the_layers_of_a_bake_add_up(run: Run, tmp_path: Path) -> None:
+    """The baked scene and flares add up to the frame."""
     capture = run.open_capture(need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
     frames = number_views(cameras)[:2]
@@ -180,6 +181,7 @@ def test_a_stopped_fit_continues_as_if_it_had_not_stopped(shot: Path, tmp_path: 
 
 
 def test_plates_show_no_other_camera(run: Run) -> None:
+    """A run over plates renders no camera but those of its frames, and has no scene Gaussians."""
     camera = run.open_capture().views[0].camera
     with pytest.raises(RunError, match="one plate per frame"):
         run.render(type(camera)(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,

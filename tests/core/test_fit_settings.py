@@ -144,6 +144,7 @@ def test_a_preset_of_an_invalid_length_is_refused_in_one_line() -> None:
 
 
 def test_the_paper_preset_is_the_paper() -> None:
+    """The preset has the paper's numbers, and its cloning ends near the paper's number of Gaussians."""
     settings = preset("paper")
     rates, density = settings.flare.rates, settings.flare.density
     assert (settings.iterations, settings.ssim_share, settings.blend) == (30000, 0.1, "over")

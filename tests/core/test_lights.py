@@ -267,6 +267,7 @@ class TestTriangulation:
 
 
     def test_a_light_in_every_fourth_of_many_views(self) -> None:
+        """A light that only every fourth of 1100 views shows is found, with all of these as its support."""
         cameras = orbit(1100, size=SIZE)
         detections = [some if i % 4 == 0 else [] for i, some in
                       enumerate(scene([(0.4, -0.5, 0.3)], cameras, clutter=0))]
@@ -424,6 +425,7 @@ class TestFile:
         assert len(json.loads(path.read_text())["lights"]) == 1
 
     def test_an_invalid_file_cannot_be_kept(self, tmp_path: Path) -> None:
+        """Keeping an invalid lights.json is refused, and the file stays as it is."""
         path = tmp_path / "lights.json"
         path.write_text("{")
         with pytest.raises(CaptureError, match=r"lights\.json"):

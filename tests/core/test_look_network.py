@@ -84,6 +84,7 @@ def test_a_moving_camera_lets_no_light_wait_for_ever(tmp_path: Path) -> None:
 
 
 def test_time_for_all_lights_is_an_exact_drawing(tmp_path: Path) -> None:
+    """With a budget of time that suffices for all lights, every light is exact in every view."""
     saved(tmp_path / "a.flare", lights=1)
     look, budget = read_look(tmp_path / "a.flare"), OffsetsBudget(60.0)
     for view in (0, 1, 2):

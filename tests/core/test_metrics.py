@@ -37,6 +37,7 @@ def pair() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_psnr_of_a_constant_error() -> None:
+    """An error of a tenth everywhere is 20 dB; equal pictures have infinite PSNR."""
     assert psnr(np.full((4, 4, 3), 0.6), np.full((4, 4, 3), 0.5)) == pytest.approx(20)
     assert psnr(np.ones((4, 4)), np.ones((4, 4))) == math.inf
 
@@ -258,6 +259,7 @@ def test_exact_layers_reveal_clipping_hidden_by_noise() -> None:
 
 
 def test_the_summary_is_the_mean_and_json() -> None:
+    """The summary has the means over the views, can be written as JSON, and names the worst view in its table."""
     scene, flare = layers()
     frame = Picture(srgb_from_linear(scene + flare), "srgb")
     reference = Picture(srgb_from_linear(scene), "srgb")

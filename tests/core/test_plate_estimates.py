@@ -53,6 +53,7 @@ def standing() -> tuple[ShotFrames, dict[str, Pixels]]:
 
 
 def test_a_ghost_that_the_network_misses_goes(standing: tuple[ShotFrames, dict[str, Pixels]]) -> None:
+    """A small ghost that the network left in the plates is removed by the neighbouring frames."""
     shot, exact = standing
     name = NAMES[CHOSEN]
     plate = PlateEstimator(shot).estimate(name)
@@ -71,6 +72,7 @@ def _ring(number: int) -> Pixels:
 
 def test_of_a_standing_camera_a_wide_flare_goes_and_light_on_walls_stays_where_the_network_removed_it(
         standing: tuple[ShotFrames, dict[str, Pixels]]) -> None:
+    """With a standing camera a wide ring is removed, and lamp light that the network took off a wall returns."""
     _, exact = standing
     frames = {name: srgb_from_linear(np.clip(linear_from_srgb(plate) + _ring(number), 0, 1))
               for number, (name, plate) in enumerate(exact.items())}
@@ -88,6 +90,7 @@ def test_of_a_standing_camera_a_wide_flare_goes_and_light_on_walls_stays_where_t
 
 
 def test_what_hides_the_background_stays(standing: tuple[ShotFrames, dict[str, Pixels]]) -> None:
+    """A box that crosses the shot stays in the plate."""
     shot, _ = standing
     plate = PlateEstimator(shot).estimate(NAMES[CHOSEN])
     box = np.s_[62:83, 4 * CHOSEN + 2:4 * CHOSEN + 16]

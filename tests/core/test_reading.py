@@ -122,6 +122,7 @@ def test_a_pipe_in_a_run_is_no_hang(tmp_path: Path) -> None:
 
 
 def test_a_text_has_a_bound(tmp_path: Path) -> None:
+    """A text file of a terabyte is refused, and not read into memory."""
     path = tmp_path / "large.json"
     with open(path, "wb") as stream:
         stream.truncate(1 << 40)
@@ -133,6 +134,7 @@ def test_a_text_has_a_bound(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, r'["\u0000"]', r'["\ud800"]', r'{"\ud800": 1}',
                                   '{"a": 1, "a": 2}'])
 def test_text_that_no_code_can_use_is_refused(text: str) -> None:
+    """JSON that nests too deeply, holds a NUL or half a surrogate pair, or repeats a key is refused."""
     with pytest.raises(ValueError, match=" "):
         parse_json(text)
 

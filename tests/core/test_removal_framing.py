@@ -53,6 +53,7 @@ def with_hidden(path: Path, hidden: int | None, dtype: type = np.uint8) -> Path:
 
 @pytest.mark.parametrize(("suffix", "dtype"), [(".png", np.uint8), (".png", np.uint16), (".tif", np.uint8)])
 def test_hidden_colours_change_nothing(flare_everywhere: Path, tmp_path: Path, suffix: str, dtype: type) -> None:
+    """Colours under full transparency stay as they are and do not change the result elsewhere."""
     remover = Remover(flare_everywhere, working_size=64)
     plates = [read_plate(with_hidden(tmp_path / f"{hidden}{suffix}", hidden, dtype)) for hidden in (None, 0, 255, 90)]
     results = [remover.remove(plate) for plate in plates]

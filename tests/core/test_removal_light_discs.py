@@ -31,6 +31,7 @@ def test_a_light_disc_stays_as_bright_as_filmed(flare_everywhere: Path, inside_m
     pytest.param(1, 0.7, 1, id="a pixel, which noise is too"),
 ])
 def test_other_bright_regions_are_not_retained(size: int, level: float, glow: float) -> None:
+    """No light is kept in a ghost, in a region as large as a window or a clipped glow, or in a single pixel."""
     display, flare = lit_street(size, level)
     assert light_discs.retained_fraction(display, flare, np.full_like(flare, glow)).max() == 0
 
@@ -68,6 +69,7 @@ def test_part_of_the_glow_stays_near_a_light_at_night() -> None:
 
 @pytest.mark.parametrize(("about", "part"), [(0.2, 1.0), (0.25, 0.5), (0.3, 0.0)])
 def test_no_glow_stays_by_day(about: float, part: float) -> None:
+    """The share of the glow that stays falls to 0 as the surroundings of the light become bright."""
     display, flare = lit_street(10, level=0.7)
     display[display < 0.2] = about
     stays = light_discs.retained_fraction(display, flare, np.ones_like(flare))[65, 58, 0]

@@ -243,6 +243,7 @@ def test_a_renewed_bank_equals_one_that_never_stopped() -> None:
 
 
 def test_parts_of_a_bank_take_turns() -> None:
+    """A bank with fewer places than flares renews its parts in turn, so that each flare comes up again."""
     bank = SynthesisBank(4, 6, SIZE, lenses.built_in_lenses(), part_count=4)
     drawn = []
     for turn in range(8):
@@ -294,6 +295,7 @@ def even_ghost(monkeypatch: pytest.MonkeyPatch, centre: tuple[float, float], rad
 
 @pytest.mark.parametrize("radius", [0.05, 0.3])
 def test_an_even_stop_gives_an_even_ghost(monkeypatch: pytest.MonkeyPatch, radius: float) -> None:
+    """Without aberration an evenly lit stop gives a disc of constant brightness."""
     ghost = even_ghost(monkeypatch, (0.2, -0.1), radius, third=0)
     x, y = canvas_grid(256)
     from_it = np.hypot(x - 0.2, y + 0.1)
@@ -302,6 +304,7 @@ def test_an_even_stop_gives_an_even_ghost(monkeypatch: pytest.MonkeyPatch, radiu
 
 
 def test_a_fold_of_the_map_piles_light_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the map from stop to picture folds, a ghost has a bright rim, and nothing beyond it."""
     ghost = even_ghost(monkeypatch, (0, 0), 0.5, third=-0.6)  # past r = 0.745 the stop's light turns back
     rim = 128 + int(0.5 * 0.745 * (1 - 0.6 * 0.745**2) * 128)
     assert ghost[128, rim - 2:rim + 2, 0].max() > 2 * ghost[128, 128, 0]

@@ -383,6 +383,7 @@ def test_a_truncated_video_is_reported(tmp_path: Path) -> None:
 
 
 def test_the_small_frames_of_a_squeezed_video_are_not(tmp_path: Path) -> None:
+    """Stills keep the pixels of an anamorphic video; the small frames and masks of the solve are unsqueezed."""
     frames = [render(camera) for camera in orbit(4, size=SIZE, arc=0.3)]
     video = videos.write_video(tmp_path / "shot.mp4", "libx264", "yuv420p", [frame / 255 for frame in frames],
                                aspect=Fraction(4, 3))
@@ -485,6 +486,7 @@ def test_the_sharpest_frame_of_each_stretch_is_chosen() -> None:
 
 
 def test_pairs_follow_the_matching() -> None:
+    """Frames are paired exhaustively, or in sequence with loops to similar frames, as the matching says."""
     rng = np.random.default_rng(0)
     places = rng.integers(0, 256, (5, 300, 128)).astype(np.uint8)  # five places, visited again and again
     def descriptors(i: int) -> NDArray[np.uint8]:

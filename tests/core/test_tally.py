@@ -71,5 +71,6 @@ def test_equal_numbers_keep_a_fixed_order() -> None:
 
 @pytest.mark.parametrize("name", ["sub\\bu\u0308ro.JPG", "./sub/bu\u0308ro.jpg", "sub//b\u00fcro.Jpg"])
 def test_a_name_has_one_form(name: str) -> None:
+    """Names that differ in separators, Unicode normalisation or the case of their suffix have one canonical form."""
     assert canonical_name(name) == "sub/b\u00fcro.jpg"
     assert canonical_name("sub\\frame") == "sub/frame"

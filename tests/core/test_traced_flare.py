@@ -86,6 +86,7 @@ def test_a_stopped_fit_leaves_no_file(tmp_path: Path) -> None:
 
 
 def test_ghosts_have_their_level() -> None:
+    """The root mean square of the traced ghosts is the setting `ghosts.level`."""
     settings = TracedFlareSettings().override({**SMALL, "ghosts.level": 0.05})
     setup, camera = traced_flare.setup_with_ghost_gain(settings), traced_flare.traced_camera(settings)
     optics, pairs = build_optics(setup)

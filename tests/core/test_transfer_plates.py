@@ -79,6 +79,7 @@ def test_an_exr_keeps_its_alpha_and_gains_the_light(flare: Path, look: Look, tmp
 
 
 def test_hidden_colours_are_no_light(tmp_path: Path) -> None:
+    """Colours under full transparency do not affect the picture that is read."""
     for hidden in (0, 255):
         assert cv2.imwrite(str(tmp_path / f"{hidden}.png"), with_alpha(hidden))
     first, second = (upright_picture(tmp_path / f"{hidden}.png").pixels for hidden in (0, 255))

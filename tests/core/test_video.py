@@ -157,6 +157,7 @@ def test_wide_primaries_of_standard_range_become_rec_709(primaries: int, chromat
 
 
 def test_linear_video_is_light(tmp_path: Path) -> None:
+    """A video whose transfer is tagged as linear is read as scene-linear light."""
     light = PATCHES / 255
     path = write_video(tmp_path / "a.mkv", "ffv1", "gbrp16le", [stripes(64)], tags=(0, 8, 1))
     with Video(path) as video:

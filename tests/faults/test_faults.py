@@ -50,6 +50,7 @@ def run_with_fault(library: Path, folder: Path, call: str, number: int, error: s
     ("unlink", 1, "EIO", {"aa", "bb"}), ("none", 0, "EIO", {"aa", "bb"})])
 def test_the_chosen_call_fails(library: Path, tmp_path: Path, call: str, number: int, error: str,
                                left: set[str]) -> None:
+    """The library makes exactly the chosen call fail, and the files written before it remain."""
     done = run_with_fault(library, tmp_path.resolve(), call, number, error)
     assert {path.name for path in tmp_path.iterdir()} == left
     assert bool(done.returncode) == (left != {"aa", "bb"})
@@ -58,6 +59,7 @@ def test_the_chosen_call_fails(library: Path, tmp_path: Path, call: str, number:
 
 @needs_injection
 def test_the_chosen_call_kills(library: Path, tmp_path: Path) -> None:
+    """The library kills the process at the chosen call."""
     done = run_with_fault(library, tmp_path.resolve(), "rename", 2, "kill")
     assert done.returncode == -signal.SIGKILL
     assert {path.name for path in tmp_path.iterdir()} == {"aa", "b"}

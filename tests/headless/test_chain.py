@@ -103,6 +103,7 @@ def finished(stopped: Ended, words: list[object]) -> Ended:
 
 
 def test_a_stop_is_clean(stopped: Ended, out: Path, finished: Ended) -> None:
+    """An interrupted fit says so, leaves no partial file, and goes on from its checkpoint."""
     assert "Stopped during fit" in stopped.events[-1]["text"]
     assert "Traceback" not in stopped.errors
     begun = next(event for event in finished.events if event["type"] == "stage" and event["name"] == "fit")
@@ -159,6 +160,7 @@ def test_frames_are_composited_in_blender_beside_the_engine(finished: Ended, out
 
 
 def again_from_blender(command: Sequence[str], words: list[object], out: Path) -> Ended:
+    """Run the commands once more from a Blender; assert that they keep the fit and make layers and frames again."""
     shutil.rmtree(out / "frames", ignore_errors=True)
     shutil.rmtree(out / "layers")
     ended = run(command, *words, FIT_FLARE_ENGINE=sys.executable)
@@ -170,6 +172,7 @@ def again_from_blender(command: Sequence[str], words: list[object], out: Path) -
 
 @pytest.mark.usefixtures("finished")
 def test_the_same_from_a_blender_without_an_engine(words: list[object], out: Path) -> None:
+    """The commands make layers and composites also in a Blender that hands the work to an engine elsewhere."""
     if not OLDER.is_file():
         pytest.skip(f"there is no {OLDER} (`make setup` makes it)")
     ended = again_from_blender([str(OLDER), "-c", AS_BLENDER, str(RUN), "--"], words, out)
@@ -178,6 +181,7 @@ def test_the_same_from_a_blender_without_an_engine(words: list[object], out: Pat
 
 @pytest.mark.usefixtures("finished")
 def test_the_same_from_a_real_blender(words: list[object], out: Path) -> None:
+    """The commands make layers and composites also when Blender itself starts them."""
     named = os.environ.get("FIT_FLARE_BLENDER") or shutil.which("blender")
     if not named:
         pytest.skip("there is no Blender: name one in FIT_FLARE_BLENDER, or put it on the PATH")

@@ -117,6 +117,7 @@ def test_blender_is_looked_for_in_order(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 @pytest.mark.parametrize("on_windows", [True, False])
 def test_a_blender_in_a_folder_with_spaces(on_windows: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A path of Blender may contain spaces; with further arguments it has to be quoted."""
     monkeypatch.setattr(hand_off, "WINDOWS", on_windows)
     program = tmp_path / "Program Files" / "blender.exe"
     program.parent.mkdir()
@@ -128,6 +129,7 @@ def test_a_blender_in_a_folder_with_spaces(on_windows: bool, tmp_path: Path, mon
 
 
 def test_a_process_has_one_side() -> None:
+    """This process is the engine's side and has not imported Blender."""
     assert hand_off.current_side() == "engine"
     assert "bpy" not in sys.modules
 

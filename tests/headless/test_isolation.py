@@ -27,6 +27,8 @@ def trapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_traps_work(trapped: Path) -> None:
+    """Without protection, modules in the working folder are imported in place of Python's: they fail and leave a
+    mark."""
     assert subprocess.run([sys.executable, "-m", "venv", "--help"], capture_output=True, check=False).returncode
     assert trapped.exists()
 

@@ -48,6 +48,7 @@ Run = Callable[..., list[dict[str, Any]]]
 
 
 def test_transfer_to_a_picture(run: Run, made: Path, tmp_path: Path) -> None:
+    """A transfer to a picture writes layers and a frame; without a light in the picture it needs one named."""
     write_png(tmp_path / "plate.png", np.full((54, 96, 3), 0.3))
     run("transfer", made, "--to", tmp_path / "plate.png", "--light", "sun=60,10", "--out", tmp_path / "out", "--set",
         "sun.intensity=3")
@@ -185,6 +186,7 @@ def blend(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_transfer_to_a_blend_whose_objects_hide_the_light(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
+    """A transfer to a .blend follows its camera and lamp, and fades the flare while an object hides the lamp."""
     out = tmp_path / "out"
     run("transfer", made, "--to", blend, "--out", out, "--frames", "1-9", "--jobs", "2", "--float")
     shot = Shot.read(out / "shot.1-9.json")

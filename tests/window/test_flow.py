@@ -19,6 +19,7 @@ BLENDER, COMMAND = (os.environ.get(f"FIT_FLARE_{name}", "") for name in ("BLENDE
                     reason="neither FIT_FLARE_BLENDER_WINDOW nor FIT_FLARE_WINDOW_COMMAND names a real Blender; "
                            "the flow of tests/window was not run")
 def test_the_whole_work_in_the_real_window(tmp_path: Path) -> None:
+    """The way of an artist from import to transfer works by mouse and keys, without blocking the window."""
     runner = Path(__file__).with_name("run.py")
     done = subprocess.run([sys.executable, str(runner), "--blender", BLENDER, "--out", str(tmp_path)],
                           capture_output=True, text=True, timeout=1500, check=False)

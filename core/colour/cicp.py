@@ -21,8 +21,8 @@ PQ, HLG = 16, 18
 def space_of_code_points(primaries: int, transfer: int) -> ColourSpace | None:
     """Return the space of two code points; None where one of them is not known here.
 
-    Unspecified primaries (2) count as Rec. 709, and an unspecified transfer (2) as sRGB's (13). So do the curves of
-    video cameras (1, 6, 14, 15), which screens show as sRGB: still pictures mean that by them.
+    Unspecified primaries (2) count as Rec. 709. An unspecified transfer (2) and the curves of video cameras (1, 6, 14,
+    15) count as sRGB's (13): screens show them so, and still pictures with these numbers mean that.
     """
     chromaticities = PRIMARIES.get(primaries)
     if chromaticities is None:

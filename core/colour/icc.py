@@ -31,12 +31,12 @@ class UnreadableProfile(ValueError):
 
 
 def space_of_profile(profile: bytes) -> ColourSpace:
-    """Return the space of an ICC profile: the built-in sRGB where it differs no more than by rounding.
+    """Return the space of an ICC profile; the built-in sRGB if the profile differs from it only by rounding.
 
-    Raises UnreadableProfile for one that is damaged, not for R G B or grey, or of tables.
+    Raises UnreadableProfile for a profile that is damaged, not for R G B or grey, or made of tables.
     """
     tags = _read_tags(profile)
-    if b"cicp" in tags and len(tags[b"cicp"]) >= 12:  # code points say what the curves round
+    if b"cicp" in tags and len(tags[b"cicp"]) >= 12:  # code points are exact, where the curves are rounded
         from .cicp import space_of_code_points
 
         space = space_of_code_points(*tags[b"cicp"][8:10])
@@ -84,10 +84,10 @@ def _make_space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> 
 
 
 def _invert_curve(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) -> Pixels:
-    """Return the values 0..1 at which `curve` gives `light`: interpolated in its samples, then moved by one
-    secant step.
+    """Return the values 0..1 at which `curve` gives `light`: interpolated in the curve's samples, then refined by one
+    secant step, since the samples are coarse where the curve is flat or steep.
 
-    decoded: the curve's samples at `ramp`, never decreasing. They alone are coarse where the curve is flat or steep.
+    decoded: the curve's samples at `ramp`, never decreasing.
     """
     value = np.interp(light, decoded, ramp)
     step = np.float32(0.5 / _SAMPLES)
@@ -116,7 +116,7 @@ def _read_tags(profile: bytes) -> dict[bytes, bytes]:
 
 
 def _read_description(tags: dict[bytes, bytes]) -> str:
-    """Return the profile's name: of version 4 ("mluc") in its first language, of version 2 ("desc") in ASCII."""
+    """Return the profile's name: in its first language for version 4 ("mluc"), in ASCII for version 2 ("desc")."""
     text = tags.get(b"desc", b"")
     if text[:4] == b"mluc" and len(text) >= 28:
         length, offset = struct.unpack(">II", text[20:28])
@@ -175,7 +175,7 @@ def _parametric_function(function_type: int, parameters: list[float]) -> Table:
         return power
     if a == 0:
         raise UnreadableProfile("has a curve that no picture has")
-    if function_type in (1, 2):  # from x = -b / a on; below, function 1 is 0, and 2 is c, which it adds above too
+    if function_type in (1, 2):  # d = -b / a; below it, function 1 is 0 and function 2 is c, which it also adds above
         c, d, e, f = 0.0, -b / a, c if function_type == 2 else 0.0, c if function_type == 2 else 0.0
 
     def decode(x: NDArray[Any]) -> Pixels:
@@ -186,7 +186,7 @@ def _parametric_function(function_type: int, parameters: list[float]) -> Table:
 
 
 def _to_d50(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Adapt a matrix (3, 3) from R, G, B to X, Y, Z from its own white to the D50 of profiles (Bradford)."""
+    """Adapt the white of a matrix (3, 3) from R, G, B to X, Y, Z to D50, the white of profiles (Bradford)."""
     from .spaces import _BRADFORD
 
     white = _BRADFORD @ matrix.sum(1)  # X, Y, Z of R = G = B = 1

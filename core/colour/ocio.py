@@ -42,10 +42,12 @@ def has_configuration() -> bool:
 
 
 def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
-    """Return the space `name` of a configuration: a file, "ocio://..." for one of the library's own, None for OCIO.
+    """Return the space `name` of an OpenColorIO configuration.
 
-    A space that OpenColorIO calls linear comes as a matrix. Raises SettingsError for a configuration that cannot be
-    read or lacks the space, EngineError where the library is not installed.
+    config: its file, or "ocio://..." for one of the library's own; None for the one that the variable OCIO names, or
+    else the library's default. A space that OpenColorIO calls linear is returned as a linear space with a matrix.
+    Raises SettingsError for a configuration that cannot be read or lacks the space, EngineError where the library is
+    not installed.
     """
     library = _import_library()
     config_path = str(config or os.environ.get("OCIO") or _BUILT_IN)
@@ -73,7 +75,8 @@ def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
 
 
 def camera_space(name: str) -> ColourSpace:
-    """Return the space of a camera's logarithm, by OpenColorIO's own transforms. Raises EngineError without it."""
+    """Return the space of a camera's logarithmic curve, by OpenColorIO's own transforms. name: a key of
+    _CAMERA_TRANSFORMS. Raises EngineError where OpenColorIO is not installed."""
     library = _import_library()
     transform = library.BuiltinTransform(style=f"{_CAMERA_TRANSFORMS[name]}_to_ACES2065-1")
     config = library.Config.CreateRaw()
@@ -102,9 +105,9 @@ def _import_library() -> ModuleType:
 
 
 def _get_processor(library: ModuleType, config: Any, name: str, *, forward: bool) -> Any:
-    """Return the processor from the space to linear Rec. 709 (`forward`), or back.
+    """Return the processor from the space `name` to linear Rec. 709 (`forward`), or back.
 
-    A configuration without a name for linear Rec. 709 is converted through OpenColorIO's own one.
+    If the configuration has no name for linear Rec. 709, OpenColorIO's built-in space is used for it.
     """
     linear = next((name for name in CONFIGURED_NAMES["linear"] if config.getColorSpace(name) is not None), None)
     try:
@@ -136,8 +139,8 @@ def _built_in_space(space: Any) -> ColourSpace | None:
 
 
 def _derive_chromaticities(matrix: NDArray[np.float64]) -> Chromaticities:
-    """Derive primaries from a space's matrix (3, 3) to linear Rec. 709, with the white of Rec. 709: the matrix has its
-    own white adapted to that."""
+    """Derive the primaries of a space from its matrix (3, 3) to linear Rec. 709. The white is that of Rec. 709, to
+    which the matrix adapts the space's own."""
     from .spaces import matrix_to_xyz
 
     xyz = matrix_to_xyz(REC_709) @ matrix

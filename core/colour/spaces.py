@@ -67,7 +67,7 @@ class ColourSpace:
     def fingerprint(self) -> str:
         """A short hash of what the space does to colours.
 
-        Configurations may give one name to different spaces, and a file may change.
+        Two configurations may have different spaces of one name, and a configuration's file may change.
         """
         levels = np.array([0.02, 0.18, 0.9], np.float32)
         colours = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(-1, 3)
@@ -110,7 +110,7 @@ def linear_space(name: str, matrix: NDArray[np.float64], chromaticities: Chromat
 def curved_space(name: str, decode: Curve, encode: Curve, chromaticities: Chromaticities, *,
                  has_headroom: bool = False) -> ColourSpace:
     """Make a space with a curve. decode, encode: the curve to and from light in the space's own primaries, which are
-    `chromaticities`; has_headroom: see `ColourSpace`."""
+    `chromaticities`. has_headroom: the signal 0..1 holds light above white."""
     matrix = matrix_between(chromaticities, REC_709)
     if np.allclose(matrix, np.eye(3), atol=1e-4):
         return ColourSpace(name, decode, encode, None, chromaticities, has_headroom)
@@ -144,8 +144,8 @@ def colour_space(name: str, config: Path | str | None = None) -> ColourSpace:
     """Return a space by name: a built-in one, or one of an OpenColorIO configuration (`config`, else the variable
     OCIO).
 
-    With `config` its names come first. Raises SettingsError for an unknown name, EngineError where OpenColorIO is
-    needed and not installed.
+    With `config`, its names take precedence over the built-in ones. Raises SettingsError for an unknown name,
+    EngineError where OpenColorIO is needed and not installed.
     """
     if config is not None:
         from .ocio import ocio_space

@@ -57,7 +57,7 @@ class _Expose(torch.autograd.Function):
 
 
 def decode_with_slope(display: Tensor) -> tuple[Tensor, Tensor]:
-    """Return `decode` of display values and its derivative by them, from one power. The caller may change both."""
+    """Return `decode(display)` and its derivative, which share one power. The caller may change both in place."""
     base = (display + OFFSET) / SCALE
     power, low = base ** (GAMMA - 1), display <= DISPLAY_TOE
     linear = torch.where(low, display / TOE_SLOPE, base * power)
@@ -65,7 +65,7 @@ def decode_with_slope(display: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def encode_with_slope(linear: Tensor) -> tuple[Tensor, Tensor]:
-    """Return `encode` of linear light and its derivative by it, from one power. The caller may change both."""
+    """Return `encode(linear)` and its derivative, which share one power. The caller may change both in place."""
     bright, low = linear.clamp_min(LINEAR_TOE), linear <= LINEAR_TOE
     power = bright ** (1 / GAMMA)
     encoded = torch.where(low, linear * TOE_SLOPE, power * SCALE - OFFSET)

@@ -38,8 +38,8 @@ def layers_file(folder: PurePosixPath | str, number: int) -> str:
 
 
 def number_views(views: Iterable[str]) -> list[NumberedFrame]:
-    """Number views by the rules of this module's head, and return them by folder and number. A view in a folder keeps
-    the folder: `left/layers.0001.exr`.
+    """Number views by the rules at the top of this module; return them sorted by folder and number. The file of a view
+    in a folder is in that folder too: `left/layers.0001.exr`.
 
     Raises SettingsError for a number below 0.
     """
@@ -69,12 +69,12 @@ def _parse_number(name: PurePath) -> int | None:
 
 
 def _differing_numbers(names: Sequence[str]) -> dict[str, int]:
-    """Return the number of each name where all are equal but for one number; empty where they are not."""
+    """Return the number in which the names differ, by name; empty unless they differ in exactly one number."""
     pieces = {name: re.split(r"(\d+)", PurePosixPath(name).stem) for name in names}
     if len(pieces) < 2 or len({len(name_pieces) for name_pieces in pieces.values()}) > 1:
         return {}
     differing = [column for column, values in enumerate(zip(*pieces.values(), strict=True)) if len(set(values)) > 1]
-    if len(differing) != 1 or differing[0] % 2 == 0:  # texts stand at the even places, numbers at the odd ones
+    if len(differing) != 1 or differing[0] % 2 == 0:  # `re.split` puts texts at even indices, numbers at odd ones
         return {}
     numbers = {name: name_pieces[differing[0]] for name, name_pieces in pieces.items()}
     if any(len(number) > _MAX_DIGITS for number in numbers.values()):
@@ -84,10 +84,10 @@ def _differing_numbers(names: Sequence[str]) -> dict[str, int]:
 
 
 def number_sequences(paths: Iterable[Path]) -> dict[Path, int]:
-    """Return the frame number of each plate, counted in each sequence by itself.
+    """Return the frame number of each plate; every sequence is numbered by itself (`number_views`).
 
-    The plates of a folder are one sequence, as for `number_views`; where two of them have one number, the names before
-    the number tell the sequences apart, so sh010.1001.png and sh020.1001.png are both frame 1001.
+    The plates of a folder are one sequence. If two of them have the same number, the folder is split into sequences by
+    the names before the number: sh010.1001.png and sh020.1001.png are both frame 1001.
     """
     folders: dict[Path, list[Path]] = {}
     for path in dict.fromkeys(paths):
@@ -109,8 +109,8 @@ def number_sequences(paths: Iterable[Path]) -> dict[Path, int]:
 def plates_by_number(pictures: Sequence[Path]) -> dict[int, Path]:
     """Map plates by the number that each name ends with; plates without one are left out.
 
-    Where no plate has a number, they have the number in which their names differ, else they are counted from 1 in
-    natural order. Raises SettingsError where two share a number, or one has a number below 0.
+    If no name ends with a number, the plates are numbered by the number in which their names differ, or else counted
+    from 1 in natural order. Raises SettingsError where two share a number, or one has a number below 0.
     """
     plates: dict[int, Path] = {}
     for path in pictures:
@@ -143,11 +143,11 @@ def select_frames(frames: Sequence[NumberedFrame], text: str | None) -> list[Num
 
 def select_task_frames(frames: Sequence[NumberedFrame], text: str | None,
                        job_text: str | None = None) -> list[NumberedFrame]:
-    """Return the frames of one task of a job, as `select_frames` does; empty where the task has nothing to do.
+    """Return the frames in the list `text` of one task of a job; empty if the task has nothing to do.
 
-    job_text: the frames of the whole job. A task has nothing to do where its frames do not exist and others of the job
-    do; without `job_text`, where its frames lie between existing ones. Raises SettingsError where none of the job's
-    frames exists.
+    job_text: the list of frames of the whole job; None if unknown. If none of the task's frames exists, it has nothing
+    to do as long as other frames of the job exist or, without `job_text`, its frames lie between existing ones;
+    otherwise SettingsError is raised. text: None selects all frames.
     """
     if text is None:
         return list(frames)
@@ -162,7 +162,7 @@ def select_task_frames(frames: Sequence[NumberedFrame], text: str | None,
 
 
 def _is_between(numbers: Sequence[int], ranges: Sequence[range]) -> bool:
-    """Return whether any of the ranges begins after the first and ends before the last of sorted numbers."""
+    """Return whether any of the ranges lies between the first and the last of the sorted numbers."""
     return bool(numbers) and any(numbers[0] < number_range[0] and number_range[-1] < numbers[-1]
                                  for number_range in ranges)
 
@@ -175,10 +175,12 @@ def _no_frames_error(frames: Sequence[NumberedFrame], text: str) -> SettingsErro
 
 
 def missing_numbers(frames: Sequence[NumberedFrame], text: str | None) -> str:
-    """Return the numbers in the list `text` that no frame has, as such a list; "" where there are none, or no text."""
+    """Return the numbers in the list `text` that no frame has, as a list of the same form ("3,5-9"); "" where none is
+    missing, or `text` is None."""
     existing, gaps = {frame.number for frame in frames}, []
     for numbers in _parse_ranges(text) if text is not None else []:
-        # Indices in the range that a frame has; a gap lies between neighbours that are more than 1 apart.
+        # Indices of the range's numbers that exist, between two sentinels; a gap is where neighbours differ by more
+        # than 1.
         present = [-1, *sorted(numbers.index(number) for number in existing if number in numbers), len(numbers)]
         gaps += [numbers[before + 1:after] for before, after in itertools.pairwise(present) if after > before + 1]
     return ",".join(str(gap[0]) if len(gap) == 1 else f"{gap[0]}-{gap[-1]}" + f":{gap.step}" * (gap.step > 1)

@@ -28,9 +28,9 @@ MAX_PIXELS = 1 << 23
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """The range of focal lengths, px, of the frames of a fit, at the size that it used them.
+    """The smallest and greatest focal length, px, of the frames of a fit, at the size at which the fit used them.
 
-    The two differ where a lens was zoomed. Raises ValueError where they are no focal lengths.
+    They differ if a lens was zoomed. Raises ValueError where they are no focal lengths.
     """
 
     min_focal_length: float
@@ -56,15 +56,16 @@ class PixelGrid:
         return {"least": self.min_focal_length, "most": self.max_focal_length}
 
     def pixel_ratio(self, focal_length: float) -> float:
-        """Number of pixels of a picture of this focal length, px, along one of the fit's frames; 1 inside the range."""
+        """Pixels of a picture per pixel of the fit's frames, along one axis; 1 for a focal length inside the range.
+
+        focal_length: that of the picture, px.
+        """
         ratio = focal_length / min(max(focal_length, self.min_focal_length), self.max_focal_length)
         return 1.0 if abs(ratio - 1) < SIZE_TOLERANCE else ratio
 
     def supersampling_factor(self, focal_length: float, width: int, height: int) -> int:
-        """Return by which factor to render a picture larger and average it down; 1 where it is as fine as the frames.
-
-        A factor with which no Gaussian falls between the pixels, limited by `MAX_PIXELS`.
-        """
+        """Return the factor by which to render a picture larger, to be averaged down: large enough that no Gaussian
+        falls between the pixels, limited by `MAX_PIXELS`; 1 if the picture is as fine as the frames."""
         ratio = self.pixel_ratio(focal_length)
         if ratio >= MIN_PIXEL_RATIO:
             return 1

@@ -57,9 +57,10 @@ class Plate:
 
     codes: (height, width, 3), the file's type, R G B; a grey file has three equal channels. encoding: "srgb" for
     integer codes, "linear" for floats. alpha: (height, width), codes as stored; None for a file without, and for an
-    EXR, whose alpha is one of its channels. extras: of an EXR, "header" and all "channels" of the main part, and the
-    "names" of those with the codes; of one with several parts, also "parts" and the number of the "main" one. declared:
-    the space that the file declares, or that the user names; None for the usual one of its encoding.
+    EXR, whose alpha is one of its channels. extras: empty but for an EXR, which has the "header" and all "channels" of
+    its main part, and the "names" of the channels that hold the codes; with several parts also "parts" (header and
+    channels of each) and "main" (the main part's index). declared: the space that the file declares, or that the user
+    names; None for the default of its encoding.
     """
 
     path: Path
@@ -126,7 +127,7 @@ class Plate:
     @cached_property
     def in_rec709(self) -> Plate:
         """The plate as 16 bit sRGB codes, or as float scene-linear Rec. 709 light where its codes are floats or hold
-        light above white; itself where it is so already."""
+        light above white; the plate itself if `is_rec709`."""
         if self.is_rec709:
             return self
         values = self.values if self.encoding == "srgb" else finite_light(self.codes)
@@ -146,7 +147,7 @@ class Plate:
         if codes.dtype.kind == "f":
             changed &= np.isfinite(codes).all(-1)
         values, removed = self.codes[changed].astype(np.float32) / np.float32(self.max_code), light[changed]
-        if self.space.is_linear:  # light subtracts there, so that the values need no conversion
+        if self.space.is_linear:  # convert the removed light to the plate's space, and subtract it there
             values = values - self.space.from_linear(removed)
         else:
             values = self.space.from_linear(self.space.to_linear(values) - removed)
@@ -164,8 +165,8 @@ class Plate:
 
     @cached_property
     def description(self) -> Description | None:
-        """Header of the file, for a clean plate that is a PNG; None where the file is itself a PNG, an EXR, or of an
-        unknown format."""
+        """Header of the file, from which a clean plate in PNG gets its metadata; None where the file is itself a PNG,
+        an EXR, or of an unknown format."""
         kind = file_kind(self.path)
         if kind == "jpeg":
             return _describe_jpeg(self.path)
@@ -173,8 +174,8 @@ class Plate:
 
     @property
     def warning(self) -> str:
-        """Sentences for the user, "" for none: that the suffix is not that of the file's contents, and what is lost
-        when a plate with changed codes is written."""
+        """Sentences for the user, "" for none: that the file's suffix does not fit its contents, and what is lost when
+        the plate is written with changed codes."""
         suffix, kind = self.path.suffix.lower(), file_kind(self.path)
         written_kind, kind_warning = SUFFIX_KINDS.get(_format_suffix(self.path, self)), ""
         # Only where the clean plate keeps the file's name, and with it the suffix.
@@ -202,8 +203,8 @@ def _describe_jpeg(path: Path) -> Description:
 
 
 def clean_name(path: Path) -> Path:
-    """Return the name of the clean plate of a file: its own, or with the suffix of a lossless format where its own can
-    not be written, or not without loss."""
+    """Return the name of a file's clean plate: the file's own, or one with the suffix of another format where this
+    program does not write the file's own."""
     suffix = path.suffix.lower()
     if suffix == ".cin":
         return path.with_suffix(".dpx")
@@ -328,8 +329,9 @@ def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
 def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDArray[Any] | None = None) -> None:
     """Write `codes` in the format and depth of `plate`, with its alpha, channels and tags, to `path`.
 
-    The suffix of `path` is the plate's, or that of `clean_name`. A plate that did not change is copied. alpha: as
-    stored, in place of the plate's. Raises FrameError for what the format cannot hold.
+    path: has the plate's suffix, or that of `clean_name`. A plate that did not change is copied. alpha: codes as
+    stored, to write in place of the plate's alpha; None for the plate's. Raises FrameError for what the format cannot
+    hold.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -363,8 +365,8 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDAr
 
 
 def _encode_by_opencv(path: Path, plate: Plate, codes: NDArray[Any], suffix: str) -> bytes:
-    """Return a PNG, JPEG or TIFF of codes, with the plate's alpha and metadata. suffix: of the format. path: for the
-    message of a FrameError."""
+    """Return the bytes of a PNG, JPEG or TIFF with these codes and the plate's alpha and metadata. suffix: chooses the
+    format. path: named in the message of a FrameError."""
     import cv2
 
     stored: NDArray[Any] = codes[..., 0] if plate.grey and plate.alpha is None else codes[..., ::-1]
@@ -377,7 +379,7 @@ def _encode_by_opencv(path: Path, plate: Plate, codes: NDArray[Any], suffix: str
     encoded = copy_metadata(data.tobytes(), plate.path, has_alpha=plate.alpha is not None)
     if suffix == ".png" and (description := plate.description) is not None:
         encoded = with_colour_chunks(encoded, description.profile, description.code_points)
-        is_upright = file_kind(plate.path) != "jpeg"  # others are decoded so
+        is_upright = file_kind(plate.path) != "jpeg"  # all other formats with a description are decoded upright
         exif = upright_block(description.exif) if is_upright else description.exif
         encoded = with_description(encoded, exif, description.xmp)
     return encoded
@@ -423,7 +425,7 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
     """
     channels = dict(plate.extras["channels"])
     for index, name in enumerate(plate.extras["names"]):
-        channels[name] = np.ascontiguousarray(codes[..., index], channels[name].dtype)  # channels may differ in depth
+        channels[name] = np.ascontiguousarray(codes[..., index], channels[name].dtype)  # each in its own depth
     parts = list(plate.extras.get("parts", [None]))
     parts[plate.extras.get("main", 0)] = plate.extras["header"], channels
     save_exr_parts(path, [(_scanline_header(header), part_channels) for header, part_channels in parts],

@@ -30,11 +30,11 @@ def read_picture(path: Path | str, *, space: ColourSpace | None = None, over_bla
     """Decode a picture of any format (docs/file_formats.md) to display values, or to scene-linear light where its codes
     hold light above white; alpha is dropped.
 
-    over_black: combine the picture with black by its alpha, so that hidden colours are never seen.
+    over_black: multiply the light by alpha, so that colours that alpha hides do not show.
 
-    What the file declares (profile, curve, primaries) is converted to Rec. 709; `space` is used instead where it is not
-    None. An EXR with more pixels than the frame (overscan), or fewer, is cropped to the frame, and black where it has
-    none.
+    The colours are converted to Rec. 709 from `space` or, if that is None, from the space that the file declares
+    (profile, curve, primaries). An EXR with more pixels than the frame (overscan), or fewer, is cropped to the frame,
+    and black where it has none.
 
     Raises FrameError where the file is missing, damaged or of another kind, or holds NaN or infinity.
     """
@@ -59,8 +59,8 @@ def read_picture(path: Path | str, *, space: ColourSpace | None = None, over_bla
 
 
 def _to_picture(path: Path, stored: NDArray[Any], space: ColourSpace | None) -> Picture:
-    """Convert the result of `read_stored_pixels` to Rec. 709 as `read_picture` returns it, without alpha. space: in
-    place of the declared one. Raises FrameError."""
+    """Convert the result of `read_stored_pixels` to a picture in Rec. 709, without alpha. space: the colour space of
+    the codes; None for the one that the file declares. Raises FrameError."""
     colour = rgb_codes(stored)
     if stored.dtype.kind == "f":
         pixels = colour.astype(np.float32, copy=False)
@@ -90,7 +90,7 @@ def _read_exr_picture(path: Path, space: ColourSpace | None) -> Picture:
 def rgb_codes(stored: NDArray[Any]) -> NDArray[Any]:
     """Return the colours of `read_stored_pixels` as R G B (height, width, 3), contiguous.
 
-    By OpenCV, which takes a fifth of the time of numpy's reversed slices.
+    Uses OpenCV, which takes a fifth of the time of numpy's reversed slices.
     """
     import cv2
 
@@ -113,7 +113,7 @@ def has_float_pixels(path: Path, space: ColourSpace | None = None) -> bool:
             formats = tiff.read_tags(stream, (tiff.SAMPLE_FORMAT,)).get(tiff.SAMPLE_FORMAT)
         if formats is not None and formats.values[0] == tiff.FLOATS:
             return True
-        # Whether these decode to floats shows only afterwards; LogLuv, for one, is stored as integers.
+        # Only decoding shows whether these give floats: LogLuv, for instance, is stored as integers.
         signed = formats is not None and formats.values[0] != tiff.UNSIGNED
         if (is_big or signed) and read_stored_pixels(path).dtype.kind == "f":
             return True
@@ -131,8 +131,8 @@ def has_half_pixels(path: Path) -> bool:
 
 
 def read_stored_pixels(path: Path) -> NDArray[Any]:
-    """Read the pixels of any format but EXR, without rotation or multiplication: (height, width) or B G R with alpha
-    last.
+    """Read the pixels of any format but EXR as (height, width), or B G R with alpha last, neither rotated by Exif nor
+    multiplied by alpha.
 
     PNG and usual TIFFs are decoded by OpenCV, faster than OpenImageIO and with the same codes; JPEG by simplejpeg,
     which reports corrupt data; others in `decoders`. Raises FrameError where the file is missing or damaged, or would
@@ -179,9 +179,9 @@ def _decode_jpeg(path: Path) -> NDArray[Any]:
 
 
 def decode_by_opencv(path: Path, flags: int) -> NDArray[Any] | None:
-    """Decode a file with OpenCV's `flags`, a TIFF as stored; None where it cannot be.
+    """Decode a file with OpenCV's `flags`, a TIFF as stored; None where OpenCV cannot decode it.
 
-    From memory, since OpenCV's reader cannot open every path that Windows allows.
+    The file is read first and decoded from memory, since OpenCV cannot open every path that Windows allows.
     """
     import cv2
 

@@ -31,7 +31,7 @@ def picture_size(path: Path | str) -> tuple[int, int]:
             size = _size_from_header(stream)
         if not kind and holds_video(head):
             raise FrameError(f"{path} holds a video, not a picture; give it the suffix of its format, such as .mp4.")
-        # `_size_from_header` reads neither BigTIFF nor these formats, of raw files only the size of a preview.
+        # `_size_from_header` cannot read BigTIFF and these formats; in a raw file it finds the size of a preview.
         if is_big or kind not in ("png", "jpeg", "tiff", "exr", ""):
             size = describe(path, kind)[:2]
     except OSError as problem:
@@ -65,8 +65,8 @@ def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
 
 
 def _exr_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """Return the size of the displayWindow; of the dataWindow where that is missing, empty or too large to be opened,
-    so that `checked_size` refuses the file."""
+    """Return the size of the displayWindow, or of the dataWindow if there is no displayWindow. A dataWindow that is
+    missing, empty or too large is returned too, so that `checked_size` refuses the file."""
     sizes = exr_header.windows(stream)
     stored = sizes.get("dataWindow")
     is_usable = stored is not None and min(stored) > 0 and stored[0] * stored[1] <= MAX_PIXELS

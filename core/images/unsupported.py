@@ -42,8 +42,7 @@ _CMYK = "is CMYK, for print; convert it to RGB"
 
 
 def unsupported_reason(path: Path) -> str:
-    """Say what would be decoded wrongly, or not at all though the file is intact, and what to do; "" for a good file.
-    """
+    """Say why an intact file would be decoded wrongly or not at all, and what to do about it; "" for a good file."""
     with open_regular(path) as stream:
         magic = stream.read(4)
         stream.seek(0)
@@ -69,9 +68,9 @@ def unsupported_reason(path: Path) -> str:
 
 
 def needs_openimageio(path: Path) -> bool:
-    """True for a TIFF that OpenCV decodes as something else, or not at all: BigTIFF; 16 bit floats; planes, or 0 for
-    white, of more than 8 bits; grey with alpha; depths that are none of 1, 8, 16, 32 and 64 bits; and compressions that
-    it is built without."""
+    """True for a TIFF that OpenCV decodes as something else, or not at all: BigTIFF; 16 bit floats; above 8 bits,
+    separate planes or 0 for white; grey with alpha; depths other than 1, 8, 16, 32 and 64 bits; and compressions that
+    OpenCV is built without."""
     with open_regular(path) as stream:
         if stream.read(4) in tiff.BIG_TIFF:
             return True

@@ -223,7 +223,8 @@ class Video:
             self._container = None
 
     def __iter__(self) -> Iterator[VideoFrame]:
-        """Yield the frames from that of `seek`, else from the first one. `problems` is complete after the last one."""
+        """Yield the frames, from the one that `seek` chose or the first. `problems` is complete after the last
+        frame."""
         number, start = self._start, self._start
         self._start, self.problems = 0, []
         damaged, colours, changes_size = list[int](), dict[tuple[int, ...], VideoColour](), False
@@ -250,8 +251,8 @@ class Video:
                                  "; if it is cut off, copy it again.")
 
     def check_named_space(self, name: str) -> None:
-        """Raise FrameError where the video's tags name light or wide primaries, so that its frames are converted and
-        their codes cannot be read in the space that a user names."""
+        """Raise FrameError where the video's tags name light or wide primaries: its frames are then converted by these
+        tags, so that the colour space `name` of the user cannot apply."""
         if self.colour.is_light or self.colour.is_wide:
             named = self.colour.transfer if self.colour.is_light else "wide primaries"
             raise FrameError(f"{self.path} names its own colours ({named}), and --plate-space {name} others; leave the "
@@ -311,7 +312,7 @@ class Video:
                 packet = next(packets)
             except (StopIteration, EOFError):
                 return
-            except errors:  # the container is damaged here; what the decoder still holds comes out
+            except errors:  # the container is damaged here; None makes the decoder give the frames that it still holds
                 packet = None
             try:
                 frames = self._decoder.decode(packet)
@@ -324,10 +325,8 @@ class Video:
                 return
 
     def _frames_from(self, number: int) -> Iterator[Any]:
-        """Yield PyAV's frames from frame `number` on.
-
-        By seeking, where the time of that frame is known and decoding arrives at it; else by decoding from the start.
-        """
+        """Yield PyAV's frames from frame `number` on: after a seek if the frame's time is known and decoding from the
+        key frame before it reaches that time, else by decoding all frames from the start."""
         first_pass, self._first_pass = self._first_pass, None
         if number == 0 and first_pass is not None:
             yield from first_pass
@@ -352,7 +351,7 @@ class Video:
                 yield frame
 
     def _seek_key_frame(self, ticks: int) -> bool:
-        """Go to the key frame before a time; False where the file cannot be searched."""
+        """Reopen the file at the key frame before a time, in ticks; False where the file cannot be searched."""
         av = import_av()
         self._open()
         try:
@@ -362,8 +361,8 @@ class Video:
         return True
 
     def _packet_times(self) -> list[int] | None:
-        """Return the time of every frame, in ticks, in the order of display, from the packets alone; None where one is
-        unknown. The file is then at its end."""
+        """Return the time of every frame, in ticks, in the order of display, from the packets alone; None where a time
+        is unknown. Reads on to the file's end."""
         av = import_av()
         times = list[int]()
         try:
@@ -420,9 +419,9 @@ def write_frame(stem: Path, frame: VideoFrame) -> Path:
 def _read_colour(path: Path, raw: Any, stream: Any) -> VideoColour:
     """Return what a frame's codes mean by its tags, which are code points of ITU-T H.273.
 
-    Without tags, as players assume: limited range of Y Cb Cr, full range of grey and RGB; the matrix of BT.2020 with
-    its primaries, else by the size; the primaries of BT.2020 with its matrix, PQ or HLG. Raises FrameError for colours
-    that cannot be converted.
+    Missing tags are filled in as players do. Range: limited for Y Cb Cr, full for grey and RGB. Matrix: BT.2020 if the
+    primaries are, else by the size. Primaries: BT.2020 if the matrix is or the transfer is PQ or HLG. Raises FrameError
+    for colours that cannot be converted.
     """
     context = stream.codec_context
 

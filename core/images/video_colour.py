@@ -86,7 +86,7 @@ class VideoColour:
         max_code = np.iinfo(dtype).max
         matrix, offset = self._decoding_affine
         if planes.shape[-1] == 1:
-            levels = (np.arange(1 << self.bits) - self._black) * matrix[0, 0]  # without the offset of the differences
+            levels = (np.arange(1 << self.bits) - self._black) * matrix[0, 0]  # grey: luma without colour differences
             table = (np.clip(levels / self.signal_top, 0, 1) * max_code + 0.5).astype(dtype)
             return np.asarray(cv2.merge([np.take(table, np.minimum(planes[..., 0], (1 << self.bits) - 1))] * 3))
         if dtype == np.uint8 and self.matrix == RGB:
@@ -138,7 +138,7 @@ class VideoColour:
         return srgb_from_linear(light)
 
     def to_plane_differences(self, differences: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return how the codes of the planes, Y Cb Cr or R G B, change for a change of the signal R G B 0..1; both
+        """Convert differences of the signal R G B, 0..1, to differences of the planes' codes, Y Cb Cr or R G B; both
         (height, width, 3)."""
         import cv2
 
@@ -146,8 +146,7 @@ class VideoColour:
 
     @property
     def signal_top(self) -> float:
-        """The signal that the greatest code of `to_signal` stands for: 1, or more for HLG, whose limited range goes
-        beyond."""
+        """The signal that the greatest code of `to_signal` stands for: 1, or HLG_HEADROOM for HLG."""
         return HLG_HEADROOM if self.transfer == "HLG" else 1.0
 
     @property
@@ -186,8 +185,8 @@ def usual_matrix(width: int, height: int) -> int:
 
 @lru_cache(maxsize=4)
 def _light_table(transfer: Transfer) -> NDArray[np.float32]:
-    """(65536,) light of each 16 bit code of `to_signal`: reference white is 1 for PQ, the scene's peak is 1 for HLG;
-    display values of wide primaries are decoded as sRGB."""
+    """Return the light (65536,) of each 16 bit code of `to_signal`. 1 is reference white for PQ, and the scene's peak
+    for HLG; display values (of wide primaries) are decoded as sRGB."""
     signal = np.arange(65536, dtype=np.float64) / 65535
     if transfer == "PQ":
         return (_nits_from_pq(signal) / REFERENCE_WHITE_NITS).astype(np.float32)

@@ -61,15 +61,15 @@ def nearest_planar_name(frame: Any) -> str:
     bits = max((component.bits for component in components), default=8)
     is_rgb = frame.format.is_rgb or frame.format.has_palette or frame.format.name.startswith(("bayer", "xyz", "mono"))
     depth = next((depth for depth in _DEPTHS if depth >= bits), 16)
-    if has_alpha and depth in (9, 14):  # depths that FFmpeg has not with alpha
+    if has_alpha and depth in (9, 14):  # FFmpeg has no formats with alpha of these depths
         depth += 1 if depth == 9 else 2
     name = f"gbr{'a' if has_alpha else ''}p" if is_rgb else f"yuv{'a' if has_alpha else ''}444p"
     return name if depth == 8 else f"{name}{depth}le"
 
 
 def to_planar(frame: Any, is_limited: bool) -> tuple[Any, PlaneFormat]:
-    """Return a PyAV frame in a planar format, itself where it has one, and the format. is_limited: range of its codes.
-    """
+    """Return (frame, its format): a PyAV frame converted to a planar format, or itself if it is planar. is_limited: its
+    codes have limited range."""
     planar = plane_format(frame.format.name)
     if planar is None:
         name = nearest_planar_name(frame)
@@ -128,7 +128,7 @@ _BUFFERS = threading.local()
 def _scratch_array(slot: int, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
     """Return an array of this thread that the next frame overwrites: fresh memory costs more than the conversion.
 
-    slot: number of the array; those of different slots do not overwrite each other.
+    slot: number of the array; arrays of different slots are separate memory.
     """
     buffers: dict[str, NDArray[Any]] = _BUFFERS.__dict__
     buffer = buffers.get(str(slot))
@@ -169,7 +169,8 @@ class Orientation:
 
 
 def side_data(frame: Any) -> dict[str, bytes]:
-    """Return the side data of a PyAV frame by its name; "KIND_28", say, for a kind that PyAV has no name for."""
+    """Return the side data of a PyAV frame by the name of its kind; a kind that PyAV does not know is named "KIND_28"
+    or the like."""
     try:
         return {item.type.name: bytes(item) for item in frame.side_data}
     except ValueError:  # a kind of a later FFmpeg, such as an Exif block: PyAV then lists none at all
@@ -193,7 +194,7 @@ def display_matrix(frame: Any) -> list[int] | None:
 
 
 def orientation_from_matrix(matrix: list[int] | None) -> Orientation:
-    """Return the orientation nearest to a display matrix; turns by other angles than quarters are rounded."""
+    """Return the orientation nearest to a display matrix (`display_matrix`): rotations are rounded to quarter turns."""
     if matrix is None:
         return Orientation()
     a, b, c, d = matrix[0], matrix[1], matrix[3], matrix[4]  # shown x = a x + c y, shown y = b x + d y

@@ -38,9 +38,12 @@ Change = Callable[[VideoFrame], tuple[NDArray[np.float32], NDArray[np.float32]] 
 
 @dataclass(frozen=True)
 class Encoder:
-    """An encoder. name: FFmpeg's. suffixes: of the containers that hold it. keeps: whether it encodes a planar format
-    as it is. Frames in another format are converted to `alpha` if they have alpha, to `deep` if they have more than 8
-    bits, else to `fallback`. limited: always write limited range. tag: the codec's tag in MP4 and MOV."""
+    """An encoder of FFmpeg, with its options.
+
+    name: FFmpeg's name. suffixes: suffixes of the containers that hold it. keeps: returns whether a planar format is
+    encoded unchanged. Frames in another format are converted to `alpha` if they have alpha, to `deep` if they have more
+    than 8 bits, else to `fallback`. limited: always write limited range. tag: the codec's tag in MP4 and MOV.
+    """
 
     name: str
     options: dict[str, str]
@@ -71,7 +74,8 @@ most containers refuse."""
 
 
 def choose_codec(target: Path, video: Video, codec: str | None) -> str:
-    """Return the codec for a file: `codec`, else one by the container, the depth and the alpha of a video.
+    """Return the codec for a file: `codec`, or if that is None one that suits the container and the video's depth and
+    alpha.
 
     Raises SettingsError for a container that is not written, or that does not hold the codec.
     """
@@ -157,10 +161,11 @@ def _timecode(container: Any, stream: Any) -> str | None:
 
 
 def _choose_pixel_format(encoder: Encoder, video: Video, first: VideoFrame) -> PlaneFormat:
-    """Return the planar format to encode, the first of these that applies. first: the first frame of the video.
+    """Return the planar format to encode. first: the first frame of the video.
 
-    The source's, if the encoder keeps it; the source's, without alpha where the encoder has none, if the encoder
-    accepts that and is not one of limited range; the encoder's formats for alpha, for more than 8 bits, or for any.
+    It is the source's format if the encoder keeps it. Otherwise it is the source's format, without alpha if the encoder
+    has none, provided that the encoder accepts it and is not limited to limited range; else the encoder's own format
+    for alpha, for more than 8 bits, or for all other frames.
     """
     av = import_av()
     _, planar = to_planar(first.raw, video.colour.limited)
@@ -183,10 +188,10 @@ def _choose_pixel_format(encoder: Encoder, video: Video, first: VideoFrame) -> P
 
 
 def _add_video_stream(out: Any, video: Video, source: Any, encoder: Encoder, left_out: list[str]) -> Any:
-    """Add the stream of the frames to `out`, with the tags, timing and shape of that of `video`, and return it.
+    """Add a video stream to `out` with the tags, timing and shape of the stream of `video`, and return it.
 
-    source: the container of the video, opened anew. left_out: sentences about what is not written, to which others are
-    added.
+    source: the container of the video, opened a second time. left_out: list of sentences about what is not written;
+    this function adds to it.
     """
     first = next(iter(video), None)
     if first is None:
@@ -211,7 +216,7 @@ def _add_video_stream(out: Any, video: Video, source: Any, encoder: Encoder, lef
     if ratio:
         context.sample_aspect_ratio = ratio
     tags = {"colorspace": raw.colorspace, "color_trc": raw.color_trc, "color_primaries": raw.color_primaries}
-    for name, value in tags.items():  # where the frame names none, its container may
+    for name, value in tags.items():  # a tag that the frame lacks is taken from the container
         setattr(context, name, value if value not in (0, UNSPECIFIED) else getattr(original.codec_context, name))
     if not planar.is_rgb and video.colour.matrix == RGB:
         context.colorspace = BT_709 if min(video.stored_size) > MAX_601_HEIGHT else BT_601  # converted from RGB
@@ -225,8 +230,8 @@ def _add_video_stream(out: Any, video: Video, source: Any, encoder: Encoder, lef
 
 
 def _is_limited(planar: PlaneFormat, video: Video, encoder: Encoder) -> bool:
-    """True if codes are written in limited range: never of RGB, always of RGB that is encoded as Y Cb Cr, else as the
-    encoder demands or the source has it. planar: the format that is encoded."""
+    """True if codes are written in limited range: never as RGB; as Y Cb Cr if the encoder demands it, the source has
+    it, or the source is RGB. planar: the format that is encoded."""
     if planar.is_rgb:
         return False
     return encoder.limited or video.colour.limited or video.colour.matrix == RGB
@@ -236,11 +241,11 @@ class _OtherStreams:
     """Sound and subtitles of the source, copied packet by packet beside the frames; sound that does not fit into the
     new container is encoded anew.
 
-    left_out: sentences about what is not written or encoded anew, to which others are added.
+    left_out: list of sentences about what is not written or is encoded anew; this class adds to it.
     """
 
     def __init__(self, source: Any, out: Any, video: Video, left_out: list[str]) -> None:
-        """Add the streams to the container `out`. source: the container of the video, opened anew."""
+        """Add the streams to the container `out`. source: the container of the video, opened a second time."""
         self._out, self._targets, self._encoded = out, dict[int, Any](), dict[int, Any]()
         copied_streams = list[Any]()
         for stream in source.streams:
@@ -252,7 +257,7 @@ class _OtherStreams:
             elif stream.type == "subtitle" and codec in out.supported_codecs:
                 target = out.add_stream_from_template(stream)
             else:
-                if codec or "timecode" not in str(stream.metadata).lower():  # that of the timecode becomes a tag
+                if codec or "timecode" not in str(stream.metadata).lower():  # a timecode stream becomes a tag
                     left_out.append(f"Stream {stream.index} of {video.path} ({stream.type}) is left out.")
                 continue
             _copy_tags(stream.metadata, target.metadata, _STREAM_FACTS)
@@ -262,7 +267,8 @@ class _OtherStreams:
         self._waiting: Any = None
 
     def _add_sound(self, stream: Any, codec: str, video: Video, left_out: list[str]) -> Any:
-        """Add a stream of sound to the output and return it: as it is, or encoded anew where its codec does not fit."""
+        """Add a sound stream to the output and return it: copied, or encoded anew if the output cannot hold its
+        codec."""
         is_mov = self._out.format.name == "mov"
         if codec.startswith(MOV_SOUND) if is_mov else codec in self._out.supported_codecs:
             return self._out.add_stream_from_template(stream)
@@ -308,7 +314,7 @@ def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Chang
             on_frame: Callable[[], None]) -> None:
     """Encode every frame with its change, and write the other streams up to LEAD_S ahead of it.
 
-    stream: of the frames, by `_add_video_stream`. on_frame: called after each frame.
+    stream: the video stream that `_add_video_stream` added. on_frame: called after each frame.
     """
     planar = plane_format(stream.pix_fmt)
     assert planar is not None
@@ -320,7 +326,7 @@ def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Chang
         raw = apply_change(frame, *before_and_after) if before_and_after is not None else frame.raw
         if raw.format.name != planar.name or (not planar.is_rgb and frame.colour.limited != limited):
             raw = _reformat(raw, frame, planar, context, limited=limited)
-        ticks = frame.number if frame.time is None else frame.time[0]  # see the time base of `_add_video_stream`
+        ticks = frame.number if frame.time is None else frame.time[0]  # without times, the time base is one frame
         if last_ticks is not None and ticks <= last_ticks:  # a damaged file may repeat a time
             ticks = last_ticks + 1
         # Type 0 of a picture lets the encoder choose its key frames.
@@ -336,8 +342,7 @@ def _encode(out: Any, stream: Any, encoder: Encoder, video: Video, change: Chang
 def _reformat(raw: Any, frame: VideoFrame, planar: PlaneFormat, context: Any, *, limited: bool) -> Any:
     """Convert PyAV's frame `raw` to the planar format that `context` encodes, by swscale with its exact flags.
 
-    frame: the video's frame that `raw` is, or was made from, which says what its codes mean. limited: the range to
-    write.
+    frame: the decoded frame that `raw` belongs to; its colour says what the codes mean. limited: write limited range.
     """
     from av.video.reformatter import Interpolation
 
@@ -355,10 +360,10 @@ _SWSCALE_MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9}
 
 
 def apply_change(frame: VideoFrame, before: NDArray[np.float32], after: NDArray[np.float32]) -> Any:
-    """Return PyAV's frame with the change from `before` to `after` added to its codes, in a planar format.
+    """Return PyAV's frame, in a planar format, with the change from `before` to `after` added to its codes.
 
-    before, after: upright pixels (height, width, 3), as of `VideoFrame.picture`. Codes of pixels that do not change
-    stay as they are; those of subsampled colour change by the mean of their pixels.
+    before, after: upright pixels (height, width, 3), display values or light as `VideoFrame.picture` has them. Codes of
+    unchanged pixels stay; a subsampled chroma code changes by the mean over its pixels.
     """
     colour = frame.colour
     difference = colour.from_pixels(after) - colour.from_pixels(before)

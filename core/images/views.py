@@ -44,10 +44,10 @@ def _view_plate(plate: Plate, view: StereoView, header: Mapping[str, Any],
 
 
 def join_views(plate: Plate, codes: Sequence[NDArray[Any]]) -> tuple[Plate, NDArray[Any]]:
-    """Return the plate and the codes to give to `write_plate`: the plate with the new codes of all views but the first
-    in its channels, and the codes of the first.
+    """Return the arguments for `write_plate`: the plate, whose channels hold the new codes of all views but the first,
+    and the codes of the first view.
 
-    codes: of each view of `split_views`, in its order.
+    codes: codes of each view, in the order of `split_views`.
     """
     views = _views_of_plate(plate)
     if not views:
@@ -62,7 +62,7 @@ def join_views(plate: Plate, codes: Sequence[NDArray[Any]]) -> tuple[Plate, NDAr
     extras = {**plate.extras, "channels": parts[views[0].part][1]}
     if "parts" in extras:
         extras["parts"] = parts
-    # Without its own codes, `write_plate` does not take the file for unchanged because the first view is.
+    # `write_plate` copies a plate whose codes are unchanged. Empty codes prevent that if only another view has changed.
     return replace(plate, extras=extras, codes=plate.codes[:0] if is_changed else plate.codes), codes[0]
 
 
@@ -70,8 +70,8 @@ def write_view_results(results: Sequence[Path], plate: Plate,
                        cleaned: Sequence[tuple[NDArray[Any], NDArray[Any]]]) -> None:
     """Write the clean plate with all its views, and the flares of all if `results` has a second path.
 
-    cleaned: codes and flare of each view of `split_views`. The first view's flare is at the root ("R"), the others'
-    behind their names ("right.R").
+    cleaned: (codes, flare) of each view, in the order of `split_views`. The channels of the first view's flare have no
+    prefix ("R"), those of the others have the view's name ("right.R").
     """
     views = _views_of_plate(plate)
     if not views:

@@ -67,8 +67,8 @@ def union_window(windows: Iterable[DataWindow]) -> DataWindow:
 
 
 def move_to_window(pixels: Pixels, source: DataWindow, target: DataWindow) -> Pixels:
-    """Return pixels (height, width, ...) of the data window `source` as those of `target`, on the same frame; 0 where
-    there are none."""
+    """Move pixels (height, width, ...) from the data window `source` to the data window `target` of the same frame:
+    crop, and fill with 0 where `source` has none."""
     if (source.size, source.origin) == (target.size, target.origin):
         return pixels
     left, top = (source.origin[axis] - target.origin[axis] for axis in (0, 1))
@@ -76,8 +76,7 @@ def move_to_window(pixels: Pixels, source: DataWindow, target: DataWindow) -> Pi
 
 
 def crop_to_display_window(pixels: Pixels, window: DataWindow) -> Pixels:
-    """Return the frame (the display window) of pixels (height, width, ...) that `window` places; 0 where there are
-    none."""
+    """Crop pixels (height, width, ...) of the data window to the frame (display window); 0 where there are none."""
     if window.is_frame:
         return pixels
     (width, height), (x, y) = window.frame, window.origin

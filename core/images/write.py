@@ -28,7 +28,7 @@ def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: b
     """Write one part, scanlines, ZIP; each channel (height, width), under its full name ("scene.R").
 
     half: store 16 bit floats, clipped to their range; depth ("Z" and "*.Z") stays 32 bit, since it needs more. header:
-    more attributes. commit_lock: see `atomic_path`.
+    more attributes. commit_lock: held while the finished file is renamed to `path`.
     """
     def convert(name: str, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return a channel in the type that is stored."""
@@ -55,9 +55,11 @@ def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str,
 
 def save_exr_parts(path: Path | str, parts: Sequence[tuple[Mapping[str, Any], Mapping[str, NDArray[Any]]]],
                    commit_lock: AbstractContextManager[None] | None = None, source: Path | None = None) -> None:
-    """Write parts, each with its header and channels. commit_lock: see `atomic_path`. source: the EXR that they were
-    read from. `exr.py` reads its texts and names that are not UTF-8 as others of the same lengths; their own bytes are
-    written back over these.
+    """Write parts, each with its header and channels.
+
+    commit_lock: held while the finished file is renamed to `path`. source: the EXR that the parts were read from; None
+    for new parts. `exr.py` replaces texts and names that are not UTF-8 by others of the same lengths; here the original
+    bytes are written over the replacements.
 
     Raises OSError where the system refuses, for instance for a full disk, and FrameError for a path that is not UTF-8.
     """
@@ -83,10 +85,10 @@ def save_exr_parts(path: Path | str, parts: Sequence[tuple[Mapping[str, Any], Ma
 
 
 def _restore_bytes(path: Path, strings: Mapping[str, bytes], names: Mapping[bytes, bytes]) -> None:
-    """Overwrite parts of an EXR's headers with others of the same lengths.
+    """Overwrite texts and names in an EXR's headers with bytes of the same lengths.
 
-    strings: by the names of `exr_header.locate_strings`; a text that was changed to another length stays. names: of
-    attributes and channels, by the names in the file.
+    strings: the bytes of each text, by the names of `exr_header.locate_strings`; a text whose length has changed stays.
+    names: the original names of attributes and channels, by their names in the file.
     """
     with open(path, "r+b") as stream:
         replacements = [(offset, strings[name]) for name, (offset, text) in exr_header.locate_strings(stream).items()

@@ -41,9 +41,10 @@ def evaluate(renderer: ViewRenderer, capture: Capture, cameras: Mapping[View, Ca
              lpips: Perceptual | None = None) -> dict[str, Any]:
     """Return the content of eval.json: the scores of the given views, each rendered from its camera.
 
-    Scene and flare are scored against truth/ if the capture has it, else against removed/, else not at all. area: the
-    area inside the frames' black borders; only that is scored. lpips is null without its weights. Raises FrameError for
-    pictures that cannot be read, and Cancelled. Pixels that a view's mask leaves out of the fit are not scored.
+    Scene and flare are scored against truth/ if the capture has it, else against removed/, else not at all. Pixels that
+    a view's mask leaves out of the fit are not scored. cameras: the views to score, with the camera to render each.
+    area: the area inside the frames' black borders; only this is scored. lpips: the metric; None leaves its score null.
+    Raises FrameError for pictures that cannot be read, and Cancelled.
     """
     progress = progress or Progress()
     reference: Reference = "truth" if capture.has_truth else "removed" if capture.has_clean_frames else "none"
@@ -79,12 +80,13 @@ def _no_picture(_view: View, _size: tuple[int, int]) -> None:
 def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: Picture | None,
                flare_truth: Picture | None = None, unscored: NDArray[np.bool_] | None = None,
                lpips: Perceptual | None = None, scored_mask: NDArray[np.bool_] | None = None) -> dict[str, Scores]:
-    """Return the scores of one view by layer: psnr, ssim, lpips (null without weights), flip.
+    """Return the scores of one view by layer: psnr, ssim, lpips (None without the metric), flip. A flare also has
+    `empty_psnr`, the score of an empty flare.
 
-    composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size. unscored: (height,
-    width), pixels in which the linear flare is not scored; by default the clipped ones. scored_mask: (height, width),
-    the pixels to score, None for all; the others are replaced by those of the reference, since some scores look at
-    whole windows. A flare also has `empty_psnr`, the score of an empty flare.
+    composite, scene: rendered scene-linear layers (height, width, 3). frame: the picture as filmed. scene_reference,
+    flare_truth: references of the same size; None leaves out what needs them. unscored: (height, width), pixels in
+    which the linear flare is not scored; None for the clipped ones. scored_mask: (height, width), the pixels to score;
+    None for all. In the other pixels the reference replaces the picture, since some scores look at whole windows.
     """
     displayed, clean, filmed = _to_display(composite), _to_display(scene), frame.display()
     scores = {"composite": _score_picture(displayed, filmed, lpips, scored_mask)}
@@ -107,23 +109,24 @@ def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: 
 def unscored_mask(capture: Capture, view: View, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
     """Return (height, width), the pixels where the camera clipped, in which the linear flare is not scored.
 
-    They have the frame's brightest code or, where the exact layers are known, scene and flare together reach white in
-    any channel. size: (width, height) of the result, the camera's by default.
+    A pixel counts as clipped if it has the frame's brightest code or, where the exact layers are known, if scene plus
+    flare reach white in any channel. size: (width, height) of the result; None for the frame's own size.
     """
     frame, scene, flare = capture.frame(view), capture.truth_scene(view), capture.truth_flare(view)
     clipped = clipped_mask(frame)
     if scene is not None and flare is not None and frame.encoding != "linear":
         reaches_white = (scene.linear() + flare.linear() >= 1).any(-1)
-        # Layers of another size than the frame do not tell.
+        # Layers of another size than the frame are not used.
         clipped = clipped | reaches_white if reaches_white.shape == clipped.shape else clipped
     return _downscale_mask(clipped, frame.size, size)
 
 
 def clipped_mask(frame: Picture, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
-    """Return (height, width), the pixels of a frame's brightest code, which hides how bright they were; none in a
-    linear frame.
+    """Return (height, width), the pixels that have a frame's brightest code, which hides how bright they were; none in
+    a linear frame.
 
-    size: (width, height) of the result, where the frame is larger: pixels with a clipped one among theirs.
+    size: (width, height) of the result; None for the frame's own. A pixel of a smaller result is set if any of the
+    frame's pixels that it covers is clipped.
     """
     if frame.encoding == "linear":
         clipped = np.zeros(frame.pixels.shape[:2], np.bool_)
@@ -133,7 +136,7 @@ def clipped_mask(frame: Picture, size: tuple[int, int] | None = None) -> NDArray
 
 
 def _downscale_mask(mask: NDArray[np.bool_], full: tuple[int, int], size: tuple[int, int] | None) -> NDArray[np.bool_]:
-    """Return a mask at another size: pixels with a set one among theirs."""
+    """Return a mask at a smaller size: a pixel is set if any pixel that it covers is."""
     if size is None or size == full:
         return mask
     import cv2
@@ -142,8 +145,8 @@ def _downscale_mask(mask: NDArray[np.bool_], full: tuple[int, int], size: tuple[
 
 
 def displayed_flare(composite: Array, scene: Array) -> Array:
-    """Return |composite - scene| in display values (height, width, 3), of scene-linear layers: the paper's measure of a
-    flare."""
+    """Return |composite - scene| in display values (height, width, 3), the paper's measure of a flare. composite,
+    scene: scene-linear layers."""
     return np.abs(_to_display(composite) - _to_display(scene))
 
 
@@ -153,7 +156,8 @@ def _to_display(linear: Array) -> Array:
 
 def _score_picture(image: Array, target: Array, lpips: Perceptual | None,
                    scored_mask: NDArray[np.bool_] | None) -> Scores:
-    """Return the scores of one layer of display values; arguments as of `score_view`."""
+    """Return the scores of `image` against `target`, display values (height, width, 3). scored_mask: (height, width),
+    the pixels to score; None for all."""
     if scored_mask is not None:
         image = np.where(scored_mask[..., None], image, target)
     return {"psnr": psnr(image, target, scored_mask), "ssim": ssim(image, target, mask=scored_mask),
@@ -164,8 +168,8 @@ def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]
               size: tuple[int, int]) -> dict[str, Any]:
     """Return the content of eval.json: means over views, then each view. Numbers that are not finite become null.
 
-    The PSNR of the flare, the PSNR of an empty flare and the relative error are means over the views whose reference
-    holds a flare, because an empty flare has an infinite PSNR where the reference is black.
+    views: (name, scores by layer) of each. The means of a flare's PSNR, empty PSNR and relative error are over the
+    views whose reference holds a flare: where it is black, an empty flare has an infinite PSNR.
     """
     means = {layer: _mean_scores([scores[layer] for _, scores in views if layer in scores]) for layer in LAYERS}
     return {
@@ -179,7 +183,8 @@ def summarise(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]
 
 
 def _mean_scores(view_scores: list[Scores]) -> Scores:
-    """Return the mean of each score of one layer over its views, as `summarise` says; None where no view has one."""
+    """Return the mean of each score of one layer over its views, without infinite ones; None where no view has one. The
+    scores _COMPARED_TO_EMPTY leave out views without a flare."""
     means: Scores = {}
     scores_with_flare = [scores for scores in view_scores if not _has_no_flare(scores)]
     for key in view_scores[0] if view_scores else ():
@@ -190,7 +195,7 @@ def _mean_scores(view_scores: list[Scores]) -> Scores:
 
 
 def _has_no_flare(scores: Scores) -> bool:
-    """True if the reference of one view holds no flare, by its scores before or after eval.json."""
+    """True if the reference of one view holds no flare: its empty PSNR is infinite, or null as eval.json has it."""
     empty = scores.get("empty_psnr", 0.0)
     return empty is None or not math.isfinite(empty)
 

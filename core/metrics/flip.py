@@ -73,7 +73,7 @@ def _filter_contrast(planes: Planes) -> Planes:
     filtered = np.empty_like(planes)
     for channel, gaussians in enumerate(_CONTRAST):
         rows = [np.exp(-math.pi ** 2 * degrees ** 2 / b) for _, b in gaussians]
-        gains = [a * math.sqrt(math.pi / b) for a, b in gaussians]  # as the authors weight them
+        gains = [a * math.sqrt(math.pi / b) for a, b in gaussians]  # the weights of the authors' program
         total = sum(gain * row.sum() ** 2 for gain, row in zip(gains, rows, strict=True))
         plane = np.ascontiguousarray(planes[..., channel])
         filtered[..., channel] = sum(_convolve(plane, row * (gain / total), row)
@@ -89,7 +89,7 @@ def _convolve(plane: Plane, row: NDArray[np.float64], column: NDArray[np.float64
 
 
 def _to_lab(rgb: Planes) -> Planes:
-    """Convert linear Rec. 709 to L*a*b* (white: that of the primaries)."""
+    """Convert linear Rec. 709 to CIE L*a*b*, relative to the white of Rec. 709."""
     relative = _apply_matrix(rgb, _RELATIVE_XYZ_FROM_RGB)
     edge = 6 / 29
     root = np.where(relative > edge ** 3, np.cbrt(relative), relative / (3 * edge ** 2) + 4 / 29)
@@ -127,7 +127,7 @@ def _feature_difference(first: Plane, second: Plane) -> Plane:
     points = (offsets ** 2 / sigma ** 2 - 1) * gaussian
     largest = np.zeros(first.shape, np.float32)
     for row in (edges, points):
-        # The weights of either sign sum to 1.
+        # Scale positive and negative weights separately, so that each sum to 1 in magnitude.
         row = np.where(row > 0, row / row[row > 0].sum(), row / -row[row < 0].sum())
         smoothing = gaussian / gaussian.sum()
         strengths = [np.hypot(_convolve(plane, row, smoothing), _convolve(plane, smoothing, row))

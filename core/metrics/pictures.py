@@ -39,7 +39,7 @@ def psnr(image: Array, target: Array, mask: Array | None = None) -> float:
 def relative_l2(image: Array, target: Array, mask: Array | None = None) -> float:
     """Return |image - target| / |target| in the L2 norm: 0 is exact, 1 is the score of an empty picture.
 
-    mask: as in `psnr`. NaN if the target is empty.
+    mask: (height, width) bool, the pixels to score. NaN if the target is empty.
     """
     error = float(np.linalg.norm(_masked_difference(image, target, mask)))
     size = float(np.linalg.norm(_masked_difference(target, np.zeros_like(target), mask)))
@@ -64,8 +64,9 @@ def ssim(image: Array, target: Array, borders: Borders = "valid", mask: Array | 
     """Return the structural similarity, Wang et al. 2004, eq. 13: 11x11 Gaussian window of sigma 1.5, K = 0.01, 0.03.
 
     borders: "valid" counts only windows inside the picture, as the authors' program does; "same" pads with zeros and
-    counts every pixel, as the 3DGS losses and tables do (slightly higher). The mean is over pixels and channels; mask:
-    as in `psnr`, for the middle of the window. Raises SettingsError for a picture smaller than the window.
+    counts every pixel, as the 3DGS losses and tables do (slightly higher). The mean is over pixels and channels.
+    mask: (height, width) bool; a window counts if its middle is set. Raises SettingsError for a picture smaller than
+    the window.
     """
     _check_same_size(image, target)
     if borders == "valid" and min(image.shape[:2]) < WINDOW:
@@ -80,7 +81,7 @@ def ssim(image: Array, target: Array, borders: Borders = "valid", mask: Array | 
     similarity = ((2 * mean_x * mean_y + c1) * (2 * covariance + c2)
                   / ((mean_x ** 2 + mean_y ** 2 + c1) * (variance_x + variance_y + c2)))
     if mask is not None:
-        # Without borders the similarity is smaller than the picture.
+        # With "valid" borders the similarity map is smaller than the picture.
         margin = (image.shape[0] - similarity.shape[0]) // 2
         similarity = similarity[mask[margin:mask.shape[0] - margin, margin:mask.shape[1] - margin]]
     return float(similarity.mean()) if similarity.size else math.nan
@@ -104,7 +105,7 @@ def _blur(picture: NDArray[np.float64], borders: Borders) -> NDArray[np.float64]
 def flip(image: Array, target: Array, mask: Array | None = None) -> float:
     """Return the mean LDR-FLIP (Andersson et al. 2020), 0 for equal pictures, up to 1, at 67 pixels per degree.
 
-    mask: as in `psnr`.
+    mask: (height, width) bool, the pixels to score; NaN if there are none.
     """
     from .flip import flip_map
 

@@ -46,9 +46,10 @@ def label_lines(layout: Any, text: str, icon: str = "NONE", width: int = 44) -> 
 
 
 def _wrap(text: str, width: int) -> list[str]:
-    """Return a text as lines of `width` characters; a longer word, such as a path, is cut into pieces."""
+    """Return a text as lines of at most `width` characters; a longer word, such as a path, is cut into pieces, of which
+    the last may have up to 4 characters more."""
     lines, line = [], ""
-    for word in [*text.split(), ""]:
+    for word in [*text.split(), ""]:  # the empty word ends the last line
         if word and len(line) + len(word) + 1 <= width:
             line = f"{line} {word}".strip()
             continue

@@ -110,7 +110,7 @@ def _draw_weights(layout: Any) -> None:
         label_lines(box, f"{weights.missing_reason()}.")
         return
     label_lines(box, "Clean frames by the network, and fits with Estimated Clean Frames, need them (20 MB). "
-                + ("Set Up Engine downloads them too." if weights.source_url() else
+                + ("Set Up Engine downloads them too." if weights.published_url() else
                    "This extension was not installed from a repository that offers them: name their file above."))
     set_up = engine.set_up_job()
     error = job.error if job is not None else ""
@@ -118,7 +118,7 @@ def _draw_weights(layout: Any) -> None:
         error = str(set_up.result.get("weights_error", ""))
     if error:
         label_lines(box, error, "ERROR")
-    if weights.source_url():
+    if weights.published_url():
         box.row().operator("fit_flare.download_weights", icon="IMPORT")
 
 
@@ -186,7 +186,7 @@ class FITFLARE_OT_download_weights(GuardedOperator, bpy.types.Operator):
             return NO_ONLINE_ACCESS
         if weights.find_weights() is not None:
             return "The weights are installed already"
-        return "" if weights.source_url() else "This extension was not installed from a repository that offers them"
+        return "" if weights.published_url() else "This extension was not installed from a repository that offers them"
 
     def act(self, _context: bpy.types.Context) -> None:
         weights.download_weights()

@@ -53,7 +53,7 @@ def missing_reason() -> str:
     if path:
         return f"The weights named by {source} are missing: {path}. Name a file that exists, or name none"
     return ("The removal network needs its weights. Open the preferences of Fit Flare and "
-            f"{'download them' if source_url() else 'name their file under Removal Weights'}")
+            f"{'download them' if published_url() else 'name their file under Removal Weights'}")
 
 
 def environment() -> dict[str, str]:
@@ -63,7 +63,7 @@ def environment() -> dict[str, str]:
     return {} if path is None or path == IN_THE_BOX else {WEIGHTS_VARIABLE: str(path)}
 
 
-def source_url() -> str:
+def published_url() -> str:
     """Return the address of the weights in the repository that the extension was installed from.
 
     "" for Blender's own repository and one on disk, which have no weights, and without a repository."""
@@ -78,7 +78,7 @@ def source_url() -> str:
 
 def download_args() -> list[str]:
     """Return the arguments of SET_UP that download the weights; [] where they are not missing or offered nowhere."""
-    url = source_url() if find_weights() is None and not configured_weights()[1] else ""
+    url = published_url() if find_weights() is None and not configured_weights()[1] else ""
     return ["--weights", url, str(downloaded_file()), published_digest()] if url else []
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 ASPECT_TOLERANCE = 0.02
 """Difference from 1 within which a pixel aspect ratio counts as 1."""
+MAX_BLIND_SHARE = 0.5
+"""Share of the cameras above which, if they see nothing of a scene, it is of another world than they are."""
+SAMPLED_POINTS = 10_000
+"""Approximate number of points of a scene that are looked for on the frames before all of them are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +139,19 @@ class Camera:
         points = np.asarray(pixels, np.float64).reshape(-1, 2)
         with np.errstate(invalid="ignore"):
             return np.asarray((np.asarray(depth) > 0) & (points >= 0).all(axis=1) & (points <= self.size).all(axis=1))
+
+
+def count_blind_cameras(cameras: Sequence[Camera], points: Floats) -> int:
+    """Return how many cameras have no point of a scene (n, 3) on their frames.
+
+    It may be too high where it is at most MAX_BLIND_SHARE of the cameras: a sample of the points suffices then.
+    """
+    blind = 0
+    for some_points in (points[::max(len(points) // SAMPLED_POINTS, 1)], points):
+        blind = sum(not camera.contains(*camera.project(some_points)).any() for camera in cameras)
+        if blind <= MAX_BLIND_SHARE * len(cameras):
+            break
+    return blind
 
 
 def is_rotation(matrix: Floats) -> bool:

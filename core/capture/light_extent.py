@@ -80,7 +80,7 @@ class SampledExtent:
 @dataclass(frozen=True, eq=False)
 class LightExtent:
     """An extent around a light's position; see the module's head. Make one with `rectangle`, `ellipse`, `sphere`,
-    `of_points`, or `read`.
+    `of_points`, or `from_json`.
 
     axes (2, 3): half axes of a rectangle or ellipse. radius: of a sphere. points (n, 3): offsets of the points, ordered
     so that neighbours are beside each other. factors (n, 3): None, or linear RGB of each point; each point is then a
@@ -118,7 +118,7 @@ class LightExtent:
                    factors=None if factors is None else np.array(factors, np.float64))._checked()
 
     @classmethod
-    def read(cls, entry: Any) -> LightExtent:
+    def from_json(cls, entry: Any) -> LightExtent:
         """Read the JSON form. Raises ValueError that says what is wrong."""
         if not isinstance(entry, Mapping) or entry.get("shape") not in get_args(Shape):
             raise ValueError(f"the extent of a light needs a shape: {', '.join(get_args(Shape))}")

@@ -151,7 +151,7 @@ def _parse_light(entry: Mapping[str, Any], name: str, where: str) -> Light:
         raise CaptureError(f"{where}: it has one place and a path; remove one of them.")
     xyz = _parse_place(entry, "xyz", 3, where)
     try:
-        extent = LightExtent.read(entry["extent"]) if entry.get("extent") is not None else None
+        extent = LightExtent.from_json(entry["extent"]) if entry.get("extent") is not None else None
     except ValueError as problem:
         raise CaptureError(f"{where}: {problem}; correct the extent, or remove it.") from problem
     return Light(name, np.full(3, np.nan) if xyz is None else xyz, _parse_place(entry, "xy", 2, where), keys, extent)

@@ -22,7 +22,7 @@ def read_plate_space(folder: Path) -> ColourSpace | None:
 
     Raises CaptureError for a damaged record, SettingsError for an unknown space, EngineError without OpenColorIO.
     """
-    record = _read(folder / FILE)
+    record = _read_record(folder / FILE)
     return None if record is None else colour_space(*record)
 
 
@@ -30,14 +30,16 @@ def recorded_name(folder: Path) -> str:
     """Return the name of the space of a capture's frames, without loading OpenColorIO; "" where their files decide,
     or where the record is damaged."""
     try:
-        record = _read(folder / FILE)
+        record = _read_record(folder / FILE)
     except CaptureError:
         return ""
     return "" if record is None else record[0]
 
 
-def _read(path: Path) -> tuple[str, str | None] | None:
-    """Return the name of the space and its configuration; None without a record. Raises CaptureError."""
+def _read_record(path: Path) -> tuple[str, str | None] | None:
+    """Return the name of the space and the path of the OpenColorIO configuration that defines it; None without a
+    record. The path is None for a built-in space, and for one of the configuration that the variable OCIO names.
+    Raises CaptureError."""
     if not path.is_file():
         return None
     data = read_json(path, CaptureError)

@@ -271,7 +271,7 @@ def _make_far_points(sphere: FarSphere, patches: Patches, views: Sequence[View],
     if len(directions) > MAX_POINTS:
         directions = _visible_directions(cameras, pitch * (len(directions) / MAX_POINTS) ** 0.5)
         directions = directions[patches.are_far(directions)]
-    colours = _sample_views(directions, sphere, views, targets, frames)
+    colours = _sample_colours(directions, views, targets, frames)
     is_exact = all(target.clean is not None for target in targets)
     visible = np.isfinite(colours[..., 0]).any(0)
     chosen_colours = np.nanquantile(colours[:, visible], 0.5 if is_exact else COLOUR_QUANTILE, axis=0)
@@ -280,17 +280,16 @@ def _make_far_points(sphere: FarSphere, patches: Patches, views: Sequence[View],
                       np.zeros(len(xyz), np.float32))
 
 
-def _sample_views(directions: Floats, sphere: FarSphere, views: Sequence[View], targets: Sequence[Targets],
-                  frames: Frames) -> Values:
-    """Return colours (views, n, 3), display values at the usual exposure, of the far sphere in directions (n, 3); NaN
-    where a view does not see a direction. targets: of the views."""
+def _sample_colours(directions: Floats, views: Sequence[View], targets: Sequence[Targets], frames: Frames) -> Values:
+    """Return colours (views, n, 3), display values at the usual exposure, of points at infinity in directions (n, 3);
+    NaN where a view does not see a direction. targets: camera, frame and clean frame of each view."""
     colours = np.full((len(views), len(directions), 3), np.nan, np.float32)
     for row, view, (camera, frame, clean) in zip(colours, views, targets, strict=True):
-        # Points are then PITCH_PX apart, as the directions of the sweep are.
+        # Scale the frame so that neighbouring far points lie PITCH_PX pixels apart.
         small = camera.scaled(max(round(camera.width * PITCH_PX / POINT_PITCH_PX), 8))
         picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
         values = Picture(picture, "srgb").resized(*small.size).display()
-        inside, places = _project_sphere(small, np.array(sphere.centre), directions, 0.0)
+        inside, places = _project_sphere(small, camera.position, directions, 0.0)
         row[inside] = _bilinear(values, places)
         if (mask := frames.mask(view)) is not None:
             x, y = np.minimum((places / small.width * camera.width).astype(int), np.array(camera.size) - 1).T

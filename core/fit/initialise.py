@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..capture import LIGHTS, Capture, View
+from ..capture.camera import MAX_BLIND_SHARE, count_blind_cameras
 from ..errors import CaptureError
 from ..flare.deformation import QueryRange
 from ..flare.frame_lights import FrameLights
@@ -28,8 +29,6 @@ NEAREST_QUANTILE, NEAR_PLANE_FACTOR = 0.01, 0.5
 that is less than the usual near plane: captures in small units, such as metres around a watch, need it."""
 SAMPLED_POINTS = 10_000
 """Approximate number of points whose depths are computed."""
-MIN_SHARE_OF_SEEING_VIEWS = 0.5
-"""Share of the views that must have a Gaussian of a scene from elsewhere on their frames."""
 CAMERA_RANGE = 1e6
 """Half the side of the model's camera range in a fit over plates, world units: so large that all cameras fall on one
 point of the grid, and appearance follows only the place of the light in the picture."""
@@ -91,17 +90,11 @@ def _scene_from_points(capture: Capture, settings: FitSettings, views: tuple[Vie
 
 def _check_in_view(scene: SceneGaussians, views: tuple[View, ...], path: str) -> None:
     """Raise CaptureError where few views have a Gaussian of the scene on their frames: it is of another world."""
-    means = scene.means.detach().numpy()
-    seeing_views = 0
-    # Some Gaussians suffice as a rule; all are projected only if those are on too few frames.
-    for points in (means[::max(len(means) // SAMPLED_POINTS, 1)], means):
-        seeing_views = sum(bool(view.camera.contains(*view.camera.project(points)).any()) for view in views)
-        if seeing_views >= MIN_SHARE_OF_SEEING_VIEWS * len(views):
-            return
-    raise CaptureError(f"{path} is of another world than the capture: {len(views) - seeing_views} of {len(views)} "
-                       f"views have none of its {len(scene)} Gaussians before them; export it in the world of the "
-                       "cameras (for nerfstudio: --orientation-method none --center-method none --auto-scale-poses "
-                       "False).")
+    blind = count_blind_cameras([view.camera for view in views], scene.means.detach().numpy())
+    if blind > MAX_BLIND_SHARE * len(views):
+        raise CaptureError(f"{path} is of another world than the capture: {blind} of {len(views)} views have none of "
+                           f"its {len(scene)} Gaussians before them; export it in the world of the cameras (for "
+                           "nerfstudio: --orientation-method none --center-method none --auto-scale-poses False).")
 
 
 def _check_has_lights(capture: Capture) -> None:

@@ -31,12 +31,12 @@ class Optimisers:
         largest display value of the frames."""
         self._settings, self._extent = settings, extent
         rates = settings.scene.rates
-        features = torch.full((COEFFICIENTS, 1), rates.features_rest)
+        sh_rates = torch.full((COEFFICIENTS, 1), rates.features_rest)
         # Coefficient 0 is the constant colour; the others change it with direction, and learn more slowly.
-        features[0] = rates.features * (COLOUR_RATE_FACTOR if display_white > 1 else 1)
+        sh_rates[0] = rates.features * (COLOUR_RATE_FACTOR if display_white > 1 else 1)
         rate_by_name: dict[str, float | Tensor] = {
             "means": self._means_rate(0.0), "log_scales": rates.scale, "quaternions": rates.rotation,
-            "opacity_logits": rates.opacity, "sh": features.expand(COEFFICIENTS, 3).contiguous(),
+            "opacity_logits": rates.opacity, "sh": sh_rates.expand(COEFFICIENTS, 3).contiguous(),
         }
         self.scene = Adam({} if scene is None else dict(scene.named_parameters()),
                           {} if scene is None else rate_by_name)

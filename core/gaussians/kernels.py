@@ -86,7 +86,7 @@ class FusedKernels(Protocol):
         rate: float | Tensor,
     ) -> Any: ...  # fmt: skip
     def adam_steps(self, steps: Sequence[Any], *, beta1: float, beta2: float, epsilon: float) -> None: ...
-    def steps_in_backward(
+    def offer_steps(
         self, steps: Mapping[str, Any], *, beta1: float, beta2: float, epsilon: float
     ) -> AbstractContextManager[StepsInBackward]: ...
 

@@ -82,7 +82,7 @@ class Adam:
         if fused is None:
             yield
             return
-        with fused.steps_in_backward(steps, **self._options) as offer:
+        with fused.offer_steps(steps, **self._options) as offer:
             yield
         for name in offer.claimed:
             self.steps[name] += 1

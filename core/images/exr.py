@@ -132,7 +132,7 @@ def is_utf8(text: bytes) -> bool:
 
 
 @contextlib.contextmanager
-def _readable_copy(path: Path | str) -> Iterator[str]:
+def _readable_path(path: Path | str) -> Iterator[str]:
     """Yield the path of an EXR that the library can read: the file itself, or a copy without what is not UTF-8, since
     the library would refuse the whole file.
 
@@ -166,7 +166,7 @@ def read_exr_headers(path: Path | str) -> list[dict[str, Any]]:
     import OpenEXR
 
     try:
-        with _readable_copy(path) as readable, OpenEXR.File(readable, header_only=True) as file:
+        with _readable_path(path) as readable, OpenEXR.File(readable, header_only=True) as file:
             headers = [_usable_header(part.header) for part in file.parts]
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
@@ -201,7 +201,7 @@ def read_exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[A
     import OpenEXR
 
     try:
-        with _readable_copy(path) as readable, OpenEXR.File(readable, separate_channels=True) as file:
+        with _readable_path(path) as readable, OpenEXR.File(readable, separate_channels=True) as file:
             parts = [(_usable_header(part.header), {name: channel.pixels for name, channel in part.channels.items()})
                      for part in file.parts]
     except OSError as problem:

@@ -70,18 +70,23 @@ def _view_of_part(header: Mapping[str, Any]) -> str:
 def stereo_views(header: Mapping[str, Any], names: Collection[str]) -> list[StereoView]:
     """Return the views in one part of an EXR, the one at the root first; empty for a picture of one view.
 
-    names: of the channels. Without the attribute multiView, views are the channel prefixes "left" and "right"; the
-    picture at the root is then the eye that is not among them, or "root" if both are.
+    names: of the channels. Without the attribute multiView, views are the channel prefixes "left" and "right". The
+    channels without a prefix are then named after the missing eye; "root" if both eyes have a prefix.
     """
     listed_views = [str(name) for name in header.get("multiView", ())]
-    prefixed = dict.fromkeys(name.rpartition(".")[0] for name in names if name.count(".") == 1)
-    eyes = listed_views[1:] or [name for name in prefixed if name.lower() in _EYES]
-    root = listed_views[0] if listed_views else next(
-        name for name in (*_EYES, "root") if name not in [eye.lower() for eye in eyes])
-    views = [StereoView(root, colours)] if (colours := _colour_channels(names, "")) else []
+    prefixes = dict.fromkeys(name.rpartition(".")[0] for name in names if name.count(".") == 1)
+    eye_prefixes = [prefix for prefix in prefixes if prefix.lower() in _EYES]
+    if listed_views:
+        # Where the list ends with the first view, the others go by their prefixes.
+        root_view, prefixed_views = listed_views[0], listed_views[1:] or eye_prefixes
+    else:
+        prefixed_eyes = [prefix.lower() for prefix in eye_prefixes]
+        root_view = next(name for name in (*_EYES, "root") if name not in prefixed_eyes)
+        prefixed_views = eye_prefixes
+    views = [StereoView(root_view, colours)] if (colours := _colour_channels(names, "")) else []
     if not views and listed_views:
-        eyes = listed_views  # the first one is behind its name too
-    views += [StereoView(eye, colours) for eye in eyes if (colours := _colour_channels(names, f"{eye}."))]
+        prefixed_views = listed_views  # the first one is behind its name too
+    views += [StereoView(view, colours) for view in prefixed_views if (colours := _colour_channels(names, f"{view}."))]
     return views if len(views) > 1 else []
 
 

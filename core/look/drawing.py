@@ -99,8 +99,9 @@ def profile_in_box(box: Box, centre: Floats, covariance: Floats, ring: NDArray[A
                    ) -> Floats:
     """Return the profile (rows, columns) of a Gaussian in a box of pixels, 1 at its peak.
 
-    centre (2,), px. covariance (3,), px². ring (2,): radius r0 and width w of the profile exp(-(r - r0)²/(2 w²)), r the
-    Mahalanobis distance; None for exp(-r²/2). pixel_arc (2,): px, towards the brighter side of a ring; 0 for none."""
+    centre (2,), px. covariance (3,), px². ring (2,): radius r0 and width w of a ring-shaped profile
+    exp(-(r - r0)²/(2 w²)), in standard deviations like the distance r; None for exp(-r²/2). pixel_arc (2,): vector to
+    the ring's brighter side, px, 0 for an even ring; it tilts the profile's logarithm, see `arcs_to_pixels`."""
     xx, xy, yy = covariance
     left, top, right, bottom = box
     dx = np.arange(left, right, dtype=np.float32) + 0.5 - centre[0]

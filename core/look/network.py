@@ -100,21 +100,23 @@ class OffsetsBudget:
         self._drawn, self._drawn_before = {}, self._drawn
 
     def get(self, light: tuple[int, str], key: tuple[int, bytes], compute: Callable[[], Floats]) -> Floats:
-        """Return the offsets of a light: exact ones if it is new, unchanged or due in this drawing, else its last ones.
+        """Return the offsets of a light: newly computed for `key` (features of the current view) if it is the light's
+        turn or its first drawing, else its last ones.
 
-        light: number of its network, and its name. key: of its exact offsets in the cache. compute: computes these.
+        light: number of its network, and its name. compute: computes the offsets for `key`.
         """
-        if not self._drawn:  # the first light of this drawing: now it is known whether the view rests
+        if not self._drawn:  # the first light of a drawing: now it is known whether the view rests
             self._choose_due(self._rested and self._drawn_before.get(light) == key)
         self._drawn[light] = key
-        known = self._offsets.get(light)
-        if known is None or (known[0] != key and light in self._due):
-            known = self._offsets[light] = key, _cache.get(key, lambda: self._measure(compute))
-        if known[0] == key:
+        last_key, last_offsets = self._offsets.get(light, (None, None))
+        if last_offsets is None or (last_key != key and light in self._due):
+            last_key, last_offsets = key, _cache.get(key, lambda: self._measure(compute))
+            self._offsets[light] = last_key, last_offsets
+        if last_key == key:
             self._offsets.move_to_end(light)  # it has exact offsets: behind all that wait
         else:
             self.is_complete = False
-        return known[1]
+        return last_offsets
 
     def _choose_due(self, is_at_rest: bool) -> None:
         """Choose the lights that get exact offsets in this drawing: the longest waiting, as many as its time allows."""

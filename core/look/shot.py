@@ -191,7 +191,7 @@ def _read_light(entry: Mapping[str, Any]) -> PlacedLight:
     if len(factor) != 3 or not all(0 <= value <= MAX_FACTOR for value in factor):
         raise ValueError(f"the factor of a light has three numbers from 0 to {MAX_FACTOR:g}")
     red, green, blue = factor
-    extent = LightExtent.read(entry["extent"]) if entry.get("extent") is not None else None
+    extent = LightExtent.from_json(entry["extent"]) if entry.get("extent") is not None else None
     shares = read_numbers("shares") if extent is not None and entry.get("shares") is not None else None
     light = PlacedLight(str(entry["name"]), str(entry["source"]), xyz, _to_float(entry.get("share", 1.0)), extent,
                         shares, (red, green, blue), _to_float(entry.get("reference_distance", 0.0)))

@@ -13,22 +13,24 @@ L1_EPSILON = 0.01
 """Residuals below this count by their squares."""
 
 
-def robust_bounded_fit(columns: Floats, values: Floats, initial: Floats, low: ArrayLike, high: ArrayLike,
+def robust_bounded_fit(design_matrix: Floats, values: Floats, initial: Floats, low: ArrayLike, high: ArrayLike,
                        prior_weight: float) -> Floats:
-    """Return x (n,) within bounds that brings columns (m, n) @ x nearest to values (m,), by least absolute errors.
+    """Bounded L1 regression by iteratively reweighted least squares.
 
-    low, high: the bounds, (n,) or one for all. prior_weight: per value, of the squared distance from `initial`, which
-    decides where the values do not.
+    Return x (n,) within bounds that minimises the sum of absolute residuals, values (m,) - design_matrix (m, n) @ x.
+
+    low, high: the bounds, (n,) or one for all. prior_weight: m * prior_weight times the squared distance of x from
+    `initial` (n,) is added to the sum, so that x stays there where the values do not decide.
     """
     lower, upper = np.broadcast_to(low, initial.shape), np.broadcast_to(high, initial.shape)
     solution, weights = initial.copy(), np.ones(len(values))
     prior = prior_weight * max(len(values), 1) * np.eye(len(initial))
     for _ in range(REWEIGHTINGS):
-        weighted = columns.T * weights
-        solution = bounded_least_squares(weighted @ columns + prior, weighted @ values + prior @ initial, solution,
-                                         lower, upper)
+        weighted = design_matrix.T * weights
+        solution = bounded_least_squares(weighted @ design_matrix + prior, weighted @ values + prior @ initial,
+                                         solution, lower, upper)
         # So weighted, the square of a residual counts as its absolute value.
-        weights = 1 / (np.abs(values - columns @ solution) + L1_EPSILON)
+        weights = 1 / (np.abs(values - design_matrix @ solution) + L1_EPSILON)
     return solution
 
 

@@ -100,7 +100,7 @@ def parse_json(text: str | bytes) -> Any:
     try:
         data = json.loads(text, object_pairs_hook=_reject_duplicate_keys, parse_int=_parse_int)
         if _ESCAPED.search(text):
-            _check_text(data)
+            _check_strings(data)
     except RecursionError as problem:
         raise ValueError("it nests too deeply") from problem
     return data
@@ -161,8 +161,9 @@ def _parse_int(digits: str) -> int | float:
     return int(digits) if len(digits) <= _MAX_DIGITS else float(digits)
 
 
-def _check_text(value: Any) -> None:
-    """Raise ValueError for text that can be neither written nor be the name of a file."""
+def _check_strings(value: Any) -> None:
+    """Raise ValueError if a string anywhere in parsed JSON, keys included, has a NUL or a lone surrogate: it could not
+    be a file name, or not be written as UTF-8."""
     if isinstance(value, str):
         if "\0" in value:
             raise ValueError(f"{value!r:.100} has a NUL")
@@ -172,8 +173,8 @@ def _check_text(value: Any) -> None:
             raise ValueError(f"{value!r:.100} is not UTF-8") from None
     elif isinstance(value, dict):
         for name, entry in value.items():
-            _check_text(name)
-            _check_text(entry)
+            _check_strings(name)
+            _check_strings(entry)
     elif isinstance(value, list):
         for entry in value:
-            _check_text(entry)
+            _check_strings(entry)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Camera, Capture, View, read_lights
+from ..capture.camera import MAX_BLIND_SHARE, count_blind_cameras
 from ..colour import ColourSpace
 from ..conventions.frame_numbers import NumberedFrame, layers_file, number_views, plates_by_number
 from ..errors import CaptureError, FrameError, SettingsError
@@ -37,9 +38,6 @@ from .query import TrainingViews
 from .sources import assign_sources
 
 SourceNames = Mapping[str, str]
-_SAMPLED_POINTS = 10_000
-"""Gaussians of a scene that are looked for on the frames before all of them are."""
-_MIN_SHARE_OF_SEEING_VIEWS = 0.5
 _WITH_ALPHA = (".png", ".tif", ".tiff")
 """Suffixes of files whose colours may not be multiplied with their alpha."""
 
@@ -230,7 +228,7 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
         path = None if scene_is_background else capture.frame_path(view)
         file_matches_view = view.lens is None and not view.upright
         undistorted = None if file_matches_view or path is None else _undistorted_reader(capture, view)
-        window = camera_window(view.camera, path) if undistorted is None and path is not None else None
+        window = matching_window(view.camera, path) if undistorted is None and path is not None else None
         states = [lit_capture.light_state(light, view) for light in target_lights]
         # A light of unknown brightness counts as on.
         placed = tuple(PlacedLight(state.name, sources[state.name], state.xyz, 1.0 if state.on is None else state.on,
@@ -243,14 +241,11 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
 def _read_scene_in_view(path: Path, frames: Sequence[TargetFrame]) -> SceneGaussians:
     """Read a 3DGS PLY. Raises CaptureError where fewer than half of the cameras have any of its Gaussians in view."""
     scene = read_ply(path)
-    means, seeing = scene.means.detach().numpy(), 0
-    # A sample first, then all Gaussians.
-    for points in (means[::max(len(means) // _SAMPLED_POINTS, 1)], means):
-        seeing = sum(bool(frame.shot.camera.contains(*frame.shot.camera.project(points)).any()) for frame in frames)
-        if seeing >= _MIN_SHARE_OF_SEEING_VIEWS * len(frames):
-            return scene
-    raise CaptureError(f"{path} is of another world than the cameras: {len(frames) - seeing} of {len(frames)} views "
-                       f"have none of its {len(scene)} Gaussians before them; export it in the world of the cameras.")
+    blind = count_blind_cameras([frame.shot.camera for frame in frames], scene.means.detach().numpy())
+    if blind > MAX_BLIND_SHARE * len(frames):
+        raise CaptureError(f"{path} is of another world than the cameras: {blind} of {len(frames)} views have none of "
+                           f"its {len(scene)} Gaussians before them; export it in the world of the cameras.")
+    return scene
 
 
 def _undistorted_reader(capture: Capture, view: View) -> Callable[[ColourSpace | None], Picture]:
@@ -296,7 +291,7 @@ def shot_target(shot: Shot, look: Look, requested: SourceNames, *, plates: Path 
         plate = plates_by_frame.get(number)
         window = None
         if plate is not None:
-            window = camera_window(shot_frame.camera, plate)
+            window = matching_window(shot_frame.camera, plate)
             _check_shape(plate, shot_frame.camera)
         frames.append(TargetFrame(frame, replace(shot_frame, lights=lights), plate, window=window))
     if not frames:
@@ -324,7 +319,7 @@ def plate_window(plate: Path, orientation: int = UPRIGHT) -> DataWindow:
     return window.oriented(orientation)
 
 
-def camera_window(camera: Camera, plate: Path) -> DataWindow | None:
+def matching_window(camera: Camera, plate: Path) -> DataWindow | None:
     """Return the window of a plate whose frame has the camera's size; None for a plate of another size.
 
     Raises SettingsError for a plate of another size that stores more or fewer pixels than its frame."""
@@ -367,8 +362,8 @@ def _plates_by_number(folder: Path) -> dict[int, Path]:
 
 
 def resized(target: Target, width: int | None, height: int | None) -> Target:
-    """Return the target at another size of its frames, px, without the plates' overscan; without a height the aspect
-    ratio is preserved."""
+    """Return the target with frames of another size, px, without the plates' overscan: without a height of the same
+    aspect ratio, without a width unchanged."""
     if not width:
         return target
     frames = []

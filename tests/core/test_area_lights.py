@@ -146,7 +146,7 @@ def test_a_one_sided_light_follows_the_cosine(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("shape", ["rectangle", "ellipse"])
 def test_a_mirrored_extent_emits_to_the_image_of_its_side(shape: str) -> None:
-    extent = LightExtent.read({"shape": shape, "axes": [[0.5, 0, 0], [0, 0.3, 0]], "one_sided": True})
+    extent = LightExtent.from_json({"shape": shape, "axes": [[0.5, 0, 0], [0, 0.3, 0]], "one_sided": True})
     eye = np.array([0.1, 0.2, 2.0])
     for mirror in (np.diag([-2.0, 2, 2]), np.diag([2.0, 2, -2]), -2 * np.eye(3)):
         for side in (1, -1):

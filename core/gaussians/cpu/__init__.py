@@ -13,6 +13,6 @@ from .loss import l1_ssim
 from .optimiser import AdamStep, adam_steps
 from .scene import rasterize_scene
 from .splats import splat
-from .stepping import steps_in_backward
+from .stepping import offer_steps
 
-__all__ = ["AdamStep", "adam_steps", "l1_ssim", "over", "rasterize_scene", "splat", "steps_in_backward", "upsample"]
+__all__ = ["AdamStep", "adam_steps", "l1_ssim", "offer_steps", "over", "rasterize_scene", "splat", "upsample"]

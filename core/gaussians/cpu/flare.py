@@ -163,14 +163,14 @@ def prepare_records(
 ):  # fmt: skip
     """Write record, shape, key and an upper bound on the number of tiles of each Gaussian.
 
-    Computed in float64, since in float32 xx yy - xy² cancels for needles. With the blend "add" the opacity is
-    multiplied into the colour, and the record's is 1.
+    Computed in float64, because very thin Gaussians (needles) lose too much in float32: xx yy - xy² cancels. With the
+    blend "add" the opacity is multiplied into the colour, and the record's is 1.
 
     centres, covariances, opacities, colours, rings (n 2) and arcs (n 3): the arguments of `splat`, flat; rings and arcs
     are empty if there are none. keys: the index of a Gaussian, so that the given order is kept, or CULLED_KEY.
-    max_tiles: the upper bounds; first_slots: their exclusive sums within chunks; chunk_max_tiles: their sums by
-    chunk."""
-    h = -0.5 / math.log(2.0)  # exp(-q / 2) = 2^(h q)
+    max_tiles (n,): upper bound on the tiles of each Gaussian; first_slots (n,): its exclusive sums within a chunk of
+    CHUNK Gaussians; chunk_max_tiles (chunks,): its sum by chunk."""
+    log2_scale = -0.5 / math.log(2.0)  # exponent in log2: -1/2 / ln 2, so exp(-q / 2) = 2^(log2_scale q)
     for i in range(opacities.size):
         record = i * RECORD
         xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
@@ -179,15 +179,16 @@ def prepare_records(
         opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), rendering.OPACITY_MAX)
         r0, ring_width = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
         cutoff = _cutoff_log2(opacity, add)
-        # reach: Mahalanobis distance up to which the profile is drawn; an arc moves the ring out by w² beta at most.
+        # max_distance: Mahalanobis, up to which the profile is drawn; an arc moves the ring out by w² beta at most.
         plain_reach = math.sqrt(2.0 * math.log(2.0) * max(cutoff, 0.0))
-        reach = r0 + ring_width * ring_width * _arc_strength(arcs, i, xx, xy, yy) + abs(ring_width) * plain_reach
+        arc_offset = ring_width * ring_width * _arc_strength(arcs, i, xx, xy, yy)
+        max_distance = r0 + arc_offset + abs(ring_width) * plain_reach
         keys[i], max_tiles[i] = CULLED_KEY, 0
-        if not (determinant > 0 and xx > 0 and cutoff >= 0 and reach >= 0):
+        if not (determinant > 0 and xx > 0 and cutoff >= 0 and max_distance >= 0):
             continue
         x, y, k = np.float64(centres[2 * i]), np.float64(centres[2 * i + 1]), -xy / yy
-        major, minor = h * yy / determinant, h / yy
-        half_x, half_y = reach * math.sqrt(xx), reach * math.sqrt(yy)
+        major, minor = log2_scale * yy / determinant, log2_scale / yy
+        half_x, half_y = max_distance * math.sqrt(xx), max_distance * math.sqrt(yy)
         # Negated so that a NaN centre is culled: it would be listed in tiles that do not exist.
         if not (x + half_x > 0 and y + half_y > 0 and x - half_x < width and y - half_y < height):
             continue
@@ -201,7 +202,7 @@ def prepare_records(
         records[record + RUN] = min(math.sqrt(RUN_LOG2_RANGE / -curvature), np.float64(RUN_MAX))
         records[record + RED], records[record + GREEN] = colour_gain * colours[3 * i], colour_gain * colours[3 * i + 1]
         records[record + BLUE], records[record + DEPTH] = colour_gain * colours[3 * i + 2], 0.0
-        records[record + REACH] = h * reach * reach - MARGIN
+        records[record + REACH] = log2_scale * max_distance * max_distance - MARGIN
         records[record + HALF_X], records[record + HALF_Y] = half_x, half_y
         _write_shape(shapes, i, r0, ring_width, cutoff, k, arcs)
         # Half a pixel wider than `binning` lists, so that rounding cannot make the bound too low.

@@ -3,7 +3,7 @@
 
 The projection's backward pass computes the gradients of some Gaussians at a time. Pending steps are made right there,
 while the gradients are in the cache, so that these are neither written to memory nor read again. `..optimiser.Adam`
-registers the steps (`steps_in_backward`); `scene` claims them (`claim_steps`).
+registers the steps (`offer_steps`); `scene` claims them (`claim_steps`).
 """
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ _pending: list[StepsInBackward] = []
 
 
 @contextmanager
-def steps_in_backward(
+def offer_steps(
     steps: Mapping[str, AdamStep], *, beta1: float, beta2: float, epsilon: float
 ) -> Iterator[StepsInBackward]:
     """Offer steps: within the context, a backward pass that computes all gradients of a scene may make them.

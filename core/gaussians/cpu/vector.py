@@ -185,8 +185,8 @@ def load_scalar(typing_context, array, index):  # noqa: ARG001
 
 @intrinsic
 def opaque(typing_context, number):  # noqa: ARG001
-    """Return the same int64, hidden from LLVM: a loop with such a step is not unrolled into several loops, each with a
-    branch at its end to predict."""
+    """Optimisation barrier: return the int64 unchanged, but unknown to LLVM. LLVM then does not unroll a loop with such
+    a step into several loops, each of which would end with a branch to predict."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         type_ = ir.FunctionType(args[0].type, [args[0].type])

@@ -55,6 +55,8 @@ def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progres
         try:
             key = digest(frame)
             reason = manifest.reason_to_keep(frame.name, frame.source, key, frame.results) if keep_finished else None
+            if reason == "up to date":
+                manifest.record_missing_results(frame.results)
             if reason is not None and not (overwrite and reason == "edited"):
                 kept_counts[reason] += 1
             else:

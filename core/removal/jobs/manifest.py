@@ -49,7 +49,7 @@ class Manifest:
     Arguments of the methods: name, source and results are those of a `clean_frames.CleanFrame`; digest is a text of
     `digest_inputs`.
 
-    Any number of processes may add to it, also for the same frames: every method reads the file anew, once.
+    Any number of processes may add to it, also for the same frames: every method reads the file anew.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -62,15 +62,11 @@ class Manifest:
     def reason_to_keep(self, name: Path, source: Path, digest: str, results: Sequence[Path]) -> KeepReason | None:
         """Return why the files of a frame are kept, or None if they are to be made.
 
-        "up to date": they would come out the same. "edited": someone has changed them since they were made from what
-        `source` still holds. Where a process was killed before it wrote down the content of finished files, that is
-        done now, so that later edits are noticed.
+        "up to date": they would come out the same. "edited": someone changed them after they were made, and `source`
+        has not changed since.
         """
         tables = self._read_tables()
         if self._is_up_to_date(tables, name, digest, results):
-            if not all(_relative_path(self._folder, path) in tables["written"] for path in results):
-                with contextlib.suppress(OSError):  # a frame is kept in a read-only folder too
-                    self.record_results(results)
             return "up to date"
         is_edited = (bool(self._edited_files(tables, results))
                      and tables["sources"].get(name.as_posix()) == content_hash(source))
@@ -117,6 +113,14 @@ class Manifest:
             tables = self._read_tables()
             tables["written"] |= {_relative_path(self._folder, path): content_hash(path) for path in results}
             self._write_tables(tables)
+
+    def record_missing_results(self, results: Sequence[Path]) -> None:
+        """Enter the content of a frame's files that are up to date, where a process was killed before it did so; else
+        later edits would not be noticed. A folder that cannot be written to is left as it is."""
+        written = self._read_tables()["written"]
+        if not all(_relative_path(self._folder, path) in written for path in results):
+            with contextlib.suppress(OSError):
+                self.record_results(results)
 
     def confidence(self, names: Iterable[Path]) -> dict[str, float]:
         """Return the recorded confidence in each frame's flare, 0..1, by the frame's name. Frames without a record are

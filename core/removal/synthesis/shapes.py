@@ -35,8 +35,8 @@ def draw_streak(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def draw_smear(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return what wiped grease on the front glass shows, as on most telephones at night: beams across the wiping marks,
-    which widen outwards, of fine rays or even, on one or both sides of the light.
+    """Return what wiped grease on the front glass shows, as on most telephones at night: beams at right angles to the
+    wiping marks. Each widens outwards, is smooth or made of fine rays, and lies on one or both sides of the light.
 
     The first beam has a brightness of about 1 at a distance of 0.25 from the light, so the layer (size, size, 3)
     exceeds 1 nearer to it. x, y: `canvas_grid`.

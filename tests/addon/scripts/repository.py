@@ -48,7 +48,7 @@ weights, fits, engine, preferences = (part(f"flare_addon.{name}")
                                       for name in ("weights", "fits", "engine", "preferences"))
 package = Path(weights.__file__).parents[1]
 facts["in the package"] = [path.name for path in package.rglob("*.safetensors")]
-facts["offered"] = weights.source_url().rpartition("/")[2] == weights.published_name()
+facts["offered"] = weights.published_url().rpartition("/")[2] == weights.published_name()
 ops = bpy.ops.fit_flare
 scene = bpy.context.scene
 ops.import_capture(directory=str(capture))

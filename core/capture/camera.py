@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 ASPECT_TOLERANCE = 0.02
 """Difference from 1 within which a pixel aspect ratio counts as 1."""
 MAX_BLIND_SHARE = 0.5
-"""Share of the cameras above which, if they see nothing of a scene, it is of another world than they are."""
+"""Where a larger share of the cameras sees nothing of a scene, it is of another world."""
 SAMPLED_POINTS = 10_000
 """Approximate number of points of a scene that are looked for on the frames before all of them are."""
 
@@ -144,7 +144,7 @@ class Camera:
 def count_blind_cameras(cameras: Sequence[Camera], points: Floats) -> int:
     """Return how many cameras have no point of a scene (n, 3) on their frames.
 
-    It may be too high where it is at most MAX_BLIND_SHARE of the cameras: a sample of the points suffices then.
+    If it is at most MAX_BLIND_SHARE of the cameras, it may be too high, counted with a sample of the points.
     """
     blind = 0
     for some_points in (points[::max(len(points) // SAMPLED_POINTS, 1)], points):

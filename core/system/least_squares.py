@@ -19,8 +19,8 @@ def robust_bounded_fit(design_matrix: Floats, values: Floats, initial: Floats, l
 
     Return x (n,) within bounds that minimises the sum of absolute residuals, values (m,) - design_matrix (m, n) @ x.
 
-    low, high: the bounds, (n,) or one for all. prior_weight: m * prior_weight times the squared distance of x from
-    `initial` (n,) is added to the sum, so that x stays there where the values do not decide.
+    low, high: the bounds, (n,) or one for all. prior_weight: half of m * prior_weight times the squared distance of x
+    from `initial` (n,) is added to the sum, so that x stays there where the values do not decide.
     """
     lower, upper = np.broadcast_to(low, initial.shape), np.broadcast_to(high, initial.shape)
     solution, weights = initial.copy(), np.ones(len(values))

@@ -35,8 +35,8 @@ def pictures_below(folder: Path) -> list[Path]:
 def unlisted_entries(folder: Path, *, subfolders: bool = True) -> list[tuple[str, list[str]]]:
     """Return the names of a folder's entries that `pictures_in` leaves out, by reason: (reason, names).
 
-    Hidden files and the systems' own (Thumbs.db, desktop.ini) are not mentioned. subfolders: mention those that hold
-    pictures or videos, with their number.
+    Hidden files and the systems' own (Thumbs.db, desktop.ini) are not mentioned. subfolders: mention subfolders
+    that hold pictures, with their number.
     """
     names_by_reason: dict[str, list[str]] = {}
     for path in sorted(folder.iterdir(), key=natural_key):

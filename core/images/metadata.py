@@ -208,8 +208,8 @@ def _without_claims(segment: bytes) -> bytes:
 
 
 def _copy_to_tiff(encoded: bytes, data: bytes, has_alpha: bool) -> bytes:
-    """Return the TIFF `encoded` with all tags of the source `data` but those of its structure, and with its Exif and
-    GPS directories. has_alpha: whether the encoded picture has alpha."""
+    """Return the TIFF `encoded` with all tags of the source `data` except _STRUCTURE_TAGS, and with its Exif and GPS
+    directories. has_alpha: whether the encoded picture has alpha."""
     content_tags = _AllBut(_STRUCTURE_TAGS)
     tags = tiff.read_tags(io.BytesIO(data), content_tags)
     directories = {number: tags.pop(number) for number in (EXIF_DIRECTORY, GPS_DIRECTORY) if number in tags}

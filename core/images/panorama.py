@@ -30,7 +30,8 @@ _MAX_XMP_BYTES = 1 << 22
 
 
 def wraps_around(path: Path, header: Mapping[str, Any] | None = None) -> bool:
-    """True if a picture is a panorama of 360 degrees by what its file says. header: of an EXR, if it is one.
+    """True if a picture is a panorama of 360 degrees by what its file says. header: the header of an EXR; None for
+    others.
 
     False for a part of a panorama, for a cube map, and for a file that cannot be read.
     """

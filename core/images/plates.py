@@ -105,7 +105,7 @@ class Plate:
         """The colour space of the codes: the declared one, else sRGB for integers; linear for floats, in an EXR's
         chromaticities where it has some.
 
-        Raises FrameError where those span no space.
+        Raises FrameError where the chromaticities span no space.
         """
         if self.declared is not None:
             return self.declared
@@ -296,8 +296,8 @@ def _read_transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
 def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
     """Read an EXR plate, with the headers and channels of all its parts. Raises FrameError.
 
-    The codes are the colours of the main part; of a stereo picture without colours at the root, those of its first
-    view.
+    The codes are the colours of the main part. If all channels of a stereo picture have a view's prefix, they are the
+    colours of its first view.
     """
     parts = read_exr_parts(path)
     check_parts(path, parts)

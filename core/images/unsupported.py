@@ -27,7 +27,7 @@ def unsupported_file_error(path: Path) -> FrameError:
 
 
 def misnamed_reason(path: Path) -> str:
-    """Say what a file holds whose suffix is neither that of its format nor of another picture; "" for unknown contents.
+    """Say what a file whose suffix is not a picture's really holds, a picture or a video; "" for unknown contents.
 
     Raises OSError.
     """

@@ -303,7 +303,7 @@ class Video:
                           "it again, or convert it to MP4 (H.264).")
 
     def _decode_frames(self) -> Iterator[Any]:
-        """Yield PyAV's frames from the present position on, without those that cannot be decoded."""
+        """Yield PyAV's frames from the present position on; frames that cannot be decoded are left out."""
         av = import_av()
         errors = (av.error.FFmpegError, OSError, ValueError, RuntimeError, MemoryError)
         packets = self._container.demux(self.stream)
@@ -377,7 +377,8 @@ class Video:
         return sorted(times)
 
     def _declared_length(self) -> int:
-        """Return the number of frames by the header; those that an edit list hides do not count."""
+        """Return the number of frames that the header declares, without frames that an edit list hides; 0 if
+        unknown."""
         stream = self.stream
         if not stream.frames:
             return 0

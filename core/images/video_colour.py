@@ -55,7 +55,7 @@ MIN_709_WIDTH, MAX_601_HEIGHT = 1280, 576
 class VideoColour:
     """The meaning of a video's codes: matrix coefficients, range, transfer, primaries (None for Rec. 709).
 
-    limited: luma from 16 to 235 of 255, instead of all codes. bits: of a code.
+    limited: luma from 16 to 235 of 255, instead of all codes. bits: bits of a code.
     """
 
     matrix: int

@@ -110,7 +110,7 @@ def unscored_mask(capture: Capture, view: View, size: tuple[int, int] | None = N
     """Return (height, width), the pixels where the camera clipped, in which the linear flare is not scored.
 
     A pixel counts as clipped if it has the frame's brightest code or, where the exact layers are known, if scene plus
-    flare reach white in any channel. size: (width, height) of the result; None for the frame's own size.
+    flare reach white in any channel. size: (width, height) of the result; None for the camera's.
     """
     frame, scene, flare = capture.frame(view), capture.truth_scene(view), capture.truth_flare(view)
     clipped = clipped_mask(frame)

@@ -158,9 +158,10 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
 
 def _score_picture(picture: Pixels, truth: Pixels, mask: Pixels | None,
                    lpips: Perceptual | None) -> Scores:
-    """Return the scores of a picture against the truth; None for one that is infinite or cannot be computed.
+    """Return the scores of a picture against the truth; None for a score that is infinite or cannot be computed.
 
-    mask: display values (height, width, 3), above 0.5 in a channel where masked_psnr counts; None for no such score.
+    mask: display values (height, width, 3); masked_psnr is over the pixels with a channel above 0.5. None: no such
+    score.
     """
     small = min(picture.shape[:2]) < 11  # the side of SSIM's window
     scores: Scores = {"psnr": psnr(picture, truth), "ssim": None if small else ssim(picture, truth),

@@ -52,7 +52,7 @@ def atomic_path(target: Path | str,
 
     commit_lock: held during the rename. The temporary name keeps the suffix, since writers choose their format by it. A
     symbolic link is replaced by a file: what it points to may belong to another run. Temporary files for `target`
-    that a killed process left are removed, see `remove_partials_of`.
+    that a killed process left are removed.
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -202,8 +202,8 @@ def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
     """Hold a lock file while a short block runs, so that processes that share a folder take turns, on network disks
     too.
 
-    A lock older than `stale_s` belonged to a killed process and is taken over; so is one that stays unchanged for that
-    long, whatever the clocks say.
+    A lock older than `stale_s` seconds belonged to a killed process and is taken over; so is a lock that this process
+    sees unchanged for that long, in case the clocks of two machines differ.
     """
     lock = Path(lock)
     lock.parent.mkdir(parents=True, exist_ok=True)

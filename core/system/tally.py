@@ -21,9 +21,9 @@ MAX_RESULT_NAMES = 1000
 
 @dataclass
 class Tally:
-    """Number of used items, and the names of those left out by reason.
+    """Number of used items, and the names of the items left out, by reason.
 
-    noun: the field's word for one item, such as "frame" or "plate". verb: past participle of what was done with them.
+    noun: name of one item, such as "frame" or "plate". verb: past participle of what was done with the used items.
     """
 
     noun: str = "frame"

@@ -36,8 +36,8 @@ def _with_sorted_metadata(data: bytes) -> bytes:
 def read_tensors(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read (tensors, metadata). Raises OSError, and ValueError where the file is damaged.
 
-    Returns copies: safetensors gives views of the file, and while one of them exists Windows lets nobody replace the
-    file.
+    Returns copies: safetensors gives views of the mapped file, which Windows does not let anyone replace while a view
+    exists.
     """
     from safetensors import SafetensorError, safe_open
 

@@ -32,7 +32,8 @@ def write_scanlines(path: Path | str, channels: Mapping[str, NDArray[Any]], head
     """Write one part of float16 and float32 channels (height, width), ZIP compressed.
 
     header: texts, numbers (as 32 bit floats), "chromaticities" (eight numbers), and the windows "dataWindow" and
-    "displayWindow" as ((left, top), (right, bottom)), by default that of the pixels. Raises TypeError for other values.
+    "displayWindow" as ((left, top), (right, bottom)), by default the extent of the pixels. Raises TypeError for other
+    values.
     """
     names = sorted(channels, key=str.encode)
     pixels = [np.ascontiguousarray(channels[name]) for name in names]
@@ -54,8 +55,9 @@ def write_scanlines(path: Path | str, channels: Mapping[str, NDArray[Any]], head
 
 
 def _encode_header(names: list[str], pixels: list[NDArray[Any]], attributes: Mapping[str, Any]) -> bytes:
-    """Return magic number, version and attributes. names, pixels: of the channels, in the file's order. attributes: as
-    `header` of `write_scanlines`, with both windows."""
+    """Return magic number, version and attributes. names, pixels: names and pixels of the channels, in the file's
+    order. attributes: the `header` of `write_scanlines`, with both windows. Raises TypeError for a value of another
+    type."""
     # Of each channel: name, type, whether it is perceptually linear, and sampling of columns and lines.
     channel_list = b"".join(name.encode() + b"\0" + struct.pack("<iB3xii", _PIXEL_TYPES[channel.dtype.name], 0, 1, 1)
                             for name, channel in zip(names, pixels, strict=True)) + b"\0"

@@ -94,7 +94,7 @@ def read_tags(stream: BinaryIO, numbers: Container[int], directory_offset: int |
     """Read the tags `numbers` of the first page, or of the directory at an offset. Damaged tags are left out; a file
     that is no TIFF gives {}.
 
-    Whole numbers of 64 bits, of a BigTIFF, are returned as those of 32 bits, and left out where they do not fit.
+    The 64 bit numbers of a BigTIFF are returned as 32 bit numbers, and left out where they do not fit.
     """
     layout, entries = next(_directories(stream, directory_offset), _NO_DIRECTORY)
     tags: dict[int, Tag] = {}

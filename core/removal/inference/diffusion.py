@@ -69,8 +69,8 @@ class DiffusionRemoval(nn.Module):
     prompt: Tensor
 
     def __init__(self, base: Path | str, rank: int = RANK) -> None:
-        """base: folder of the base model, or its name in the local cache. rank: of the LoRAs. Raises EngineError where
-        packages are missing, RunError where the base cannot be read."""
+        """base: folder of the base model, or its name in the local cache. rank: rank of the LoRAs. Raises EngineError
+        where packages are missing, RunError where the base cannot be read."""
         super().__init__()
         check_packages()
         from diffusers import AutoencoderKL, DDPMScheduler, UNet2DConditionModel

@@ -77,7 +77,7 @@ def fit_guided_filter(display: Pixels, flare: Pixels) -> GuidedFilterMaps:
 
 def upsample_flare(maps: GuidedFilterMaps, codes: NDArray[Any], encoding: Encoding,
                    max_code: float) -> Iterator[tuple[slice, Pixels]]:
-    """Yield (rows, linear flare of those rows (n, width, 3)) for a plate's codes (height, width, 3), top to bottom.
+    """Yield (rows, linear flare there (n, width, 3)), strip by strip, for a plate's codes (height, width, 3).
 
     max_code: the code of white, if the encoding is "srgb". The flare is 0 or more, and no more than the plate's light.
     """

@@ -97,8 +97,7 @@ def downscale_linear(codes: NDArray[Any], encoding: Encoding, max_code: float, w
 
 
 def subtract_flare(codes: NDArray[Any], flare: Pixels, encoding: Encoding, max_code: float) -> NDArray[Any]:
-    """Return the codes with a linear flare subtracted; exactly the same where the flare is 0 or a code is not finite.
-    """
+    """Return the codes minus a linear flare; unchanged to the last bit where the flare is 0 or a code is not finite."""
     light = to_linear(codes, encoding, max_code) - flare
     if encoding == "srgb":
         clean = (to_display(light) * np.float32(max_code) + np.float32(0.5)).astype(codes.dtype)
@@ -112,7 +111,7 @@ def removed_light(codes: NDArray[Any], clean: NDArray[Any], flare: Pixels, encod
     """Return the flare to write, in scene-linear light, at most MAX_FLOAT16.
 
     For linear codes that is `flare`, the linear flare that was subtracted. For display codes it is the light of the
-    codes minus that of the clean codes, both by the sRGB curve; `flare` itself is by another curve
+    codes minus the light of the clean codes, both by the sRGB curve; `flare` itself is by another curve
     (`image_formation.GAMMA`).
     """
     if encoding == "linear":

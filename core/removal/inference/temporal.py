@@ -100,7 +100,7 @@ def shot_similarity(first: FrameFeatures, second: FrameFeatures) -> np.float32:
 
 def filter_in_time(frame: FramePrediction, neighbours: Sequence[Neighbour],
                    log_odds_bias: float = 0) -> FlarePrediction:
-    """Return the prediction for a frame, corrected with those for its neighbours.
+    """Return the prediction for a frame, corrected with the predictions for its neighbours.
 
     log_odds_bias: added to the log odds of a flare (`confidence.Sensitivity`).
     """
@@ -119,7 +119,7 @@ class _CleanEstimate(NamedTuple):
     """A frame at the size of the flow.
 
     scene: display values without flare and fine detail (h, w, 3). flare: the flare in its strongest channel (h, w).
-    flow_confidence: that a pixel shows the same place as in the frame to be filtered, 0..1 (h, w).
+    flow_confidence: how sure it is that a pixel shows the same place as in the frame to be filtered, 0..1 (h, w).
     """
 
     scene: Pixels

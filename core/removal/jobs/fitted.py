@@ -49,7 +49,7 @@ PRIOR_WEIGHT = 1e-4
 class _FittedFlareCleaner:
     """Subtracts the fitted flare from one frame after the other, for `write_clean_frames`.
 
-    The arguments are those of `remove_fitted_flare`. views_by_name: by the name of the clean frame.
+    The arguments are those of `remove_fitted_flare`. views_by_name: the views, by the name of their clean frame.
     """
 
     def __init__(self, renderer: ViewRenderer, capture: Capture, views_by_name: Mapping[Path, View],
@@ -84,9 +84,9 @@ def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequenc
     """Write the views' frames without the fitted flare below `folder`, and return the counts.
 
     Each frame keeps its name, file format and depth. A result is kept if it was made from the same frame, camera,
-    lights and fit, or edited since, unless `overwrite`. flare_folder: where to write the removed flares, if at all.
-    fit_digest: a text that changes whenever the fit would render other layers. above_white: the fit was given light
-    above white.
+    lights and fit, or edited since; with `overwrite` none is kept. flare_folder: where to write the removed flares, if
+    at all. fit_digest: a text that changes whenever the fit would render other layers. above_white: the fit was given
+    light above white.
 
     Raises CaptureError for frames with lens distortion, since the flare was fitted to undistorted ones; SettingsError
     where frames would be overwritten; FrameError for a frame that cannot be read, and for a file in `folder` that is

@@ -74,7 +74,7 @@ class Manifest:
 
     def begin_frame(self, name: Path, source: Path, digest: str, results: Sequence[Path], overwrite: bool,
                     confidence: float | None = None) -> None:
-        """Enter a frame before its files are written, and delete those that were made with another digest.
+        """Enter a frame before its files are written, and delete its old files that were made with another digest.
 
         confidence: how sure the remover is that the removed light is a flare, 0..1; None where it did not judge.
 
@@ -190,7 +190,7 @@ class Manifest:
         return {"plates": digest, **flare}
 
     def _read_tables(self) -> _Tables:
-        """Return all tables; one that is missing or damaged is empty."""
+        """Return all tables; a missing or damaged table is empty."""
         try:
             data = read_json(self._folder / MANIFEST, FrameError)
         except FrameError:

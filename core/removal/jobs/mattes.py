@@ -52,7 +52,7 @@ class Mattes:
         name: path of the plate below its folder. plate_window: where the plate's stored pixels lie in its frame.
         orientation: the plate's Exif orientation.
 
-        The matte may have the size of the plate's frame, another size of the same aspect, or that of its stored pixels.
+        The matte may have the size of the plate's frame, another size of the same aspect, or the stored pixels' size.
         Raises FrameError for a damaged matte, and for one of another aspect.
         """
         import cv2

@@ -72,7 +72,7 @@ def extract_frames(video: Path, folder: Path, progress: Progress, space: str | N
 
 
 def _decode_frames(video: Path, folder: Path, progress: Progress) -> list[str]:
-    """Write all frames, and return sentences about those that are missing or damaged."""
+    """Write all frames, and return sentences about missing and damaged frames."""
     with Video(video) as reader:
         progress.stage(f"extract the frames of {video.name}", reader.estimated_length)
         count = 0

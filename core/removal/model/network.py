@@ -31,9 +31,9 @@ SIZE_MULTIPLE = SHUFFLE_FACTOR * 2 ** (LEVELS - 1)
 
 
 class NetworkOutput(NamedTuple):
-    """What the flare adds to display values, and the same without the glow about the lights, each (n, 3, h, w).
+    """What the flare adds to display values, with and without the glow about the lights, each (n, 3, h, w).
 
-    Unclamped: values below 0 count as no flare.
+    Values are not clamped; below 0 they count as no flare.
     """
 
     flare: Tensor
@@ -41,9 +41,9 @@ class NetworkOutput(NamedTuple):
 
 
 def pyramid_inputs(display: Tensor) -> list[Tensor]:
-    """Return the input of each level, finest first, (n, INPUT_CHANNELS, h / side, w / side), where `side` is that of a
-    position in pixels: SHUFFLE_FACTOR, doubled from level to level. The finest level also holds the pixels of the frame
-    (pixel unshuffle).
+    """Return the input of each level, finest first, (n, INPUT_CHANNELS, h / side, w / side), where `side` is the side
+    of a position in pixels: SHUFFLE_FACTOR, doubled from level to level. The finest level also holds the pixels of the
+    frame (pixel unshuffle).
 
     display: whole frames (n, 3, h, w), values 0..1, principal point in the centre; h and w multiples of SIZE_MULTIPLE.
     """
@@ -154,8 +154,8 @@ class RemovalNetwork(nn.Module):
 
     widths: channels of each of the LEVELS levels, from the finest; those of the coarsest two are multiples of HEADS.
     blocks: residual blocks of each level of the encoder; the decoder has one for each level.
-    attention: attention layers between the blocks of the coarsest two levels, one after every second block; there is
-    one after the last block besides.
+    attention: number of attention layers between the blocks of each of the coarsest two levels, one after every second
+    block; another one follows the last block.
     """
 
     HEADS = 4

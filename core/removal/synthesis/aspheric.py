@@ -82,7 +82,7 @@ def _draw_ghost(random: Random, centre: Array, radius: float, texture: Array, si
     """Return (size, size, 3), one ghost with random aberrations: samples of the stop, splatted where they map to. An
     evenly lit ghost is 1.
 
-    centre, radius: of the ghost, in canvas coordinates. texture: transmission of the stop.
+    centre, radius: centre and radius of the ghost, in canvas coordinates. texture: transmission of the stop.
     """
     import cv2
 

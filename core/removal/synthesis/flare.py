@@ -43,7 +43,7 @@ def synthesise_flare(seed: int | Sequence[int], size: int, lenses: Sequence[Pres
                      kind: str | None = None) -> SynthesisedFlare:
     """Return the flare of a seed on a canvas of `size` pixels; the same arguments give the same flare.
 
-    lenses: those that ghosts are traced through. kind: one of FLARE_CLASSES, drawn if None.
+    lenses: lenses that ghosts are traced through. kind: one of FLARE_CLASSES; None draws one.
     """
     random = np.random.default_rng(seed)
     kind = kind or str(random.choice(FLARE_CLASSES, p=_CLASS_SHARES))

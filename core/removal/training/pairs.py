@@ -60,8 +60,8 @@ class FlareSource(Protocol):
 
 @dataclass(frozen=True)
 class Pair:
-    """Display values 0..1, each (height, width, 3): the frame as filmed, the same without any flare (`scene`), and
-    without flare but with the glow of its lights (`scene_with_glow`)."""
+    """Display values 0..1, each (height, width, 3): the frame with its flare, the frame without any flare (`scene`),
+    and the frame without flare but with the glow of its lights (`scene_with_glow`)."""
 
     frame: Pixels
     scene: Pixels

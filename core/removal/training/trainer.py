@@ -125,9 +125,8 @@ class RemovalTrainer:
         return loss, dict(zip(METRICS, metrics.tolist(), strict=True))
 
     def _loss_schedule(self) -> tuple[bool, Tensor]:
-        """Return whether the training is in its PSNR phase; then (3,): the power that a flare's mean square is raised
-        to, the mean square of a faint flare (FAINT_FLARE_MSE), and that of an error that does not matter
-        (ERROR_FLOOR_MSE)."""
+        """Return (whether the training is in its PSNR phase, schedule (3,)). The schedule has the power that a flare's
+        mean square is raised to, and the present values of FAINT_FLARE_MSE and ERROR_FLOOR_MSE."""
         progress = min(self.iteration / self.recipe.iterations, 1.0)
         faint_mse = FAINT_FLARE_MSE[0] * (FAINT_FLARE_MSE[1] / FAINT_FLARE_MSE[0]) ** max(4 * progress - 3, 0.0)
         first, last = ERROR_FLOOR_MSE

@@ -99,7 +99,7 @@ class Worker:
         return number % self.count == self.rank
 
     def all_gather(self, tensors: Sequence[Tensor]) -> None:
-        """Replace each tensor by that of the worker that is responsible for its index in `tensors`
+        """Replace each tensor by the values of the worker that is responsible for its index in `tensors`
         (`is_responsible_for`). Raises RunError."""
         if self.buffers is None:
             return

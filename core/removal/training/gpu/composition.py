@@ -136,7 +136,7 @@ def draw_flare_placements(random: Random, count: int, canvas_size: int, width: i
 
 def compose(scene: Tensor, gamma: Tensor, frames: FrameParameters,
             flares_and_placements: Sequence[tuple[FlareBatch, FlarePlacements]]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return display values 0..1, each (n, 3, h, w): frame, scene and scene with glow, as in `pairs.Pair`.
+    """Return (frame with flare, scene without, scene with the lights' glow), display values 0..1, (n, 3, h, w) each.
 
     scene: linear light (n, 3, h, w), h and w multiples of 16. gamma: gamma of each frame's display values, (n,).
     flares_and_placements: first for a flare of every frame, then for the second flares of the batch's first frames.

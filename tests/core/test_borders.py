@@ -71,7 +71,7 @@ def test_other_dark_areas_are_no_borders(why: str) -> None:
 
 
 def test_a_night_sky_does_not_widen_a_border() -> None:
-    """Nor are frames with one another picture than those beside them."""
+    """Dark rows beside a border do not count to it; frames with different pictures share the border of both."""
     inner = np.maximum(np.asarray(picture(0, SIZE), np.uint8), 40)
     for sky in (0, 1, 10, 30):
         dark = inner.copy()

@@ -267,7 +267,7 @@ def test_an_atomic_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_partial_files_of_a_killed_process_are_removed(tmp_path: Path) -> None:
-    """And what a living one is writing cannot: on a farm a task may be given again while its worker still lives."""
+    """The partial files of living processes stay: a farm may give a task again while its first worker still writes."""
     target = tmp_path / "layers.0001.exr"
     writes = ("import sys, time\nfrom core.system.files import atomic_path\n"
               "with atomic_path(sys.argv[1]):\n    print('begun', flush=True)\n    time.sleep(60)")
@@ -286,7 +286,7 @@ def test_partial_files_of_a_killed_process_are_removed(tmp_path: Path) -> None:
 
 
 def test_a_new_write_removes_the_partial_file_of_a_killed_process(tmp_path: Path) -> None:
-    """Whatever writes it, and nothing of another file's."""
+    """The partial file of the same target goes; that of another target stays."""
     dies = "import os, sys\nfrom core.system.files import atomic_path\nwith atomic_path(sys.argv[1]):\n    os._exit(9)"
     for name in ("eval.json", "report.json"):
         assert subprocess.run([sys.executable, "-c", dies, str(tmp_path / name)], cwd=ROOT, check=False).returncode == 9
@@ -297,7 +297,7 @@ def test_a_new_write_removes_the_partial_file_of_a_killed_process(tmp_path: Path
 
 
 def test_a_new_folder_removes_the_partial_folder_of_a_killed_process(tmp_path: Path) -> None:
-    """And what a living one makes stays."""
+    """The partial folder of a living process stays."""
     makes = ("import os, sys\nfrom core.system.files import atomic_folder\n"
              "with atomic_folder(sys.argv[1]) as folder:\n    (folder / 'a').touch()\n    ")
     args = [sys.executable, "-c", f"{makes}os._exit(9)", str(tmp_path / "frames")]
@@ -324,7 +324,7 @@ def test_a_partial_file_of_another_machine_is_kept_for_an_hour(tmp_path: Path) -
 
 
 def test_a_temporary_file_of_a_temporary_file_has_its_final_name(tmp_path: Path) -> None:
-    """So that the next process that writes the file removes it after a kill."""
+    """Both are named after the final file, so that the next process to write that file removes them after a kill."""
     with atomic_path(tmp_path / "a.flare") as outer, atomic_path(outer) as inner:
         assert inner != outer
         assert inner.name[:17] == outer.name[:17] == ".partial-a.flare-"
@@ -371,7 +371,7 @@ def test_a_slow_process_leaves_the_lock_that_replaced_its_own(tmp_path: Path) ->
 
 def test_two_processes_that_take_over_a_stale_lock_get_it_in_turn(tmp_path: Path,
                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both have seen that it is stale before either removes it."""
+    """Both processes have seen that the lock is stale before either removes it."""
     lock = tmp_path / ".lock"
     lock.touch()
     os.utime(lock, (1, 1))
@@ -412,7 +412,7 @@ def test_a_lock_dated_in_the_future_expires(tmp_path: Path) -> None:
 
 
 def test_a_duplicate_key_in_json_is_reported(tmp_path: Path) -> None:
-    """The first of both would be lost."""
+    """Without an error the first of the two values would be lost."""
     (tmp_path / "a.json").write_text('{"frames": {"6": [1], "7": [], "6": [2]}}')
     with pytest.raises(CaptureError, match="it has '6' twice"):
         read_json(tmp_path / "a.json", CaptureError)

@@ -555,7 +555,7 @@ def test_a_fit_resumes_after_it_moved_a_light(capture: Capture) -> None:
 
 
 def test_a_checkpoint_without_inputs_resumes(capture: Capture) -> None:
-    """It does not say which lights and frames the fit was given."""
+    """A checkpoint of an earlier version does not record the lights and frames that the fit was given."""
     earlier = Trainer(capture, quick())
     earlier.step()
     state = earlier.state()

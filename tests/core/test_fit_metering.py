@@ -108,7 +108,7 @@ def test_points_in_a_glow_are_outliers_of_the_exposure(tmp_path: Path) -> None:
 
 
 def test_frames_without_points_take_the_nearest_exposure(tmp_path: Path) -> None:
-    """Not as something between: a light is switched on from one frame to the next."""
+    """They take the exposure of one neighbour, not a mean: a light may be switched on from one frame to the next."""
     def filmed(number: int, light: Light) -> Light:
         return light * (0.0 if number in (4, 5, 6, 7) else 2.0 if number < 6 else 1.0)
 
@@ -137,7 +137,7 @@ def test_a_frame_with_an_uncertain_exposure_takes_the_nearest(tmp_path: Path, wh
 
 
 def test_one_frame_of_another_exposure_leaves_the_exposure_fixed(tmp_path: Path) -> None:
-    """A flash, or lightning."""
+    """A single brighter frame is a flash or lightning."""
     assert not found(wall(tmp_path / "a", lambda number, light: light * (1.5 if number == 5 else 1.0)))
 
 
@@ -147,7 +147,7 @@ def test_unmeasured_exposures_come_from_the_same_folder() -> None:
 
 
 def test_measured_exposures_can_be_read_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Even where the solve makes nonsense of it."""
+    """A run with measured exposures opens again, even if these are far from any real exposure."""
     capture = wall(tmp_path / "a", lambda number, light: light * 2.0 ** (number % 2))
     monkeypatch.setattr(metering.PointObservations, "estimate_stops", lambda _: np.linspace(-30, 30, COUNT))
     run = Run.create(tmp_path / "run", quick(10), capture.folder, found(capture))
@@ -255,7 +255,7 @@ def test_a_fit_stops_while_exposures_are_measured(drifting: tuple[Capture, dict[
 
 def test_a_resumed_fit_without_exposures_gets_none(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
                                                    monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs of versions that did not look."""
+    """A fit that began without measured exposures, as in earlier versions, goes on without."""
     capture, exposures = drifting
     monkeypatch.setattr(metering, "measure_exposures", lambda *_: {})
     with pytest.raises(Cancelled):
@@ -338,7 +338,7 @@ def test_a_clipped_value_has_a_straight_through_gradient() -> None:
 
 
 def test_a_camera_of_exposure_1_has_unchanged_numbers() -> None:
-    """Bakes of earlier versions are kept."""
+    """A camera's numbers identify its bake, so bakes of versions without exposures stay valid."""
     camera = cameras(1)[0]
     numbers: Any = camera.numbers
     assert len(numbers) == 3

@@ -63,7 +63,7 @@ def pose(number: int = 0) -> Tensor:
 
 
 def test_initial_rings_have_all_sizes_and_are_thin() -> None:
-    """Of a lens's ghosts some are as wide as half the frame, and a ring is found only from near by."""
+    """Ghosts may be half as wide as the frame, and a fit finds a ring only from an initial ring of nearly its size."""
     flare = LightFlare(OURS, RANGE, 400, random_(2)).gaussians
     scales, r0 = flare["log_scales"].detach()[:, 0].exp(), flare["rings"].detach()[:, 0]
     radii = (scales * r0)[r0 > 0].sort().values
@@ -180,7 +180,7 @@ def test_the_low_pass_keeps_the_shift_of_an_arc() -> None:
 
 
 def test_opacities_are_smooth_where_an_arc_begins() -> None:
-    """Through zero the picture's gradient does not jump, as it would with the peak kept at one."""
+    """The picture's sum has no kink at arc strength zero, as it would if the peak were kept at one."""
     covariance, rings = torch.tensor([[2e-3, 0.0, 2e-3]]), torch.tensor([[3.0, 0.4]])
     k = torch.tensor([[100.0, 0, 20], [0, 100.0, 20], [0, 0, 1]])
 

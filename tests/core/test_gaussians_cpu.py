@@ -98,7 +98,7 @@ def test_equal_depths_are_drawn_in_input_order(planes: int) -> None:
 
 
 def test_gaussians_with_nan_are_not_drawn() -> None:
-    """In the raw form too: exponential and sigmoid must not turn NaN into a size and an opacity."""
+    """NaN in logarithms of scales or logits of opacities must not become a size or an opacity either."""
     arguments = scene()  # type: ignore[operator]
     kept = torch.arange(len(arguments["means"])) % 7 != 0
     names = ("means", "quats", "scales", "opacities", "sh")
@@ -278,7 +278,7 @@ def test_an_error_in_any_thread_reaches_the_caller() -> None:
 
 
 def test_calls_reach_sleeping_and_spinning_threads() -> None:
-    """Also from several callers at once, and when fewer threads are asked than before."""
+    """Every call runs on as many threads as it asks for, also if several callers ask at once for changing numbers."""
     def call(times: int, pause: float) -> None:
         for number in range(times):
             seen: list[int] = []
@@ -370,14 +370,14 @@ def test_fused_adam_steps_equal_the_definition(shape: tuple[int, ...], rate: flo
 
 
 def test_ellipses_far_larger_than_the_picture_are_listed_within_their_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their edges are known to a pixel at best, and one row above the first one's tile was a tile below the picture."""
+    """The edges of such ellipses are exact to a pixel at best; a row listed wrongly would lie below the picture's
+    tiles."""
     width, height, count = 240, 135, 20_000
     random = np.random.default_rng(0)
     records, met = np.empty(0), np.empty(0, int)
 
     def listed(*given: Any) -> Any:
-        """Call `bin_gaussians` as the kernels do; check its packed rows and bounds, and keep its inputs for the
-        test."""
+        """Call `bin_gaussians` as the kernels do; check rows and bounds, and keep the inputs for the test."""
         nonlocal records, met
         records, tiles, rows, bounds, grid = (given[0].reshape(-1, layout.RECORD).astype(float), given[2], given[3],
                                               given[4].copy(), given[-1])

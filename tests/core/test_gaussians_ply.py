@@ -49,7 +49,7 @@ def test_a_scene_is_restored_exactly(tmp_path: Path, n: int) -> None:
 ])
 def test_near_white_and_pixel_grid_are_restored(kept: str, number: float, said: str, read: float,
                                                 tmp_path: Path) -> None:
-    """Near depth and white."""
+    """A scene's value is written as a comment where it is not the default, and invalid comments are ignored."""
     first = scene()
     setattr(first, kept, number)
     write_ply(tmp_path / "a.ply", first)

@@ -169,7 +169,7 @@ def test_text_of_an_exr_that_is_not_utf8_stays_byte_for_byte(tmp_path: Path) -> 
 
 
 def test_names_in_an_exr_that_are_not_utf8_stay_byte_for_byte(tmp_path: Path) -> None:
-    """Of a channel between others, and of an attribute."""
+    """Names of a channel and of an attribute survive cleaning, and other channels keep their places."""
     depth = np.arange(64, dtype=np.float32).reshape(8, 8)
     write_exr(tmp_path / "a.exr", {**dict.fromkeys("RGB", np.full((8, 8), 0.5)), "H\x7fhe": depth,
                                    "Hzzz": depth + 1, "H\x7fhf": depth + 2}, header={"gr?sse": "x"})

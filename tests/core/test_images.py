@@ -226,7 +226,7 @@ def test_a_tiff_with_0_for_white_is_read_as_what_it_shows(tmp_path: Path) -> Non
 
 
 def test_other_channels_of_an_exr_are_not_read_as_picture(tmp_path: Path) -> None:
-    """Depth in a part before it, cropped to what is there and infinite behind that."""
+    """The colours are read although a part before them holds depth, cropped to a region and infinite."""
     depth = np.full((3, 2), np.inf, np.float32)
     parts = [OpenEXR.Part({"name": "depth", "type": OpenEXR.scanlineimage,
                            "dataWindow": ((4, 2), (5, 4)), "displayWindow": ((0, 0), (8, 6))}, {"Z": depth}),

@@ -275,7 +275,8 @@ class TestTriangulation:
         assert np.linalg.norm(found.xyz - (0.4, -0.5, 0.3)) < 0.02 and len(found.support) == 275
 
     def test_spots_without_a_score_propose_nothing(self) -> None:
-        """As a threshold of 0 lets them through, some of them more than there are pairs to be tried."""
+        """Spots of score 0, which a threshold of 0 lets through, are no lights and do not keep a lamp from being
+        found."""
         cameras = orbit(16, size=SIZE)
         nothing = [[spot((9.0 + 3 * number, 7.0), score=0.0) for number in range(24)] for _ in cameras]
         assert not triangulate_lights(named(cameras), nothing, EXTENT)

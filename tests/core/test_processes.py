@@ -59,7 +59,7 @@ def test_start_times_are_read_from_ps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_process_of_another_user_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """What it writes is no leftover: on macOS, where a signal alone tells, one may not be sent to it."""
+    """Without /proc a signal tells whether a process runs; permission denied means that it does."""
     monkeypatch.setattr(processes, "PROC", tmp_path / "none")
     monkeypatch.setattr(processes, "WINDOWS", False)
     for refused, there in ((PermissionError, True), (ProcessLookupError, False)):
@@ -78,7 +78,7 @@ def test_a_python_is_found_in_an_environment_of_every_kind(inner: str, tmp_path:
 
 
 def test_an_environment_without_its_base_has_no_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On Windows, where its python.exe outlives that."""
+    """On Windows an environment's python.exe stays when the Python that it is based on is removed."""
     monkeypatch.setattr(processes, "WINDOWS", True)
     python, base = tmp_path / "engine" / "Scripts" / "python.exe", tmp_path / "Blender 5.0" / "python.exe"
     for file in (python, base):

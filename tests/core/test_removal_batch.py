@@ -81,7 +81,7 @@ def test_a_broken_link_is_reported_as_a_missing_plate(tmp_path: Path, flare_ever
 
 @pytest.mark.parametrize("place", ["file", "file/below"])
 def test_results_are_refused_where_a_file_is(tmp_path: Path, flare_everywhere: Path, place: str) -> None:
-    """Before the network runs on any plate."""
+    """A file in place of the output folder is an error before the network runs on any plate."""
     source = write_codes(tmp_path / "in" / "a.png", picture())
     (tmp_path / "file").touch()
     for folders in ({"folder": tmp_path / place}, {"folder": tmp_path / "out", "flare_folder": tmp_path / place}):

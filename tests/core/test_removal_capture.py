@@ -148,7 +148,7 @@ def test_a_stopped_cleaning_of_a_capture_resumes(tmp_path: Path, flare_everywher
 
 def test_frames_without_leading_zeros_are_predicted_once_each(
         tmp_path: Path, flare_everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those beside a frame are those of the numbers beside its own, and it is cleaned in that order."""
+    """Frames are cleaned in the order of their numbers, and a frame's neighbours have the numbers beside its own."""
     folder = make_capture(tmp_path / "capture", views=24)
     model = folder / "sparse" / "0" / "images.txt"
     words = model.read_text()
@@ -169,7 +169,7 @@ def test_frames_without_leading_zeros_are_predicted_once_each(
 
 def test_frames_that_differ_only_in_suffix_are_refused_at_once(
         tmp_path: Path, flare_everywhere: Path) -> None:
-    """Both would have the same clean frame."""
+    """Both frames would have the same clean frame."""
     folder = make_capture(tmp_path / "capture", views=3)
     model, frames = folder / "sparse" / "0" / "images.txt", folder / "images"
     model.write_text(model.read_text().replace(" 0001.png", " 0000.jpg"))

@@ -39,8 +39,10 @@ def predict_lifted_darks(_: Remover, view: NDArray[np.float32]) -> NDArray[np.fl
 @pytest.mark.parametrize(("in_two", "expected"), [(0.0, 1), (0.15, 1), (0.9, 0)])
 def test_disagreement_of_the_augmentations_lowers_the_confidence(
         flare_everywhere: Path, monkeypatch: pytest.MonkeyPatch, in_two: float, expected: float) -> None:
-    """Of the four augmentations two predict a flare in the right half of the frame, all of them one in its left half.
-    Two more are of the frame with its black point stretched."""
+    """Four augmentations agree on a flare in the left half of the frame; only two predict one in the right half.
+
+    Two further predictions are of the frame with its black point stretched.
+    """
     share = 1 / (1 + 0.8**2)  # of its two views, by their pixels
     shown: list[tuple[int, ...]] = []
 

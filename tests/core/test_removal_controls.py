@@ -72,7 +72,7 @@ def test_the_last_choice_alone_decides_which_results_are_made_again(flare_everyw
 
 
 def test_the_sensitivity_decides_on_a_doubtful_flare(flare_everywhere: Path) -> None:
-    """Of a flare whose log odds are -0.5 and one of 0.5."""
+    """Of flares with log odds of -0.5 and 0.5, low sensitivity accepts neither, normal the second, high both."""
     confidence = {}
     for sensitivity in ("low", "normal", "high"):
         remover = Remover(flare_everywhere)

@@ -120,7 +120,7 @@ def test_grey_frames_lose_the_luminance_of_the_flare(tmp_path: Path) -> None:
 
 
 def test_a_light_that_is_off_leaves_no_dark_flare(capture: Capture, tmp_path: Path) -> None:
-    """And one that shines half as much half of it."""
+    """No flare is subtracted for a light that is off, and half of it for a light of half the brightness."""
     for view, share in zip(capture.views, (0.0, 0.5, 1.0), strict=True):
         light = scene_of(capture, view.camera) + np.float32(share) * flare(view.camera)
         write_png(capture.frame_path(view), srgb_from_linear(light).clip(0, 1))
@@ -310,7 +310,7 @@ def test_clean_frames_of_another_fit_or_capture_are_made_again(capture: Capture,
 
 
 def test_borders_are_unchanged(capture: Capture, tmp_path: Path) -> None:
-    """They are no part of what was fitted: not those of video levels either."""
+    """Borders, also at the black of video levels, are no part of the fitted picture."""
     shutil.copytree(capture.folder, tmp_path / "boxed")
     for path in (tmp_path / "boxed" / "images").iterdir():
         codes = cv2.imread(str(path))

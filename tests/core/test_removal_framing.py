@@ -164,7 +164,7 @@ def test_a_picture_whose_sides_meet_is_a_panorama(tmp_path: Path, change: str, s
 
 
 def test_a_panorama_has_no_seam(flare_everywhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its flare, of a network that predicts more at the right edge, continues from there at the left one."""
+    """With a network that predicts more flare towards the right, the flare of a panorama still joins at its sides."""
     remover = Remover(flare_everywhere, working_size=128)
     monkeypatch.setattr(remover, "linear_flare", lambda prediction, **_: np.broadcast_to(
         np.linspace(0.01, 0.1, prediction.display.shape[1], dtype=np.float32)[None, :, None], prediction.display.shape))

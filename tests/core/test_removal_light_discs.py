@@ -15,7 +15,7 @@ from tests.core.removal_cases import lit_street
 
 @pytest.mark.parametrize("inside_matte", [False, True])
 def test_a_light_disc_stays_as_bright_as_filmed(flare_everywhere: Path, inside_matte: bool) -> None:
-    """It is found by its contrast without the flare; its glow is removed, and most of what clips about it."""
+    """The disc is found by its contrast without the flare; its glow is removed, with most of what clips around it."""
     display, flare = lit_street(10, level=0.7)
     prediction = FlarePrediction(display, flare, np.float32(1), 0 * flare)
     clean = display**2 - Remover(flare_everywhere).linear_flare(prediction, inside_matte=inside_matte)
@@ -42,7 +42,7 @@ def test_other_bright_regions_are_not_retained(size: int, level: float, glow: fl
     pytest.param(0.9, 1.0, 0.5, id="hardly brighter than its surroundings"),
 ])
 def test_a_disc_without_contrast_is_found_by_its_glow(about: float, glow: float, part: float) -> None:
-    """Of its middle all stays, towards its rim less."""
+    """The middle of the disc is kept fully, its rim less."""
     display, flare = lit_street(10, level=0.15)
     flare[display == 0.5] += about - 0.5
     display[display == 0.5] = about
@@ -85,7 +85,7 @@ def test_a_dimmer_light_disc_keeps_less_glow(white: float, part: float) -> None:
 
 @pytest.mark.parametrize(("glow", "inside_matte"), [("keep at lights", True), ("remove", False)])
 def test_no_glow_stays_inside_a_matte_or_with_all_glow(flare_everywhere: Path, glow: Glow, inside_matte: bool) -> None:
-    """The light disc does."""
+    """The light disc itself stays."""
     display, flare = lit_street(10, level=0.15)
     prediction = FlarePrediction(display, flare, np.float32(1), np.ones_like(flare))
     whole = Remover(flare_everywhere, glow=glow).linear_flare(prediction, inside_matte=inside_matte)

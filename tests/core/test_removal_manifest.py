@@ -166,7 +166,7 @@ def test_a_clean_plate_stays_when_its_plate_can_no_longer_be_read(tmp_path: Path
 
 
 def test_a_flare_of_an_outdated_clean_plate_is_made_again(tmp_path: Path, flare_everywhere: Path) -> None:
-    """It would not go with the clean plate."""
+    """The old flare would not belong to the new clean plate."""
     write_codes(tmp_path / "in" / "a.png", picture())
     one, other = (Remover(flare_everywhere, working_size=size) for size in (64, 96))
     args = ([tmp_path / "in"], tmp_path / "out")
@@ -179,7 +179,7 @@ def test_a_flare_of_an_outdated_clean_plate_is_made_again(tmp_path: Path, flare_
 
 
 def test_an_edited_clean_plate_is_kept(tmp_path: Path, flare_everywhere: Path) -> None:
-    """It is kept when settings change, unless `overwrite`; one whose plate has changed is refused."""
+    """Changed settings leave an edited clean plate, unless `overwrite`; a changed plate is refused."""
     for name in ("a", "b"):
         write_codes(tmp_path / "in" / f"{name}.png", picture())
     one, other = (Remover(flare_everywhere, working_size=size) for size in (64, 96))

@@ -67,7 +67,8 @@ def test_a_matte_has_the_orientation_of_its_plate(tmp_path: Path, orientation: i
 
 
 def test_a_matte_follows_the_windows_of_its_file_and_of_the_plate(tmp_path: Path) -> None:
-    """Cropped to what is painted, or of the frame alone where the plate has overscan, or of all of that."""
+    """A matte may be cropped to what is painted, cover the frame, or have half its size; the plate may have
+    overscan."""
     painted = np.zeros((60, 90), np.float32)
     painted[20:30, 50:70] = 1
     cropped = {"dataWindow": ((50, 20), (69, 29)), "displayWindow": ((0, 0), (89, 59))}
@@ -142,7 +143,7 @@ def test_mattes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     ("black", "left", "left"), ("white", "left", "left"), ("left", "left", "left"), ("left", "full", "left"),
     ("black", "full", "none"), ("black", "none", "none")])
 def test_the_alpha_of_an_exr_matte_counts(colour: str, alpha: str, marked: str, tmp_path: Path) -> None:
-    """Rotos come with the shape in alpha alone, with it in all channels, or white beside it."""
+    """Rotoscoping tools write the shape into alpha alone, into all channels, or into alpha beside white."""
     left = np.zeros((48, 64), np.float32)
     left[:, :32] = 1
     shapes = {"left": left, "black": 0 * left, "none": 0 * left, "white": 0 * left + 1, "full": 0 * left + 1}

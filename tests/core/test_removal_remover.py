@@ -39,7 +39,7 @@ def test_a_uniform_flare_is_subtracted_in_linear_light(flare_everywhere: Path, m
 
 def test_a_flare_is_upsampled_along_the_edges_of_clipped_areas(
         flare_everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A flare that the frame clips has the light's edge in it; it must come up as sharp as the plate has it."""
+    """The predicted flare has the edge of the clipped light; enlarged, that edge must be as sharp as the plate's."""
     remover = Remover(flare_everywhere, working_size=64)
     codes = np.full((512, 512, 3), 80, np.uint8)
     codes[:, 256:] = 255
@@ -84,7 +84,7 @@ def test_a_rotated_frame_has_the_same_prediction(flare_everywhere: Path) -> None
 
 
 def test_the_glow_fraction_is_what_stays_with_glow_kept(flare_everywhere: Path) -> None:
-    """In the mean over the augmentations."""
+    """The mean flare without its glow fraction is the flare of a remover that keeps all glow."""
     display = picture(64, 96, 1, np.float32)
     removed, kept = (Remover(flare_everywhere, glow=glow).predict(display) for glow in ("keep at lights", "keep"))
     assert 0.01 < removed.glow_fraction.mean() < 0.99 and kept.glow_fraction.max() == 0
@@ -100,7 +100,7 @@ def test_the_glow_fraction_is_what_stays_with_glow_kept(flare_everywhere: Path) 
 def test_the_per_channel_prediction_counts_for_one_colour_in_the_dark(
          flare_everywhere: Path, monkeypatch: pytest.MonkeyPatch, frame: tuple[float, ...], lit: tuple[float, ...],
         alone: float, counts: float) -> None:
-    """As the glow of a red light does."""
+    """A prediction from one channel alone finds, for example, the glow of a red light."""
     def predict(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
         is_grey = view[0, 0, 0] == view[0, 0, 1]
         lights = is_grey and np.isclose(view[0, 0, 0], lit, atol=1e-3).any()

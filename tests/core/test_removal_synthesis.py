@@ -198,7 +198,7 @@ def test_pairs_are_brighter_with_flare_and_keep_the_light() -> None:
 
 
 def test_lights_against_the_light_are_where_the_scene_is_bright() -> None:
-    """In a picture that is bright in its upper right quarter, and dark in the rest."""
+    """The scene is bright in its upper right quarter and dark elsewhere."""
     scene = np.full((64, 96, 3), 0.02, np.float32)
     scene[:32, 48:] = 0.7
     made = synthesise_flare((2, 0), 128, lenses.built_in_lenses(), "glow")

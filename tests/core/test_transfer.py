@@ -129,7 +129,7 @@ def test_the_flare_of_a_picture_lies_at_its_light(look: Look, tmp_path: Path) ->
                                                 ((128, 32), 140.0), ((60, 60), 70 * 60 / 64)])
 def test_a_portrait_picture_has_the_turned_field_of_view(look: Look, tmp_path: Path, size: tuple[int, int],
                                                          expected: float) -> None:
-    """Its focal length is that of the picture that lies, not that of its narrow side."""
+    """The focal length of an upright picture follows from its long side."""
     write_png(tmp_path / "a.png", np.full((size[1], size[0], 3), 0.2))
     found = picture_target([tmp_path / "a.png"], look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
     assert look.camera.width == 64 and look.camera.fx == 70
@@ -496,7 +496,7 @@ def test_a_plate_with_a_name_that_is_not_utf_8_is_written_and_kept(flare: Path, 
 
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_layers_in_the_plates_folder_raise(flare: Path, look: Look, tmp_path: Path, overwrite: bool) -> None:
-    """They would be written over, or be plates themselves the next time."""
+    """The layers would replace the plates, or be taken for plates the next time."""
     for kind in ("exr", "png"):
         plate = tmp_path / kind / ("layers.0001.exr" if kind == "exr" else "shot.0001.png")
         plate.parent.mkdir()
@@ -583,7 +583,7 @@ def test_the_plate_space_setting_overrides_the_file(model: str, params: Any, fla
 
 @pytest.mark.parametrize("space", ["auto", "acescg", "linear"])
 def test_a_distorted_exr_is_converted_once(space: str, look: Look, tmp_path: Path) -> None:
-    """One colour all over, which no lens bends: it comes out as that of the file itself."""
+    """An undistorted plate of one colour keeps the light of its file: its colour space is not applied twice."""
     folder = make_capture(tmp_path / "capture", views=3, model="OPENCV", params=(57.6, 57.6, 32, 24, 0.02, 0, 0, 0))
     (folder / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
     poses = folder / "sparse" / "0" / "images.txt"

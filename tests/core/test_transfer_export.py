@@ -153,7 +153,7 @@ def test_a_preset_omits_exactly_the_hidden_elements(word: str, tmp_path: Path) -
 
 
 def test_a_preset_is_in_picture_widths(tmp_path: Path) -> None:
-    """Not of the footage the flare was trained on."""
+    """Lengths are relative to the target's picture, not to the footage that the flare was trained on."""
     saved(tmp_path / "a.flare", OURS, 1)
     look, camera = read_look(tmp_path / "a.flare"), cameras(3)[1]
     view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}

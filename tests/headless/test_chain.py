@@ -199,7 +199,7 @@ def test_a_run_is_not_resumed_with_other_settings(words: list[object]) -> None:
 
 @pytest.mark.usefixtures("finished")
 def test_without_blender_the_other_steps_run_and_a_message_says_so(words: list[object]) -> None:
-    """In a Python without bpy and with no Blender named: the chain, and one sentence."""
+    """In a Python without bpy, and with no Blender named, the chain makes all but the composite."""
     code = ("import importlib.util, runpy, sys\n"
             "find = importlib.util.find_spec\n"
             "importlib.util.find_spec = lambda name, *rest: None if name == 'bpy' else find(name, *rest)\n"

@@ -46,7 +46,7 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
 
 
 def test_runs_of_a_list_lie_below_the_folder_for_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the list calls the captures."""
+    """Also those of captures that the list names as "..", "." or "../b"."""
     (tmp_path / "shoot" / "lists").mkdir(parents=True)
     (tmp_path / "shoot" / "lists" / "list.txt").write_text("..\n.\n../b\n")
     monkeypatch.chdir(tmp_path / "shoot" / "lists")
@@ -303,7 +303,7 @@ def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
 def test_commands_run_with_closed_streams(closed: tuple[int, ...]) -> None:
-    """Daemons and schedulers start programs so."""
+    """Daemons and schedulers start programs with closed standard streams."""
     for extra in ([], ["--progress", "json"]):
         args = [sys.executable, str(cli.hand_off.RUN_SCRIPT), "engine", *extra]
         launcher = f"import os; [os.close(n) for n in {closed}]; os.execv({args[0]!r}, {args!r})"
@@ -323,7 +323,7 @@ def test_a_full_disk_for_the_output_is_not_a_failure(options: str, full: str) ->
 
 
 def test_a_torch_that_cannot_be_loaded_is_not_reported_as_a_disk_error(tmp_path: Path) -> None:
-    """As Windows says that a library of its own is missing."""
+    """On Windows a missing library of torch raises an OSError."""
     (tmp_path / "torch").mkdir()
     (tmp_path / "torch" / "__init__.py").write_text("raise OSError(126, 'The specified module could not be found')")
     done = subprocess.run([sys.executable, str(cli.hand_off.RUN_SCRIPT), "engine"], capture_output=True, check=False,
@@ -400,7 +400,7 @@ def test_a_blender_that_cannot_be_loaded_is_reported_in_one_line(tmp_path: Path)
 @pytest.mark.parametrize("light", [0.5, float("nan")])
 def test_an_engine_that_rasterises_wrongly_is_refused(light: float, monkeypatch: pytest.MonkeyPatch,
                                                       capsys: pytest.CaptureFixture[str]) -> None:
-    """It is what the preferences' button asks for."""
+    """The button Test in the preferences runs this check."""
     assert cli.main(["engine"]) == 0
     wrong = SimpleNamespace(colour=torch.full((16, 16, 3), light))
     monkeypatch.setattr("fit_flare.core.gaussians.splat", lambda *_, **__: wrong)
@@ -427,7 +427,7 @@ def test_a_python_without_numpy_runs_the_engine_instead(tmp_path: Path) -> None:
 
 
 def test_parsing_arguments_needs_numpy_only() -> None:
-    """As in Blender's own Python: every module of ours but the engine's comes in without these."""
+    """Blender's own Python has numpy and none of the engine's libraries."""
     code = (f"import importlib, runpy, sys\n"
             f"sys.modules.update(dict.fromkeys(('torch', 'cv2', 'OpenEXR', 'numba', 'safetensors', 'tqdm')))\n"
             f"sys.argv = ['run.py', 'fit', '--help']\n"

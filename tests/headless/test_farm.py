@@ -74,7 +74,7 @@ def whole(capture: Path, made: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 
 def test_templates_are_valid() -> None:
-    """`openjd check` of each, all at once."""
+    """`openjd check` accepts every job template."""
     checks = [subprocess.Popen([sys.executable, "-m", "openjd", "check", path], stdout=subprocess.PIPE,
                                stderr=subprocess.STDOUT, text=True) for path in TEMPLATES]
     for check in checks:
@@ -87,7 +87,7 @@ def test_there_is_a_template_for_each_job() -> None:
 
 
 def test_three_chunks_make_what_one_command_makes(capture: Path, made: Path, whole: Path, tmp_path: Path) -> None:
-    """In any order."""
+    """Three chunks of frames, run in any order, make the same files as one command."""
     parameters = {"Run": made, "Capture": capture, "Out": tmp_path / "out", "Frames": FRAMES, "FramesPerTask": 3}
     chunks = json.dumps([{"Frame": text} for text in ("6-8", "0-2", "3-5")])
     log = job("bake.yaml", "Bake", "--tasks", chunks, **parameters)
@@ -151,7 +151,7 @@ def test_every_capture_of_a_list_is_fitted(capture: Path, tmp_path: Path, capfd:
 
 
 def test_a_transfer_runs_in_chunks(capture: Path, made: Path, tmp_path: Path) -> None:
-    """On to a shot: two tasks and the record."""
+    """A transfer to a shot runs as two tasks and writes its record."""
     flare = made / "flare.flare"
     name = read_look(flare).names[0]
     views = Capture.open(capture).views[:4]

@@ -45,7 +45,10 @@ def test_the_up_axis_of_a_capture_is_up_in_blender(facts: Any) -> None:
 
 
 def test_frame_numbers_are_those_of_blender(facts: Any) -> None:
-    """Blender shows the file with the number frame - frame_start + 1 + frame_offset. Block of cameras.py: "frames"."""
+    """Blender shows the file with the number frame - frame_start + 1 + frame_offset.
+
+    Block of cameras.py: "frames".
+    """
     assert facts["custom"] == [3, 4, 5]
     assert facts["footage"] == "plate.1007.exr"
 

@@ -107,8 +107,10 @@ def test_loading_a_file_clears_the_caches(facts: Any) -> None:
 
 
 def test_a_light_can_be_picked_only_inside_the_picture(facts: Any) -> None:
-    """However picking ends, cursor and status line are as they were before. Block of lights.py: "a click in the
-    picture"."""
+    """However picking ends, cursor and status line are as they were before.
+
+    Block of lights.py: "a click in the picture".
+    """
     clicks = facts["clicks"]
     for beside in ("beside the picture", "below the view", "on the panel"):
         assert clicks[beside] == [["PASS_THROUGH"], False]

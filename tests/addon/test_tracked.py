@@ -19,7 +19,10 @@ def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFact
 
 @pytest.mark.parametrize("how", ["as solved", "set to the floor", "on a dolly"])
 def test_points_of_the_tracker_lie_on_their_tracks(facts: Any, how: str) -> None:
-    """The frames have the lens's distortion; without it points are 5 pixels off. Block of tracked.py: "beginning"."""
+    """The frames have the lens's distortion; without it points are 5 pixels off.
+
+    Block of tracked.py: "beginning".
+    """
     assert facts["solve error"] < 0.01
     assert facts[how] < 0.05
 
@@ -67,8 +70,10 @@ def test_a_shot_with_cuts_has_one_name_for_every_range(facts: Any) -> None:
 
 
 def test_a_light_or_camera_without_a_finite_position_is_reported(facts: Any) -> None:
-    """Drivers may give such positions; writing the shot must not fail as a defect of ours. Block of tracked.py: "a sun,
-    and what hides it"."""
+    """Drivers may give such positions; writing the shot must not fail as a defect of ours.
+
+    Block of tracked.py: "a sun, and what hides it".
+    """
     (light, of_light), *of_cameras = facts["nowhere"]
     assert light == "CaptureError" and of_light.startswith("The position of the light 'Nowhere' is not finite at frame "
                                                            "1;")

@@ -44,12 +44,11 @@ class PictureCache:
 
     @contextlib.contextmanager
     def overflowing_into(self, folder: Path) -> Iterator[None]:
-        """Within the context, keep what exceeds memory in a temporary file in `folder`; it is deleted at the end,
-        however this process ends.
+        """Within the context, keep arrays that do not fit in memory in a temporary file in `folder`.
 
-        Except on Windows the file has no name.
+        The file is deleted at the end, even if the process is killed: except on Windows it has no name.
         """
-        # Without a file, as without room in it, pictures are decoded again.
+        # If no file can be made, what does not fit in memory is decoded again each time.
         with contextlib.suppress(OSError):
             self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115 - closed below
             self._folder = folder
@@ -59,7 +58,8 @@ class PictureCache:
             self._close()
 
     def get(self, name: str) -> Codes | None:
-        """Return the array stored under a name; None if it was not stored, or the disk fails."""
+        """Return the array stored under a name; None if it was not stored, or if the disk fails, which also closes the
+        file."""
         place = self._on_disk.get(name)
         if place is None or self._file is None:
             return self._in_memory.get(name)
@@ -72,7 +72,7 @@ class PictureCache:
             return None
 
     def put(self, name: str, codes: Codes) -> None:
-        """Store an array under a name, in memory or on disk; without room in both it is not stored."""
+        """Store an array under a name: in memory, or else on disk; without room on either it is silently not stored."""
         if codes.nbytes <= self._free_bytes:
             self._free_bytes -= codes.nbytes
             self._in_memory[name] = codes

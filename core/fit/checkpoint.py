@@ -34,7 +34,11 @@ State = dict[str, Any]
 
 
 def save(path: Path, state: Mapping[str, Any]) -> None:
-    """Write a state atomically: nested names as "table/.../name", and large tables by the rows that are not 0."""
+    """Write a state atomically as one safetensors file.
+
+    Nested names become "table/.../name". Of a large table that is mostly 0 only the other rows are stored, as
+    "name@rows" and "name@values".
+    """
     tensors: dict[str, Tensor] = {}
     values: dict[str, Any] = {}
     shapes: dict[str, list[int]] = {}
@@ -74,7 +78,7 @@ def load(path: Path) -> State:
 
 
 def _nest(flat: Mapping[str, Any]) -> State:
-    """Return nested tables by the names "table/.../value". Raises ValueError where a name is a table and a value."""
+    """Return nested tables from values named "table/.../value". Raises ValueError if a name is both table and value."""
     state: State = {}
     for name, value in flat.items():
         *keys, last = name.split("/")
@@ -106,8 +110,8 @@ def _leaves(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
 class FitInputs:
     """The lights of a capture, and a digest of each view's camera, frame, mask and, with `clean_frames`, clean frame.
 
-    A checkpoint holds them; a fit resumes only with the same inputs. clean_frames: True if the fit uses those
-    in removed/. lights: False for a fit without flare.
+    A checkpoint holds both; a fit resumes only with the same inputs. clean_frames: True if the fit uses the clean
+    frames in removed/. lights: False for a fit without flare.
     """
 
     def __init__(self, capture: Capture, *, clean_frames: bool, lights: bool) -> None:
@@ -119,17 +123,17 @@ class FitInputs:
         """Return the entries for the checkpoint: "views", a list of [name, digest], and, if the fit has lights,
         "lights", a list of [name, [x, y, z]], with the paths of those that move.
 
-        Lights are those of the capture, even where the fit has moved them.
+        The lights' positions are those in the capture, even if the fit has moved the lights.
         """
         if self._views is None:
             self._views = [[view.name, self._digest(view)] for view in self._capture.views]
         return {"views": self._views, **({} if self._lights is None else {"lights": self._lights})}
 
     def check(self, stored: dict[str, Any]) -> None:
-        """Raise RunError if the entries of a checkpoint are of other inputs.
+        """Raise RunError if the entries `stored` in a checkpoint differ from these inputs.
 
-        Flares belong to lights by their order, so a resumed fit needs the same lights and frames. Checkpoints of older
-        formats have fewer entries.
+        A flare belongs to a light by its number, so a resumed fit needs the same lights in the same order. An entry
+        that an older format lacks is not checked.
         """
         current = self.state()
         tolerance = LIGHT_TOLERANCE * self._capture.extent
@@ -151,17 +155,18 @@ class FitInputs:
         files = [capture.frame_path(view), *([capture.clean_frame_path(view)] if self._uses_clean_frames else []),
                  *([] if mask is None else [mask])]
         rotation, position = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-        # Adding 0 makes -0 from rounding 0, which has other text.
+        # Adding 0 turns -0, which has another text, into 0.
         numbers = [*np.round(rotation, 5).ravel() + 0.0, *position, camera.fx, camera.fy, camera.cx, camera.cy]
         inputs = [*map(content_hash, files), *(f"{number:.5g}" for number in numbers), str(view.lens)]
         return hashlib.blake2b(" ".join(inputs).encode(), digest_size=8).hexdigest()
 
 
 def _describe_light_change(old: list[Any], new: list[Any], tolerance: float) -> str:
-    """Return a clause on what differs between two lists of `Light.numbers`, [name, [x, y, z], ...]; "" if nothing does.
+    """Return a clause for the user on what differs between two lists of lights; "" if nothing does.
 
-    It is about the names, else about the first light whose position (None if it moves) or other values differ.
-    Positions may differ by `tolerance`, and by what Blender's single precision rounds to.
+    A light is [name, position or None if it moves, other values...]. The clause is on the names if they differ, else on
+    the first light whose position or other values differ. Positions may differ by `tolerance`, world units, plus
+    Blender's rounding to single precision.
     """
     old_names, new_names = ([name for name, *_ in lights] for lights in (old, new))
     if old_names != new_names:

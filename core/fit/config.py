@@ -24,8 +24,10 @@ def write_config(path: Path, settings: FitSettings) -> None:
 
 
 def _write_table(lines: list[str], keys: list[str], table: Any) -> None:
-    """Append a dataclass to `lines` as a TOML table, its plain values before its nested tables. keys: dotted name of
-    the table, in parts; empty for the outermost one."""
+    """Append a dataclass to `lines` as a TOML table, its plain values before its nested tables.
+
+    keys: parts of the table's dotted name; empty for the outermost table.
+    """
     plain = [entry for entry in fields(table) if not is_dataclass(getattr(table, entry.name))]
     if keys:
         lines += ["", f"[{'.'.join(keys)}]"]
@@ -48,7 +50,7 @@ def _to_toml(value: Any) -> str:
 
 
 def read_config(path: Path, progress: Progress | None = None) -> FitSettings:
-    """Read the settings of a run; with `progress`, old names are reported in one line.
+    """Read the settings of a run; with `progress`, settings under old names are reported to the user in one line.
 
     Raises RunError if the file is missing, damaged, or has unknown names.
     """
@@ -57,7 +59,7 @@ def read_config(path: Path, progress: Progress | None = None) -> FitSettings:
         if "mode" not in data:  # a truncated file would otherwise pass for one with default settings
             raise ValueError("it has no mode")
         values, renamed = current_names(_flatten(data))
-        values.pop("split.excess_unfound", None)  # of versions that fitted an unconverged scene alone
+        values.pop("split.excess_unfound", None)  # a setting that no longer exists
         settings: FitSettings = parse_table(FitSettings, _nest(values)).validated()
     except OSError as problem:
         raise RunError(f"{path} cannot be read ({problem.strerror}); name the folder of a run.") from problem
@@ -70,7 +72,7 @@ def read_config(path: Path, progress: Progress | None = None) -> FitSettings:
 
 
 def _flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values of nested tables by dotted name; an empty table stays one."""
+    """Return the values of nested tables by dotted name; an empty table is kept as a value."""
     flat: dict[str, Any] = {}
     for name, value in table.items():
         flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) and value else {prefix + name: value}

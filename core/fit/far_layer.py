@@ -88,8 +88,11 @@ class SweepView:
 
 
 def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) -> FarLayer | None:
-    """Return the far layer of a capture; None where nothing that `views` see lies beyond their parallax, or cannot be
-    told: without points, or with all cameras in one place."""
+    """Return the far layer of a capture, by a sphere sweep over some of the views.
+
+    None if too little that the views see lies beyond their parallax, or if this cannot be decided: without points, or
+    with all cameras in one place.
+    """
     sampled = subsample(views, SWEEP_VIEWS)
     cameras = [view.camera.scaled(min(SWEEP_WIDTH, view.camera.width)) for view in sampled]
     spread = _camera_spread(cameras)
@@ -128,7 +131,8 @@ class Patches:
 def classify_patches(views: list[SweepView]) -> Patches | None:
     """Return which patches of directions are far; None where too few are for a far layer."""
     costs = sweep_patches(views)
-    # The patches that are certainly far decide whether there is a far layer; then every patch is decided anew.
+    # Patches that are certainly far decide whether there is a far layer. If so, every patch is decided by its
+    # neighbours.
     has_contrast = costs.near >= MIN_CONTRAST
     is_far = has_contrast & (costs.infinite < DECISIVE_RATIO * costs.near) & (costs.infinite <= costs.bare)
     if is_far.sum() < max(MIN_FAR_PATCHES, MIN_FAR_SHARE * has_contrast.sum()):
@@ -147,9 +151,9 @@ class SweepCosts(NamedTuple):
 
 
 def sweep_patches(views: list[SweepView]) -> SweepCosts:
-    """Return how much the views disagree on each patch of directions, on spheres about the cameras of several radii.
+    """Return how much the views disagree on each patch of directions, for spheres of several radii about the cameras.
 
-    Patches that too few views see are left out.
+    The cost of a patch is the mean over its directions. Patches that too few views see are left out.
     """
     cameras = [view.camera for view in views]
     focal = float(np.median([camera.focal_length for camera in cameras]))
@@ -167,16 +171,17 @@ def sweep_patches(views: list[SweepView]) -> SweepCosts:
         visible_counts = np.bincount(patch_indices, visible, len(patch_directions))
         is_visible = (visible_counts > 0) & (visible_counts >= MIN_VISIBLE_SHARE * sizes)
         row[:] = np.where(is_visible, sums / np.maximum(visible_counts, 1), np.nan)
-    # Known on the infinite sphere, on that of bare parallax, and on some near one.
+    # A patch is usable if its cost is known on the infinite sphere, on that of bare parallax and on a near one.
     usable = np.isfinite(costs[:2]).all(0) & np.isfinite(costs[2:]).any(0)
     infinite, bare = costs[:2, usable]
     return SweepCosts(patch_directions[usable], infinite, bare, np.nanmedian(costs[2:, usable], axis=0))
 
 
 def _classify_by_neighbours(costs: SweepCosts) -> Booleans:
-    """Return which patches (n,) are far, each by the nearest patches that are not plain, weighted by their contrast.
+    """Return which patches (n,) are far, each decided by the NEIGHBOURS nearest patches with contrast.
 
-    A patch that is not plain is far, too, if its own cost on the infinite sphere is below MAX_COST.
+    A patch is far if these differ less on the infinite sphere than on near ones, by MIN_GAIN of the latter. A patch
+    with contrast is far also if its own cost on the infinite sphere is below MAX_COST.
     """
     has_contrast = costs.near >= MIN_CONTRAST
     directions, infinite, near = (values[has_contrast] for values in (costs.directions, costs.infinite, costs.near))
@@ -190,7 +195,8 @@ def _classify_by_neighbours(costs: SweepCosts) -> Booleans:
 
 
 def _make_sweep_view(view: View, frames: Frames) -> SweepView:
-    """Return a view for the sweep, at the usual exposure: its clean frame if the fit has one, else its frame."""
+    """Return a view for the sweep, small and at the usual exposure: its clean frame if the fit has one, else its
+    frame."""
     camera, frame, clean = frames.targets(view)
     small = camera.scaled(min(SWEEP_WIDTH, camera.width))
     picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
@@ -199,16 +205,17 @@ def _make_sweep_view(view: View, frames: Frames) -> SweepView:
     counts = None
     if mask is not None:
         share = Picture(mask.numpy().astype(np.float32), "linear").resized(*small.size).pixels
-        counts = np.asarray(share > 0.99)  # all that was averaged to the pixel counts
+        counts = np.asarray(share > 0.99)  # a small pixel counts only if all pixels that it averages do
     return SweepView(small, values, counts)
 
 
 def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: float) -> tuple[Floats, Booleans]:
-    """Return the share (n,) of the views that differ from the largest group that agrees, and which (n,) enough views
-    see, for points in directions (n, 3) on a sphere about the cameras.
+    """Return for points in directions (n, 3) on a sphere about the cameras how much the views disagree, and whether at
+    least MIN_VIEWS see each, (n,) both.
 
-    Groups are robust: a direction may be hidden by something near in most views. inverse_radius: of the sphere, 0 for
-    an infinite one. The share is 0 where too few views see a point.
+    Disagreement is the share of the seeing views that differ from the largest group of views that agree; 0 if too few
+    see the point. A group is robust: something near may hide a direction in most views. inverse_radius: 1 / radius of
+    the sphere, 0 for an infinite one.
     """
     centre = _camera_centre([view.camera for view in views])
     values = np.full((len(views), len(directions), 3), np.nan, np.float32)
@@ -245,10 +252,10 @@ def _bilinear(picture: Values, places: Floats) -> Values:
 
 def _project_sphere(camera: Camera, centre: Floats, directions: Floats, inverse_radius: float
                     ) -> tuple[Booleans, Floats]:
-    """Return which points (n,) of a sphere about `centre`, in these directions, lie on the camera's frame, and their
-    places (m, 2), pixels. inverse_radius: of the sphere, 0 for an infinite one."""
+    """Return which points (n,) of a sphere about `centre`, in directions (n, 3), lie on the camera's frame, and their
+    places (m, 2), pixels. inverse_radius: 1 / radius of the sphere, 0 for an infinite one."""
     rotation = camera.world_to_camera[:3, :3]
-    # (centre + radius * direction - position) / radius: the camera sees no difference.
+    # The point relative to the camera, over the radius: (centre + radius * direction - position) / radius.
     local = (directions + inverse_radius * (centre - camera.position)) @ rotation.T
     in_front = local[:, 2] > 1e-6
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -258,9 +265,10 @@ def _project_sphere(camera: Camera, centre: Floats, directions: Floats, inverse_
 
 
 def _make_far_points(sphere: FarSphere, patches: Patches, views: Sequence[View], frames: Frames) -> PointCloud:
-    """Return at most about MAX_POINTS points on the far sphere in the far patches, in the colours of the frames.
+    """Return about MAX_POINTS points at most, on the far sphere in the far patches, in the colours of the frames.
 
-    Colours are those at the usual exposure: medians of clean frames, else a low quantile of the frames.
+    Colours are at the usual exposure: the median over the views where all have clean frames, else a low quantile, since
+    a flare only adds light.
     """
     targets = [frames.targets(view) for view in views]
     focal = float(np.median([target.camera.focal_length for target in targets]))
@@ -310,7 +318,8 @@ def _camera_spread(cameras: list[Camera]) -> float:
 def _visible_directions(cameras: list[Camera], pitch: float) -> Floats:
     """Return unit vectors (n, 3) that some camera sees, about `pitch` radians from each other.
 
-    They are part of a Fibonacci lattice (Swinbank and Purser 2006) about the mean viewing direction.
+    The directions are those of a Fibonacci lattice (Swinbank and Purser 2006) about the mean viewing direction, which
+    is even on the sphere.
     """
     forwards = np.array([camera.forward for camera in cameras])
     axis = forwards.mean(0)
@@ -331,7 +340,7 @@ def _visible_directions(cameras: list[Camera], pitch: float) -> Floats:
 
 
 def _nearest_indices(directions: Floats, others: Floats) -> NDArray[np.int64]:
-    """Return (n,) the index of the nearest of other unit vectors (m, 3) for each of (n, 3)."""
+    """Return for each of the unit vectors `directions` (n, 3) the index (n,) of the nearest of `others` (m, 3)."""
     indices = np.zeros(len(directions), np.int64)
     columns = torch.from_numpy(others.T.astype(np.float32))
     for start in range(0, len(directions), DIRECTIONS_AT_ONCE):

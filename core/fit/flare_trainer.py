@@ -88,10 +88,10 @@ class FlareTrainer(abc.ABC):
                       self.settings.kernels, visibility=self.settings.flare.active_visibility)
 
     def finish_lights(self, folder: Path) -> Sequence[str]:
-        """Normalise the lights' brightness, leave out lights that do not flare, and write the lights by frame, if they
-        change; return messages to the user on their shares.
+        """Normalise the lights' brightness, drop lights that do not flare from `flare`, and write the lights by frame
+        into the folder, if any moves or changes; return messages to the user on the lights' shares of the flare.
 
-        In a fit over plates, the brightness is solved once more for all views first, held-out ones too.
+        In a fit over plates, the brightness is first solved once more for all views, held-out ones too.
         """
         if self.flare is None:
             return ()
@@ -105,7 +105,8 @@ class FlareTrainer(abc.ABC):
         return share_messages(shares, flaring)
 
     def _pick_view(self) -> View:
-        """Return the view of this iteration: each view once per round, in a random order given by seed and round."""
+        """Return the view of this iteration: each view once per round, in a random order that depends on seed and
+        round."""
         done = self.iteration - 1
         order = torch.randperm(len(self.views), generator=self._generator(done // len(self.views), 1))
         return self.views[int(order[done % len(self.views)])]
@@ -120,7 +121,8 @@ class FlareTrainer(abc.ABC):
         return torch.Generator().manual_seed(seed % (1 << 62))
 
     def _change_flare_density(self) -> None:
-        """Clone and prune the flare's Gaussians, at the iterations that the settings name."""
+        """Clone and prune the Gaussians of each light's flare, in iterations that the settings name; else do
+        nothing."""
         settings = self.settings.flare.density
         adam = self.optimisers.flare
         if self.flare is None or adam is None or not settings.is_due(self.iteration):
@@ -130,7 +132,8 @@ class FlareTrainer(abc.ABC):
             clone_and_prune(light, adam, names, settings, self._generator(self.iteration, 2 + number))
 
     def _flare_penalty(self, pose: Tensor, frame: str) -> Tensor:
-        """Return the penalties on delta_l at a pose (4, 4), and on the brightness of the lights in its frame."""
+        """Return the penalties on delta_l, the learned correction of each light's place, at a pose (4, 4), and on the
+        brightness of the lights in its frame."""
         assert self.flare is not None
         settings, penalty = self.settings, torch.zeros(())
         if settings.flare.correction_weight:
@@ -142,7 +145,8 @@ class FlareTrainer(abc.ABC):
         return penalty
 
     def check_finite(self) -> None:
-        """Raise RunError if a parameter is NaN or infinite: rasterizers skip those and hide them."""
+        """Raise RunError if a parameter is NaN or infinite: rasterizers skip such Gaussians, so the pictures hide
+        it."""
         for model in (self.scene, self.flare):
             for name, parameter in model.named_parameters() if isinstance(model, nn.Module) else ():
                 if not parameter.detach().sum().isfinite():

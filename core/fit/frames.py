@@ -29,14 +29,15 @@ T = TypeVar("T")
 
 
 def subsample(items: Sequence[T], number: int) -> Sequence[T]:
-    """Return `number` to 2 `number` - 1 of the items at equal steps; all where there are fewer than `number`."""
+    """Return items at equal steps: `number` to 2 `number` - 1 of them, or all if there are fewer than `number`."""
     return items[:: max(len(items) // number, 1)]
 
 
 def sample_colours(xyz: NDArray[Any], camera: Camera, picture: Tensor) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Return which (n,) of the world points (n, 3) lie on the camera's frame, and a picture's pixels there, (m, ...).
+    """Return which (n,) of the world points (n, 3) lie on the camera's frame, and the pixels (m, ...) of a picture at
+    those m points.
 
-    picture: of the camera's size; a mask will do, too.
+    picture: (height, width, ...) of the camera's size; it may be a mask.
     """
     pixels, depth = camera.project(xyz)
     inside = camera.contains(pixels, depth)
@@ -104,8 +105,11 @@ class Frames:
         return camera.scaled(self._width)
 
     def _find_picture_area(self) -> PictureArea | None:
-        """Return the area inside the borders that all frames share, at the working size; None without borders, or if
-        frames differ in size."""
+        """Return the area inside the black borders that all frames share, at the working size; None without borders, or
+        if frames differ in size.
+
+        Some of the frames are measured; black ones are skipped.
+        """
         sizes = {self.camera(view).size for view in self.capture.views}
         if len(sizes) != 1:
             return None
@@ -164,7 +168,8 @@ class Frames:
                       decode: Callable[[View, tuple[int, int]], Picture | None]) -> Tensor | None:
         """Return a picture of a view without borders, display values (height, width, 3); None where there is none.
 
-        kind, decode: see `_load_codes`.
+        kind: first part of the picture's name in the cache. decode: reads the picture of a view at a size (width,
+        height).
         """
         codes = self._load_codes(view, kind, decode)
         if codes is None:
@@ -175,9 +180,10 @@ class Frames:
 
     def _load_codes(self, view: View, kind: str,
                     decode: Callable[[View, tuple[int, int]], Picture | None]) -> NDArray[np.uint16] | None:
-        """Return the whole picture as 16 bit codes, from the cache if possible; None where there is none.
+        """Return the whole picture as 16 bit codes, from the cache or decoded and cached; None where there is none.
 
-        kind: first part of its name in the cache. decode: reads the picture of a view at a size (width, height).
+        kind: first part of the picture's name in the cache. decode: reads the picture of a view at a size (width,
+        height).
         """
         name = f"{kind}/{view.name}"
         codes = self.cache.get(name)

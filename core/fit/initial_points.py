@@ -45,7 +45,11 @@ class _Features(NamedTuple):
 
 
 def ensure_points(capture: Capture, settings: FitSettings, progress: Progress) -> tuple[Capture, tuple[str, ...]]:
-    """Return the capture with points, and a message to the user if they had to be made. Raises Cancelled."""
+    """Return the capture with points, and a message to the user if they had to be made.
+
+    Points are triangulated from matched frames; if these are too few, random ones are added. Nothing is done for a
+    capture with points, and in fits that start from a scene or plates. Raises Cancelled.
+    """
     if len(capture.points) or settings.scene.start or settings.uses_plates:
         return capture, ()
     xyz, rgb, observed = _triangulate_matches(capture, progress)
@@ -60,9 +64,10 @@ def ensure_points(capture: Capture, settings: FitSettings, progress: Progress) -
 
 def _triangulate_matches(capture: Capture,
                          progress: Progress) -> tuple[Floats, NDArray[np.uint8], dict[str, NDArray[np.int64]]]:
-    """Return points (n, 3), colours (n, 3), and the indices of those observed in each view, by its name.
+    """Return points (n, 3), colours (n, 3), and by the view's name the indices of the points that it observes.
 
-    Each frame is matched with the next two; every sound match gives a point, in the colour of the first frame.
+    SIFT features of each frame are matched with those of the next two; every sound match gives a point, in the colour
+    of the first frame.
     """
     import cv2
 
@@ -106,8 +111,11 @@ def _detect_features(sift: Any, picture: Picture) -> _Features:
 
 
 def _match_features(matcher: Any, first: Any, second: Any) -> NDArray[np.int64]:
-    """Return (n, 2) indices of features whose descriptors are nearest to each other, and by MATCH_RATIO nearer than to
-    any third. first, second: descriptors of two frames, None without features."""
+    """Return (n, 2) indices of the features of two frames that match.
+
+    The descriptors of a match are nearest to each other, and that in `second` is nearer than MATCH_RATIO times the
+    second nearest (Lowe's ratio test). first, second: descriptors of the frames, None without features.
+    """
     if first is None or second is None or min(len(first), len(second)) < 2:
         return np.zeros((0, 2), np.int64)
     forward = [(nearest.queryIdx, nearest.trainIdx) for nearest, second_nearest in matcher.knnMatch(first, second, 2)
@@ -142,7 +150,7 @@ def triangulate_pair(first: Camera, second: Camera, pixels: Floats, other_pixels
 def _random_points(capture: Capture, triangulated: Floats, seed: int) -> tuple[Floats, NDArray[np.uint8]]:
     """Return points (n, 3) in the view of the cameras, with the colours (n, 3) of the frames where they were drawn.
 
-    Depths are log-uniform about that of what each camera looks at (`_subject_distance`). triangulated: points (m, 3).
+    Depths are log-uniform about the distance of what each camera looks at. triangulated: known points (m, 3).
     """
     generator = np.random.default_rng(seed)
     views = subsample(capture.views, MATCHED_VIEWS)
@@ -171,8 +179,11 @@ def _focus_point(cameras: list[Camera]) -> Floats | None:
 
 
 def _subject_distance(camera: Camera, known: Floats, focus: Floats | None, capture: Capture) -> float:
-    """Return the distance, world units, of what a camera looks at: of known points (n, 3), the common focus (3,), or
-    the capture's extent."""
+    """Return the distance, world units, of what a camera looks at.
+
+    It is the median depth of at least 20 known points (n, 3), else the depth of `focus` (3,), the point nearest to all
+    optical axes, else the capture's extent.
+    """
     if len(known) >= 20:  # enough for a median
         depths = camera.project(known)[1]
         if (depths > 0).any():

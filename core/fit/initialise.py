@@ -38,7 +38,7 @@ SNAP_WIDTH, SNAP_VIEWS = 160, 40
 
 def initial_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
     """Return the scene that a fit starts from: a scene trained elsewhere, or one Gaussian for each point of the
-    capture, with near plane and white for its frames."""
+    capture. Its near plane and white are set for the capture's frames."""
     if settings.scene.start:
         scene = _load_scene(settings, views)
     else:
@@ -49,8 +49,8 @@ def initial_scene(capture: Capture, settings: FitSettings, views: tuple[View, ..
 
 
 def nearest_depth(capture: Capture) -> float:
-    """Return the depth, world units, of the nearest points on the views' frames: the 1 % quantile; infinity if no view
-    has any."""
+    """Return the depth, world units, of the nearest points that the views show: the 1 % quantile over all views;
+    infinity if no view shows a point."""
     points = capture.points.xyz[:: max(len(capture.points) // SAMPLED_POINTS, 1)]
     depths = []
     for camera in (view.camera for view in capture.views):
@@ -61,8 +61,8 @@ def nearest_depth(capture: Capture) -> float:
 
 
 def _load_scene(settings: FitSettings, views: tuple[View, ...]) -> SceneGaussians:
-    """Read the scene to start from; a frozen one has no gradients. Raises CaptureError for a scene that is empty or of
-    another world."""
+    """Read the scene to start from; a frozen one gets no gradients. Raises CaptureError for a scene that is empty or
+    lies in another world than the cameras."""
     scene = read_ply(settings.scene.start)
     if not len(scene):
         raise CaptureError(f"{settings.scene.start} holds no Gaussians; export it again.")
@@ -70,13 +70,14 @@ def _load_scene(settings: FitSettings, views: tuple[View, ...]) -> SceneGaussian
     for parameter in scene.parameters():
         parameter.requires_grad_(not settings.scene.frozen)
     if not settings.scene.frozen:
-        scene.pixel_grid = None  # it learns another grid
+        scene.pixel_grid = None  # the fit adapts it to the pixel grid of its own frames
     return scene
 
 
 def _scene_from_points(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames
                        ) -> SceneGaussians:
-    """Return one Gaussian for each point of the capture, with the far layer or the sky where the settings ask for one.
+    """Return a scene of one Gaussian for each point of the capture, plus far ones if the settings ask for them: the far
+    layer, or, where none is found and the fit is by parallax, a sky. Raises CaptureError without points.
     """
     if not len(capture.points):
         raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")
@@ -118,7 +119,7 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
     if frame_lights is None:
         positions = _static_positions(capture, views, frames, settings, generator)
     else:
-        # Those of the middle frame, for cameras of other frames.
+        # The lights' places in the middle frame, for cameras that belong to no frame.
         positions = frame_lights.positions[len(frame_lights.positions) // 2].clone()
     cameras = [view.camera for view in views]
     corner_radius = max(camera.corner_radius for camera in cameras)
@@ -140,9 +141,9 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
 
 def _views_in_front(number: int, views: tuple[View, ...], positions: torch.Tensor, frame_lights: FrameLights | None
                     ) -> list[ViewOfLight]:
-    """Return the light of this number as seen from the views that have it in front of the camera.
+    """Return the light of this number as seen from each of the views that have it in front of the camera.
 
-    positions: (lights, 3), world units, for lights without places by frame.
+    positions: (lights, 3), world units, used if `frame_lights` is None. frame_lights: the lights' places by frame.
     """
     light_views = []
     for view in views:
@@ -170,9 +171,9 @@ def _static_positions(capture: Capture, views: tuple[View, ...], frames: Frames,
 
 
 def _snap_views(views: tuple[View, ...], frames: Frames) -> list[FlareView]:
-    """Return some of the views that have clean frames, reduced for `snap_lights`.
+    """Return the flares of some of the views that have clean frames, at a small size, for `snap_lights`.
 
-    They are the frames of the fit, so that none is decoded twice.
+    They come from the frames that the fit uses, so none is decoded twice.
     """
     flare_views = []
     for view in subsample(views, SNAP_VIEWS):

@@ -49,9 +49,9 @@ TV_REWEIGHTINGS, TV_EPSILON = 30, 1e-3
 def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, render_view: RenderView) -> None:
     """Set the brightness of the lights in these views, which are in the order of the shot.
 
-    The present flares at that brightness explain frame - scene best. Where a frame leaves it uncertain, the brightness
-    in the lights' file and that of the neighbouring frames decide (`smooth_with_steps`). The flare stays as it is:
-    held-out frames give the places and the brightness of lights, and nothing else.
+    In each view the brightness is fitted, by robust least squares, so that the flares explain frame - scene. It is then
+    averaged with the brightness in the lights' file by certainty, and smoothed over the frames by total variation. The
+    rest of the flare is unchanged: held-out frames give the brightness of lights, and nothing else.
     """
     lights = flare.frame_lights
     if lights is None:
@@ -79,8 +79,8 @@ def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, r
 
 
 def _lights_in_frame(lights: FrameLights, view: View, edge: float = 0.0) -> NDArray[np.bool_]:
-    """Return (lights,) which lights lie on the frame of a view. edge: width of its border that does not count, as a
-    share of the frame's width."""
+    """Return (lights,), True for lights on the frame of a view. edge: width of a border of the frame that does not
+    count, as a share of the frame's width."""
     camera = view.camera
     pixels, depth = camera.project(lights.positions[lights.rows[view.name]].numpy())
     margin = edge * camera.width
@@ -91,7 +91,7 @@ def _lights_in_frame(lights: FrameLights, view: View, edge: float = 0.0) -> NDAr
 def smooth_with_steps(values: NDArray[np.float64], certainty: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return x (n,) that minimises sum certainty (x - values)^2 / 2 + sum |change of x| / STEP_SCALE.
 
-    certainty: 1 / variance of each value. It is total variation denoising, by reweighted least squares.
+    This is total variation denoising, by iteratively reweighted least squares. certainty: 1 / variance of each value.
     """
     smooth = values.copy()
     if len(values) < 2:
@@ -104,7 +104,10 @@ def smooth_with_steps(values: NDArray[np.float64], certainty: NDArray[np.float64
 
 def _solve_tridiagonal(weights: NDArray[np.float64], springs: NDArray[np.float64],
                        target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Solve (diag(weights) + the Laplacian of a chain with these springs) x = target, by elimination."""
+    """Solve (diag(weights) + L) x = target by elimination (Thomas algorithm).
+
+    L is the Laplacian of a chain: spring i pulls x[i] and x[i + 1] together.
+    """
     diagonal = weights.copy()
     diagonal[:-1] += springs
     diagonal[1:] += springs
@@ -121,11 +124,10 @@ def _solve_tridiagonal(weights: NDArray[np.float64], springs: NDArray[np.float64
 
 def _solve_frame(targets: Targets, scene: NDArray[np.float32], flares: Sequence[NDArray[np.float32] | None],
                  start: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the strengths (lights,) of flares (height, width, 3), linear light, in a frame over its scene, and their
-    certainty, 1 / variance.
+    """Return the strengths (lights,) at which the flares explain frame - scene, and their certainty, 1 / variance.
 
-    flares: None for a light behind the camera. start: (lights,) present strengths, which stay, with a certainty of 0,
-    where a light has no flare in the frame.
+    scene: (height, width, 3), linear light. flares: (height, width, 3) each, linear light, None for a light behind the
+    camera. start: (lights,) present strengths; a light without flare in the frame keeps its own, with certainty 0.
     """
     solved, certainty = start.copy(), np.zeros(len(start))
     present = [number for number, flare in enumerate(flares) if flare is not None and flare.max() > 0]
@@ -138,8 +140,8 @@ def _solve_frame(targets: Targets, scene: NDArray[np.float32], flares: Sequence[
     solved[present] = robust_bounded_fit(columns, light, start[present], 0.0, MAX_BRIGHTNESS, PRIOR_WEIGHT)
     residual = light - columns @ solved[present]
     energies = np.square(columns).sum(0)
-    # If errors were independent, the variance of a strength would be variances / energies, by the squared errors at
-    # each pixel (White 1980); but `area` pixels count as one. The last term keeps the certainty finite.
+    # White's (1980) estimate of a strength's variance, from the squared error at each pixel, is variances / energies.
+    # It expects independent errors; here `area` pixels count as one. The last term keeps the certainty finite.
     variances = (np.square(columns) * residual[:, None] ** 2).sum(0) / np.maximum(energies, 1e-12)
     area = CORRELATION_SHARE * len(light)
     certainty[present] = energies / (area * variances + 1e-6 * area)
@@ -148,9 +150,9 @@ def _solve_frame(targets: Targets, scene: NDArray[np.float32], flares: Sequence[
 
 @torch.no_grad()
 def normalise_brightness(flare: FlareModel, views: Sequence[View]) -> None:
-    """Scale each light so that its brightness is 1 in the brightest of these views, and its flare to match.
+    """Scale each light's brightness to 1 in the brightest of these views, and its flare's colours by the inverse.
 
-    Views with the light in the frame decide, if there are any: elsewhere its brightness is uncertain.
+    Only views with the light in the frame count, if there are any: in others its brightness is uncertain.
     """
     lights = flare.frame_lights
     if lights is None:
@@ -167,9 +169,10 @@ def normalise_brightness(flare: FlareModel, views: Sequence[View]) -> None:
 
 def _scale_colours(sh: torch.Tensor, head: nn.Linear, names: Sequence[str], widths: Sequence[int],
                    factor: float) -> None:
-    """Multiply the colours 0.5 + C0 (sh + change) + ... of Gaussians by a factor, `change` the network's offset.
+    """Multiply the colours of Gaussians by a factor, in place.
 
-    names, widths: the parts of the output of `head`, the network's last layer.
+    A colour is 0.5 + C0 (sh + change) + ..., where the network's output `change` varies with the light's place. sh: the
+    coefficients. head: last layer of the network; names, widths: parts of its output.
     """
     sh *= factor
     sh[:, :3] += (factor - 1) * 0.5 / C0

@@ -50,7 +50,7 @@ def flare_shares(flare: FlareModel, views: Sequence[View], frames: Frames,
                  render_view: RenderView) -> dict[str, FlareShare]:
     """Return share and peak of each light's flare, by the light's name.
 
-    Both are measured outside the lights' discs: the picture of a lamp is no flare.
+    Both are measured in some of the views, outside the lights' discs: the picture of a lamp itself is no flare.
     """
     sums, peaks = dict.fromkeys(flare.names, 0.0), dict.fromkeys(flare.names, 0.0)
     for view in subsample(views, SAMPLED_VIEWS):
@@ -72,7 +72,8 @@ def select_flaring(shares: Mapping[str, FlareShare]) -> list[str]:
 
 
 def share_messages(shares: Mapping[str, FlareShare], flaring: Sequence[str]) -> list[str]:
-    """Return messages to the user about the lights' shares. flaring: the lights that the .flare has."""
+    """Return messages to the user on the lights' shares of the flare. flaring: names of the lights that the .flare
+    keeps."""
     if not any(share.is_visible for share in shares.values()):
         return [f"No light of the capture flares: the flare of each is below {MIN_PEAK:g} of white everywhere. The "
                 f"flare layers of this run are dark, and its .flare has {', '.join(flaring)} alone."]
@@ -103,7 +104,7 @@ def select_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:
 def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
     """Write lights.json of a run: the lights of the capture with their places and fitted brightness, by frame.
 
-    Lights that are not in `flare` have no brightness. Nothing is written where all lights are static and always on.
+    A light that is not in `flare` gets no brightness. Nothing is written if all lights are static and always on.
     """
     lights = flare.frame_lights
     if lights is None:
@@ -128,7 +129,8 @@ def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
 def make_frame_lights(capture: Capture, names: Sequence[str]) -> FrameLights:
     """Return places and brightness of these lights of a capture, in every view.
 
-    An unknown brightness starts at 1. A fit starts from a doubtful one, but it has no prior (NaN), as an unknown one.
+    A known brightness is start and prior of the fit; a doubtful one is the start, without a prior (NaN); an unknown one
+    starts at 1 without a prior.
     """
     by_name = {light.name: light for light in capture.lights}
     states = [[capture.light_state(by_name[name], view) for name in names] for view in capture.views]

@@ -52,10 +52,11 @@ Indices = NDArray[np.int64]
 
 
 def measure_exposures(capture: Capture, frames: Frames, progress: Progress | None = None) -> dict[str, float]:
-    """Return the exposure of each view relative to the median frame; empty if all are equal, or too few can be
-    measured.
+    """Return the exposure of each view, by name, relative to the median frame; empty if all are about equal, or if too
+    few can be measured.
 
-    A view that cannot be measured takes the exposure of the nearest one, by name, that can. Raises Cancelled.
+    A view that cannot be measured takes the exposure of the nearest measured one in the capture's order, if possible of
+    the same folder. Raises Cancelled.
     """
     progress = progress or Progress()
     stops = PointObservations.of(capture, subsample(capture.views, SAMPLED_VIEWS), frames, progress).estimate_stops()
@@ -70,8 +71,10 @@ def measure_exposures(capture: Capture, frames: Frames, progress: Progress | Non
 
 
 def _fill_unmeasured(stops: Floats, folders: Sequence[Path]) -> Floats:
-    """Replace exposures (n,) that are not finite by the nearest finite one, of the same folder if possible: a folder
-    often has the frames of one camera. folders: of the n frames."""
+    """Return exposures (n,) in which each that is not finite is replaced by the nearest finite one.
+
+    One of the same folder is preferred: a folder often has the frames of one camera. folders: folder of each frame.
+    """
     usable = np.flatnonzero(np.isfinite(stops))
 
     def nearest(index: int) -> int:
@@ -111,8 +114,8 @@ class PointObservations:
 
     @classmethod
     def of(cls, capture: Capture, views: Sequence[View], frames: Frames, progress: Progress) -> PointObservations:
-        """Sample the clean frames of views, else the frames, at points that the solve found there, where they are
-        neither too dark nor clipped. frames: decoded, at the size of the fit."""
+        """Sample the clean frames of views, or the frames where there are none, at the points that the camera solve
+        found in each view. Pixels that are too dark, clipped or masked are left out."""
         # Points whose index is a multiple of `step`, so that views have them in common.
         step = max(int(np.median([len(view.points) for view in views])) // SAMPLED_POINTS, 1)
         samples = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
@@ -137,7 +140,8 @@ class PointObservations:
     def estimate_stops(self) -> Floats:
         """Return the exposure of each view (count,), stops, not finite where it cannot be measured.
 
-        In turn, the lines of the views are fitted to the points' luminances, and these are estimated by the lines.
+        Alternates between two steps: a line observed = slope * luminance + veil is fitted to each view, and each
+        point's luminance becomes the median over the lines. The slopes are the exposures.
         """
         luminances = self._initial_luminances()
         for _ in range(REFINEMENTS):
@@ -148,9 +152,10 @@ class PointObservations:
         return np.log2(slopes)
 
     def _initial_luminances(self) -> Floats:
-        """Estimate the luminance of each point in a view of the usual exposure, by the point's index, without veils.
+        """Return a first estimate of each point's luminance in a view of the usual exposure, by the point's index.
 
-        Points and exposures are in turn the medians of what the other leaves, in stops. NaN for points not observed.
+        Veils are ignored. In stops, points and exposures alternately become the medians of the light less the other
+        (median polish). NaN for points that are not observed.
         """
         light, stops = np.log2(self.light), np.zeros(self.count)
         count = int(self.points.max(initial=-1)) + 1
@@ -162,8 +167,8 @@ class PointObservations:
         return np.asarray(2**luminances)
 
     def _fit_lines(self, luminances: Floats) -> tuple[Floats, Floats]:
-        """Return slope and veil of each view (count,) for the points' luminances; not finite where they cannot be
-        measured."""
+        """Return slope and veil (count,) of each view's line over the points' luminances; NaN where too few points are
+        known, or the slope is too uncertain."""
         slopes, veils = np.full((2, self.count), np.nan)
         for number in range(self.count):
             in_view = self.views == number
@@ -178,7 +183,10 @@ class PointObservations:
 
 
 def _group_medians(values: Floats, groups: Indices, count: int) -> Floats:
-    """Return the lower median of each group's finite values (count,); not finite for a group without any."""
+    """Return the lower median (count,) of each group's finite values; NaN for a group without any.
+
+    groups: index of the group of each value.
+    """
     finite = np.isfinite(values)
     values, groups = values[finite], groups[finite]
     order = np.lexsort((values, groups))
@@ -192,7 +200,8 @@ def _group_medians(values: Floats, groups: Indices, count: int) -> Floats:
 def _fit_line(known: Floats, observed: Floats) -> tuple[Floats, float]:
     """Fit observed = slope * known + veil, (n,) linear light; return (slope, veil) and the slope's standard error.
 
-    Errors are relative, with Cauchy weights: the glow about a light lifts the points beside it.
+    Iteratively reweighted least squares on relative errors, with Cauchy weights: the glow about a light lifts the
+    points beside it. The error is infinite where the points have one brightness.
     """
     columns = np.stack([known, np.ones_like(known)], 1)
     error_weights = 1 / (known.clip(min=0) + ERROR_FLOOR) ** 2
@@ -211,9 +220,9 @@ def _fit_line(known: Floats, observed: Floats) -> tuple[Floats, float]:
 
 
 def resolve_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings, tuple[str, ...]]:
-    """Return the settings with `white` resolved, and sentences for the user.
+    """Return the settings with `white` resolved, the light at which frames are clipped, and sentences for the user.
 
-    It is 1, the white of most formats, or MAX_WHITE if a training frame holds more than 1 and all files of the fit,
+    White is 1, as in most formats, or MAX_WHITE if a training frame holds more than 1 and all files of the fit,
     clean frames included, are float files.
     """
     if settings.white is not None:

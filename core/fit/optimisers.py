@@ -53,12 +53,12 @@ class Optimisers:
             self._flare_optimisers.set_rates(progress)
 
     def _means_rate(self, progress: float) -> float:
-        """Return the rate of the scene's positions, world units, at a share of the fit."""
+        """Return the learning rate of the scene's positions, world units, after a share 0..1 of the fit."""
         rates = self._settings.scene.rates
         return _decay(rates.position, rates.position_final, progress) * self._extent
 
     def step(self, *, scene: bool) -> None:
-        """Step all by their gradients and clear these; the scene's optimiser only if `scene` is True."""
+        """Step all optimisers, the scene's only if `scene` is True, and clear their gradients."""
         for optimiser in (self.scene if scene else None, self.flare, self.grids, self._brightness):
             if optimiser is not None:
                 optimiser.step()
@@ -108,7 +108,7 @@ class FlareOptimisers:
     grids that a view touched, and `brightness`, None for lights that stay on."""
 
     def __init__(self, flare: FlareModel, rates: FlareRates) -> None:
-        """rates: of the settings; those of lengths in the plane are multiplied by `LightFlare.scale`."""
+        """rates: the settings' learning rates; those of lengths in the plane are multiplied by `LightFlare.scale`."""
         self._rates = rates
         gaussian_rates = {
             "positions": rates.position, "log_scales": rates.scale, "rotations": rates.rotation,
@@ -135,7 +135,10 @@ class FlareOptimisers:
         self._initial_rates = dict(self.dense.rates)
 
     def set_rates(self, progress: float) -> None:
-        """Set the learning rates at a share of the fit, 0 to 1."""
+        """Set the learning rates at a share of the fit, 0 to 1.
+
+        Positions decay exponentially all along, the others from the middle of the fit on.
+        """
         rates = self._rates
         decay = _decay(1.0, rates.final_ratio, 2 * progress - 1)  # 1 until the middle of the fit
         for name, rate in self._initial_rates.items():

@@ -36,8 +36,9 @@ def scene_loss(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor
                settings: SplitSettings, progress: float) -> Tensor:
     """Return the loss on the scene alone, (height, width, 3) display values; `trainer` adds it to the composite's loss.
 
-    lights: (n, 3), world. discs: (height, width), the lights' clipped pixels, or None. progress: of the fit, 0..1; as
-    it grows, brighter frames pull the scene up less, and the scene is held down more near the lights.
+    It is a quantile loss, plus a penalty on the scene's light near the lights, plus an L1 loss in the discs. With
+    `progress`, 0..1, brighter frames pull the scene up less and the penalty grows. lights: (n, 3), world. discs:
+    (height, width), the lights' clipped pixels, or None.
     """
     ramp = _ramp(progress)
     loss = settings.scene_weight * quantile_loss(scene, targets.frame, settings.excess_weight * (1 - ramp))
@@ -53,7 +54,7 @@ def estimate_loss(scene: Tensor, estimate: Tensor, ssim_share: float, progress: 
     """Return the loss of a scene against an estimated clean frame, display values (height, width, 3).
 
     Its weight falls to 0 by the middle of the fit (progress, 0..1), so that flare left in the estimate can be
-    corrected. ssim_share: 1 - lambda, as in the other losses.
+    corrected. ssim_share: weight of SSIM against L1.
     """
     weight = 1 - _ramp(progress)
     return weight * l1_ssim(scene, estimate, 1 - ssim_share) if weight else scene.new_zeros(())
@@ -65,9 +66,9 @@ def far_flare_penalty(added: Tensor, estimated_flare: Tensor | None, ratio: floa
     world.
 
     It is for a scene that has not converged. Missing a ghost costs more than this penalty, so ghosts, which the scene
-    cannot make, stay; what the scene can make goes to it. estimated_flare: frame minus estimated clean frame, or None;
-    ratio: `excess_ratio` of the scene. The nearer the ratio is to `settings.converged_ratio`, the more of the estimated
-    flare is exempt.
+    cannot reproduce, stay in the flare; other light moves to the scene. estimated_flare: frame minus estimated clean
+    frame, or None. ratio: the scene's `excess_ratio`; from `settings.diverged_ratio` to `settings.converged_ratio` the
+    exempt share of the estimated flare rises from 0 to 1.
     """
     if estimated_flare is not None:
         confidence = (ratio - settings.diverged_ratio) / max(settings.converged_ratio - settings.diverged_ratio, 1e-9)
@@ -84,19 +85,18 @@ def _ramp(progress: float) -> float:
 def quantile_loss(scene: Tensor, frame: Tensor, excess_weight: float) -> Tensor:
     """Return the pinball loss of a scene against a frame, display values (height, width, 3).
 
-    It is the mean |scene - frame|, with `excess_weight` as the weight where the frame is brighter. Fitted to several
-    frames, the scene is their excess_weight / (1 + excess_weight) quantile.
+    The mean of |scene - frame|, times `excess_weight` where the frame is brighter. A scene fitted to several frames
+    tends to their excess_weight / (1 + excess_weight) quantile.
     """
     excess = frame - scene
     return torch.where(excess > 0, excess * excess_weight, -excess).mean()
 
 
 def excess_ratio(residuals: Iterable[Tensor]) -> float:
-    """Return the sum of squares by which frames are brighter than the scene over that by which they are darker, at most
-    MAX_EXCESS_RATIO.
+    """Return the squared excess of frames over the scene, divided by their squared deficit; at most MAX_EXCESS_RATIO.
 
-    The larger it is, the more of the excess is flare. residuals: frame - scene (height, width, 3) of some views,
-    display values.
+    The larger the ratio, the more of the excess is flare: a flare only adds light, while errors have both signs.
+    residuals: frame - scene (height, width, 3) of some views, display values.
     """
     excess = deficit = 0.0
     for residual in residuals:
@@ -106,6 +106,6 @@ def excess_ratio(residuals: Iterable[Tensor]) -> float:
 
 
 def light_proximity(camera: Camera, lights: ArrayLike, radius: float) -> NDArray[np.float32]:
-    """Return (height, width), how near the lights (n, 3), world, are: 1 at a light, 1/2 at `radius`, a share of the
-    width, from it."""
+    """Return (height, width), how near each pixel is to the nearest of the lights (n, 3), world: 1 at the light, 1/2 at
+    a distance of `radius`, a share of the frame's width."""
     return 1 / (1 + squared_light_distances(camera, lights) / np.float32(radius**2))

@@ -53,8 +53,11 @@ class Alignment:
                 for other in (index - offset, index + offset) if 0 <= other < len(self._names)]
 
     def align(self, picture: Pixels, source: str, target: str) -> Pixels | None:
-        """Return a picture of frame `source`, (height, width, 3), warped to the camera of frame `target`: NaN where the
-        source does not show what the target shows; None if the frames cannot be aligned."""
+        """Return a picture of frame `source`, (height, width, 3), warped to the camera of frame `target`.
+
+        By optical flow if the camera travels, else by a homography. NaN where the source does not show what the target
+        shows; None if no homography aligns the frames.
+        """
         import cv2
 
         if self.travels:

@@ -92,8 +92,10 @@ class PlateEstimator:
     def estimate(self, name: str, cleaned: Mapping[str, Pixels] | None = None) -> Pixels:
         """Return the plate of a frame, display values; the network's plate if no neighbour can be aligned.
 
-        cleaned: frames minus the fitted flare, which show the background in place of the network's plates. The frame
-        itself stays as filmed: a flare subtracted from the frame that it was fitted to would hide its own errors.
+        Where nothing hides the background, the median of the aligned plates times a smooth gain, the network's plate is
+        replaced by it; where the camera moves, the plate is only made darker, in small parts. cleaned: frames minus the
+        fitted flare, which replace the network's plates in the median. The frame itself is used as filmed: a flare
+        subtracted from the frame that it was fitted to would hide its own errors.
         """
         shot, alignment = self._shot, self.alignment
         plates = shot.plates if cleaned is None else cleaned
@@ -123,7 +125,7 @@ class PlateEstimator:
 
 
 def _median(stack: Pixels) -> Pixels:
-    """Return the medians of (n, height, width, 3) over n, without NaN; the first picture is finite."""
+    """Return the median (height, width, 3) of pictures (n, height, width, 3), without NaN; the first has none."""
     count = np.isfinite(stack[..., 0]).sum(0)
     ordered = np.sort(stack, 0)  # NaN comes last
     low, high = ((count - 1) // 2)[None, ..., None], (count // 2)[None, ..., None]
@@ -132,10 +134,10 @@ def _median(stack: Pixels) -> Pixels:
 
 
 def _small_parts(excess: Pixels) -> Pixels:
-    """Return by how much an excess (height, width, 3), display values of 0 or more, is above its median nearby.
+    """Return by how much an excess (height, width, 3), display values of 0 or more, exceeds its median in a window.
 
-    Only small parts of the excess remain. The network misses what is small, and an excess over a large area comes from
-    a wrong gain as often as from a flare.
+    So only parts smaller than the window remain. The network misses what is small, and an excess over a large area
+    comes from a wrong gain as often as from a flare.
     """
     import cv2
 
@@ -152,15 +154,15 @@ def _blur(values: Pixels, sigma: float) -> Pixels:
 
 
 def smooth_gain(picture: Pixels, background: Pixels, usable: Pixels) -> Pixels:
-    """Return the gain (height, width, 3) of a picture over a background, a gain that changes smoothly.
+    """Return a smooth gain (height, width, 3) of a picture over a background: picture = gain * background nearby.
 
-    picture, background: (height, width, 3), linear light. usable: (height, width, 1) weights of the pixels. It is a
-    least squares fit of relative errors in a window. Pixels whose gain differs from that around them count less, for
-    they may hold flare.
+    It is fitted to relative errors in a Gaussian window by iteratively reweighted least squares: pixels that differ
+    from gain * background count less, since they may hold flare. picture, background: (height, width, 3), linear light.
+    usable: (height, width, 1), weights of the pixels.
     """
     sigma = max(GAIN_WINDOW * picture.shape[1], 1.0)
     base = usable / (background + DARK) ** 2
-    weight, prior = base, 1e-5  # of a gain of 1, where nothing is usable
+    weight, prior = base, 1e-5  # prior: weight of a gain of 1, which is taken where nothing is usable
     for _ in range(GAIN_REWEIGHTINGS):
         gain = (_blur(weight * picture * background, sigma) + prior) / (_blur(weight * background**2, sigma) + prior)
         error = (picture - gain * background) / (background + DARK)
@@ -171,9 +173,10 @@ def smooth_gain(picture: Pixels, background: Pixels, usable: Pixels) -> Pixels:
 def hidden_share(frame: Pixels, expected: Pixels, gain: Pixels, test: HidingTest) -> NDArray[np.float32]:
     """Return (height, width), 0..1, how likely something hides the background of a frame.
 
-    Three things show it: a channel darker than expected, the texture of the background absent, or a gain far from 1;
-    the likeliest counts. frame: (height, width, 3), linear light. expected: the background times the gain, likewise.
-    gain: `smooth_gain` times `local_gain`. test: for the camera's motion.
+    The largest of three likelihoods counts: a channel is darker than expected, the background's texture is absent, or
+    the gain is far from 1. frame: (height, width, 3), linear light. expected: the frame expected without flare,
+    background times gain. gain: `smooth_gain` times `local_gain`. test: thresholds
+    for a camera that stands or moves.
     """
     import cv2
 
@@ -202,8 +205,8 @@ def _logistic(values: Pixels, middle: float, steepness: float) -> Pixels:
 def local_gain(picture: Pixels, expected: Pixels) -> Pixels:
     """Return the gain (height, width, 1) of the texture of a picture over that of the expected one, linear light.
 
-    Light on a wall raises its texture too, a flare adds light alone. The gain is the estimate less one standard error,
-    and 1 at least: the smallest that the texture makes likely.
+    Light on a wall raises the wall's texture too; a flare adds light alone. The gain returned is the estimate less one
+    standard error, the smallest that the texture makes likely, between 1 and MAX_LOCAL_GAIN.
     """
     sigma = max(LIGHT_WINDOW * picture.shape[1], 1.0)
     gain, error = _line_gain(picture, expected, sigma)
@@ -213,7 +216,10 @@ def local_gain(picture: Pixels, expected: Pixels) -> Pixels:
 
 def _texture_deviation(frame: Pixels, expected: Pixels, sigma: float) -> Pixels:
     """Return (height, width), by how many standard errors the gain of a local line frame = gain * expected + flare lies
-    below 1: a flare adds light that does not depend on the texture, and what hides the background has another texture.
+    below 1.
+
+    A flare leaves the gain at 1, since it adds light that does not depend on the texture; where something hides the
+    background, its texture is missing and the gain falls.
     """
     gain, error = _line_gain(frame, expected, sigma)
     return np.asarray((1 - gain) / np.hypot(error, TEXTURE_TOLERANCE), np.float32)

@@ -34,7 +34,9 @@ class PlateScene:
     @classmethod
     def from_folder(cls, folder: Path, cameras: Mapping[str, Camera], display_white: float,
                     space: ColourSpace | None = None) -> PlateScene:
-        """Open the plates of a folder: a picture for each frame, of its name with any suffix. space: of the pictures.
+        """Open the plates of a folder: for each frame a picture of the same name with any suffix.
+
+        space: colour space of the pictures; None for the one that their format implies.
         """
         files = {path.with_suffix("").relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.*"))}
 
@@ -47,8 +49,8 @@ class PlateScene:
     def render_frame(self, camera: Camera) -> Rendering:
         """Return the plate of the camera's frame at the camera's size, display values; it has no depth.
 
-        The camera may show a part of the frame, at any scale. Raises RunError for a camera of no frame, such as one of
-        another shot.
+        The camera may show a part of the frame, at any scale. Raises RunError for a camera without a plate, such as one
+        of another shot.
         """
         full_camera = self._cameras.get(camera.frame)
         plate = None if full_camera is None else self._read(camera.frame)

@@ -53,8 +53,9 @@ class PlateTrainer(FlareTrainer):
 
     def __init__(self, capture: Capture, settings: FitSettings, exposures: Mapping[str, float] | None = None,
                  progress: Progress | None = None) -> None:
-        """Read the frames and clean frames, start the flare, and estimate the first plates. exposures: by the names of
-        views; a plate has the exposure of its frame."""
+        """Read the frames and clean frames, make the initial flare, and estimate the first plates.
+
+        exposures: exposure of each view, by name; a plate has the exposure of its frame."""
         super().__init__(settings)
         self.exposures = exposures or {}
         self.capture = capture = capture.with_frame_names()
@@ -82,8 +83,11 @@ class PlateTrainer(FlareTrainer):
 
     @torch.no_grad()
     def _estimate_plates(self, *, subtract_flare: bool = False) -> None:
-        """Estimate the plates of all frames by their neighbours: by the clean frames, or with `subtract_flare` by the
-        frames minus the fitted flare."""
+        """Estimate the plates of all frames from neighbouring frames; does nothing without an estimator.
+
+        Neighbours show the background by their clean frames, or with `subtract_flare` by the frames minus the fitted
+        flare. A frame whose lights are all out is its own plate.
+        """
         if self._estimator is None:
             return
         cleaned = {view.name: self._without_flare(view) for view in self.capture.views} if subtract_flare else None
@@ -104,7 +108,7 @@ class PlateTrainer(FlareTrainer):
         return brightness is None or bool((brightness > MIN_BRIGHTNESS).any())
 
     def _without_flare(self, view: View) -> Pixels:
-        """Return a frame without the fitted flare, display values; where it is clipped, its plate."""
+        """Return a frame minus the fitted flare, display values; where the frame is clipped, its plate."""
         layers = self.render_view(view).layers
         frame = self.frames.frame(view)
         clean = encode((decode(frame) - layers.flare).clamp_min(0))
@@ -132,7 +136,7 @@ class PlateTrainer(FlareTrainer):
         return PlateScene(cameras, read, self.frames.display_white)
 
     def step(self) -> dict[str, float]:
-        """Run one iteration on the next view; return the loss of the composite."""
+        """Run one iteration on the next view; return {"loss": loss of the composite}, or {} if no light is in front."""
         self.iteration += 1
         assert self.flare is not None
         settings, view = self.settings, self._pick_view()
@@ -155,8 +159,8 @@ class PlateTrainer(FlareTrainer):
         return figures
 
     def _refine(self) -> None:
-        """At a few iterations, solve the brightness of the lights in all frames; from `refine_at` on, estimate the
-        plates again, too, with the flare subtracted."""
+        """At intervals, solve the brightness of the lights in all frames and, from `refine_at` of the fit on, estimate
+        the plates again with the flare subtracted; in other iterations do nothing."""
         every = max(round(self.settings.brightness.solve_every * self.settings.iterations), 1)
         if self.iteration % every == 0 and self.iteration < self.settings.iterations:
             assert self.flare is not None

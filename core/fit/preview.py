@@ -20,7 +20,9 @@ MAX_SMALL_SIDE = 512  # pixels of the longer side of a small preview
 
 
 def preview_row(frame: torch.Tensor, view: RenderedView) -> NDArray[np.float32]:
-    """Return one view as a strip (height, 4 widths and gaps, 3), display values; the flare is shown as light on black.
+    """Return one view as a strip of frame, composite, scene and flare side by side, with grey gaps, display values.
+
+    The flare is shown as light on black.
     """
     flare = encode(view.layers.flare.clamp_min(0)).clamp(0, 1)
     pictures = [frame, view.composite, view.scene.colour.clamp(0, 1), flare]
@@ -40,8 +42,10 @@ def write_preview(path: Path, rows: Sequence[NDArray[np.float32]]) -> None:
 
 
 def write_small_preview(path: Path, strip: NDArray[np.float32]) -> None:
-    """Write one view's composite above its flare, small enough for a panel that reads it again and again. strip: from
-    `preview_row`."""
+    """Write one view's composite above its flare, small enough for a panel that reads the file again and again.
+
+    strip: the view's frame, composite, scene and flare side by side, from `preview_row`.
+    """
     width = (strip.shape[1] - 3 * GAP) // 4
     composite, flare = (strip[:, index * (width + GAP):index * (width + GAP) + width] for index in (1, 3))
     pictures = np.ascontiguousarray(np.concatenate([composite, flare]), np.float32)

@@ -68,7 +68,8 @@ def render_flare(flare: FlareModel | None, blend: Blend, camera: Camera, kernels
 
 def _visibilities(flare: FlareModel, camera: Camera, scene: Scene | None, visibility: VisibilitySettings | None,
                   kernels: Kernels) -> dict[str, Tensor] | None:
-    """Return the visibility of each light behind a scene; None where nothing hides lights, as plates do not."""
+    """Return the visibility of each light behind a scene, by its name; None if nothing hides lights: without
+    `visibility`, and in a scene of plates."""
     if visibility is None or not isinstance(scene, SceneGaussians):
         return None
     pose, _ = pose_and_intrinsics(camera)
@@ -82,8 +83,8 @@ def render(scene: Scene, flare: FlareModel | None, blend: Blend, camera: Camera,
            pixel_grid: PixelGrid | None = None) -> RenderedView:
     """Render scene, flares and composite of a view, without gradients.
 
-    visibility: how the scene hides lights; None if it does not. edits: changes of the flare, which `look` evaluates in
-    place of `flare`; both or neither. pixel_grid: the grid at which the flare was fitted; None in the fit itself.
+    visibility: how the scene hides lights; None if it does not. look, edits: with both, `look` evaluates the flare
+    under these edits, in place of `flare`. pixel_grid: the grid at which the flare was fitted; None in the fit itself.
     """
     rendering = scene.render_frame(camera) if isinstance(scene, PlateScene) else render_scene(scene, camera, kernels)
     flares: dict[str, Splats] = {}
@@ -103,15 +104,18 @@ def render(scene: Scene, flare: FlareModel | None, blend: Blend, camera: Camera,
 
 def render_scene(scene: SceneGaussians, camera: Camera, kernels: Kernels = "auto", *, sh_degree: int | None = None,
                  depth: bool = True) -> Rendering:
-    """Render a scene at the size and exposure of a camera, as the camera of the fitted frames would show it."""
+    """Render a scene at the size and exposure of a camera, supersampled where that is coarser than the fitted frames.
+
+    sh_degree: degree of the colours' harmonics; None for all. depth: whether to render depth too.
+    """
     rendering = _render_supersampled(scene, camera, kernels, sh_degree, depth)
     return rendering if camera.exposure == 1 else replace(rendering, colour=expose(rendering.colour, camera.exposure))
 
 
 def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels, sh_degree: int | None,
                          depth: bool) -> Rendering:
-    """Render at the camera's size. Where that is coarser than the fitted frames, pixels are means, in linear light, of
-    a larger picture. sh_degree: of the colours; None for all degrees."""
+    """Render a scene at the camera's size, exposure 1. Where that is coarser than the fitted frames, pixels are means,
+    in linear light, of a larger picture. sh_degree: degree of the colours' harmonics; None for all."""
     grid = scene.pixel_grid
     samples = 1 if grid is None else grid.supersampling_factor(camera.focal_length, *camera.size)
     if samples == 1:
@@ -135,7 +139,10 @@ def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels
 
 def _evaluate_edited(look: Look, flare: FlareModel, edits: LookEdits, camera: Camera,
                      visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
-    """Return each light's Gaussians under an artist's edits, with places and brightness of the camera's frame."""
+    """Return the look's Gaussians of each light under an artist's edits, by the light's name.
+
+    The lights have the places and brightness that `flare` has for the camera's frame.
+    """
     shares = flare.shares(visibilities, camera.frame) or {}
     places = dict(zip(flare.names, flare.positions_in(camera.frame).numpy(), strict=True))
     gaussians_by_light = look.evaluate(camera.world_to_camera, lights=places, edits=edits,
@@ -144,7 +151,7 @@ def _evaluate_edited(look: Look, flare: FlareModel, edits: LookEdits, camera: Ca
 
 
 def splat_look(look: Look, gaussians: LookGaussians, camera: Camera) -> Splats:
-    """Splat Gaussians of a look on the camera's picture, on the grid at which they were fitted."""
+    """Splat Gaussians of a look on the camera's picture, at the pixel grid that they were fitted at."""
     _, intrinsics = pose_and_intrinsics(camera)
     return splat_flare(as_tensors(gaussians), intrinsics, *camera.size, look.blend, pixel_grid=look.pixel_grid,
                        exposure=camera.exposure)

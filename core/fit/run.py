@@ -74,8 +74,8 @@ class Run:
                exposure_by_view: Mapping[str, float] | None = None) -> Run:
         """Make a new run folder with its settings.
 
-        exposure_by_view: by the view's name, relative to the median frame. Raises RunError if the folder holds a run,
-        or the capture's name is not UTF-8.
+        exposure_by_view: exposure of each view, by name, relative to the median frame; None or empty if all are equal.
+        Raises RunError if the folder holds a run, or the capture's name is not UTF-8.
         """
         folder = Path(folder)
         cls.check_free(folder)
@@ -84,7 +84,7 @@ class Run:
             raise RunError(f"The name of the capture's folder, {str(run.capture_folder)!r}, is not UTF-8 and cannot be "
                            "written down; rename it.")
         write_text(folder / CAPTURE, f"{run.capture_folder}\n")
-        remove_file(folder / exposures.FILE)  # of a fit that was killed as it began
+        remove_file(folder / exposures.FILE)  # left by a fit that was killed as it began
         if exposure_by_view:
             write_json(folder / exposures.FILE, dict(exposure_by_view))
         write_config(folder / CONFIG, settings)
@@ -92,8 +92,8 @@ class Run:
 
     @classmethod
     def open(cls, folder: Path | str, progress: Progress | None = None) -> Run:
-        """Open the run in a folder; with `progress`, old names of settings are reported. Raises RunError if it is not
-        one."""
+        """Open the run in a folder; with `progress`, old names of settings are reported to the user. Raises RunError if
+        the folder is no run."""
         folder = Path(folder)
         if not (folder / CONFIG).is_file():
             raise RunError(f"{folder} is not the folder of a run (it has no {CONFIG}); name one that fit has written.")
@@ -104,7 +104,7 @@ class Run:
             raise RunError(f"{folder / CAPTURE} cannot be read ({problem.strerror}); start the fit anew.") from problem
         except UnicodeDecodeError as problem:
             raise RunError(f"{folder / CAPTURE} is not UTF-8 text; start the fit anew.") from problem
-        if not capture_folder.name:  # of an empty file it would be the working folder
+        if not capture_folder.name:  # an empty file would give the working folder
             raise RunError(f"{folder / CAPTURE} names no capture; start the fit anew.")
         return cls(folder, settings, capture_folder)
 
@@ -114,10 +114,9 @@ class Run:
         return exposures.read_exposures(self.folder)
 
     def open_capture(self, folder: Path | None = None, *, need_frames: bool = True) -> Capture:
-        """Open the capture of the run, in `folder` or where it was fitted.
+        """Open the capture of the run, in `folder`, or where it was fitted if that is None.
 
-        It has the exposures and light positions of the fit.
-
+        The capture gets the exposures and light positions of the fit, and is remembered for the run's scene and flare.
         Without `need_frames`, views whose frames are missing have the size of the fitted frames. Raises RunError,
         CaptureError, FrameError.
         """
@@ -218,8 +217,8 @@ class Run:
                       edits=edits, pixel_grid=pixel_grid)
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
-        """Render the layers of a view at the camera's size, with the flare under `edits`; lights behind the camera have
-        black layers."""
+        """Render the layers of a view at the camera's size, as numpy arrays, with the flare under `edits`; lights
+        behind the camera have black layers."""
         view = self.render_view(camera, edits)
         flares = {name: layer.numpy() for name, layer in view.layers.flares.items()}
         dark = np.zeros_like(view.layers.scene.numpy())

@@ -38,7 +38,7 @@ PREVIEW_ROWS = 4
 
 def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: Progress | None = None, *,
         resume: bool = False) -> Run:
-    """Fit scene and flare of a capture; the results are in the run's folder.
+    """Fit scene and flare of a capture; results, checkpoints, metrics and previews are written to the run's folder.
 
     With `resume`, an unfinished run in `folder` continues from its checkpoint with its own settings, and gives the same
     fit as an uninterrupted one; without a run there, one is started.
@@ -81,7 +81,10 @@ def _make_trainer(capture: Capture, settings: FitSettings, exposures: Mapping[st
 
 
 def _run_to_end(trainer: FlareTrainer, run: Run, progress: Progress) -> None:
-    """Train from the trainer's iteration on, and write the results."""
+    """Train from the trainer's iteration on, and write the results.
+
+    A requested stop writes a checkpoint and raises Cancelled. Start, stop and end are logged.
+    """
     folder = run.folder
     _truncate_metrics(folder / METRICS, trainer.iteration)
     _log(run, f"started at iteration {trainer.iteration} of {run.settings.iterations}")
@@ -174,7 +177,7 @@ def _write_previews(trainer: FlareTrainer, run: Run) -> None:
 
 
 def _truncate_metrics(path: Path, iteration: int) -> None:
-    """Drop the lines of metrics after `iteration`, which a resumed fit writes again."""
+    """Drop the lines of a metrics file for iterations after `iteration`, which a resumed fit writes again."""
     if not path.exists():
         return
     lines = []
@@ -183,7 +186,7 @@ def _truncate_metrics(path: Path, iteration: int) -> None:
             if parse_json(line)["iteration"] <= iteration:
                 lines.append(line + "\n")
         except (ValueError, KeyError, TypeError):
-            continue  # the line that a kill cut short
+            continue  # a line that was cut short when the process was killed
     with atomic_path(path) as temporary:
         temporary.write_text("".join(lines), encoding="utf-8", newline="\n")
 

@@ -272,7 +272,7 @@ class FitSettings:
 
 
 def _is_valid_holdout(holdout: str | int | None) -> bool:
-    """True unless it is a number of too many digits: `Capture.split` takes text of digits for a number."""
+    """True unless `holdout` is text of too many digits: text of digits is taken for a number."""
     if not isinstance(holdout, str) or not holdout.strip().lstrip("+-").isdigit():
         return True
     return re.fullmatch(rf"[+-]?\d{{1,{MAX_INT_DIGITS}}}", holdout.strip()) is not None
@@ -354,9 +354,9 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
     """Return the settings of a preset, with every schedule scaled to the number of iterations.
 
     `paper` has the paper's form and figures, 30,000 iterations. `draft`, `standard` and `high` have our form, shorter
-    schedules and higher rates.
-    All are a fifth longer in the modes `estimated` and `split`, unless `iterations` is given. `model` and `blend`
-    choose another form: the paper's covers in display space, ours adds in linear light and is hidden by the scene.
+    schedules and higher rates. All are a fifth longer in the modes `estimated` and `split`, unless `iterations` is
+    given. model, blend: another form and blend than the preset's: "paper" blends "over" in display space, "ours" adds
+    in linear light and is hidden by the scene. Raises SettingsError for an unknown name or a number out of bounds.
     """
     if name not in ITERATIONS:
         raise SettingsError(f"There is no preset {name!r}; choose {', '.join(ITERATIONS)}.")
@@ -371,7 +371,7 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
     if model == "ours":
         flare = replace(flare, occlusion=True, scene_only_until=SCENE_ONLY_UNTIL, snap_lights=True,
                         correction_weight=CORRECTION_WEIGHT)
-    # Validated before schedules are computed from its length.
+    # Validated before schedules are computed from the length.
     settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=flare,
                            separate_until=SEPARATE_UNTIL if model == "ours" else 0.0).validated()
     if name == "paper":
@@ -418,8 +418,8 @@ def _scale_schedule(settings: FitSettings, factor: float) -> FitSettings:
 def _shorten_schedule(settings: FitSettings, count: int, max_gaussians: int) -> FitSettings:
     """Return a schedule for a short fit: events at the same shares of the whole, and higher rates.
 
-    A light starts with `count` Gaussians; the scene has at most `max_gaussians`. Where the scene is
-    fitted alone first, the flare's density changes later.
+    A light starts with `count` Gaussians; the scene has at most `max_gaussians`. If the scene is fitted alone first,
+    the flare's density changes later.
     """
     length = settings.iterations
     every = max(round(length / 40), 20)
@@ -454,9 +454,9 @@ RENAMED_VALUES = {("exposure", "found"): "measured"}
 
 
 def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return settings by dotted name under their present names and values, and the present name of each old one used.
+    """Return settings under their present dotted names and values, and the present name by each old name that was used.
 
-    If an old and a present name of one setting occur, the later one in `values` counts.
+    If a setting occurs under both its old and its present name, the later in `values` counts.
     """
     current, renamed = {}, {}
     for name, value in values.items():
@@ -472,8 +472,8 @@ def override_settings(settings: FitSettings, values: Mapping[str, Any],
                       progress: Progress | None = None) -> FitSettings:
     """Return settings with some replaced by dotted name, such as {"flare.rates.network": 1e-3}.
 
-    Old names work too, and with `progress` the present ones are reported. Raises SettingsError for an unknown name or a
-    value of the wrong kind.
+    Old names work too; with `progress`, the user is told the present ones. Raises SettingsError for an unknown name or
+    a value of the wrong kind.
     """
     values, renamed = current_names(values)
     for old, new in renamed.items():
@@ -485,7 +485,7 @@ def override_settings(settings: FitSettings, values: Mapping[str, Any],
 
 
 def override_field(table: Any, keys: list[str], value: Any, name: str) -> Any:
-    """Return a dataclass with the field at the end of `keys` replaced; `name` is for the message of a SettingsError."""
+    """Return a dataclass with the field at the path `keys` replaced. name: its dotted name, for error messages."""
     field_names = {entry.name for entry in fields(table)}
     if keys[0] not in field_names:
         raise SettingsError(f"There is no setting {name!r}; here there are {', '.join(sorted(field_names))}.")

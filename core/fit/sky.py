@@ -25,9 +25,9 @@ COLOUR_QUANTILE = 0.25
 
 
 def add_sky_points(capture: Capture, views: tuple[View, ...], frames: Frames) -> PointCloud:
-    """Return the capture's points and points on a sphere about them, without those that no view sees.
+    """Return the capture's points, plus points on a large sphere about the cameras that some view sees.
 
-    The points on the sphere have the colours of the frames at the usual exposure.
+    A point on the sphere has a low quantile of the frames' colours there, at the usual exposure: flares only add light.
     """
     points = capture.points
     centre = np.mean([view.camera.position for view in views], 0)

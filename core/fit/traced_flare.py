@@ -100,11 +100,11 @@ class TracedResult:
 
 def make_flare(settings: TracedFlareSettings, out: Path, progress: Progress, *, notes: str = "", licence: str = ""
                ) -> TracedResult:
-    """Trace, fit, measure the error on a path that the fit did not see, and write a .flare at `out`.
+    """Trace a lens's flare, fit a model to it, measure its error, and write it as a .flare at `out`.
 
-    notes: stored in the file; empty for those of `default_notes`. licence: stored, too.
-
-    Raises SettingsError, and Cancelled where the progress stops it; then nothing is written.
+    The error is measured on a path of the light that the fit did not see. notes, licence: text stored in the file;
+    without notes, a note on the lens. Raises SettingsError, and Cancelled after a requested stop; then nothing is
+    written.
     """
     settings = settings.validated()
     camera, setup = traced_camera(settings), setup_with_ghost_gain(settings)
@@ -131,10 +131,10 @@ def traced_camera(settings: TracedFlareSettings) -> Camera:
 
 
 def setup_with_ghost_gain(settings: TracedFlareSettings) -> LensSetup:
-    """Return the setup of the tracer with the gain that gives the ghosts their level, `settings.ghosts.level`.
+    """Return the tracer's setup with the gain at which the ghosts have the level `settings.ghosts.level`.
 
-    The gain is measured with the light at PROBES, on ghosts drawn more coarsely. Raises SettingsError where no ghost of
-    the lens reaches the frame.
+    Their level is measured on coarsely drawn ghosts with the light at PROBES. Raises SettingsError if no ghost of the
+    lens reaches the frame.
     """
     setup = settings.lens_setup()
     if settings.ghosts.count == 0 or settings.ghosts.level == 0:
@@ -143,7 +143,7 @@ def setup_with_ghost_gain(settings: TracedFlareSettings) -> LensSetup:
     camera = traced_camera(settings)
     bands = 3 if settings.ghosts.dispersion else 1
     drawing_settings = replace(setup.ghosts, bands=bands, supersample=1, limit=math.inf)
-    # An anamorphic lens is a spherical one that sees x divided by the squeeze, as in `render_flare`.
+    # An anamorphic lens is traced as a spherical one that sees x divided by the squeeze.
     pictures = np.stack([draw_ghosts(optics, pairs, drawing_settings, (x / setup.squeeze, y),
                                      (camera.fx * setup.squeeze, camera.fy), (camera.cx, camera.cy), camera.width,
                                      camera.height) for x, y in _to_normalised(settings, PROBES)])
@@ -152,7 +152,7 @@ def setup_with_ghost_gain(settings: TracedFlareSettings) -> LensSetup:
         raise SettingsError(f"No ghost of the lens {settings.lens} reaches the frame; check that its file lists clear "
                             "diameters, or set ghosts.level=0.")
     gain = settings.ghosts.level / level
-    for _ in range(GAIN_STEPS):  # what the limit takes, the rest has to make up for
+    for _ in range(GAIN_STEPS):  # the limit dims the brightest pixels, so the gain is raised until the level is right
         if gain * pictures.max() <= settings.ghosts.limit:
             break
         gain *= settings.ghosts.level / _root_mean_square(limit_brightness(gain * pictures, settings.ghosts.limit))
@@ -173,7 +173,7 @@ def _to_normalised(settings: TracedFlareSettings, fractions: Sequence[Sequence[f
 def spread_places(settings: TracedFlareSettings) -> Places:
     """Return places (n, 2) of the light, spread over the frame and beyond it, normalised coordinates.
 
-    They are denser towards the centre, where ghosts lie over each other and change fastest.
+    They follow the R2 sequence, and are denser towards the centre, where ghosts overlap and change fastest.
     """
     sequence = np.arange(1, settings.tracing.positions + 1)[:, None] * np.array(PLACE_STEPS)
     square = sequence % 1 * 2 - 1  # -1..1
@@ -188,7 +188,10 @@ def path_places(settings: TracedFlareSettings) -> Places:
 
 def trace(settings: TracedFlareSettings, setup: LensSetup, places: Places, progress: Progress, stage: str
           ) -> TracedPictures:
-    """Trace the flare at each place (n, 2) of the light, normalised coordinates. stage: its name for the progress."""
+    """Trace the flare at each place (n, 2) of the light, normalised coordinates, on several threads.
+
+    stage: name of this step for the progress. Raises Cancelled after a requested stop.
+    """
     camera = traced_camera(settings)
     progress.stage(stage, len(places))
     pictures = np.zeros((len(places), camera.height, camera.width, 3), np.float32)
@@ -220,7 +223,10 @@ def _fit_settings(settings: TracedFlareSettings) -> FitSettings:
 
 def fit_traced(settings: TracedFlareSettings, setup: LensSetup, traced: TracedPictures, progress: Progress
                ) -> FlareModel:
-    """Fit a flare model to traced pictures; the same settings and pictures give the same model. setup: the traced lens.
+    """Fit a flare model to traced pictures with Adam; the same settings and pictures give the same model.
+
+    The loss of a picture is the L1 error of encoded light plus the relative L2 error of linear light. setup: the traced
+    lens.
     """
     fit = _fit_settings(settings)
     generator = torch.Generator().manual_seed(settings.fit.seed)
@@ -242,7 +248,7 @@ def fit_traced(settings: TracedFlareSettings, setup: LensSetup, traced: TracedPi
         index = remaining.pop()
         optimisers.set_rates(iteration / fit.iterations)
         drawn = _draw_flare(flare, lights[index], intrinsics, camera)
-        # Under the root, 1e-4 bounds the slope where the error vanishes.
+        # 1e-4 bounds the slope of the root where the error vanishes.
         relative_squared_error = (drawn - pictures[index]).square().sum() / energies[index]
         relative_error = (relative_squared_error + 1e-4).sqrt()
         loss = (_encode_light(drawn) - encoded[index]).abs().mean() + SQUARED_WEIGHT * relative_error
@@ -256,8 +262,10 @@ def fit_traced(settings: TracedFlareSettings, setup: LensSetup, traced: TracedPi
 
 def _initial_model(settings: TracedFlareSettings, setup: LensSetup, fit: FitSettings, traced: TracedPictures,
                    generator: torch.Generator) -> FlareModel:
-    """Return the model before the fit, with the light on the camera's axis, and its Gaussians at light and ghosts and
-    along the line. setup: the traced lens. fit: settings of the model."""
+    """Return the model before the fit: Gaussians at the light, at the lens's ghosts, and spread along the line.
+
+    setup: the traced lens. fit: settings of the model. traced: gives the range of the light's places.
+    """
     cameras = torch.tensor([[-CAMERA_RANGE] * 3, [CAMERA_RANGE] * 3])
     corner_radius = math.hypot(settings.reach, settings.reach * settings.height / settings.tracing.width)
     query_range = QueryRange.of(cameras, torch.tensor(traced.places, dtype=torch.float32), corner_radius)
@@ -277,9 +285,9 @@ def _start_at_light(flare: LightFlare, rows: Tensor, reach: float, pixel: float,
     """Move these rows of the initial Gaussians to the light, as rays at log-uniform distances, and scale all Gaussians
     to the frame.
 
-    Starburst and glow have most of a flare's light and stay at the light, where few of the Gaussians along the line
-    would lie. The first CORE_GAUSSIANS rows lie in the light itself. reach: half the frame's width, pixel: width of a
-    pixel of the traced pictures, normalised coordinates.
+    Starburst and glow have most of a flare's light and lie about the light, where few of the Gaussians along the line
+    would be. The first CORE_GAUSSIANS rows form the light itself. reach: half the frame's width; pixel: width of a
+    pixel of the traced pictures; both in normalised coordinates.
     """
     table = flare.gaussians
     with torch.no_grad():
@@ -304,7 +312,7 @@ def _start_at_light(flare: LightFlare, rows: Tensor, reach: float, pixel: float,
 
 
 def _encode_light(light: Tensor) -> Tensor:
-    """Encode linear light for the loss."""
+    """Return linear light encoded for the loss, sqrt(light + ENCODING_OFFSET): about a display's curve."""
     encoded: Tensor = (light.clamp_min(0) + ENCODING_OFFSET).sqrt()
     return encoded
 

@@ -56,10 +56,12 @@ class MeasuredGhost:
 
 
 def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Sequence[float]) -> list[MeasuredGhost]:
-    """Return the ghosts of a setup that reach the frame, brightest first, by their centroids, variances and levels.
+    """Return the ghosts of a setup that reach the frame, brightest first.
 
-    camera: of the traced pictures. lights: (n, 2) places of the light, normalised coordinates. colour: of the light,
-    linear RGB. Each place counts by the ghost's light over the frame.
+    Each ghost is drawn alone for each place of the light. Its place, radius and level follow from the centroid,
+    variance and brightness of these pictures, averaged with the ghost's light over the frame as the weight. camera:
+    that of the traced pictures. lights: (n, 2) places of the light, normalised coordinates. colour: of the light,
+    linear RGB.
     """
     optics, pairs = build_optics(setup)
     height = round(CANVAS_WIDTH * camera.height / camera.width)
@@ -73,7 +75,7 @@ def measure_ghosts(setup: LensSetup, camera: Camera, lights: Floats, colour: Seq
     for pair in pairs:
         measurements, lights_over_frame = [], []
         for light in lights:
-            # An anamorphic lens sees x divided by the squeeze.
+            # An anamorphic lens is traced as a spherical one that sees x divided by the squeeze.
             picture = draw_ghosts(optics, [pair], drawing, (light[0] / setup.squeeze, light[1]),
                                   (focal[0] * setup.squeeze, focal[1]), centre, CANVAS_WIDTH, height)
             picture = picture.astype(np.float64) * np.asarray(colour)
@@ -115,11 +117,11 @@ def _measure_moments(picture: Floats, x: Floats, y: Floats) -> _Moments:
 
 def start_at_ghosts(flare: LightFlare, rows: torch.Tensor, ghosts: Sequence[MeasuredGhost],
                     generator: torch.Generator) -> None:
-    """Move the Gaussians of these rows to the ghosts, spread evenly over a disc for each; each ghost has a latent code
-    of its own.
+    """Move the Gaussians of these rows to the ghosts, in place: evenly over a disc for each ghost.
 
-    The last two numbers of a code are the Gaussian's place in the ghost, so that the network can move, stretch and clip
-    a ghost as one. Ghosts share the rows by their light; rows that remain keep their places.
+    Brighter ghosts get more rows, in proportion to light^ENERGY_POWER; rows that remain keep their places. A ghost's
+    Gaussians share a latent code, except for its last two numbers, a Gaussian's place in the ghost, so that the network
+    can move, stretch and clip a ghost as one.
     """
     if not ghosts or not len(rows):
         return

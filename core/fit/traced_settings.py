@@ -162,8 +162,8 @@ class TracedFlareSettings:
         return self.sensor / 2 / self.used_focal_length
 
     def lens_setup(self) -> LensSetup:
-        """Return the setup of the tracer, with a ghost gain of 1. Raises SettingsError for a lens that forms no
-        picture, and for an f-number that it does not reach."""
+        """Return the tracer's setup, with a ghost gain of 1 and all tangents scaled to this frame. Raises SettingsError
+        for a lens that forms no picture, and for an f-number that it does not reach."""
         scale = self.reach / REFERENCE_REACH
         widest = find_lens(self.lens).widest_f_number()
         f_number = self.iris.f_number or 2 * widest  # two stops

@@ -69,7 +69,10 @@ class Trainer(FlareTrainer):
 
     def __init__(self, capture: Capture, settings: FitSettings, exposures: Mapping[str, float] | None = None,
                  progress: Progress | None = None) -> None:
-        """exposures: of the views, by name, if they are known; measured otherwise."""
+        """Decode and meter the frames, and make scene, flare and optimisers.
+
+        exposures: exposure of each view, by name; None to measure them.
+        """
         super().__init__(settings)
         self.fits_scene = not settings.scene.frozen
         self._excess_ratio = MAX_EXCESS_RATIO
@@ -125,8 +128,11 @@ class Trainer(FlareTrainer):
     # ---- one iteration ----------------------------------------------------------------------------
 
     def step(self) -> dict[str, float]:
-        """Run one iteration on the next view; return "loss", of the composite, absent while the scene is fitted alone,
-        and "scene_loss", absent where nothing but the composite supervises the scene."""
+        """Run one iteration on the next view; return its losses by name.
+
+        "loss" is that of the composite, absent while the scene is fitted alone; "scene_loss" that of the scene, absent
+        if only the composite supervises it. Raises RunError if either is not finite.
+        """
         self.iteration += 1
         settings = self.settings
         view = self._pick_view()
@@ -171,16 +177,19 @@ class Trainer(FlareTrainer):
         if occlusion_loss is not None:
             loss = loss + occlusion_loss
         self._optimise(loss, rendering)
-        if not scene_only:  # before, flare Gaussians are untrained, and their opacities say nothing
+        if not scene_only:  # flare Gaussians are untrained until then, and their opacities say nothing
             self._change_flare_density()
         return metrics
 
     def _optimise(self, loss: Tensor, rendering: Rendering) -> None:
-        """Backpropagate a loss, step scene and flare, and densify the scene. rendering: of the scene, in the loss."""
+        """Backpropagate a loss, make the optimisers' steps, and densify and reorder the scene at intervals.
+
+        rendering: the scene's rendering that the loss was computed from.
+        """
         # The step moves far Gaussians, too; `_turn_far_layer` puts them back on their sphere.
         far_rows = self.scene.far_rows()
         far_means = self.scene.means.detach()[far_rows]
-        if loss.requires_grad:  # it does not with a frozen scene and no light in front of the camera
+        if loss.requires_grad:  # False with a frozen scene and no light in front of the camera
             with self.optimisers.scene.step_in_backward() if self._steps_in_backward else nullcontext():
                 loss.backward()
         if self.fits_scene:
@@ -194,8 +203,11 @@ class Trainer(FlareTrainer):
 
     @torch.no_grad()
     def _turn_far_layer(self, rows: Tensor, old_means: Tensor) -> None:
-        """Turn far Gaussians (rows), which were at `old_means` (m, 3) before the optimiser's step, by the angle that
-        the step has at the distance of one extent."""
+        """Put the far Gaussians `rows`, which the optimiser moved off their sphere, back on it, turned by the step.
+
+        The angle is that of the same step at the distance of one extent. old_means: (m, 3), their means before the
+        step.
+        """
         if self.scene.far is not None and self.fits_scene and len(rows):
             steps = self.optimisers.scene.last_step("means", rows) * (self.scene.far.radius / self.extent)
             self.scene.means[rows] = self.scene.far.move(old_means, steps)
@@ -213,7 +225,8 @@ class Trainer(FlareTrainer):
                 and settings.flare.active_visibility is None)
 
     def _update_clear_visibility(self) -> None:
-        """Update at intervals how visible each light is behind the scene where nothing hides it."""
+        """Update the lights' clear visibility (that behind the scene where nothing hides them) every CLEAR_INTERVAL
+        iterations, from the first on; else do nothing."""
         visibility = self.settings.flare.active_visibility
         if self.flare is None or visibility is None or self.iteration % CLEAR_INTERVAL != 1:
             return
@@ -238,8 +251,8 @@ class Trainer(FlareTrainer):
         self._excess_ratio = excess_ratio(residual(view) for view in subsample(self.views, SAMPLED_VIEWS))
 
     def _occlusion_loss(self, targets: Targets) -> Tensor | None:
-        """Return the loss that clears the scene in front of lights that the frame shows although the scene hides them
-        from every view; None if there is no such light."""
+        """Return the loss that makes the scene transparent in front of lights that this frame shows although the scene
+        hides them from every view; None if there is no such light."""
         visibility = self.settings.flare.active_visibility
         if self.flare is None or visibility is None or not self.fits_scene or bool((self.flare.clear > 0).all()):
             return None
@@ -259,9 +272,9 @@ class Trainer(FlareTrainer):
         """Return what the flare is composited over: the clean frame until `separate_until`, then the scene; black in
         the lights' discs.
 
-        The faint and small parts of a flare drown in the errors of a scene that has not converged. Later the scene, on
-        which all views agree, is better than one clean frame with its residual flare; but not above white, where its
-        errors stay larger than a flare.
+        At first the faint parts of a flare would drown in the errors of the scene. Later the scene, on which all views
+        agree, is better than one clean frame with its residual flare, except above white, where the scene's errors stay
+        larger than a flare. light_discs: (height, width), or None.
         """
         behind = scene
         if self.settings.supervised and targets.clean is not None and self.settings.separate_until:
@@ -270,12 +283,11 @@ class Trainer(FlareTrainer):
         return behind if light_discs is None else behind.masked_fill(light_discs[..., None], 0)
 
     def _light_disc_mask(self, targets: Targets) -> Tensor | None:
-        """Return (height, width), the clipped disc of each light, which is black behind an additive flare; None if not
-        used.
+        """Return (height, width), True in the clipped disc of each light; None if the blend or the mode uses no discs.
 
-        Frame and clean frame are white there, so the flare's brightness in its middle would be undetermined, and over
-        another shot it would have a hole. Over black, the flare has to be white by itself. Above white the frames may
-        determine it.
+        Frame and clean frame are white in a disc, so the flare's brightness there would be undetermined, and over
+        another shot the flare would have a hole. So it is composited over black there, and has to be white by itself.
+        If frames go above white, only pixels where frame and clean frame are alike count.
         """
         settings = self.settings
         clean = targets.frame if settings.uses_parallax else targets.clean if settings.supervised else None
@@ -286,25 +298,36 @@ class Trainer(FlareTrainer):
         return discs if self.frames.display_white == 1 else discs & (targets.frame - clean < MIN_DIFFERENCE).all(-1)
 
     def _composite_target(self, targets: Targets, picture: Tensor, light_discs: Tensor | None) -> Tensor:
-        """Return the target of the composite: the frame. If frames go above white, a light's disc only has to be white
-        or brighter: there the target is the composite itself (`picture`), but 1 at least."""
+        """Return the picture that the composite is compared with: the frame, except in discs where frames go above
+        white.
+
+        In these a light only has to be white or brighter, so the target there is the composite itself (`picture`), but
+        1 at least.
+        """
         if self.frames.display_white == 1 or light_discs is None:
             return targets.frame
         return torch.where(light_discs[..., None], picture.clamp_min(1), targets.frame)
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
-        """Return what the scene's picture is compared with, display values; None without a clean frame, and in modes
-        without such a target. picture: the composite."""
+        """Return the picture that the scene's is compared with, display values; None where there is none.
+
+        The clean frame in supervised modes; in mode `in-flare` the frame minus the flare as reconstructed so far.
+        picture: the composite.
+        """
         if self.settings.supervised:
             return targets.clean
         if self.settings.mode == "in-flare":
-            # Input minus the flare as reconstructed so far: the composite's gain over the scene.
+            # The flare so far is what the composite has more than the scene.
             return (targets.frame - (picture - scene).detach()).clamp(0, self.frames.display_white)
         return None
 
     def _parallax_loss(self, targets: Targets, scene: Tensor, flare: Splats | None,
                        light_discs: Tensor | None) -> Tensor:
-        """Return the loss of a scene without exact clean frames (`parallax_losses`). flare: its splats, if any."""
+        """Return the loss of a scene in a fit by parallax, without exact clean frames.
+
+        Only a quantile loss while the scene is fitted alone; later also terms near the lights, against an estimated
+        clean frame, and on flare far from the lights. flare: splats of all lights, None without any.
+        """
         settings = self.settings
         if self.flare is None or self._is_scene_only(targets):
             return quantile_loss(scene, targets.frame, settings.split.excess_weight)
@@ -322,8 +345,11 @@ class Trainer(FlareTrainer):
                                         settings.split)
 
     def _sh_degree(self) -> int:
-        """Return the degree of the scene's colours in this iteration: it grows by one every `sh_every`, up to a limit
-        that is lower at first in a fit by parallax."""
+        """Return the degree of the scene's spherical harmonics in this iteration.
+
+        It grows by one every `sh_every` iterations, up to a limit that is lower at first in a fit by parallax; a scene
+        trained elsewhere has the highest from the start.
+        """
         if self.settings.scene.start:
             return MAX_DEGREE  # it was trained before
         split = self.settings.split
@@ -353,7 +379,10 @@ class Trainer(FlareTrainer):
                 "strategy": self.strategy.state_dict(), **self._inputs.state()}
 
     def _read_excess_ratio(self, state: State) -> float:
-        """Return the excess ratio of a state; formats before 1 name it `times_found`, or store only a verdict."""
+        """Return the excess ratio of a state.
+
+        Formats before 1 name it `times_found`, or store only whether the scene had converged.
+        """
         for name in ("excess_ratio", "times_found"):
             if name in state:
                 return float(state[name])

@@ -38,7 +38,7 @@ MAX_NAMES = 5
 
 
 def footage_warnings(capture: Capture, settings: FitSettings, views: Sequence[View], frames: Frames) -> tuple[str, ...]:
-    """Return sentences on footage from which a flare can hardly be separated."""
+    """Return sentences for the user on what makes it hard to separate a flare in this footage; () if nothing does."""
     warnings = []
     if settings.uses_parallax and not settings.uses_plates and capture.is_rotation_only:
         warnings.append("The camera only turns: without parallax scene and flare cannot be told apart; give clean "
@@ -63,7 +63,10 @@ def footage_warnings(capture: Capture, settings: FitSettings, views: Sequence[Vi
 
 
 def outlier_warnings(losses: Mapping[str, float]) -> tuple[str, ...]:
-    """Return a sentence that names the few frames whose loss at the end of a fit is many times the median."""
+    """Return a sentence that names the frames whose last loss is many times the median; () if none or too many are.
+
+    losses: last loss of each frame, by name.
+    """
     median = float(np.median(list(losses.values()))) if losses else 0.0
     names = [name for name, loss in losses.items() if loss > max(OUTLIER_RATIO * median, MIN_OUTLIER_LOSS)]
     if not names or len(names) > max(MAX_OUTLIER_SHARE * len(losses), 1):
@@ -74,8 +77,8 @@ def outlier_warnings(losses: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def moved_light_warnings(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
-    """Return a sentence for each light that the fit moved from its position in the capture; it moves none that has
-    places by frame."""
+    """Return a sentence for each light that the fit moved from its position in the capture; () if lights have places
+    by frame, which are never moved."""
     if flare.frame_lights is not None:
         return ()
     distances = [float(np.linalg.norm(xyz - light.xyz))

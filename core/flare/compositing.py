@@ -30,10 +30,11 @@ from .placement import PlaneGaussians
 def splat_flare(gaussians: PlaneGaussians, intrinsics: Tensor, width: int, height: int, blend: Blend, *,
                 kernels: Kernels = "auto", resolution: Resolution = "full",
                 pixel_grid: PixelGrid | None = None, exposure: float = 1.0) -> Splats:
-    """Render flare Gaussians: colour (height, width, 3) and transmittance (height, width) under these intrinsics.
+    """Rasterize flare Gaussians under intrinsics (3, 3): colour (height, width, 3), transmittance (height, width).
 
-    The colour is in display space for `over` and scene-linear for `add`. pixel_grid: the grid at which the flare was
-    fitted, so that it looks alike at every size. exposure: factor on the fitted light.
+    The colour is in display space for the blend "over", scene-linear for "add". pixel_grid: the grid at which the flare
+    was fitted, so that it looks alike at every size; None for the default low-pass filter. exposure: factor on the
+    fitted light.
     """
     centres, covariances = placement.to_pixels(gaussians, intrinsics, pixel_grid)
     arcs = None if gaussians.arcs is None else placement.arcs_to_pixels(gaussians.arcs, covariances, intrinsics)
@@ -55,7 +56,10 @@ def concatenate(flares: Mapping[str, PlaneGaussians]) -> PlaneGaussians | None:
 
 
 def _concatenate_rows(parts: list[tuple[Tensor | None, int]], plain: Tensor) -> Tensor | None:
-    """Concatenate rows, with `plain` for each Gaussian of a part that has none; None if no part has rows."""
+    """Concatenate the rows (n, k) of several sets of n Gaussians; None if no set has rows.
+
+    parts: rows and n of each set. plain: (k,), the row for each Gaussian of a set without rows.
+    """
     if all(rows is None for rows, _ in parts):
         return None
     return torch.cat([plain.expand(count, -1) if rows is None else rows for rows, count in parts])
@@ -109,9 +113,9 @@ class LinearLayers(NamedTuple):
 def linear_layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend, white: float = 1.0) -> LinearLayers:
     """Return layers from the scene's picture, display values, and each light's splats.
 
-    white: display value at which the scene is clipped; the composite is not. `over` is not a sum: a light's layer is
-    the increase of the linear picture when that light is put before those that follow it, so that the layers sum to the
-    composite exactly.
+    flares: splats by light; the first lies in front. white: display value at which the scene is clipped; the composite
+    is not. With the blend "over", lights are put over the scene from the last to the first, and a light's layer is the
+    increase of the linear picture by it, so the layers sum to the composite exactly.
     """
     display = scene.clamp(0, white)
     scene_linear = decode(display)

@@ -41,9 +41,10 @@ class QueryRange:
     def of(cls, cameras: Tensor, lights: Tensor, reach: float = math.inf) -> QueryRange:
         """Return the range of training views: camera positions (v, 3), normalised light positions (v, 2).
 
-        reach: distance of the frame's corners from the principal point, normalised; it bounds `light_high` by
-        RANGE_FACTOR. A light that passes the camera's plane comes to lie at a hundred times that; a grid over all of it
-        would leave the frame a part of one cell. Boxes are 5 % larger than the range on each side.
+        reach: distance of the frame's corners from the principal point, normalised. `light_high` is at most
+        RANGE_FACTOR times this, or times the nearest light's distance if that is larger: a light that passes the
+        camera's plane lies a hundred times as far away, and on a grid over all of this the frame would be a part of one
+        cell. Boxes are 5 % larger than the range on each side.
         """
         low, high = cameras.amin(0), cameras.amax(0)
         # A camera that hardly moves along an axis must not have its noise stretched over the whole grid.
@@ -97,7 +98,10 @@ class DeformationNetwork(nn.Module):
         self.register_buffer("light_high", torch.tensor(query_range.light_high), persistent=False)
 
     def view_features(self, camera: Tensor, light: Tensor) -> Tensor:
-        """Return features (4 levels,) of a camera position (3,), world units, and a light (2,), normalised coordinates.
+        """Return features (4 * levels,) of a camera position (3,), world units, and a light (2,), normalised
+        coordinates.
+
+        They are the light's and the camera's hash grid, interpolated there.
         """
         # One scale for each axis; `QueryRange.of` makes every extent larger than 0.
         camera_input = (camera - self.camera_low) / self.camera_extent
@@ -117,5 +121,8 @@ class DeformationNetwork(nn.Module):
         return dict(zip(self.names, self.head(x).split(self.widths, -1), strict=True))
 
     def light_correction(self, features: Tensor) -> Tensor:
-        """Return delta_l (2,) (paper, eq. 4), normalised coordinates over `LightFlare.scale`. features: of the view."""
+        """Return delta_l (2,), the correction of the light's place (paper, eq. 4).
+
+        In normalised coordinates divided by `LightFlare.scale`. features: of the view, from `view_features`.
+        """
         return self.correction(features)

@@ -38,7 +38,8 @@ def clone_and_prune(flare: LightFlare, optimiser: Adam, names: Mapping[str, str]
                     generator: torch.Generator) -> None:
     """Clone and prune one light's canonical Gaussians in place.
 
-    The optimiser's moments follow the rows; those of clones are 0. names: the optimiser's name of each of
+    Gaussians of low opacity are removed; of the others, some of high opacity are copied, and the copies moved by noise.
+    The optimiser's moments follow the rows; those of clones are 0. names: the optimiser's name of each parameter in
     `flare.gaussians`.
     """
     opacity = flare.gaussians["opacity_logits"].detach().sigmoid()[:, 0]

@@ -59,8 +59,11 @@ class HashGrid(nn.Module):
         return (rows * weights[..., None]).sum(1).reshape(-1)
 
     def _corner_rows(self, point: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the table's rows of the corners of the cell around a point (3,), and their trilinear weights, (levels,
-        8) each."""
+        """Return, for each level, the table's rows of the 8 corners of the cell around a point (3,), and their
+        trilinear weights, (levels, 8) each.
+
+        A level whose corners all fit in its rows is indexed densely, any other by a spatial hash.
+        """
         resolutions, rows, primes, corners = self._resolutions, self._rows, self._primes, self._corners
         scaled = point.clamp(0, 1)[None] * resolutions[:, None]
         low = torch.minimum(scaled.floor(), resolutions[:, None] - 1.0)  # 1 lies in the last cell
@@ -69,7 +72,7 @@ class HashGrid(nn.Module):
         weights = torch.where(corners.bool(), fraction, 1 - fraction).prod(-1)
         side = resolutions[:, None] + 1
         dense = corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])
-        scrambled = corner * primes  # the paper's hash, eq. 4
+        scrambled = corner * primes  # spatial hash, eq. 4 of Müller et al. 2022
         hashed = (scrambled[..., 0] ^ scrambled[..., 1] ^ scrambled[..., 2]) % rows[:, None]
         is_dense = (side**3 <= rows[:, None])
         return torch.where(is_dense, dense, hashed) + self._starts[:, None], weights.to(point.dtype)

@@ -46,7 +46,7 @@ class FlareFile:
 
 
 def save(path: Path | str, flare: FlareFile) -> None:
-    """Write a .flare atomically."""
+    """Write a .flare atomically: the tensors as safetensors, the rest as a JSON description in their metadata."""
     forms = [asdict(light.form) for light in flare.model.lights]
     lights = [
         {"name": name, "xyz": xyz, "form": form, "range": asdict(light.query_range), "count": light.count,
@@ -84,9 +84,10 @@ def _to_triple(values: Any) -> tuple[float, float, float]:
 
 
 def _pack(model: FlareModel) -> dict[str, Tensor]:
-    """Return the tensors of all lights by "number.parameter", with every hash table as its rows that are not zero.
+    """Return the tensors of all lights by "light's number.parameter".
 
-    `LightFlare.scale` is multiplied in, since the file does not store it.
+    Of a hash table only the rows that are not zero are returned, as "name.rows" and "name.values". `LightFlare.scale`
+    is multiplied into the tensors, since the file does not store it.
     """
     packed: dict[str, Tensor] = {}
     states = {f"{number}.{name}": tensor for number, light in enumerate(model.lights)
@@ -102,15 +103,15 @@ def _pack(model: FlareModel) -> dict[str, Tensor]:
 
 
 def _unpack(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> FlareFile:
-    """Make the model from description and tensors, the inverse of `save`. Raises ValueError, KeyError or RuntimeError
-    where they are damaged."""
+    """Make the model from the description and tensors that `save` writes. Raises ValueError, KeyError or RuntimeError
+    if they are damaged."""
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise ValueError(f"{name} holds values that are not finite")
     flares, names, positions, clear = [], [], [], []
     for light in description["lights"]:
         low, high, light_high = (_to_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
-        # The generator draws first values only, which the file's replace below.
+        # The generator draws initial values, which those of the file replace below.
         flares.append(LightFlare(FlareForm(**light["form"]), QueryRange(low, high, light_high), int(light["count"]),
                                  torch.Generator()))
         names.append(str(light["name"]))

@@ -25,7 +25,7 @@ class FrameLights(nn.Module):
     prior: Tensor
 
     def __init__(self, frames: Sequence[str], positions: Tensor, prior: Tensor) -> None:
-        """frames: names, in the order of the shot."""
+        """frames: names of the frames, in the order of the shot; positions, prior: rows in the same order."""
         super().__init__()
         self.rows = {name: row for row, name in enumerate(frames)}
         """Row of each frame, by its name, in the order of the shot."""
@@ -47,9 +47,10 @@ class FrameLights(nn.Module):
         return None if row is None else self.positions[row]
 
     def roughness(self, frame: str) -> Tensor:
-        """Return the sum of |change of brightness| between a frame and the ones before and after it.
+        """Return the total variation at a frame: the sum of |change of brightness| from the frame before it and to the
+        one after it.
 
-        Absolute values allow steps, as of a switch, and smooth the brightness where no frame decides it.
+        Absolute values allow steps, such as of a switch, and smooth the brightness where frames do not determine it.
         """
         row, last = self.rows[frame], len(self.rows) - 1
         near = torch.tensor([max(row - 1, 0), row, min(row + 1, last)])

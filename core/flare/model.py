@@ -63,7 +63,8 @@ class ViewOfLight(NamedTuple):
 
     @classmethod
     def of(cls, world_to_camera: Tensor, xyz: Tensor) -> ViewOfLight:
-        """Make it, in float32, from a pose (4, 4) and the light's position (3,) in the world."""
+        """Make the view, in float32, from a pose world_to_camera (4, 4) and the light's position xyz (3,) in the world.
+        """
         pose = world_to_camera.double()
         x, y, z = (pose[:3, :3] @ xyz.double() + pose[:3, 3]).tolist()
         camera = -pose[:3, :3].T @ pose[:3, 3]
@@ -146,7 +147,10 @@ class LightFlare(nn.Module):
                               rings, arcs)
 
     def state_without_scale(self) -> dict[str, Tensor]:
-        """Return the state of the same flare with a `scale` of 1: the scale goes into the network's last layers."""
+        """Return the state of an equal flare whose `scale` is 1.
+
+        For this, the last layers of the network that yield lengths in the plane are multiplied by the scale.
+        """
         state = {name: tensor.detach() for name, tensor in self.state_dict().items()}
         if self.scale == 1:
             return state
@@ -162,7 +166,10 @@ class LightFlare(nn.Module):
         return state
 
     def _colours(self, sh: Tensor, means: Tensor, rotation: Tensor) -> Tensor:
-        """Return colours (n, 3) in the world's direction of each mean. sh: (n, k * 3). rotation: world to camera."""
+        """Return colours (n, 3) from spherical harmonics, in the direction of each mean in the world.
+
+        sh: (n, k * 3), k coefficients of each channel. means: (n, 2) on the plane. rotation: (3, 3), world to camera.
+        """
         rays = torch.cat([means, torch.ones_like(means[:, :1])], -1)
         return colours(rays @ rotation, sh.unflatten(-1, (-1, 3)), self.form.sh_degree)
 
@@ -175,10 +182,10 @@ def _to_rings(raw: Tensor) -> Tensor:
 
 def _initial_gaussians(form: FlareForm, count: int, opacity: float, scale: float, generator: torch.Generator
                        ) -> dict[str, Tensor]:
-    """Return the rows of `count` Gaussians, by name, of log-uniform INITIAL_SIZES that leave most of the frame free.
+    """Return the rows of `count` initial Gaussians, by name of the parameter.
 
-    They are spread over LINE_RANGE, or without the line at random over a square with sides of `scale` about the
-    principal point.
+    They are spread evenly over LINE_RANGE, or, if the form has no line, at random over a square with sides of `scale`
+    about the principal point. Sizes are log-uniform over INITIAL_SIZES times `scale`, so most of the frame stays free.
     """
     if form.line:
         positions = torch.linspace(*LINE_RANGE, count)[:, None]
@@ -201,8 +208,8 @@ def _initial_gaussians(form: FlareForm, count: int, opacity: float, scale: float
     if form.static_offset:
         rows["offsets"] = torch.zeros(count, 2)
     if form.rings:
-        # A disc finds the way to a ring through worse pictures; so some begin as rings. The others have r0 = 0 and
-        # log w = 0: plain Gaussians. The radius of a ring grows with the size of its Gaussian: one fraction gives both.
+        # Optimisation rarely turns a disc into a ring, since the pictures in between are worse; so some begin as rings.
+        # The others have r0 = 0 and log w = 0: plain Gaussians. One `fraction` gives both size and radius of a ring.
         rows["rings"] = torch.zeros(count, 2)
         rows["rings"][::RING_INTERVAL, 0] = _log_interpolate(*INITIAL_RING_RADII, fraction[::RING_INTERVAL, 0]).exp()
         rows["rings"][::RING_INTERVAL, 1] = math.log(INITIAL_RING_WIDTH)
@@ -214,7 +221,7 @@ def _initial_gaussians(form: FlareForm, count: int, opacity: float, scale: float
 
 
 def _log_interpolate(low: float, high: float, fraction: Tensor) -> Tensor:
-    """Return the logarithm of the value at a fraction (0..1) between low and high, by ratio."""
+    """Return the logarithm of the value at a fraction (0..1) between low and high on a logarithmic scale."""
     return math.log(low) + (math.log(high) - math.log(low)) * fraction
 
 
@@ -260,8 +267,8 @@ class FlareModel(nn.Module):
     def training_views(self, poses: Sequence[Tensor], frames: Sequence[str] = ()) -> dict[str, list[list[float]]]:
         """Return, by the light's name, a list [camera x, y, z, light x, y] for each pose (4, 4) that has it in front.
 
-        Cameras are in world units, lights in normalised coordinates. frames: names of the poses' frames, where lights
-        move.
+        Cameras are in world units, lights in normalised coordinates. frames: name of each pose's frame, needed if
+        lights move.
         """
         views_by_light: dict[str, list[list[float]]] = {name: [] for name in self.names}
         for pose, frame in zip(poses, frames or [""] * len(poses), strict=True):
@@ -272,10 +279,11 @@ class FlareModel(nn.Module):
         return views_by_light
 
     def light_corrections(self, world_to_camera: Tensor, frame: str = "") -> Tensor:
-        """Return delta_l (n, 2) of the n lights in front of one pose (4, 4), normalised coordinates over `scale`.
+        """Return delta_l (n, 2), the corrections of the places of the n lights in front of a pose (4, 4), in normalised
+        coordinates divided by `scale`.
 
-        Its gradient stops at the view's features, which the whole flare shares: rows of the grids that only a view with
-        a hidden light touches would move by full steps because of it.
+        Gradients stop at the view's features, which the whole flare shares. Else Adam would move rows of the grids that
+        only views with a hidden light touch, by full steps.
         """
         views = self.views(world_to_camera, frame)
         corrections = [flare.network.light_correction(flare.network.view_features(view.camera, view.light).detach())
@@ -286,9 +294,9 @@ class FlareModel(nn.Module):
                 frame: str = "") -> dict[str, PlaneGaussians]:
         """Return the Gaussians of every light in front of the camera, by the light's name.
 
-        visibilities: of each light, 0..1 (see `visibility`); they scale the opacities, as the brightness of each light
-        in `frame` does. A light with a product below MIN_TRAINING_VISIBILITY gives no gradient to its flare: there is
-        next to nothing to learn, and Adam would learn it at full rate, from the error of the visibility.
+        Opacities are multiplied by the visibility of the light, 0..1, and by its brightness in `frame`. If this product
+        is below MIN_TRAINING_VISIBILITY, the light's Gaussians get no gradient: there is next to nothing to learn, and
+        Adam would learn the error of the visibility at full rate. visibilities: by the light's name; None if all are 1.
         """
         lights = zip(self.names, self.lights, self.views(world_to_camera, frame), strict=True)
         flares = {name: flare(view) for name, flare, view in lights if view.depth > 0}
@@ -301,7 +309,8 @@ class FlareModel(nn.Module):
                 for name, gaussians in flares.items()}
 
     def shares(self, visibilities: Mapping[str, Tensor] | None, frame: str) -> Mapping[str, Tensor] | None:
-        """Return visibility times brightness of each light, by name; None where neither is known: all are 1."""
+        """Return visibility times brightness of each light, by name; None if neither is known, which means 1 for
+        all."""
         brightness = None if self.frame_lights is None else self.frame_lights.brightness_in(frame)
         if brightness is None:
             return visibilities

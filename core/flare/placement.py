@@ -44,8 +44,9 @@ def on_line(mu: Tensor, light: Tensor) -> Tensor:
 def project_covariances(means: Tensor, log_scales: Tensor, quaternions: Tensor) -> Tensor:
     """Return covariances (n, 3) xx, xy, yy on the plane of 3D Gaussians in the camera frame at depth PLANE_DEPTH.
 
-    means (n, 2) on the plane, log_scales (n, 3) in world units, quaternions (n, 4) wxyz. The local affine approximation
-    of the projection (Zwicker et al. 2002): J = [1 0 -x; 0 1 -y] / depth.
+    By the local affine approximation of the projection (EWA splatting, Zwicker et al. 2002) with the Jacobian J = [1 0
+    -x; 0 1 -y] / depth. means: (n, 2) on the plane. log_scales: (n, 3), logarithms of the deviations along the axes.
+    quaternions: (n, 4), wxyz.
     """
     rotation = rotation_matrices(quaternions)
     x, y = means[:, :1], means[:, 1:]
@@ -68,7 +69,8 @@ def covariance_of_ellipse(log_scales: Tensor, directions: Tensor) -> Tensor:
 def arcs_of_ellipse(arcs: Tensor, log_scales: Tensor, directions: Tensor) -> Tensor:
     """Convert arcs a (n, 2), in deviations along the axes of an ellipse, to arcs (n, 2) on the plane: R diag(s) a.
 
-    The strength |a| = beta does not depend on the ellipse's size. log_scales, directions: see `covariance_of_ellipse`.
+    R turns to the ellipse's axes, s are its deviations; the strength |a| = beta does not depend on its size.
+    log_scales: (n, 2), logarithms of s. directions: (n, 2) of the first axis, any length.
     """
     axis = functional.normalize(directions, dim=-1, eps=1e-12)
     along, across = (arcs * log_scales.exp()).unbind(-1)
@@ -76,11 +78,12 @@ def arcs_of_ellipse(arcs: Tensor, log_scales: Tensor, directions: Tensor) -> Ten
 
 
 def opacity_gain(arcs: Tensor, rings: Tensor) -> Tensor:
-    """Return factors (n,) on opacities, which make the picture smooth in arcs (n, 2), in deviations, at zero.
+    """Return factors (n,) on opacities that make the picture differentiable in arcs (n, 2), in deviations, at zero.
 
-    Rasterizers keep the peak of a profile at its opacity, so an arc subtracts r0 beta from the profile's logarithm, and
-    beta has a kink at zero. The factor replaces this beta by beta^2 / sqrt(beta^2 + ARC_SOFTNESS^2), which has none and
-    is soon beta again. The peak is therefore above the opacity, by a factor of exp(0.03 r0) at most.
+    Rasterizers keep a profile's peak at its opacity: for an arc of strength beta = |arc| they subtract r0 beta from the
+    profile's logarithm, and beta has a kink at zero. The factor replaces this beta by beta^2 / sqrt(beta^2 +
+    ARC_SOFTNESS^2), which has none and soon equals beta. So the peak exceeds the opacity, by exp(0.03 r0) at most.
+    rings: (n, 2), r0 and w.
     """
     squared = arcs.square().sum(-1)
     beta = squared.clamp(min=STRENGTH2_MIN).sqrt()
@@ -102,7 +105,8 @@ def to_pixels(gaussians: PlaneGaussians, intrinsics: Tensor,
               pixel_grid: PixelGrid | None = None) -> tuple[Tensor, Tensor]:
     """Return centres (n, 2) px and covariances (n, 3) px^2 under intrinsics (3, 3), with the low-pass filter added.
 
-    pixel_grid: the one at which the Gaussians were fitted; None for the default low-pass filter.
+    The low-pass filter is a variance added along both axes. pixel_grid: the grid at which the Gaussians were fitted;
+    None for the default filter.
     """
     focal, centre = intrinsics.diagonal()[:2], intrinsics[:2, 2]
     fx, fy = focal
@@ -113,11 +117,11 @@ def to_pixels(gaussians: PlaneGaussians, intrinsics: Tensor,
 
 
 def arcs_to_pixels(arcs: Tensor, covariances: Tensor, intrinsics: Tensor) -> Tensor:
-    """Return b (n, 2), px^-1, of the factor exp(b d) on Gaussians in pixels, for arcs (n, 2) on the plane.
+    """Return b (n, 2), px^-1, of the factor exp(b · d) on Gaussians in pixels, for arcs (n, 2) on the plane.
 
-    An arc is the shift of the mean that the factor gives a Gaussian without a ring: covariance times b. covariances (n,
-    3), px^2: of `to_pixels`, which include the low-pass, so that the low-pass does not change the shift. In double
-    precision, since covariances of long thin Gaussians are nearly singular.
+    An arc is the shift that the factor gives the mean of a Gaussian without a ring, covariance times b; so b solves a
+    2x2 system, in double precision, since covariances of long thin Gaussians are nearly singular. covariances: (n, 3),
+    px^2, from `to_pixels`: with the low-pass filter, so that the filter does not change the shift.
     """
     x, y = (arcs * intrinsics.diagonal()[:2]).double().unbind(-1)
     xx, xy, yy = covariances.double().unbind(-1)

@@ -59,18 +59,19 @@ def light_visibilities(scene: SceneGaussians, model: FlareModel, world_to_camera
 
 
 def relative_to_clear(visibility: Tensor, clear: Tensor | float) -> Tensor:
-    """Return a visibility, 0..1, relative to `clear`, that of the light where nothing hides it; 1 where that is
-    unknown (0, see `FlareModel.clear`)."""
+    """Return a visibility divided by `clear`, at most 1; 1 if `clear` is 0, which stands for unknown.
+
+    clear: visibility of the light behind the scene where nothing hides it.
+    """
     return (visibility / clear).clamp(max=1) if clear > 0 else torch.ones(())
 
 
 @torch.no_grad()
 def visibility_from(scene: SceneGaussians, eye: NDArray[np.float64], light: NDArray[np.float64],
                     settings: VisibilitySettings, clear: float = 1.0) -> float:
-    """Return the visibility, 0..1, of a light at `light` (3,) from a camera at `eye` (3,), world units, relative to
-    `clear`.
+    """Return the visibility, 0..1, of a light at `light` (3,) from a camera at `eye` (3,), world units.
 
-    `clear` (`FlareModel.clear`) is 1 for a scene other than that of the fit.
+    It is relative to `clear`, the light's visibility where nothing hides it; 1 for a scene other than that of the fit.
     """
     visibility = light_visibility(scene, torch.from_numpy(eye), torch.from_numpy(light), settings)
     return float(relative_to_clear(visibility, clear))
@@ -80,9 +81,9 @@ def visibility_behind(scene: SceneGaussians, world_to_camera: NDArray[np.float64
                       settings: VisibilitySettings, clear: float = 1.0) -> tuple[float, tuple[float, ...] | None]:
     """Return the visibility of a placed light behind a scene, 0..1, and the visible shares of the cells of its extent.
 
-    For a point, which has no cells, the shares are None. For an extent, the visibility is 1, and the shares are the
-    light's own times those behind the scene, each cell as a disk of its size. world_to_camera: (4, 4). clear: see
-    `visibility_from`.
+    A light without extent is a point: its shares are returned unchanged, None unless given. For an extent, the
+    visibility is 1, and each share is the light's own times the visibility of a disk of the cell's size behind the
+    scene. world_to_camera: (4, 4). clear: the light's visibility where nothing hides it.
     """
     pose = np.asarray(world_to_camera, np.float64)
     eye = -pose[:3, :3].T @ pose[:3, 3]
@@ -105,11 +106,10 @@ def visibility_behind(scene: SceneGaussians, world_to_camera: NDArray[np.float64
 @torch.no_grad()
 def clear_visibilities(scene: SceneGaussians, model: FlareModel, poses: Sequence[Tensor], settings: VisibilitySettings,
                        kernels: Kernels = "auto", frames: Sequence[str] = ()) -> Tensor:
-    """Return (lights,), the visibility of each light where nothing hides it: that which a tenth of these poses (4, 4)
-    reach. frames: names of their frames, where lights move.
+    """Return (lights,), the visibility of each light where nothing hides it: the 90 % quantile over these poses (4, 4).
 
-    0 stands for unknown, where that is below MIN_CLEAR: the scene hides the light from everywhere, for example if the
-    light lies inside an object. `relative_to_clear` gives 1 then.
+    A quantile below MIN_CLEAR becomes 0, for unknown: the scene hides the light from everywhere, for example if the
+    light lies inside an object. frames: name of each pose's frame, needed if lights move.
     """
     eyes = [-pose[:3, :3].double().T @ pose[:3, 3].double() for pose in poses]
     places = [model.positions_in(frame) for frame in frames or [""] * len(poses)]
@@ -127,9 +127,9 @@ def occlusion_loss(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor],
                    kernels: Kernels = "auto") -> Tensor | None:
     """Return the loss of a scene that hides lights (3,), which the frame of the camera at `eye` (3,) shows.
 
-    It makes Gaussians in front of the lights more transparent, such as a sky at a wrong distance. It uses the logarithm
-    of the visibilities: behind many layers, the visibility itself hardly changes with a single one. None without a
-    light.
+    Its gradient makes Gaussians in front of the lights more transparent, such as a sky at a wrong distance. It is the
+    negative logarithm of the visibilities: behind many layers, the visibility itself hardly changes with a single
+    layer. None without lights.
     """
     visibilities = [light_visibility(scene, eye, light, settings, kernels) for light in lights]
     return -OCCLUSION_WEIGHT * (torch.stack(visibilities) + MIN_VISIBILITY).log().sum() if visibilities else None
@@ -137,7 +137,11 @@ def occlusion_loss(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor],
 
 def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings | None = None,
                      kernels: Kernels = "auto") -> Tensor:
-    """Return the visibility (scalar, 0..1) of a light at `light` (3,) from a camera at `eye` (3,); world units."""
+    """Return the visibility (scalar, 0..1) of a light at `light` (3,) from a camera at `eye` (3,); world units.
+
+    A small camera that looks from the eye at the light rasterizes the Gaussians in between; the visibility is the mean
+    transmittance over a Gaussian window, the light's soft disk.
+    """
     settings = settings or VisibilitySettings()
     direction = (light - eye).float()
     distance = float(direction.norm())
@@ -150,7 +154,7 @@ def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings
     focal = half / (2 * settings.radius)
     intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
     near = _near_plane(scene, distance)
-    colourless = scene.sh.new_zeros(len(rows), 1, 3)  # the colours' gradient would be the dearest part
+    colourless = scene.sh.new_zeros(len(rows), 1, 3)  # colours are not needed, and their gradient would cost most
     alpha = rasterization(scene.means[rows], scene.quaternions[rows], scene.log_scales[rows].exp(),
                           scene.opacity_logits[rows].sigmoid(), colourless, pose, intrinsics, size, size,
                           near=near, depth=False, kernels=kernels).alpha
@@ -161,16 +165,16 @@ def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings
 
 
 def _near_plane(scene: SceneGaussians, distance: float) -> float:
-    """Return the depth from which Gaussians hide a light at a distance, world units: at most the scene's near plane, so
-    that all that a picture shows can hide a light."""
+    """Return the smallest depth at which Gaussians hide a light at this distance, world units: at most the scene's near
+    plane, so that everything a picture shows can hide a light."""
     return min(1e-3 * distance, scene.near)
 
 
 def _occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
-    """Return rows of the Gaussians between camera and light that may touch the small picture, without the far layer.
+    """Return the rows of Gaussians between camera and light that may touch the small picture, without the far layer.
 
-    pose: (4, 4) of the small camera. distance: of the light. Uses numpy, which takes a third of torch's time on columns
-    of three.
+    pose: world_to_camera (4, 4) of the small camera. distance: from camera to light. Uses numpy, which takes a third of
+    torch's time here.
     """
     means, scales, rigid = (part.detach().cpu().numpy() for part in (scene.means, scene.log_scales, pose))
     x, y, depth = (means @ rigid[:3, :3].T + rigid[:3, 3]).T

@@ -38,8 +38,8 @@ class Aperture:
 
 
 def edge_radius(aperture: Aperture, sectors: int) -> Array:
-    """Return the distance of the edge from the centre, relative to the radius, for `sectors` directions from +x round
-    to +y."""
+    """Return (sectors,), the distance of the stop's edge from its centre, relative to the radius, in `sectors` even
+    directions from +x towards +y."""
     rng = np.random.default_rng(aperture.seed)
     angles = np.arange(sectors) / sectors * 2 * np.pi
     normals = np.radians(aperture.turn) + (np.arange(aperture.blades) + 0.5) / aperture.blades * 2 * np.pi
@@ -51,9 +51,10 @@ def edge_radius(aperture: Aperture, sectors: int) -> Array:
 
 
 def transmission(aperture: Aperture, size: int, fill: float) -> Array:
-    """Return the stop as a picture (size, size), 0..1, its radius `fill` of half the side.
+    """Return the stop's transmission as a picture (size, size), 0..1.
 
-    Dust and scratches on the glass absorb ABSORPTION of the light."""
+    Dust and scratches on the glass absorb ABSORPTION of the light. fill: radius of the stop over half the picture's
+    side."""
     axis = (np.arange(size) + 0.5) / size * 2 - 1
     x, y = np.meshgrid(axis / fill, axis / fill)
     radius, angle = np.hypot(x, y), np.arctan2(y, x)

@@ -96,8 +96,9 @@ def render_flare(setup: LensSetup, camera: Camera, light: Sequence[float] | NDAr
     """Return the flare of one light: scene-linear Rec. 709, (height, width, 3) float32, never negative.
 
     light: (x, y, z) in the camera's axes (x right, y down, z forward; any unit), or normalised (x/z, y/z) of a light in
-    front. The flare is zero for a light behind the camera, one that is hidden, and one so far to the side that the hood
-    shades it. colour: linear RGB. intensity: factor. visible_share: 0..1, scales the flare.
+    front. The flare is black if the light is behind the camera, hidden, or so far to the side that the hood shades it.
+    colour: of the light, linear RGB. intensity: factor on the flare. visible_share: visible share of the light, 0..1, a
+    factor too.
     """
     black = np.zeros((camera.height, camera.width, 3), np.float32)
     if len(light) == 3:

@@ -82,9 +82,10 @@ class Optics:
         return float(self.lens.vertices[-1] + self.lens.back_focus())
 
     def brightest_pairs(self, count: int, slope: float = 0.12) -> list[tuple[int, int]]:
-        """Return the `count` pairs (first, second) of surfaces whose ghosts have the most light by area on the sensor.
+        """Return the `count` pairs (first, second) of surfaces whose ghosts have the most light per area on the sensor.
 
-        slope: tan of the field angle of the light for which they are compared."""
+        Each ghost is traced as a grid of rays. slope: tan of the field angle of the light for which they are
+        compared."""
         surfaces = _trace_arguments(self, REFERENCE_WAVELENGTH)
         reflecting = [index for index in range(len(self.coating)) if index != self.lens.stop]
         scored_pairs = []
@@ -96,7 +97,7 @@ class Optics:
                 passes = arrived & (rays[..., STRAY] < 1) & (radius < self.aperture.radius)
                 if passes.sum() < 2:
                     continue
-                # A focused ghost has no area; the added length keeps it from passing all others.
+                # A ghost in focus has no area; the added length keeps it from outranking all others.
                 spread = np.ptp(rays[passes][:, :2], axis=0).max() + MIN_SPREAD * self.lens.focal_length()
                 scored_pairs.append((rays[passes][:, WEIGHT].sum() / spread**2, first, second))
         return [(first, second) for _, first, second in sorted(scored_pairs, reverse=True)[:count]]
@@ -120,9 +121,9 @@ def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.
 
 @compile_cached
 def _non_negative_span(start: float, slope: float, left: float, right: float) -> tuple[float, float]:
-    """Return the part of left..right, values of u, where start + slope u is not negative.
+    """Return the part (first, last) of the range left..right of u in which start + slope u is not negative.
 
-    The ends of an empty part are in the wrong order."""
+    If there is none, first > last."""
     if slope > 0.0:
         return max(left, -start / slope), right
     if slope < 0.0:
@@ -136,11 +137,14 @@ def _draw_cells(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, l
                 picture: NDArray[np.float32]) -> None:
     """Add the cells of a traced grid to `picture`, each as two triangles.
 
-    rays: (rows, columns, FIELDS). arrived: which of them reach the sensor. px, py: where, in pixels. light: their
-    density. stop_x, stop_y: (rows, columns, 3), where a ray passes the stop each time, mm; a passage that it does not
-    make repeats the first. radius: of the stop, mm. edges (sectors,): distance of the stop's edge from its centre,
-    relative to `radius`, in equal sectors of the angle from +x. rim: see `GhostSettings`. colour (3,): of this
-    wavelength.
+    Light and stop positions are interpolated linearly between a triangle's corners; a pixel is drawn where its ray
+    passes the stop inside its edge.
+
+    rays: (rows, columns, FIELDS). arrived: True for rays that reach the sensor. px, py: where they reach it, pixels.
+    light: density of light at each ray. stop_x, stop_y: (rows, columns, 3), place of up to three passages of the stop,
+    mm; missing ones repeat the first. radius: of the stop, mm. edges (sectors,): distance of the stop's edge from its
+    centre, relative to `radius`, in equal sectors of the angle from +x. rim: how much brighter a ghost's edge is than
+    its inside. colour (3,): of this wavelength.
     """
     rows, columns = px.shape
     height, width = picture.shape[0], picture.shape[1]
@@ -189,7 +193,7 @@ def _draw_cells(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, l
                         if mask == 0.0:
                             continue
                         rim_glow = 0.0
-                        # A passage that a ray does not make repeats the first one.
+                        # Up to three passages of the stop; missing ones repeat the first.
                         for passage in range(3):
                             if passage > 0 and stop_x[r0, c0, passage] == s0x:
                                 break
@@ -213,10 +217,10 @@ def _draw_cells(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, l
 
 
 def _density(x: Array, y: Array, cell: float) -> Array:
-    """Return the density of light at each ray: the area of its cell where it enters the lens, relative to pi f^2,
-    divided by the cell's area on the sensor, tan^2; at most MAX_DENSITY.
+    """Return the density of light (rows, columns) at each ray of a grid, at most MAX_DENSITY.
 
-    x, y: (rows, columns), where the rays meet the sensor, tan. cell: the cell's area where it enters, as above."""
+    It is the area of the ray's cell at the front of the lens divided by the cell's area on the sensor, tan^2. x, y:
+    (rows, columns), where the rays meet the sensor, tan. cell: area of a cell at the front, relative to pi f^2."""
     xr, xc = np.gradient(x)
     yr, yc = np.gradient(y)
     stretch = (xr * yc - xc * yr) / cell
@@ -228,7 +232,9 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
                 ) -> NDArray[np.float32]:
     """Return linear light (height, width, 3) of the ghosts of a white light of strength 1.
 
-    light: normalised coordinates (x/z, y/z). focal, centre: pixels.
+    Each ghost is traced as a grid of rays at each wavelength, and its cells are drawn. pairs: the two reflecting
+    surfaces of each ghost. light: normalised coordinates (x/z, y/z). focal, centre: focal lengths and principal point,
+    pixels.
     """
     supersample = max(1, min(settings.supersample, MAX_SUPERSAMPLED_WIDTH // width))
     picture = np.zeros((height * supersample, width * supersample, 3), np.float32)
@@ -250,7 +256,7 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
             # The sensor's picture is upside down; set it upright and turn it to the light's azimuth.
             x, y = -rays[..., SENSOR_X] / focal_length, -rays[..., SENSOR_X + 1] / focal_length
             cell_area = (grid[0][1] - grid[0][0]) * (grid[1][1] - grid[1][0]) / (math.pi * focal_length**2)
-            # The root is the cosine of the field angle, at which the beam enters.
+            # Divided by the root, that is, times the cosine of the field angle at which the beam enters.
             density = _density(x, y, cell_area) * rays[..., WEIGHT] / math.sqrt(1 + slope**2)
             px = supersample * (centre[0] + focal[0] * (cosine * x - sine * y))
             py = supersample * (centre[1] + focal[1] * (sine * x + cosine * y))
@@ -265,7 +271,10 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
 
 
 def limit_brightness(light: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
-    """Return light (..., 3), dimmed in the same hue where a channel exceeds `limit`; the same array if none does."""
+    """Return light (..., 3) with pixels of which a channel exceeds `limit` dimmed to it, in the same hue.
+
+    If none does, the same array is returned.
+    """
     brightest = light.max(-1, keepdims=True)
     if not (brightest > np.float32(limit)).any():
         return light
@@ -283,8 +292,9 @@ def _find_bundle(optics: Optics, slope: float, pair: tuple[int, int], surfaces: 
             ) -> tuple[Array, Array] | None:
     """Return x and y of a grid of rays that covers the bundle which passes the lens; None if no ray passes.
 
-    The bundle's bounds are those of the rays of a coarse grid that pass, or nearly do, and one cell more.
-    slope: tan of the field angle. surfaces: see `_trace_arguments`. grid: rays along each side."""
+    The bundle is found with a coarse grid: it spans the rays that pass, or nearly do, plus one cell on each side.
+    slope: tan of the field angle. surfaces: the arguments from `_trace_arguments`. grid: rays along each side of the
+    result."""
     # Oblique rays may meet the plane of the first vertex outside the rim of the first surface.
     extent = COARSE_EXTENT * optics.lens.semi_aperture[0]
     axis = np.linspace(-extent, extent, COARSE_RAYS)

@@ -57,8 +57,11 @@ class Prescription:
     stop: int
 
     def indices(self, wavelength: float) -> Array:
-        """Return the refractive index behind each surface at a wavelength in micrometres: Cauchy's first two terms,
-        through the index at the d line and the Abbe number; Abbe number 0 is glass without dispersion."""
+        """Return the refractive index (n,) behind each surface at a wavelength in micrometres.
+
+        By Cauchy's equation, a + b / wavelength^2, with a and b from the index at the d line and the Abbe number; Abbe
+        number 0 stands for glass without dispersion.
+        """
         mean_dispersion = (self.index - 1) / np.maximum(self.abbe, 1e-6)
         dispersion = np.where(self.abbe > 0, mean_dispersion / (LINE_F**-2 - LINE_C**-2), 0.0)
         return self.index + dispersion * (wavelength**-2 - LINE_D**-2)
@@ -76,7 +79,7 @@ class Prescription:
     def widest_f_number(self) -> float:
         """Return the f-number with the stop fully open: focal length / diameter of the entrance pupil, paraxially."""
         system, index_before, index = np.eye(2), 1.0, self.indices(LINE_D)
-        for k in range(self.stop):  # a ray parallel to the axis meets the stop at system[0, 0] times its height
+        for k in range(self.stop):  # in the end system[0, 0] is the height at the stop of a parallel ray of height 1
             refraction = _refraction(index_before, index[k], self.curvature[k])
             system = _transfer(self.thickness[k], index[k]) @ refraction @ system
             index_before = index[k]
@@ -94,7 +97,10 @@ class Prescription:
         return np.concatenate([[0.0], np.cumsum(self.thickness[:-1])])
 
     def _system_matrix(self, index: Array) -> Array:
-        """Return the matrix (2, 2) from before the first surface to behind the last, for these indices."""
+        """Return the ray transfer matrix (2, 2) from before the first surface to behind the last.
+
+        It acts on (height, index times slope). index: (n,), refractive index behind each surface.
+        """
         system, index_before = np.eye(2), 1.0
         for k in range(len(index)):
             system = _refraction(index_before, index[k], self.curvature[k]) @ system
@@ -131,7 +137,7 @@ def _transfer(length: float, index: float) -> Array:
 
 
 def trace_ghost_pairs(lens: Prescription) -> list[GhostPath]:
-    """Return every pair of glass surfaces that reflects, with the paraxial system of each wavelength."""
+    """Return the paraxial ghost of every pair of reflecting surfaces i < j, traced at each channel's wavelength."""
     focus = lens.back_focus()
     indices_by_channel = [lens.indices(wavelength) for wavelength in CHANNEL_WAVELENGTHS]
     # The stop, and surfaces between equal indices, reflect nothing.
@@ -154,10 +160,10 @@ def _index_before(index: Array, k: int) -> float:
 
 
 def _trace_path(lens: Prescription, index: Array, i: int, j: int, focus: float) -> tuple[Array, Array, Array]:
-    """Return (a, b) for the first and last passage of the stop, and for the sensor: the height there is a h + b u.
+    """Trace a ghost paraxially; return (a, b) at the first and last passage of the stop and at the sensor.
 
-    i < j: the surfaces that reflect. index: of the glass behind each surface. focus: from the last surface to the
-    sensor, mm."""
+    A ray that enters at height h with slope u has the height a h + b u there. i < j: the surfaces that reflect. index:
+    refractive index behind each surface. focus: distance from the last surface to the sensor, mm."""
     system = np.eye(2)
     crossings = []
     curvature, thickness, last = lens.curvature, lens.thickness, len(index) - 1
@@ -190,10 +196,10 @@ def _trace_path(lens: Prescription, index: Array, i: int, j: int, focus: float) 
 
 
 def reflectance(n0: Array, n2: Array, wavelengths: Array, coating: float) -> Array:
-    """Return the reflectance of a surface between indices n0 and n2 at normal incidence; arrays by wavelength.
+    """Return the reflectance, at normal incidence, of a surface between indices n0 and n2; arrays by wavelength.
 
-    coating: the wavelength (micrometres) for which a layer of magnesium fluoride is a quarter wave thick, 0 for bare
-    glass; cemented surfaces have none.
+    By Fresnel's equations, with the interference of one thin film. coating: wavelength, micrometres, for which a layer
+    of magnesium fluoride is a quarter wave thick; 0 for bare glass. It is ignored between two glasses.
     """
     bare: Array = np.square((n0 - n2) / (n0 + n2))
     if coating <= 0 or min(float(np.min(n0)), float(np.min(n2))) > MAX_AIR_INDEX:
@@ -216,7 +222,10 @@ def read_prescription(path: Path | str) -> Prescription:
 
 
 def parse_prescription(text: str, name: str, source: str = "The lens") -> Prescription:
-    """Parse the text format of the module's head. Raises SettingsError, with a message that begins with `source`."""
+    """Parse the text format of the module's head; lengths stay in mm. Raises SettingsError for what is no lens.
+
+    name: of the lens. source: beginning of the error's message.
+    """
     surfaces: list[list[float]] = []
     stop = -1
     for number, line in enumerate(text.splitlines(), 1):
@@ -245,10 +254,10 @@ def parse_prescription(text: str, name: str, source: str = "The lens") -> Prescr
 
 
 def read_lenses(folder: Path | str, max_count: int = 0) -> list[Prescription]:
-    """Return the photographic lenses of a folder, by name.
+    """Return the photographic lenses of a folder, in the order of their files' names.
 
-    Skips files that are no prescription, mirror lenses, converters, and focal lengths outside 5 to 800 mm.
-    max_count: read at most that many, evenly spread; 0 for all. Raises SettingsError where there is none.
+    Files that are no prescription, mirror lenses, converters, and focal lengths outside 5 to 800 mm are skipped.
+    max_count: number of files to read at most, evenly spread; 0 for all. Raises SettingsError if no lens is left.
     """
     paths = sorted(Path(folder).glob("*.lens"))
     if max_count and len(paths) > max_count:

@@ -88,14 +88,16 @@ class Streak:
 
 @lru_cache(maxsize=8)
 def starburst_texture(aperture: Aperture, settings: Starburst) -> Pixels:
-    """Return the starburst's texture (TEXTURE_SIZE, TEXTURE_SIZE, 3), which spans -extent..extent about its centre."""
-    stop = transmission(aperture, TEXTURE_SIZE, 0.25)  # the empty margin samples the pattern finely
-    power = np.abs(np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(stop)))) ** 2
-    power = (power / stop.sum() ** 2).astype(np.float32)
-    texture = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE, 3), np.float32)
-    centre = TEXTURE_SIZE // 2
-    rows, columns = np.mgrid[:TEXTURE_SIZE, :TEXTURE_SIZE].astype(np.float32) - centre
-    for wavelength, share in zip(wavelengths(BANDS), responses(BANDS), strict=True):
+    """Return the starburst's texture (TEXTURE_SIZE, TEXTURE_SIZE, 3), which spans -extent..extent (tan) along both
+    axes.
+
+    It is the Fraunhofer diffraction of the stop, the squared magnitude of its Fourier transform, scaled by wavelength
+    and summed over the spectrum; then blurred, faded at the edge and softly limited to `settings.peak`.
+    """ stop = transmission(aperture, TEXTURE_SIZE, 0.25)  # the empty margin about the stop makes the pattern's samples
+    finer power = np.abs(np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(stop)))) ** 2 power = (power / stop.sum() **
+    2).astype(np.float32) texture = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE, 3), np.float32) centre = TEXTURE_SIZE // 2
+    rows, columns = np.mgrid[:TEXTURE_SIZE, :TEXTURE_SIZE].astype(np.float32) - centre for wavelength, share in
+    zip(wavelengths(BANDS), responses(BANDS), strict=True):
         scale = np.float32(REFERENCE_WAVELENGTH / wavelength)
         # A pattern that is wider by 1 / scale is fainter by scale^2: its light stays the same.
         scaled_power = cv2.remap(power, columns * scale + centre, rows * scale + centre, cv2.INTER_LINEAR)
@@ -127,12 +129,15 @@ def draw_glow(settings: Glow, x: Pixels, y: Pixels) -> Pixels:
 
 
 def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) -> Pixels:
-    """Return a ring at image coordinates (x, y), (height, width, 3). x, y and light: tan from the principal point."""
+    """Return a ring's light (height, width, 3), summed over the spectrum, at image coordinates (x, y).
+
+    x, y (height, width each) and light: tangents from the principal point.
+    """
     u, v = x - settings.follow * light[0], y - settings.follow * light[1]
     distance = np.hypot(u, v)
     field_tan = math.hypot(*light)
-    # Cosine of the angle to the light's direction; it fades for a light near the principal point, which
-    # has none: to 0.7 of itself at a field angle of tan 0.22.
+    # Cosine of the angle to the direction from the principal point to the light. A light near that point has no
+    # direction, so the value fades towards it: to 0.7 of itself at a field angle of tan 0.22.
     light_cosine = (u * light[0] + v * light[1]) / np.maximum(distance, 1e-6) / math.sqrt(field_tan**2 + 0.05)
     brightness = settings.gain * np.maximum(1 - settings.lean * light_cosine, 0)
     ring = np.zeros((*x.shape, 3), np.float32)
@@ -145,8 +150,10 @@ def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) 
 
 
 def draw_streak(settings: Streak, light: tuple[float, float], x: Pixels, y: Pixels) -> Pixels:
-    """Return a streak through the light, and its fainter mirror image, at image coordinates (x, y), (height, width, 3).
-    x, y and light: tan from the principal point."""
+    """Return the light (height, width, 3), at image coordinates (x, y), of a streak and its fainter mirror image.
+
+    x, y (height, width each) and light: tangents from the principal point.
+    """
     cosine, sine = math.cos(math.radians(settings.turn)), math.sin(math.radians(settings.turn))
     total = np.zeros(x.shape, np.float32)
     for position_factor, streak_gain in ((1.0, 1.0), (MIRROR_POSITION, settings.mirror)):

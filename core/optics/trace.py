@@ -33,9 +33,12 @@ FIELDS = 10
 def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating: float) -> float:
     """Return the unpolarised reflectance of light that comes from n0 and meets n2; 1 for total reflection.
 
+    By Fresnel's equations for one thin film: R = |(r01 + r12 e^{i d}) / (1 + r01 r12 e^{i d})|^2 for each polarisation,
+    with r01 and r12 the amplitudes reflected at the layer's two sides and d the phase gained in it. The layer has the
+    index that reflects least, sqrt(n0 n2), but at least that of magnesium fluoride.
+
     cosine: of the angle of incidence. coating: wavelength (micrometres) for which the layer is a quarter wave thick; 0
-    for bare glass. The layer has the index that reflects least, but no lower one than magnesium fluoride's.
-    One thin film: R = |(r01 + r12 e^{i d}) / (1 + r01 r12 e^{i d})|^2 for each polarisation.
+    for bare glass.
     """
     sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
     s2 = sine * n0 / n2
@@ -72,9 +75,11 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
               out: Array) -> bool:
     """Trace one ray that meets the plane z = 0 at (x, y), from a light at tan(field angle) = `slope` along +x.
 
-    first < second: the pair of surfaces that reflects; both -1 for none. The arrays describe the surfaces, as in
-    `Prescription`; coating, wavelength: see `reflectance`; stop: index of the stop; sensor: its z. Returns False where
-    the ray misses a surface or is reflected totally. `out` (FIELDS,) receives the result."""
+    Returns False if the ray misses a surface or is reflected totally; else `out` (FIELDS,) receives the result. first <
+    second: the pair of surfaces that reflects; both -1 for none. curvature, vertices, index, semi_aperture (n,): those
+    of the surfaces, as a `Prescription` has them. coating (n,): wavelength, micrometres, for which a surface's layer is
+    a quarter wave thick, 0 for bare glass. stop: index of the stop. sensor: z of the sensor. wavelength: of the light,
+    micrometres."""
     slope_norm = math.sqrt(1.0 + slope * slope)
     dx, dy, dz = -slope / slope_norm, 0.0, 1.0 / slope_norm
     px, py, pz = x, y, 0.0
@@ -83,7 +88,7 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
     surface, direction, reflections = 0, 1, 0
     while surface < count:
         c, z0 = curvature[surface], vertices[surface]
-        # Meet the sphere (or plane, c = 0): a t^2 - 2 b t + k = 0, the root nearest to the vertex.
+        # The ray meets the sphere (or plane, c = 0) at distance t: a t^2 - 2 b t + k = 0, the root nearest the vertex.
         oz = pz - z0
         a = c
         b = dz - c * (px * dx + py * dy + oz * dz)
@@ -108,7 +113,7 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
         index_before = index[surface - 1] if surface > 0 else 1.0
         index_after = index[surface]
         n0, n2 = (index_before, index_after) if direction > 0 else (index_after, index_before)
-        # The normal, turned along the ray.
+        # The surface's normal, on the side to which the ray travels.
         nx, ny, nz = -c * px, -c * py, 1.0 - c * (pz - z0)
         cosine = nx * dx + ny * dy + nz * dz
         if cosine < 0.0:
@@ -147,9 +152,10 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
 def trace_grid(xs: Array, ys: Array, slope: float, first: int, second: int, curvature: Array, vertices: Array,
                index: Array, semi_aperture: Array, coating: Array, stop: int, sensor: float,
                wavelength: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Trace a ray through each point of the grid xs x ys on the plane z = 0; see `trace_ray` for the other arguments.
+    """Trace a ray through each point of the grid xs x ys on the plane z = 0.
 
-    Returns the rays (rows, columns, FIELDS), and which of them reach the sensor.
+    Returns the rays (rows, columns, FIELDS), and which (rows, columns) reach the sensor. The other arguments are those
+    of `trace_ray`.
     """
     rays = np.zeros((ys.shape[0], xs.shape[0], FIELDS))
     arrived = np.zeros((ys.shape[0], xs.shape[0]), np.bool_)

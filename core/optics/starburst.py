@@ -88,16 +88,18 @@ class Streak:
 
 @lru_cache(maxsize=8)
 def starburst_texture(aperture: Aperture, settings: Starburst) -> Pixels:
-    """Return the starburst's texture (TEXTURE_SIZE, TEXTURE_SIZE, 3), which spans -extent..extent (tan) along both
-    axes.
+    """Return the starburst's texture (TEXTURE_SIZE, TEXTURE_SIZE, 3), spanning -extent..extent (tan) on both axes.
 
     It is the Fraunhofer diffraction of the stop, the squared magnitude of its Fourier transform, scaled by wavelength
     and summed over the spectrum; then blurred, faded at the edge and softly limited to `settings.peak`.
-    """ stop = transmission(aperture, TEXTURE_SIZE, 0.25)  # the empty margin about the stop makes the pattern's samples
-    finer power = np.abs(np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(stop)))) ** 2 power = (power / stop.sum() **
-    2).astype(np.float32) texture = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE, 3), np.float32) centre = TEXTURE_SIZE // 2
-    rows, columns = np.mgrid[:TEXTURE_SIZE, :TEXTURE_SIZE].astype(np.float32) - centre for wavelength, share in
-    zip(wavelengths(BANDS), responses(BANDS), strict=True):
+    """
+    stop = transmission(aperture, TEXTURE_SIZE, 0.25)  # the margin makes the pattern's samples finer
+    power = np.abs(np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(stop)))) ** 2
+    power = (power / stop.sum() ** 2).astype(np.float32)
+    texture = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE, 3), np.float32)
+    centre = TEXTURE_SIZE // 2
+    rows, columns = np.mgrid[:TEXTURE_SIZE, :TEXTURE_SIZE].astype(np.float32) - centre
+    for wavelength, share in zip(wavelengths(BANDS), responses(BANDS), strict=True):
         scale = np.float32(REFERENCE_WAVELENGTH / wavelength)
         # A pattern that is wider by 1 / scale is fainter by scale^2: its light stays the same.
         scaled_power = cv2.remap(power, columns * scale + centre, rows * scale + centre, cv2.INTER_LINEAR)

@@ -95,7 +95,7 @@ class Format(NamedTuple):
     name: str
     folder: Path
     file: str
-    read_look: Callable[[Path], Any]
+    read: Callable[[Path], Any]
 
 
 def formats(base: Path) -> list[Format]:

@@ -82,7 +82,8 @@ def camera_to_world(matrix: Any) -> Floats:
 def core_camera(data: Any, matrix: Any, render: Any) -> Camera:
     """Return the core's camera for a Blender camera (its evaluated data and matrix_world), in Blender's world.
 
-    Raises CaptureError as `intrinsics_of` does, and for a camera that is scaled to zero or not at a finite position.
+    Raises CaptureError for a camera that is not a perspective camera, is scaled to zero, or is not at a finite
+    position.
     """
     fx, fy, cx, cy = intrinsics_of(data, render)
     width, height = render_size(render)

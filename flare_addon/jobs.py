@@ -185,7 +185,7 @@ class Job:
             self.error = str(event["text"])
 
     def _is_alive(self) -> bool:
-        """Return whether the process of the job is running; for another machine, whether its events let it seem so."""
+        """Return whether the process of the job is running; on another machine this is judged by its events."""
         if self._process is not None:
             return self._process.poll() is None
         if self.origin.host != HOST:

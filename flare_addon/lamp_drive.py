@@ -139,7 +139,7 @@ def _cosine(rotation: Any, offset: Any) -> float:
 def dark_reason(scene: Any, depsgraph: Any, item: Any, rendered: set[Any] | None = None) -> str:
     """Return why a flare is dark at the current frame by its switches, and what to do; "" where it is not.
 
-    rendered: the `rendered_collections`, where they are known.
+    rendered: the collections that renders show; None to find them here.
     """
     target = item.target
     rendered = rendered_collections(scene) if rendered is None else rendered

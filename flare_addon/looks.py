@@ -225,8 +225,8 @@ def add_flare(scene: Any, target: Any, source: str) -> Any:
 
 
 def _sync_elements(item: Any, look: Look, light: LightLook) -> None:
-    """Update the elements of a flare to those of its look's light; elements that stay keep their sliders, others start
-    with the edits in the look's file."""
+    """Give a flare the elements of its look's light; elements that it had keep their sliders, new ones start with the
+    edits in the look's file."""
     kinds = {element.name: element.kind for element in light.elements}
     for index in reversed(range(len(item.elements))):
         if item.elements[index].name not in kinds:
@@ -281,7 +281,7 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
 
     Raises CaptureError where the light's object is disabled, so that its place is unknown, unless its flare is dark.
     camera: matrix_world of the camera. to_capture: matrix (4, 4) from Blender's world to the coordinates of the result.
-    item: the flare. hides: whether objects hide the light. rendered: `lamp_drive.rendered_collections` of the scene.
+    item: the flare. hides: whether objects hide the light. rendered: the collections that renders show.
     """
     eye, target = camera.translation, item.target
     is_dark = item.follow_visibility and not lamp_drive.is_visible(target, depsgraph, rendered)

@@ -14,7 +14,7 @@ from .paths import is_folder
 
 
 def draw_switches(column: Any, scene: Any, item: Any) -> None:
-    """Draw what a flare follows of its light object, and why it is dark where its switches make it so."""
+    """Draw the switches for what a flare follows of its light object, and why it is dark if they make it so."""
     if item.target is None:
         return
     if lamp_drive.is_lamp(item.target):

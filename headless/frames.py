@@ -35,7 +35,8 @@ def select(known: Sequence[NumberedFrame], text: str | None, progress: Progress)
 def select_task(known: Sequence[NumberedFrame], args: argparse.Namespace, progress: Progress) -> list[NumberedFrame]:
     """Return the frames of `known` for --frames and --job-frames (`select_task_frames`), and report missing numbers.
 
-    Empty, with a line, where the task has nothing to do. Raises SettingsError where none of the job's frames exists.
+    Empty where the task has nothing to do, which is reported too. Raises SettingsError where none of the job's frames
+    exists.
     """
     frames = select_task_frames(known, args.frames, args.job_frames)
     _report_missing(known, args.frames, progress)

@@ -74,7 +74,7 @@ class LayerFolder:
                              "Blender shows these in other places; bake or transfer them again.")
 
     def window(self, number: int | None = None) -> DataWindow:
-        """Return where the pixels of a frame, of the first by default, lie, from its header."""
+        """Return the data window of a frame, by default of the first, from its header: where its pixels lie."""
         path = self.files[self.first if number is None else number]
         with open_regular(path) as stream:
             corners = exr_header.window_corners(stream)

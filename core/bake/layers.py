@@ -66,8 +66,8 @@ class FrameLayers:
     def channels(self) -> dict[str, Pixels]:
         """Return (h, w) by channel name, for one EXR part; at most one dot in a name.
 
-        Blender files `flare.lamp.R` under a layer that cannot be chosen again, so a light's layer is `flare_lamp.R`,
-        with the light's name made safe by `layer_names`.
+        Blender would sort a channel `flare.lamp.R` into a layer that nodes cannot choose again, so a light's channels
+        are named `flare_lamp.R`, with the light's name made safe by `layer_names`.
         """
         channels: dict[str, Pixels] = {}
         alpha, flare = np.ones_like(self.scene[..., 0]) if self.alpha is None else self.alpha, self.flare
@@ -89,7 +89,8 @@ def _add_channels(channels: dict[str, Pixels], prefix: str, colour: Pixels, alph
 
 
 def _apply_colour(layer: Pixels, matrix: Any) -> Pixels:
-    """Return a layer (h, w, 3) under a colour matrix (3, 3); a pixel without negative channels gets none."""
+    """Return a layer (h, w, 3) under a colour matrix (3, 3); a pixel without negative light does not get
+    any."""
     matrix = np.asarray(matrix, np.float32)
     factors = matrix.diagonal()
     # A flare that covers something brighter has negative light, which is kept.

@@ -16,7 +16,7 @@ TITLES = ("frame", "composite", "scene", "flare")
 
 
 def contact_sheet(path: Path | str, rows: Iterable[tuple[str, Picture, FrameLayers]]) -> None:
-    """Write a PNG. rows: the view's name, its frame, its layers; all of one size."""
+    """Write the sheet as a PNG to `path`. rows: name, frame and layers of each view, all of one size."""
     strips = []
     for name, frame, layers in rows:
         linear = (layers.composite, layers.scene, layers.flare)

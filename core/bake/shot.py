@@ -41,7 +41,7 @@ class ShotRenderer(ShotSource):
         return self.shot.fingerprint(self.run.fingerprint if self.run is not None else "")
 
     def render(self, shot_frame: ShotFrame, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
-        """Render the layers of a frame, under its camera at the size of the layers."""
+        """Render the layers of a frame. camera: the frame's, at the size of the layers."""
         import torch
 
         placed = [self._occlude(light, camera) for light in shot_frame.lights]

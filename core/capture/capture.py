@@ -81,7 +81,7 @@ class Capture:
 
     def __init__(self, folder: Path, views: Sequence[View], points: PointCloud, lights: Sequence[Light] = (),
                  *, frames: dict[str, Path] | None = None, cache_bytes: int = 1 << 30) -> None:
-        """frames: the file of each view by name; without it the capture has no pictures."""
+        """frames: the file of each view by name. Also finds the pictures in removed/, truth/ and masks/ of `folder`."""
         self.folder = folder
         self.views = tuple(views)
         self.points = points

@@ -283,7 +283,7 @@ _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
 def _read_images_bin(file: _ByteReader) -> list[Image]:
-    """Read an images.bin. Raises CaptureError."""
+    """Return the images of an images.bin. Raises CaptureError."""
     images: list[Image] = []
     for _ in range(file.read_count(73)):  # bytes of an image without its name and observations
         _, *pose, camera_id = file.unpack("idddddddi")
@@ -296,7 +296,7 @@ def _read_images_bin(file: _ByteReader) -> list[Image]:
 
 
 def _read_images_txt(path: Path, lines: list[str]) -> list[Image]:
-    """Read an images.txt: for each image its line, and the line of its 2D points, which may be empty or missing.
+    """Return the images of an images.txt, which has a line for each image and a line of its 2D points, perhaps missing.
 
     Raises CaptureError.
     """
@@ -375,7 +375,7 @@ _TRACK_LENGTH = struct.Struct("<Q")
 
 
 def _read_points_bin(file: _ByteReader) -> Steps[Points]:
-    """Read a points3D.bin, in steps. Raises CaptureError.
+    """Return the points of a points3D.bin and their ids, in steps (a generator). Raises CaptureError.
 
     A point's track has any length, so a first pass finds the byte where each point starts; a second pass reads the
     points in blocks.
@@ -402,7 +402,7 @@ def _read_points_bin(file: _ByteReader) -> Steps[Points]:
 
 
 def _read_points_txt(path: Path, lines: list[str]) -> Points:
-    """Read a points3D.txt. Raises CaptureError."""
+    """Return the points of a points3D.txt and their ids. Raises CaptureError."""
     values, rgb, point_ids = [], [], []
     for line_number, line in _data_lines(lines):
         fields = line.split(maxsplit=8)

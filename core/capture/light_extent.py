@@ -119,7 +119,7 @@ class LightExtent:
 
     @classmethod
     def from_json(cls, entry: Any) -> LightExtent:
-        """Read the JSON form. Raises ValueError that says what is wrong."""
+        """Read an extent from its JSON form, as in the module's head. Raises ValueError that says what is wrong."""
         if not isinstance(entry, Mapping) or entry.get("shape") not in get_args(Shape):
             raise ValueError(f"the extent of a light needs a shape: {', '.join(get_args(Shape))}")
         if not isinstance(entry.get("one_sided", False), bool):

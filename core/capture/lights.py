@@ -82,8 +82,8 @@ class Light:
 
     @property
     def numbers(self) -> list[Any]:
-        """All values as plain data, [name, [x, y, z]] for a light that does not move; they change whenever the light
-        does."""
+        """All values of the light as plain data, for comparisons and hashes: [name, [x, y, z]] for a light at one
+        place, with further values for any other."""
         plain: list[Any] = [self.name, None if self.moves else self.xyz.tolist()]
         if self.xy is not None:
             plain.append(self.xy.tolist())

@@ -254,7 +254,7 @@ class _CameraNode:
 
 
 def _compose_pose(translation: Sequence[float], degrees: Sequence[float], order: str) -> Floats:
-    """Return camera to world (4, 4); the rotations are about the axes of `order`, the first one first."""
+    """Return camera to world (4, 4); the rotations, in degrees about x, y and z, apply in `order`."""
     pose = np.eye(4)
     for axis in order:  # each turns from the axis after it to the next one: y to z about x
         index = "XYZ".index(axis)

@@ -168,7 +168,7 @@ def _split_at_valleys(mu: Floats, energy: Floats) -> list[NDArray[np.int64]]:
 
 def _merge_faint(groups: list[tuple[str, NDArray[np.int64]]], energy: Floats,
                  mu: Floats | None) -> list[tuple[str, NDArray[np.int64]]]:
-    """Merge the faintest group, again and again, into the nearest of its kind, or of any kind if it is the last of its.
+    """Merge the faintest group into the nearest group on the line, of its own kind if there is one; repeat.
 
     groups: kind and rows of each. energy, mu (n,): light of each Gaussian, and place on the line. Ends with at most
     MAX_ELEMENTS groups, each with MIN_ELEMENT_ENERGY of the light's energy or more."""

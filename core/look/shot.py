@@ -102,7 +102,7 @@ class Shot:
         return digest.hexdigest()[:16]
 
     def write(self, path: Path | str) -> None:
-        """Write a JSON file for `read`."""
+        """Write the shot as the JSON file that `read` reads."""
         frames = [{"frame": frame.frame, "name": frame.name, "width": frame.camera.width, "height": frame.camera.height,
                    "intrinsics": [frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy],
                    "world_to_camera": frame.camera.world_to_camera.tolist(), "exposure": frame.camera.exposure,

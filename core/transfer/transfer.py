@@ -95,7 +95,8 @@ class Transfer:
 
     @cached_property
     def fingerprint(self) -> str:
-        """A hash that changes whenever all pictures would; a frame renderer's fingerprint covers the single frame."""
+        """A hash of what all frames share: the .flare, the target's scene and the settings. `frame_fingerprint` covers
+        the rest."""
         digest = hashlib.sha256(read_bytes(self.flare))
         digest.update(self.target.fingerprint().encode())
         space_fingerprint = self.plate_space.fingerprint if self.plate_space is not None else ""

@@ -379,7 +379,7 @@ def remove_nodes(scene: Any) -> None:
 def _restore_tree(scene: Any, tree: Any, state: dict[str, Any]) -> None:
     """Restore the compositor tree of the scene, from which our nodes were removed. state: from before the set-up.
 
-    A tree that we made is discarded unless the artist added nodes; one of the artist loses the output that we added.
+    A tree that we made is discarded unless the artist added nodes; an artist's tree loses the output that we added.
     """
     if not state["tree"] and all(node.bl_idname in _ENDS or node.name == RENDER for node in tree.nodes):
         trees.discard_tree(scene, tree, bool(state["use_nodes"]))

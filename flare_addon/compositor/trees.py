@@ -62,7 +62,7 @@ def replace_tree(scene: Any, tree: Any) -> Any:
 def new_tree(scene: Any) -> Any:
     """Give a scene without a compositor tree an empty one; return it.
 
-    In an earlier Blender a tree that was switched off keeps its nodes.
+    Until Blender 4.5, a tree that was switched off is switched on and keeps its nodes.
     """
     if GROUPS_ARE_TREES:
         return replace_tree(scene, bpy.data.node_groups.new("Compositor", "CompositorNodeTree"))
@@ -74,7 +74,7 @@ def new_tree(scene: Any) -> Any:
 
 
 def discard_tree(scene: Any, tree: Any, use_nodes: bool) -> None:
-    """Remove the compositor tree of the scene, with its effect. use_nodes: state until 4.5."""
+    """Remove the compositor tree of the scene, with its effect. use_nodes: whether it was on (until 4.5)."""
     if not GROUPS_ARE_TREES:
         tree.nodes.clear()
         scene.use_nodes = use_nodes

@@ -209,7 +209,7 @@ class _JobReports:
 def _set_up_after_bake(job: jobs.Job, scene: Any) -> None:
     """Set the compositor of a scene up for new layers, if the panel says so.
 
-    One that is set up already stays as it is, unless the bake was to set it up anew.
+    A compositor that is set up already stays as it is, unless the bake was started to set it up again.
     """
     state, set_up_again = scene.fit_flare, scene.name in _scenes_to_set_up
     _scenes_to_set_up.discard(scene.name)

@@ -190,8 +190,8 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> None:
         """Place a light on the surface at (x, y) of the picture, or at a distance where there is none.
 
-        It is the new light of Add Flare. Where there is none, a light is added for the first flare without a light
-        object, or for a new flare.
+        The new light that Add Flare made is moved there, if it was not placed yet. Else a light is added, for the first
+        flare without a light object or for a new flare.
         """
         scene = context.scene
         depsgraph = context.evaluated_depsgraph_get()

@@ -174,7 +174,7 @@ def default_mode(capture: Capture, frozen: bool, progress: Progress) -> Mode:
 def resolve_folders(args: argparse.Namespace) -> tuple[Path, Path]:
     """Return the folders of the capture and of the run. Raises SettingsError.
 
-    With --list the run is called after its capture, with the number of its entry before where names are equal.
+    With --list the run has the name of its capture, after the number of its entry where several have that name.
     """
     if args.list_file is None:
         if args.capture is None:

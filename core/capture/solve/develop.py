@@ -61,8 +61,10 @@ def write_capture(sources: Sequence[SourceFrame], solved: Solved, out: Path, wor
 
 
 def _file_names(sources: Sequence[SourceFrame]) -> list[str]:
-    """Name each frame by its file, with the suffix of a lossless format that holds its light. Unique on any file
-    system."""
+    """Return a name for each frame: that of its file, with the suffix of a lossless format that can hold its light.
+
+    The names differ even without regard to case.
+    """
     names: list[str] = []
     used: set[str] = set()
     for source in sources:

@@ -114,7 +114,7 @@ def solve(sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, v
 
 def _solve(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, settings: SolveSettings, video: bool,
            progress: Progress) -> Solved:
-    """Carry out `solve`, with pycolmap's errors as they are raised."""
+    """Carry out `solve`; errors of pycolmap are raised as they are, and `solve` converts them."""
     database = work / DATABASE
     _check_frames_differ(sources, work)
     _extract_features(pycolmap, sources, work, database, settings, progress)
@@ -137,7 +137,7 @@ def _solve(pycolmap: Any, sources: Sequence[SourceFrame], work: Path, settings: 
 
 @contextlib.contextmanager
 def _report_library_errors(work: Path, progress: Progress) -> Iterator[None]:
-    """Raise CaptureError in place of what pycolmap raises, which is RuntimeError or ValueError with a line of C++.
+    """Raise CaptureError in place of pycolmap's errors: RuntimeError, or ValueError whose message names a line of C++.
 
     Errors of Python code and lack of memory pass unchanged.
     """
@@ -191,7 +191,7 @@ def load_pycolmap() -> Any:
 
 
 def _check_frames_differ(sources: Sequence[SourceFrame], work: Path) -> None:
-    """Raise CaptureError where every frame shows the same, by thumbnails of 64 x 64 pixels."""
+    """Raise CaptureError where all frames are equal, compared as thumbnails of 64 x 64 pixels."""
     import cv2
 
     first: Any = None

@@ -42,8 +42,8 @@ def choose_pairs(matching: Matching, frames: int, descriptors: Callable[[int], N
     """Return pairs (i, j), i < j, of frame indices below `frames`, in an order that is fast to match.
 
     "sequential" pairs each frame with its neighbours and, to close loops, with the 5 most similar frames farther away.
-    "similar" pairs it with the 24 most similar frames, and with the next two, as many folders are in the order of
-    filming. `descriptors(i)` gives the SIFT descriptors (n, 128) of a frame; called only where needed.
+    "similar" pairs each frame with the 24 most similar frames, and with the next two, since many folders are in the
+    order of filming. `descriptors(i)` gives the SIFT descriptors (n, 128) of a frame; called only where needed.
     """
     if matching == "exhaustive":
         pairs = {(i, j) for i in range(frames) for j in range(i + 1, frames)}

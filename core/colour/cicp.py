@@ -29,7 +29,7 @@ def space_of_code_points(primaries: int, transfer: int) -> ColourSpace | None:
         return None
     if transfer in (PQ, HLG):
         base = colour_space("pq" if transfer == PQ else "hlg")
-        if chromaticities == REC_2020 or transfer == HLG:  # HLG decodes with the luminance of Rec. 2020 alone
+        if chromaticities == REC_2020 or transfer == HLG:  # HLG needs Rec. 2020, by whose luminance it decodes
             return base
         return curved_space("pq of other primaries", light_from_pq, pq_from_light, chromaticities, has_headroom=True)
     if transfer == 8:  # linear

@@ -43,7 +43,7 @@ def space_of_profile(profile: bytes) -> ColourSpace:
         if space is not None:
             return space
     name = _read_description(tags)
-    data_space = profile[16:20]  # of the header
+    data_space = profile[16:20]  # field of the header: what the profile is for
     if data_space == b"GRAY" and b"kTRC" in tags:
         return _make_space(name, np.eye(3), [_parse_curve(tags[b"kTRC"])] * 3)
     if data_space != b"RGB ":
@@ -68,7 +68,7 @@ def _make_space(name: str, matrix: NDArray[np.float64], curves: list[Table]) -> 
     if is_709 and np.abs(decoded - linear_from_srgb(ramp)).max() < SRGB_TOLERANCE:
         return colour_space("srgb")
     forward, inverse = matrix.T.astype(np.float32), np.linalg.inv(matrix).T.astype(np.float32)
-    increasing = [np.maximum.accumulate(channel) for channel in decoded]  # as the inverse by samples needs
+    increasing = [np.maximum.accumulate(channel) for channel in decoded]  # never decreasing, for the inverse
 
     def to_linear(pixels: NDArray[Any]) -> Pixels:
         clipped = np.clip(np.asarray(pixels, np.float32), 0, 1)
@@ -144,7 +144,7 @@ def _parse_curve(data: bytes) -> Table:
         if count == 0:
             return lambda x: np.asarray(x, np.float32)  # linear
         if count == 1:
-            return _power_function(float(values[0]) / 256)  # the exponent, with 8 bits behind the point
+            return _power_function(float(values[0]) / 256)  # the exponent, a fixed-point number with 8 fractional bits
         table, positions = values.astype(np.float64) / 65535, np.linspace(0, 1, count)
         return lambda x: np.interp(x, positions, table).astype(np.float32)
     if data[:4] == b"para" and len(data) >= 12:
@@ -170,7 +170,7 @@ def _parametric_function(function_type: int, parameters: list[float]) -> Table:
     function_type: the number of the function, 0..4. parameters: its parameters, in the order g, a, b, c, d, e, f.
     """
     g, a, b, c, d, e, f = (parameters + [0.0] * 7)[:7]
-    power = _power_function(g)  # checks the exponent too
+    power = _power_function(g)  # raises for an invalid exponent
     if function_type == 0:
         return power
     if a == 0:

@@ -54,7 +54,7 @@ def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
     check_regular(config_path)
     try:
         configuration = library.Config.CreateFromFile(config_path)
-    except Exception as problem:  # its own class, which exists only where it is installed
+    except Exception as problem:  # PyOpenColorIO's own class, unknown if it is not installed
         raise SettingsError(f"The OpenColorIO configuration {config_path} cannot be read ({_one_line(problem)}); "
                             "choose another file.") from problem
     space = configuration.getColorSpace(name)

@@ -110,7 +110,7 @@ def _count_leading_lines(read_line: Callable[[int], NDArray[Any]], positions: It
         pixels = read_line(position)
         if colour is None:
             colour = np.median(pixels, 0)
-            if not colour.max() <= MAX_BORDER_LEVEL:  # so written, NaN is no border
+            if not colour.max() <= MAX_BORDER_LEVEL:  # not `>`: so that NaN is no border
                 return 0
         difference = np.abs(pixels - colour).max(-1)
         if (difference <= LEVEL_TOLERANCE).mean() < MIN_EVEN_SHARE or not difference.max() <= 3 * LEVEL_TOLERANCE:

@@ -69,7 +69,7 @@ def _png_space(path: Path) -> ColourSpace | None:
     if len(code_points) == 4 and (space := space_of_code_points(code_points[0], code_points[1])) is not None:
         return space
     if b"iCCP" in chunks:
-        space = profile_space(path, _inflate(chunks[b"iCCP"].partition(b"\0")[2][1:]))  # behind name and method
+        space = profile_space(path, _inflate(chunks[b"iCCP"].partition(b"\0")[2][1:]))  # after name and method
         if space is not None:
             return space
     if b"sRGB" in chunks:

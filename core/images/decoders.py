@@ -99,7 +99,7 @@ def describe(path: Path, kind: Kind) -> Description:
             if _avif_orientation(picture) in SWAPS_SIDES:
                 width, height = height, width
             if not profile and (frame := _read_av1_frame(path)) is not None:
-                code_points = int(frame.raw.color_primaries), int(frame.raw.color_trc)  # Pillow does not give them
+                code_points = int(frame.raw.color_primaries), int(frame.raw.color_trc)  # Pillow gives none
         space = profile_space(path, profile) or (space_of_code_points(*code_points) if code_points else None)
         exif, xmp = (bytes(picture.info.get(name) or b"") for name in ("exif", "xmp"))
         # Orientation 1: `decode_foreign` turns these formats upright.
@@ -166,7 +166,7 @@ def profile_space(path: Path, profile: bytes) -> ColourSpace | None:
         return space_of_profile(profile)
     except UnreadableProfile as problem:
         if "damaged" in str(problem):
-            return None  # viewers ignore it likewise
+            return None  # viewers ignore a damaged profile too
         raise FrameError(f"{path} has a colour profile that {problem}; convert it to sRGB, or name its space with "
                          "--plate-space.") from problem
 
@@ -200,7 +200,7 @@ def open_oiio(path: Path) -> Any:
     oiio = _import_library("OpenImageIO", path)
     check_regular(path)
     _check_stated_size(path)
-    oiio.attribute("limits:imagesize_MB", 8192)  # MAX_PIXELS of four floats
+    oiio.attribute("limits:imagesize_MB", 8192)  # enough for MAX_PIXELS with four floats each
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
     image_input = oiio.ImageInput.open(str(path), settings)
@@ -251,7 +251,7 @@ def _check_stated_size(path: Path) -> None:
         return
     order: Literal["big", "little"] = "big" if head[:4] in _STATED_SIZES else "little"
     stated_size, user_data = (int.from_bytes(head[offset:offset + 4], order) for offset in offsets)
-    if size < stated_size < 0xFFFFFFFF or size < user_data < 0xFFFFFFFF:  # all bits set: not stated
+    if size < stated_size < 0xFFFFFFFF or size < user_data < 0xFFFFFFFF:  # a field with all bits set states nothing
         raise _damaged_error(path, f"it has {size} of {max(stated_size, user_data)} bytes")
 
 
@@ -342,7 +342,7 @@ def _open_by_pillow(path: Path, kind: Kind) -> Any:
     image.MAX_IMAGE_PIXELS = MAX_PIXELS  # type: ignore[attr-defined]  # Pillow refuses photographs of 200 megapixels
     try:
         return image.open(path)
-    except Exception as problem:  # the plug-ins raise what their libraries do; that of JPEG XL gives no reason
+    except Exception as problem:  # plug-ins raise any exception; JPEG XL's gives no reason
         is_vague = kind == "jxl" or isinstance(problem, image.UnidentifiedImageError)
         raise _damaged_error(path, "" if is_vague else problem) from problem
 

@@ -108,7 +108,7 @@ def non_utf8_names(path: Path | str) -> dict[bytes, bytes]:
         for part in {part for part, _, _ in locations}:
             stored = [name for number, _, name in locations if number == part]
             readable = [name if is_utf8(name) else _in_ascii(name) for name in stored]
-            # Two names have become one, or the ranks of the names differ.
+            # Two names have become one, or the sorted order has changed.
             if len(set(readable)) < len(set(stored)) or [sorted(stored).index(name) for name in stored] != [
                     sorted(readable).index(name) for name in readable]:
                 example = min(names.values()).decode("latin-1")

@@ -54,7 +54,7 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
     spec.set_format(types.get(codes.dtype.name, oiio.FLOAT))
     spec.channelformats = ()
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    if format_name == "dpx" and file_kind(source) == "cineon":  # whose codes are film density in 10 bits
+    if format_name == "dpx" and file_kind(source) == "cineon":  # a Cineon's codes are film density in 10 bits
         spec.attribute("dpx:Transfer", "Printing density")
         spec.attribute("oiio:BitsPerSample", 10)
     if format_name == "tiff":

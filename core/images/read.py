@@ -44,7 +44,7 @@ def read_picture(path: Path | str, *, space: ColourSpace | None = None, over_bla
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     if is_exr(path):
-        return _read_exr_picture(path, space)  # premultiplied, so over black already
+        return _read_exr_picture(path, space)  # an EXR is premultiplied, so it is over black already
     stored = read_stored_pixels(path)
     picture = _to_picture(path, stored, space)
     if not over_black or stored.ndim == 2 or stored.shape[2] < 4 or tiff.is_premultiplied(path):

@@ -274,7 +274,7 @@ class Video:
                 raise FrameError(f"{self.path} holds no video; give the file with the picture.")
             best = self._container.streams.best("video")
             self.stream: Any = best if best in streams else streams[0]
-            if self.stream.codec_context is None:  # no decoder
+            if self.stream.codec_context is None:  # FFmpeg has no decoder for the codec
                 raise self._unreadable_error()
             self._decoder = self._create_alpha_decoder() or self.stream.codec_context
             self._decoder.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
@@ -426,7 +426,7 @@ def _read_colour(path: Path, raw: Any, stream: Any) -> VideoColour:
     """
     context = stream.codec_context
 
-    def tag(frame_tag: int, container_tag: int) -> int:  # the frame's, unless only the container has one
+    def tag(frame_tag: int, container_tag: int) -> int:  # the frame's tag, or the container's if the frame has none
         return int(container_tag if frame_tag in (UNSPECIFIED, 0) and container_tag else frame_tag)
 
     matrix, transfer, primaries = (tag(*pair) for pair in (

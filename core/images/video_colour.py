@@ -92,7 +92,7 @@ class VideoColour:
         if dtype == np.uint8 and self.matrix == RGB:
             return planes.copy()  # `stack_planes` reuses their memory
         affine = np.concatenate([matrix, offset[:, None]], 1) * (max_code / self.signal_top)
-        if dtype == np.uint16 and planes.dtype == np.uint8:  # cv2.transform returns the type that it is given
+        if dtype == np.uint16 and planes.dtype == np.uint8:  # cv2.transform returns the type of its input
             planes = planes.astype(np.uint16)
         return np.asarray(cv2.transform(planes, affine.astype(np.float32)))
 
@@ -103,7 +103,7 @@ class VideoColour:
         if not self.is_light and not self.is_wide:
             return signal
         light = np.take(_light_table(self.transfer), signal)
-        if self.transfer == "HLG":  # its OOTF: scene's light times a power of its luminance gives the display's
+        if self.transfer == "HLG":  # OOTF: scene light times a power of its luminance is display light
             luminance = cv2.transform(light, _REC_2020_LUMINANCE[None])
             light *= np.power(luminance, np.float32(HLG_GAMMA - 1))[..., None]
             light *= np.float32(HLG_PEAK_NITS / REFERENCE_WHITE_NITS)

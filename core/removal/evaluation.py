@@ -163,7 +163,7 @@ def _score_picture(picture: Pixels, truth: Pixels, mask: Pixels | None,
     mask: display values (height, width, 3); masked_psnr is over the pixels with a channel above 0.5. None: no such
     score.
     """
-    small = min(picture.shape[:2]) < 11  # the side of SSIM's window
+    small = min(picture.shape[:2]) < 11  # SSIM's window does not fit
     scores: Scores = {"psnr": psnr(picture, truth), "ssim": None if small else ssim(picture, truth),
                       "lpips": lpips(picture, truth) if lpips else None, "flip": flip(picture, truth)}
     if mask is not None:

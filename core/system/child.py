@@ -44,7 +44,7 @@ def run_in_child(function: Callable[..., Any], *args: Any, progress: Progress) -
     function: defined at the top level of a module, so that the child can import it. Raises what the function and
     `progress` raise, and ChildDied where the child dies, for instance because a library aborts it.
     """
-    search_path = [*([] if _PACKAGE else [str(_ROOT)]), *filter(None, sys.path)]  # "" would be the working folder
+    search_path = [*([] if _PACKAGE else [str(_ROOT)]), *filter(None, sys.path)]  # "" is the working folder
     code = _START.format(path=search_path, package=_PACKAGE, root=str(_ROOT), module=__name__)
     with subprocess.Popen([sys.executable, "-I", "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                           stderr=subprocess.DEVNULL, env=child_environment(), **new_process_group()) as process:
@@ -81,7 +81,7 @@ def _exchange_messages(to_child: IO[bytes], from_child: IO[bytes], call: tuple[C
             if progress_error is None:
                 name, args, figures = message
                 getattr(progress, name)(*args, **figures)
-        except BaseException as problem:  # the child has to end its work first
+        except BaseException as problem:  # raised when the child has ended its work
             progress_error = problem
         _send(to_child, progress_error is None)
 
@@ -123,10 +123,10 @@ class _ChildProgress(Progress):
 
 def serve() -> None:
     """Run the call that the parent sends; the child's main function."""
-    for name in ("SIGINT", "SIGHUP", "SIGBREAK"):  # the parent decides
+    for name in ("SIGINT", "SIGHUP", "SIGBREAK"):  # only the parent reacts to these signals
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
-    # The messages keep their own descriptors; what libraries read and print at 0 and 1 goes nowhere.
+    # Messages get descriptors of their own; 0 and 1, which libraries read and print to, become the null device.
     from_parent, to_parent = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     null_device = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1):
@@ -140,7 +140,7 @@ def serve() -> None:
         answer = ("raised", problem)
     try:
         data = pickle.dumps(answer)
-    except Exception:  # an exception of a library that cannot be pickled
+    except Exception:  # the exception cannot be pickled
         data = pickle.dumps(("raised", RuntimeError(f"{type(answer[1]).__name__}: {answer[1]}")))
     to_parent.write(data)
     to_parent.flush()

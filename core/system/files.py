@@ -56,7 +56,7 @@ def atomic_path(target: Path | str,
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    check_regular(target)  # a pipe or device of that name is somebody's
+    check_regular(target)  # do not replace a pipe or a device
     remove_partials_of(target)
     temporary = target
     try:
@@ -223,7 +223,7 @@ def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
                     with file_lock(lock.with_name(lock.name + ".taken_over"), stale_s):  # one process takes it over
                         _remove_lock(lock, status.st_mtime_ns)
             except FileNotFoundError:
-                # Windows refuses while another process removes it; a folder that is not writable refuses for ever.
+                # Windows refuses while another process removes the lock; an unwritable folder refuses for ever.
                 refusals += isinstance(problem, PermissionError)
                 if refusals > _MAX_REFUSALS:
                     raise problem from None
@@ -232,7 +232,7 @@ def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
     finally:
         try:
             retry_while_locked(_remove_lock, lock, created_ns)
-        except OSError:  # the work is done; an old lock is taken over at once
+        except OSError:  # the block is done; age the lock, so that it is taken over at once
             with contextlib.suppress(OSError):
                 os.utime(lock, (0, 0))
 

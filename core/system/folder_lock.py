@@ -49,10 +49,10 @@ def _open_locked(lock: Path) -> int | None:
         descriptor = os.open(lock, os.O_CREAT | os.O_RDWR)
         try:
             _lock(descriptor)
-            # The lock counts only while its file still has this name.
+            # Its last holder may have removed this file before it was locked; then try again with a new one.
             if os.path.samestat(os.fstat(descriptor), lock.stat()):
                 return descriptor
-        except FileNotFoundError:  # its holder has removed it meanwhile
+        except FileNotFoundError:  # its holder removed the file in between: try again
             pass
         except OSError as problem:
             if problem.errno not in _ALREADY_LOCKED:

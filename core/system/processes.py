@@ -48,7 +48,7 @@ def _is_base_missing(python: Path) -> bool:
     """
     try:
         config = (python.parent.parent / "pyvenv.cfg").read_text(encoding="utf-8", errors="replace")
-    except OSError:  # it is its own base
+    except OSError:  # no virtual environment: python.exe is the interpreter itself
         return False
     home = re.search(r"^home\s*=\s*(.+?)\s*$", config, re.MULTILINE)
     return home is not None and not Path(home[1], "python.exe").is_file()
@@ -74,7 +74,7 @@ def machine_id() -> str:
     systems get no such file, since their machines may share a user's folder.
     """
     if sys.platform == "darwin":
-        with contextlib.suppress(OSError, RuntimeError, ValueError):  # of a user without a home, too
+        with contextlib.suppress(OSError, RuntimeError, ValueError):  # RuntimeError: the user has no home
             return _read_or_create_id(Path.home() / "Library" / "Application Support" / "fit_flare" / "machine")
     return platform.node()
 

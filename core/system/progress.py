@@ -214,7 +214,7 @@ class TerminalProgress(Progress):
         self._reported = self._done
 
     def say(self, text: str) -> None:
-        if self._bar is not None and self._done >= self._total:  # a full bar stays above the text
+        if self._bar is not None and self._done >= self._total:  # leave a finished bar above the text
             self.close()
         elif self._bar is not None:
             self._bar.clear()

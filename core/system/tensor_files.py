@@ -17,7 +17,7 @@ def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], metadata: Map
     from safetensors.torch import save
 
     with atomic_path(path) as temporary:
-        # As bytes: the writer of safetensors makes a temporary file of another name, which a kill would leave behind.
+        # Encode in memory: safetensors' own writer makes a temporary file, which would stay after a kill.
         data = save({name: value.cpu().contiguous() for name, value in tensors.items()}, dict(metadata))
         temporary.write_bytes(_with_sorted_metadata(data))
 
@@ -46,5 +46,5 @@ def read_tensors(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
         with safe_open(str(path), "pt") as file:
             return ({name: file.get_tensor(name).clone() for name in file.keys()},  # noqa: SIM118 - not a mapping
                     dict(file.metadata() or {}))
-    except (SafetensorError, UnicodeError) as problem:  # of a path that is not UTF-8, too
+    except (SafetensorError, UnicodeError) as problem:  # UnicodeError: a path that is not UTF-8
         raise ValueError(str(problem)) from problem

@@ -92,7 +92,7 @@ def without_thumbnail(block: bytes) -> bytes:
     tags = tiff.integer_values(tiff.read_tags(io.BytesIO(block), (_THUMBNAIL, _THUMBNAIL_LENGTH), second_directory))
     start = tags.get(_THUMBNAIL, 0)
     end = start + tags.get(_THUMBNAIL_LENGTH, 0)
-    if start >= link + 4 and end <= len(block):  # else a damaged tag would have the first directory overwritten
+    if start >= link + 4 and end <= len(block):  # guards the first directory against a damaged tag
         changed[start:end] = b"" if end == len(block) else bytes(end - start)
     return bytes(changed)
 

@@ -13,7 +13,7 @@ def without_thumbnails(resources: bytes) -> bytes:
     """Return image resources without thumbnails; what cannot be parsed stays byte for byte."""
     others, offset = [], 0
     while resources[offset:offset + 4] in _SIGNATURES and len(resources) >= offset + 12:
-        length_offset = offset + 7 + resources[offset + 6]  # the name has a byte of length, and an even size in all
+        length_offset = offset + 7 + resources[offset + 6]  # after the name, padded to an even size
         length_offset += (length_offset - offset) % 2
         length = int.from_bytes(resources[length_offset:length_offset + 4], "big")
         end = length_offset + 4 + length + length % 2

@@ -37,7 +37,7 @@ def is_truncated(data: bytes) -> bool:
         next_offset = offset + 12 + int.from_bytes(data[offset:offset + 4], "big")
         if next_offset > end:
             return True
-        if data[offset + 4:offset + 8] == b"IEND":  # what follows is no part of it
+        if data[offset + 4:offset + 8] == b"IEND":  # what follows is not part of the PNG
             return False
         offset = next_offset
     return False

@@ -107,9 +107,9 @@ def read_tags(stream: BinaryIO, numbers: Container[int], directory_offset: int |
         value_type = np.dtype(types[kind]).newbyteorder(layout.order)
         length = count * value_type.itemsize * (2 if kind in _RATIONALS else 1)
         raw = entry[layout.value_position:][:length]
-        if length > layout.entry_size - layout.value_position:  # then the field holds the offset of the values
+        if length > layout.entry_size - layout.value_position:  # the field holds the offset of the values
             start = layout.number(entry[layout.value_position:])
-            if start + length > stream.seek(0, io.SEEK_END):  # reading asks for all the memory that is claimed
+            if start + length > stream.seek(0, io.SEEK_END):  # else `read` would allocate what it claims
                 continue
             stream.seek(start)
             raw = stream.read(length)

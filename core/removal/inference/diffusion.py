@@ -131,7 +131,7 @@ class DiffusionRemoval(nn.Module):
         x = encoder.conv_out(encoder.conv_act(encoder.conv_norm_out(encoder.mid_block(x))))
         if self.vae.quant_conv is not None:
             x = self.vae.quant_conv(x)
-        # The first half of the channels is the mean of the latents, the second their variance.
+        # The first half of the channels is the mean of the latents, the second their log variance.
         return x.chunk(2, 1)[0] * self.vae.config.scaling_factor, features
 
     def _decode(self, latents: Tensor, features: list[Tensor]) -> Tensor:

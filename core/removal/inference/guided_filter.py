@@ -56,7 +56,7 @@ def fit_guided_filter(display: Pixels, flare: Pixels) -> GuidedFilterMaps:
     def mean(values: Pixels) -> Pixels:
         return np.asarray(cv2.blur(values, window, borderType=cv2.BORDER_REFLECT), np.float32)
 
-    clipped_reach = (4 * RADIUS + 1, 4 * RADIUS + 1)  # as far as a clipped pixel affects the two means
+    clipped_reach = (4 * RADIUS + 1, 4 * RADIUS + 1)  # the pixels that a clipped pixel affects through two means
     # guidance: share of the guided filter in the result, 0..1; it falls off smoothly around clipped pixels.
     clipped = cv2.dilate((display.max(-1) > CLIPPING_LEVEL).astype(np.uint8), np.ones(clipped_reach, np.uint8))
     guidance = mean(clipped.astype(np.float32))[..., None]

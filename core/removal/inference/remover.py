@@ -156,7 +156,7 @@ class Remover:
             light = np.where(alpha[..., None] > 0, light, 0)  # codes under alpha 0 are arbitrary, and stay
         written_flare = np.minimum(plate.light_in_plate_primaries(light), MAX_FLOAT16)
         if alpha is not None:
-            written_flare = written_flare * alpha[..., None]  # as much as a composite of the plate shows
+            written_flare = written_flare * alpha[..., None]  # as much as shows when the plate is composited
         return plate.without_light(light), written_flare.astype(np.float16)
 
     def clean_display(self, display: Pixels) -> Pixels:

@@ -77,7 +77,7 @@ def collect_with_neighbours(inputs: Sequence[Path], exclude: Iterable[Path | Non
     plates = dict.fromkeys(path for path, _ in collect_plates(inputs, excluded_inputs))
     for folder in dict.fromkeys(item.parent for item in inputs if not item.is_dir()):
         excluded_paths = _excluded_paths(folder, excluded_inputs)
-        with contextlib.suppress(OSError):  # a plate may be readable in a folder that is not
+        with contextlib.suppress(OSError):  # the folder cannot be listed, but its plate may be readable
             plates.update(dict.fromkeys(path for path in pictures_in(folder) if path.resolve() not in excluded_paths))
     return list(plates)
 
@@ -227,7 +227,7 @@ def _raise_if_fatal(error: Exception, manifest: Manifest, folder: Path) -> None:
     if not is_plate_error(error):
         raise error
     if isinstance(error, OSError) and error.errno in DISK_FULL:
-        raise error  # no later frame would fit either
+        raise error  # the disk is full, so every later frame would fail too
     if isinstance(error, OSError) and manifest.is_write_error(error):
         raise FrameError(f"{folder} cannot be written to ({error.strerror}); choose another folder for the clean "
                          "frames, or get write permission for this one.") from error

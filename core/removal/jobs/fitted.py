@@ -240,7 +240,7 @@ def subtract_fitted_flare(plate: Plate, flare: Pixels, scene: Pixels,
         filled_mask = filled_mask | scene_mask[..., None]
     difference = light - flare
     filled_light = np.maximum(difference, np.minimum(scene, light))
-    # No light becomes negative; what is negative in the plate, as outside a gamut, stays.
+    # Light becomes no less than 0, but negative light of the plate (colours outside its gamut) stays.
     difference = np.maximum(np.where(filled_mask, filled_light, difference), np.minimum(light, 0))
     if plate.encoding == "srgb":
         codes = (srgb_from_linear(difference) * np.float32(plate.max_code) + np.float32(0.5)).astype(plate.codes.dtype)

@@ -196,7 +196,7 @@ class RemovalNetwork(nn.Module):
             if level:
                 x = F.interpolate(self.up[level - 1](x), scale_factor=2, mode="nearest") + skips.pop()
         out = F.pixel_shuffle(self.head(x), SHUFFLE_FACTOR).float()
-        # The share without glow is a sigmoid whose slope at 0 is 1, by the factor 4.
+        # The share without glow is a sigmoid; the factor 4 makes its slope at 0 equal to 1.
         return NetworkOutput(out[:, :3], out[:, :3] * torch.sigmoid(out[:, 3:] * 4))
 
     def _encode_level(self, x: Tensor, level: int) -> Tensor:

@@ -38,14 +38,14 @@ class Recipe:
     iterations: int = 15_000
     size_stages: tuple[tuple[float, int, int], ...] = ((0.5, 96, 256), (1.0, 208, 400))
     """End of the stage, a share of the iterations; least and greatest long side of a frame in it, pixels."""
-    pixels_per_iteration: int = 300_000  # of all frames of an iteration together
-    learning_rate: float = 4e-4          # greatest, after the warm-up
+    pixels_per_iteration: int = 300_000  # pixels of all frames of an iteration together
+    learning_rate: float = 4e-4          # the greatest, reached after the warm-up
     warmup_iterations: int = 300
     weight_decay: float = 1e-4           # of AdamW and Muon, relative to the learning rate
     ema_decay: float = 0.9995            # of the exponential moving average of the weights, which is written
     initial_weights_mix: float = 0.0     # share of the weights at the start of a training in the written weights
     psnr_phase: float = 0.15             # share of the iterations, the last ones, that maximise each frame's PSNR
-    patch_loss_share: float = 0.0        # of that loss that is the PSNR of patches, not of the whole frame
+    patch_loss_share: float = 0.0        # share of that loss that is the PSNR of patches, not of the whole frame
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
     blocks: tuple[int, ...] = (0, 1, 4, 8, 6)
     attention: tuple[int, ...] = (3, 2)  # layers between the blocks of the two coarsest levels

@@ -93,7 +93,7 @@ def defocus(scene: Pixels, aperture: Pixels) -> Pixels:
     import cv2
 
     blurred = cv2.filter2D(scene, -1, aperture / aperture.sum(), borderType=cv2.BORDER_REFLECT)
-    return np.asarray(np.maximum(blurred, 0), np.float32)  # OpenCV filters by FFT, whose rounding may be negative
+    return np.asarray(np.maximum(blurred, 0), np.float32)  # OpenCV filters by FFT, which may round below 0
 
 
 def _add_dead_leaves(random: Random, scene: Pixels, draw_view: DrawView) -> Pixels:
@@ -159,7 +159,7 @@ def _draw_polygon(corners: NDArray[np.float64], width: int, height: int) -> Pixe
     import cv2
 
     mask = np.zeros((height, width), np.float32)
-    cv2.fillPoly(mask, [(corners * 16).astype(np.int32)], (1.0,), cv2.LINE_AA, 4)  # in sixteenths of a pixel
+    cv2.fillPoly(mask, [(corners * 16).astype(np.int32)], (1.0,), cv2.LINE_AA, 4)  # 4: corners in 1/16 px
     return mask
 
 
@@ -200,7 +200,7 @@ def _add_haze(random: Random, scene: Pixels) -> Pixels:
     """
     height, width = scene.shape[:2]
     diagonal = math.hypot(width, height)
-    # x and y from the sun, which is on the horizon; y is below the horizon too.
+    # x and y of each pixel relative to the sun, which is on the horizon.
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) - random.uniform(-0.3, 1.3) * width,
                        np.arange(height, dtype=np.float32) - random.uniform(0, 0.7) * height)
     opacity = np.float32(1) - np.exp(-_optical_depth(random, scene, y / height))[..., None]

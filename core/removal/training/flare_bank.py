@@ -69,7 +69,7 @@ class SynthesisBank:
         """Return a random flare of the current part."""
         slots = range(self._part, len(self._entries), self._part_count)
         slot = slots[int(random.integers(len(slots)))]
-        # The greatest serial number below the end that falls into this slot.
+        # The greatest serial number below the end whose remainder by the bank's size is this slot.
         serial = self._end_serial - 1 - (self._end_serial - 1 - slot) % len(self._entries)
         entry = self._entries[slot]
         if entry is None or entry[0] != serial:

@@ -50,7 +50,7 @@ class MuonAdamW:
         gradients = [_as_matrix(cast(Tensor, self._parameters[name].grad)) for name in matrices_to_step]
         momenta = [self._momenta[name] for name in matrices_to_step]
         torch._foreach_lerp_(momenta, gradients, 1 - MUON_MOMENTUM)
-        # Nesterov momentum: the gradient is counted once more beside the momentum.
+        # Nesterov momentum: mix the momentum with the present gradient once more.
         directions = [direction.contiguous() for direction in torch._foreach_lerp(gradients, momenta, MUON_MOMENTUM)]
         for group in _group_same_shapes(directions, filter(worker.is_responsible_for, range(len(directions)))):
             orthogonal = orthogonalise(torch.stack([directions[number] for number in group]))
@@ -120,7 +120,7 @@ def orthogonalise(matrices: Tensor) -> Tensor:
     square = torch.bmm(wide, wide.mT)
     factors = torch.eye(square.shape[-1], dtype=square.dtype, device=square.device).expand_as(square)
     for _ in range(NEWTON_SCHULZ_STEPS):
-        # factor: a + b s + c s^2 for the square s; a step takes s to factor s factor
+        # factor: a + b s + c s^2, where s is the square; a step turns s into factor s factor
         factor = torch.baddbmm(square, square, square, beta=b, alpha=c)
         factor.diagonal(dim1=-2, dim2=-1).add_(a)
         factors = torch.bmm(factors, factor)

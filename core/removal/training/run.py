@@ -69,7 +69,7 @@ def read_recipe(folder: Path | str) -> Recipe | None:
     if not path.exists():
         return None
     _, metadata = weights.read_weights(path)
-    weights.read_architecture(path, metadata)  # raises for a foreign file
+    weights.read_architecture(path, metadata)  # raises RunError if the file is no checkpoint
     return from_dict(parse_json(metadata["recipe"]))
 
 
@@ -112,7 +112,7 @@ class TrainingSetup(NamedTuple):
     """Everything from which a worker starts its training."""
 
     recipe: Recipe
-    source: Path | None  # weights, or the checkpoint of the same training
+    source: Path | None  # file of weights to begin with, or the training's own checkpoint; None for random weights
     resumes: bool
     backgrounds: Backgrounds
     lenses: Sequence[Prescription]

@@ -58,7 +58,7 @@ class RemovalTrainer:
         self.optimiser = MuonAdamW(self.network, recipe.weight_decay)
         self.averaged_weights = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
         self.initial_weights: dict[str, Tensor] = {}  # empty unless the training begins with given weights
-        # A graph cannot branch: one with and one without the loss of the PSNR phase.
+        # A CUDA graph cannot branch, so there is one for the PSNR phase and one for before.
         self._graphed_gradients = {phase: GraphedFunction(partial(self._gradients, phase)) for phase in (False, True)}
         self._pending_metrics: AsyncCopy | None = None
         if self.device.type == "cuda":
@@ -256,5 +256,5 @@ def _patch_means(squared: Tensor) -> Tensor:
 
 def _autocast(on: torch.device) -> Any:
     """Return the context of the forward pass: bfloat16 where the device is fast at it."""
-    # A cache would hold the weights of the step that was captured as a graph, not of the one that replays it.
+    # Without cache: a replayed CUDA graph would read the cached weights of the step in which it was captured.
     return torch.autocast(on.type, dtype=torch.bfloat16, cache_enabled=False) if has_bfloat16(on) else nullcontext()

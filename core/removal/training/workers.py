@@ -92,7 +92,7 @@ class Worker:
         for row in rows[1:]:
             for tensor, part in _buffer_slices(tensors, row):
                 tensor.add_(part)
-        self.buffers.wait()  # before anyone writes again
+        self.buffers.wait()  # all have read the rows, so the next call may write them
 
     def is_responsible_for(self, number: int) -> bool:
         """Return whether this worker does piece `number` of shared work."""

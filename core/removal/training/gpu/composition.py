@@ -67,7 +67,7 @@ class FrameParameters(_PerFrame):
     has_flare: Any
     has_lights: Any    # 0 only where the frame has no flare either
     faces_light: Any   # (n,): whether the lights are where the scene is bright
-    target_light: Any  # (n,): light to which the scene is exposed there; 0 to leave the exposure
+    target_light: Any  # (n,): brightness to expose the scene to at the light; 0 to leave the exposure
     grain: Any
     shoulder: Any      # strength of a curve that bends towards white; 0 for none
     contrast: Any
@@ -88,7 +88,7 @@ class FlarePlacements(_PerFrame):
     blur: Any          # (n,) pixels
     colour: Any        # (n, 3, 1, 1)
     gain: Any
-    max_mean: Any      # mean light over the frame that it is limited to
+    max_mean: Any      # limit of the flare's mean light over the frame
 
 
 def draw_frame_parameters(random: Random, count: int, recipe: Recipe) -> FrameParameters:

@@ -26,7 +26,7 @@ def simulate_jpeg(codes: Tensor, quality: Tensor) -> Tensor:
     codes: (n, 3, h, w), whole numbers 0..255 as floats, h and w multiples of SIZE_MULTIPLE; so is the result.
     quality: (n,), 50..100.
     """
-    scale = 200 - 2 * quality  # libjpeg's, for a quality of 50 or more
+    scale = 200 - 2 * quality  # libjpeg's scale of the quantisation tables, per cent, for a quality of 50 or more
     ycc = torch.einsum("ij,njhw->nihw", _constant(_TO_YCC, codes), codes)
     luma = _quantise_blocks(ycc[:, :1] - 128, scale, _LUMA) + 128
     chroma = _quantise_blocks(F.avg_pool2d(ycc[:, 1:], 2), scale, _CHROMA)

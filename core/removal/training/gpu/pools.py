@@ -126,7 +126,7 @@ class Pools:
         values: the numbers in the item's slot. An iteration that samples this place during the copy sees parts of both
         items.
         """
-        with torch.cuda.stream(self._stream):  # a no-op for None
+        with torch.cuda.stream(self._stream):  # does nothing for None, on a CPU
             tensor = torch.from_numpy(values)
             if item.kind == SCENE:
                 pool = self._scenes[item.shape]
@@ -140,7 +140,7 @@ class Pools:
                 self._flares[index].copy_(tensor.view(self._flares.shape[1:]))
                 self._flare_metadata[index].copy_(torch.from_numpy(item.metadata))
         if self._stream is not None:
-            self._stream.synchronize()  # before the slot is reused
+            self._stream.synchronize()  # the copy must end before the slot is reused
         if item.kind == SCENE:
             self.scenes_stored[item.shape] += SCENES_PER_BLOCK
         else:
@@ -179,7 +179,7 @@ def keep_pools_filled(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, le
     """
     spawning = multiprocessing.get_context("spawn")
     process_counts = (max(process_count // 2, 1), max(process_count - process_count // 2, 1))
-    # numbers in one slot, by kind
+    # numbers in one slot, for scenes and for flares
     lengths = (SCENES_PER_BLOCK * 3 * max(shape.width * shape.height for shape in pools.shapes),
                FLARE_CHANNELS * recipe.canvas_size**2)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:

@@ -115,7 +115,7 @@ def check_single_poses(solve: CameraSolve, folder: Path) -> None:
 
 @dataclass
 class MatchedFrames:
-    """The picture of each posed frame, by the frame's name in the solve, and what has no counterpart.
+    """The pictures of posed frames (`files`, by the frame's name in the solve), and what has no counterpart.
 
     missing: names of poses without a picture; unposed: names of pictures without a pose, below the folder of the
     frames. warnings: sentences for the user.

@@ -454,7 +454,7 @@ class Capture:
 
 @dataclass(eq=False)
 class _OpenedViews:
-    """The views of a capture. By view name: the file, and the order among all poses. names: view name by pose name."""
+    """The views of a capture; files and order (index among all poses) by view name; names: view name by pose name."""
 
     views: list[View] = field(default_factory=list)
     files: dict[str, Path] = field(default_factory=dict)

@@ -153,10 +153,10 @@ class HashGrid:
     def __call__(self, point: Floats) -> Floats:
         """Return features (levels * features,) of a point (3,), clamped to 0..1.
 
-        They are, for each level, the values at the corners of the point's cell, interpolated linearly."""
+        For each level they are the values at the eight corners of the point's cell, interpolated trilinearly."""
         resolutions = self._resolutions[:, None]
         scaled = (np.clip(point, 0, 1).astype(np.float32)[None] * resolutions.astype(np.float32))
-        cell = np.minimum(np.floor(scaled), resolutions.astype(np.float32) - 1)  # 1 lies in the last cell
+        cell = np.minimum(np.floor(scaled), resolutions.astype(np.float32) - 1)  # a point at 1 lies in the last cell
         fraction = (scaled - cell)[:, None]
         corners = cell.astype(np.int64)[:, None] + CORNERS
         weights = np.where(CORNERS.astype(bool), fraction, 1 - fraction).prod(-1)

@@ -61,7 +61,7 @@ def draw_added(gaussians: PlaneGaussians, look: Look, intrinsics: ArrayLike, wid
         divisor = LEVELS[index]
         level_rows = np.flatnonzero(indices == index)
         if picture is None and not len(level_rows) and index:
-            continue  # coarser grids than the first with a Gaussian stay empty; there is a finest grid always
+            continue  # no grid is needed above the coarsest with a Gaussian; the finest is always made
         size = -(-height // divisor) + 2 * _MARGIN, -(-width // divisor) + 2 * _MARGIN
         grid = np.zeros((*size, 3), np.float32) if picture is None else _enlarge(picture, size)
         for row in level_rows.tolist():

@@ -245,7 +245,7 @@ def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path,
     default_threshold = options.sift.peak_threshold
     for (camera_id, has_little_texture), names in names_by_group.items():
         reader.existing_camera_id = camera_id
-        # Walls and skies: weak features are better than none.
+        # A lower threshold for frames of walls and skies: weak features are better than none.
         options.sift.peak_threshold = (LOW_TEXTURE_THRESHOLD if has_little_texture else 1.0) * default_threshold
         for start in range(0, len(names), FEATURE_BATCH):
             batch = names[start:start + FEATURE_BATCH]

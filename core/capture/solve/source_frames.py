@@ -261,8 +261,8 @@ def feature_mask(picture: Picture) -> NDArray[np.bool_]:
     """Return (h, w), True where features may be extracted: not on clipped pixels, their bloom, or the lines of ghosts.
 
     The rim of a bloom moves with exposure and flare. The ghosts of a light lie on the line from its clipped spot
-    through the centre of the frame, and move with the lens. Linear light is clipped at the exposure of the small
-    picture.
+    through the centre of the frame, and move with the lens. In linear light, a pixel counts as clipped that
+    is clipped in the small picture.
     """
     import cv2
 

@@ -59,7 +59,7 @@ class FrameRenderer(CameraRenderer, Protocol):
 
 
 class SequenceSource(Protocol):
-    """The source of a sequence of frames. fingerprint: changes with all pictures; elements: names by light."""
+    """The source of a sequence of frames. fingerprint: digest of what all frames share. elements: names by light."""
 
     @property
     def fingerprint(self) -> str: ...

@@ -37,7 +37,7 @@ class ShotRenderer(ShotSource):
 
     @property
     def fingerprint(self) -> str:
-        """A digest that changes with all pictures; what belongs to one frame is in its renderer's."""
+        """A digest of what all frames share; what belongs to one frame is in the fingerprint of its renderer."""
         return self.shot.fingerprint(self.run.fingerprint if self.run is not None else "")
 
     def render(self, shot_frame: ShotFrame, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:

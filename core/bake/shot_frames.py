@@ -53,7 +53,7 @@ class ShotSource(ABC):
 
     @property
     def fingerprint(self) -> str:
-        """A digest that changes with all pictures; what belongs to one frame is in its renderer's."""
+        """A digest of what all frames share; what belongs to one frame is in the fingerprint of its renderer."""
         return self.shot.fingerprint()
 
     @abstractmethod

@@ -55,12 +55,13 @@ PLATES_FOLDER = "frames"
 
 @dataclass(frozen=True)
 class TransferSettings:
-    """Settings of a transfer. query: view that the appearance follows (see `query`). scale: units of the target's world
-    for one of the source's. smooth: frames on either side over which visibility is smoothed, 0 for none. plate_space:
-    colour space of the plates, "auto" for that of their capture or files. visibility: how the target's scene hides
-    lights. fall_off: reference distance of the inverse square fall-off, world units, 0 for the distance in the first
-    frame, None for no fall-off; lights with a reference distance of their own keep it. highlights: luminance from which
-    pixels of the plates are lights, instead of the target's; None for the target's. highlight_gain: factor of these."""
+    """Settings of a transfer. query: view that the appearance follows ("source", "target" or "blend"). scale: units of
+    the target's world for one of the source's. smooth: frames on either side over which visibility is smoothed, 0 for
+    none. plate_space: colour space of the plates, "auto" for that of their capture or files. visibility: how the
+    target's scene hides lights. fall_off: reference distance of the inverse square fall-off, world units, 0 for the
+    distance in the first frame, None for no fall-off; lights with a reference distance of their own keep it.
+    highlights: luminance from which pixels of the plates are lights, instead of the target's; None for the target's.
+    highlight_gain: factor of these."""
 
     query: Follows = "blend"
     scale: float = 1.0

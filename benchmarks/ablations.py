@@ -117,7 +117,10 @@ def _variants(study: str, settings_by_name: dict[str, FitSettings]) -> list[Expe
 
 
 def experiments(make_preset: PresetFactory) -> list[Experiment]:
-    """Return the experiments of all studies."""
+    """Return the experiments of all studies, which the head of this file explains.
+
+    make_preset: makes settings of a form and a mode, with the length and the seed of the fits.
+    """
     ours, papers = partial(our_settings, make_preset), partial(paper_settings, make_preset)
     result = _variants("form", {
         "ours": ours(),
@@ -165,7 +168,10 @@ def experiments(make_preset: PresetFactory) -> list[Experiment]:
 
 
 def _robustness_experiments(make_preset: PresetFactory) -> list[Experiment]:
-    """Return fits of both forms with displaced lights, for each choice of corrections and each sigma."""
+    """Return fits of both forms with displaced lights, for each choice of corrections and each sigma.
+
+    The corrections move the lights (delta_l) and the flare on its plane (delta_f).
+    """
     result = []
     for corrections, light, plane in (("both", True, True), ("delta_l", True, False), ("delta_f", False, True),
                                       ("neither", False, False)):

@@ -67,7 +67,7 @@ def _is_above_white(light: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def main() -> None:
-    """Print a row for each capture and mode, with light above white and without."""
+    """Fit each capture in each mode, clipped and with its light above white, and print the table."""
     parser = argparse.ArgumentParser(description="Fits of float frames, with and without light above white.")
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--preset", choices=OUR_PRESETS, default="draft")

@@ -81,7 +81,7 @@ def fit_psnr(target: Tensor, count: int, arcs: bool, seed: int, iterations: int 
 
 
 def main() -> None:
-    """Print a table of PSNR with and without arcs."""
+    """Fit both pictures with and without arcs, and print a table of the PSNR."""
     parser = argparse.ArgumentParser(description="Gain of arcs for a clipped ghost.")
     parser.add_argument("--counts", nargs="+", type=int, default=[4, 16], help="numbers of Gaussians")
     parser.add_argument("--seeds", type=int, default=4)

@@ -49,7 +49,7 @@ class Tally:
     false: int = 0
 
     def add(self, picture: LitPicture, detections: Sequence[Detection]) -> None:
-        """Count one picture; a detection hits every light whose mask has its centroid."""
+        """Count one picture; a detection hits every light whose mask contains the detection's centroid."""
         detected = union_mask(detections, picture.picture.size)
         for name, truth in (("shape", picture.masks.any(axis=0)), ("glare", picture.clipped)):
             self.pixels[name] += [(detected & truth).sum(), (detected & ~truth).sum(), (truth & ~detected).sum()]

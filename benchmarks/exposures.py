@@ -81,7 +81,7 @@ def layer_scores(run: Run, capture: Capture) -> list[str]:
 
 
 def compare_exposures(capture: Capture, mode: str, args: argparse.Namespace) -> list[list[str]]:
-    """Return a row for the unchanged capture, and one for each way to fit the drifting one."""
+    """Fit, and return a row for the unchanged capture, and two for the drifting one: exposure fixed and measured."""
     count = len(capture.views)
     stops = {view.name: args.stops * math.sin(2 * math.pi * PERIODS * number / count)
              for number, view in enumerate(capture.views)}
@@ -108,7 +108,7 @@ def _exposure_error(estimated: Mapping[str, float], stops: Mapping[str, float]) 
 
 
 def main() -> None:
-    """Print a table for each capture."""
+    """Fit each capture with changing exposure, and print a table for it."""
     parser = argparse.ArgumentParser(description="Frames whose exposure changes.")
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--stops", type=float, default=0.7, help="to either side")

@@ -49,7 +49,7 @@ def side_by_side(capture: Capture, name: str, runs: list[Run]) -> Pixels:
 
 
 def main() -> None:
-    """Write the picture."""
+    """Write the picture that the arguments describe."""
     parser = argparse.ArgumentParser(description="A view's exact flare beside the flares of fits.")
     parser.add_argument("capture", type=Path)
     parser.add_argument("view")

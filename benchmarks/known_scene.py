@@ -42,7 +42,7 @@ class KnownScene(Trainer):
 
 @torch.no_grad()
 def score_flare(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
-    """Return the mean scores of the flare over views, in the form of `eval`.
+    """Return the mean scores of the flare over views, under the names that `eval` uses.
 
     "flare": |composite - scene| in display values, compared with exact layers; without these, with frame minus clean
     frame. "flare_linear": the linear layer outside clipped pixels, compared with the exact one.

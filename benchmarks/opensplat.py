@@ -73,6 +73,7 @@ class Rasterizer:
         self, module: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colours: Tensor,
         camera: tuple[Tensor, Tensor], width: int, height: int, upstream: Tensor,
     ) -> None:  # fmt: skip
+        """Project the scene with our projection and keep the inputs of OpenSplat's rasterizer."""
         self.module, self.size, self.upstream = module, (width, height), upstream
         with torch.no_grad():
             projected = projection.project(

@@ -45,7 +45,7 @@ def processor() -> str:
 
 
 def conditions() -> str:
-    """Describe machine, versions and other load in one line."""
+    """Return a line on the processor, the system, versions, and whether the machine is idle."""
     import numba
 
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
@@ -57,7 +57,7 @@ def conditions() -> str:
 
 
 def write_section(path: Path, name: str, text: str) -> None:
-    """Replace the text between the markers of this name, or append both to the document."""
+    """Replace the text between the markers of this name in a document; append text and markers if these are missing."""
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     old_text = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
     section = f"{begin}\n{text.strip()}\n{end}"
@@ -71,7 +71,7 @@ def write_section(path: Path, name: str, text: str) -> None:
 
 
 def plot_times(times_by_set: dict[str, dict[str, float]], picture: Path) -> None:
-    """Draw times, ms, against the number of Gaussians, a line for each kernel set.
+    """Write a plot of times, ms, against the number of Gaussians, with a line for each kernel set.
 
     times_by_set: seconds by number of Gaussians (as text), by kernel set.
     """

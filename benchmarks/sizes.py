@@ -83,7 +83,7 @@ def compare_sizes(run: Run, capture: Capture, fitted_width: int, max_width: int)
 
 
 def main() -> None:
-    """Print a table for each capture."""
+    """Fit each capture, render it at other sizes, and print a table for it."""
     parser = argparse.ArgumentParser(description="A fit at other sizes than its own.")
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--preset", choices=OUR_PRESETS, default="draft")

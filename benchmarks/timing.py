@@ -23,7 +23,10 @@ def time_once(work: Callable[[], object]) -> float:
 
 
 def median_times(cases: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Return the median seconds of each case over rounds in which the cases take turns, after a warm-up call."""
+    """Return the median seconds of each case over rounds in which the cases take turns, after a warm-up call.
+
+    A short case is repeated in each turn: up to 30 times, for about MAX_CASE_SECONDS.
+    """
     samples: dict[str, list[float]] = {name: [] for name in cases}
     repeats = {}
     for name, work in cases.items():

@@ -40,7 +40,7 @@ class Flares(NamedTuple):
 
 
 def make_scene(count: int, seed: int = 0) -> Scene:
-    """Make a scene of `count` Gaussians."""
+    """Return random parameters of `count` scene Gaussians, with the distributions that the head of this file states."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(2, 10, count)
     x = z * TAN_HALF_ANGLE * rng.uniform(-1.1, 1.1, count)
@@ -66,7 +66,8 @@ def make_flares(count: int, width: int, height: int, seed: int = 1) -> Flares:
     rng = np.random.default_rng(seed)
     covered_area = np.exp(rng.uniform(math.log(0.05), math.log(0.4), count)) * width * height
     opacities = np.exp(rng.uniform(math.log(0.006), math.log(0.03), count))
-    variance = covered_area / (math.pi * 2 * np.log(255 * opacities))  # alpha falls to 1/255 at the rim
+    # Alpha is 1/255 at the radius r with r² = 2 variance ln(255 opacity); the covered area is π r².
+    variance = covered_area / (math.pi * 2 * np.log(255 * opacities))
     stretch = np.exp(rng.normal(0, 0.5, count))
     angle = rng.uniform(0, math.pi, count)
     cosine, sine = np.cos(angle), np.sin(angle)

@@ -32,7 +32,7 @@ def run_command(work: Callable[[Progress], None]) -> int:
 
 @contextlib.contextmanager
 def silence_blender() -> Iterator[None]:
-    """Send Blender's own output to the null device within this context."""
+    """Send to the null device what Blender's library writes to standard output (file descriptor 1) in this context."""
     sys.stdout.flush()
     saved, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)

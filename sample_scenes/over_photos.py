@@ -37,8 +37,8 @@ def add_flares(capture: Capture, out: Path, setup: LensSetup, light: NDArray[np.
                intensity: float, width: int, progress: Progress) -> None:
     """Write the new capture; views that exist already are kept.
 
-    light: world coordinates (3,). colour: of the light, linear R G B. intensity: factor on its flare in a frame of
-    exposure 1. width: of the new frames, pixels.
+    light: its world coordinates (3,). colour: the light's, linear R G B. intensity: factor on its flare in a frame of
+    exposure 1. width: pixels of the new frames.
     """
     capture = capture.with_exposures(metering.measure_exposures(capture, Frames(capture, width)))
     progress.stage("flares", len(capture.views))

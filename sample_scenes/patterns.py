@@ -56,7 +56,7 @@ def random_colour(rng: np.random.Generator, palette: Palette) -> tuple[int, int,
 
 
 def poster(rng: np.random.Generator, height: int, width: int, palette: Palette, shapes: int = 60) -> Texture:
-    """Draw overlapping discs, rings, polygons, bars and lines, the largest first and so behind."""
+    """Draw `shapes` overlapping discs, rings, polygons, bars and lines, the largest first and so behind."""
     picture = np.full((height, width, 3), random_colour(rng, palette), np.uint8)
     size = min(height, width)
     for index in range(shapes):

@@ -161,7 +161,8 @@ def _intersect(rectangle: Quad, eye: Array, rays: Pixels) -> tuple[Pixels, Pixel
 def shade(hits: Hits, eye: Array, rays: Pixels, lamps: Sequence[Lamp], ambient: Array) -> Pixels:
     """Return the radiance (n, 3) along rays: emission, and ambient and lamp light that the surface reflects.
 
-    Where a lamp's disc is nearer than the surface, the ray has the lamp's radiance. ambient: (3,).
+    Where a lamp's disc is nearer than the surface, the ray has the lamp's radiance. ambient: light
+    (3,) that reaches every surface evenly.
     """
     has_hit = np.isfinite(hits.distance)
     points = eye.astype(np.float32) + np.where(has_hit, hits.distance, 0)[:, None] * rays

@@ -79,9 +79,9 @@ def add_box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn:
             tilt: Vec = (0.0, 0.0), bevel: float = 0.0) -> Any:
     """Add a box of `size`, its base centre at `location`.
 
-    turn: degrees about z, after `tilt`: degrees about x and y.
     materials: one for all faces, or one each for the sides (-y, +x, +y, -x) and top; the bottom has the last one. Each
-    face shows its whole texture. bevel: width of the rounded edges, 0 for none.
+    face shows its whole texture. turn: degrees about z, after `tilt`: degrees about x and y. bevel: width of the
+    rounded edges, 0 for none.
     """
     half_x, half_y, height = size[0] / 2, size[1] / 2, size[2]
     mesh = bmesh.new()
@@ -176,7 +176,7 @@ def add_monkey(name: str, size: float, location: Vec, material: Any, turn: float
 
 
 def add_lamp(light: LightSource) -> Any:
-    """Add a light: a sphere that only the camera sees, and a lamp in its place (a sun, if distant).
+    """Add a light: a sphere that only the camera sees, and, if it has power, a lamp in its place (a sun, if distant).
 
     The sphere has the property `light_source`, so that the ray casts of the visible share can skip it.
     """
@@ -231,7 +231,7 @@ def set_uniform_world(colour: Vec, strength: float) -> None:
 
 
 def set_environment_map(texture: Texture) -> None:
-    """Set a world that shows a panorama (h, 2 h, 3) in linear light (`panorama`) and lights the scene by it.
+    """Set a world that shows a panorama (h, 2 h, 3) in linear light and lights the scene by it.
 
     It is infinitely far, so it has no parallax.
     """

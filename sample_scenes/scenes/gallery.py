@@ -14,7 +14,7 @@ STUDIO = LightSource("studio", (0.75, 3.1, 1.5), (0.7, 0.88, 1.0), 0.08, 50.0, 1
 def camera_path(numbers: Array) -> Array:
     """Return poses (n, 4, 4), world to camera, on a slow arc of 75 degrees through the room, at heights from 1 to 2.
 
-    numbers: of the frames, 0..39.
+    numbers: the frames', 0..39.
     """
     poses = []
     for t in np.asarray(numbers) / 40:

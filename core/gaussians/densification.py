@@ -90,7 +90,8 @@ class Classic:
 
     @torch.no_grad()
     def observe(self, rendering: Rendering) -> None:
-        """Accumulate the gradients by the centres of the visible Gaussians."""
+        """Accumulate, for each visible Gaussian, the norm of the loss's gradient by its projected centre, and a
+        count."""
         height, width = rendering.alpha.shape
         # From px^-1 to normalised device coordinates, in which the picture is 2 wide and 2 high.
         norms = torch.hypot(*(rendering.centre_gradients * rendering.alpha.new_tensor([width / 2, height / 2])).T)
@@ -100,8 +101,8 @@ class Classic:
 
     @torch.no_grad()
     def update(self, iteration: int) -> bool:
-        """Every `every` iterations clone, split and prune; every `reset_every` iterations reset the opacities. Return
-        whether rows were added or removed."""
+        """Every `every` iterations clone, split and prune Gaussians; every `reset_every` iterations lower all opacities
+        to at most `reset_to`. Return whether rows were added or removed."""
         settings = self.settings
         if iteration > settings.stop:
             return False
@@ -117,8 +118,10 @@ class Classic:
         return changed
 
     def _refine(self, prune_large: bool) -> None:
-        """Clone small and split large Gaussians of high gradient, and prune faint ones; with `prune_large` prune very
-        large ones too (gsplat: _grow_gs and _prune_gs)."""
+        """Clone small and split large Gaussians of high mean gradient, and prune faint ones; with `prune_large` very
+        large ones too (gsplat: _grow_gs and _prune_gs).
+
+        Under a cap, those of the highest gradient are cloned or split first."""
         settings, scene = self.settings, self.scene
         size = scene.scales.amax(-1) / scene.units(self.extent)
         is_removed = scene.opacities < settings.faint
@@ -140,8 +143,8 @@ class Classic:
         self.optimiser.append_rows(halves)
 
     def _split(self, is_split: Tensor) -> dict[str, Tensor]:
-        """Return two Gaussians for each one to split, by name of the parameter: smaller, at positions sampled from
-        it."""
+        """Return two smaller Gaussians for each one to split, by name of the parameter; their means are sampled from
+        the one that is split."""
         halves = {name: p.detach()[is_split].repeat_interleave(2, 0) for name, p in self.scene.named_parameters()}
         noise = _randn(halves["means"].shape, self.generator, halves["means"])
         offsets = rotation_matrices(halves["quaternions"]) @ (noise * halves["log_scales"].exp())[..., None]
@@ -150,7 +153,7 @@ class Classic:
         return halves
 
     def reorder(self, order: Tensor) -> None:
-        """Apply a new order of the rows to the statistics."""
+        """Apply a new order of the scene's rows (n,) to the statistics."""
         self.gradients, self.views = self.gradients[order], self.views[order]
 
     def state_dict(self) -> dict[str, Any]:
@@ -196,7 +199,7 @@ class Mcmc:
         self, scene: SceneGaussians, optimiser: Adam, generator: torch.Generator,
         settings: McmcSettings | None = None, extent: float = 1.0,
     ) -> None:  # fmt: skip
-        """extent: of the scene, by which the units of far Gaussians are measured."""
+        """extent: size of the scene, world units; Gaussians of the far layer are measured relative to it."""
         self.scene, self.optimiser, self.generator = scene, optimiser, generator
         self.extent = extent
         self.settings = settings or McmcSettings()
@@ -212,7 +215,8 @@ class Mcmc:
 
     @torch.no_grad()
     def update(self, iteration: int) -> bool:
-        """Every `every` iterations relocate and add Gaussians; in each inject noise. Return whether rows changed."""
+        """Every `every` iterations relocate dead Gaussians and add new ones; in every iteration inject noise. Return
+        whether rows were moved or added."""
         settings = self.settings
         changed = settings.start < iteration <= settings.stop and iteration % settings.every == 0
         if changed:
@@ -222,7 +226,9 @@ class Mcmc:
         return changed
 
     def _relocate(self) -> None:
-        """Move dead Gaussians, whose opacity is at most `faint`, to others drawn by opacity."""
+        """Turn dead Gaussians, whose opacity is at most `faint`, into copies of live ones, sampled by opacity.
+
+        The moments of both are set to zero."""
         is_dead = self.scene.opacities <= self.settings.faint
         targets = torch.nonzero(is_dead)[:, 0]
         alive = torch.nonzero(~is_dead)[:, 0]
@@ -235,7 +241,7 @@ class Mcmc:
             self.optimiser.reset_moments(name, torch.cat([sources, targets]))
 
     def _add_copies(self) -> None:
-        """Add Gaussians as copies of others drawn by opacity, up to `growth` and `cap`."""
+        """Add copies of Gaussians, sampled by opacity: `growth` times as many in all, at most `cap`."""
         n = len(self.scene)
         num_added = min(self.settings.cap, int(n * self.settings.growth)) - n
         if num_added <= 0:
@@ -252,8 +258,10 @@ class Mcmc:
         return drawn.to(weights.device)
 
     def _split_opacity(self, sources: Tensor) -> None:
-        """Reduce opacity and scale of Gaussians that are about to be copied, so that each and its copies together
-        render as it did alone. sources: their row numbers, each as often as it is copied."""
+        """Reduce opacity and scale of Gaussians that are about to be copied, so that a Gaussian and its copies together
+        render as the Gaussian did alone.
+
+        sources: row numbers of the Gaussians, each as often as it is copied."""
         rows, drawn = torch.unique(sources, return_counts=True)
         copies = (drawn + 1).clamp(max=self.MAX_COPIES)
         opacity, shrink = relocated_opacity_and_scale(self.scene.opacities[rows], copies)
@@ -262,8 +270,10 @@ class Mcmc:
         self.scene.log_scales[rows] += shrink.log()[:, None]
 
     def _inject_noise(self) -> None:
-        """Add noise, multiplied by each Gaussian's covariance, to the means of nearly transparent ones (the paper's eq.
-        9)."""
+        """Add noise, multiplied by the Gaussian's covariance, to the means of nearly transparent Gaussians (the paper's
+        eq. 9).
+
+        Its strength falls with opacity by a sigmoid, and is proportional to the learning rate of the means."""
         rate = self.optimiser.rates["means"]
         opacities = self.scene.opacities
         rows = torch.nonzero(opacities < self.MAX_NOISE_OPACITY)[:, 0]
@@ -290,11 +300,12 @@ class Mcmc:
 
 
 def relocated_opacity_and_scale(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Return opacity and scale factor of `copies` Gaussians in one place that together render as one of `opacity`; all
-    (n,). It is gsplat's compute_relocation.
+    """Return opacity and scale factor of `copies` equal Gaussians in one place that together render as one of
+    `opacity`; all (n,). The same as gsplat's compute_relocation.
 
-    For N copies, o' = 1 - (1 - o)^(1/N) preserves the centre; o / sum_{j=1..N} (-1)^(j-1) C(N, j) o'^j / sqrt(j), the
-    integral along a line through it (Kheradmand et al. 2024, eq. 8, with its double sum over binomials in closed form).
+    For N copies of a Gaussian of opacity o, the new opacity o' = 1 - (1 - o)^(1/N) preserves alpha at the centre, and
+    the scale factor o / sum_{j=1..N} (-1)^(j-1) C(N, j) o'^j / sqrt(j) preserves the integral of alpha along a line
+    through the centre (Kheradmand et al. 2024, eq. 8, with its double sum over binomials in closed form).
     """
     o, count = opacity.double(), copies.double()
     new_opacity = 1 - (1 - o) ** (1 / count)

@@ -26,7 +26,8 @@ class FarSphere:
 
     @classmethod
     def parse(cls, x: float, y: float, z: float, radius: float) -> FarSphere | None:
-        """Return a sphere of numbers from a file; None if they are no sphere."""
+        """Return the sphere that numbers from a file describe; None if one is not finite or the radius is not
+        positive."""
         if not all(map(math.isfinite, (x, y, z, radius))) or radius <= 0:
             return None
         return cls((x, y, z), radius)
@@ -42,7 +43,7 @@ class FarSphere:
         return offsets.square().sum(-1) > self.min_distance**2
 
     def move(self, means: Tensor, steps: Tensor) -> Tensor:
-        """Return means (m, 3) on the sphere, moved along it by steps (m, 3), world units."""
+        """Return means (m, 3) moved by steps (m, 3), world units, and put back on the sphere along its radius."""
         centre = torch.tensor(self.centre, dtype=means.dtype, device=means.device)
         offsets = means + steps - centre
         # The clamp bounds the factor, for a step that leads close to the centre.

@@ -92,8 +92,9 @@ class FusedKernels(Protocol):
 
 
 def fused_kernels(like: Tensor) -> FusedKernels | None:
-    """Return the CPU kernels if they support tensors such as `like`, else None; for the loss, the optimiser and layers,
-    which have a torch version too."""
+    """Return the CPU kernels if they support tensors of the device and type of `like`, else None.
+
+    For the loss, the optimiser and layers, which have a torch version too."""
     if not like.is_cpu or like.dtype != torch.float32:
         return None
     kernels = _load_kernel_set("cpu")
@@ -101,7 +102,7 @@ def fused_kernels(like: Tensor) -> FusedKernels | None:
 
 
 def select_kernels(name: str, like: Tensor) -> KernelSet:
-    """Return the kernel set of this name; for "auto", the fastest for tensors such as `like`.
+    """Return the kernel set of this name; for "auto", the fastest one for the device and type of the tensor `like`.
 
     Raises SettingsError for an unknown name, EngineError for a kernel set that is not installed.
     """
@@ -120,7 +121,8 @@ def select_kernels(name: str, like: Tensor) -> KernelSet:
 
 
 def _fastest_kernel_set(like: Tensor) -> str:
-    """Return the name of the fastest kernel set that can be used for such tensors."""
+    """Return the name of the fastest usable kernel set for the device and type of `like`; logs a warning, once, if the
+    one for the device cannot be imported."""
     preferred = {"cuda": "cuda", "cpu": "cpu"}.get(like.device.type, "tiles")
     if like.dtype != torch.float32:
         return "tiles"  # the faster ones compute in float32 alone

@@ -22,8 +22,7 @@ def over(front: Splats, behind: Tensor) -> Tensor:
 
 
 def upsample_layer(layer: Splats, factor: int, width: int, height: int) -> Splats:
-    """Upsample a layer that was drawn at 1 / factor size with a border of one pixel to (height, width); see
-    `upsample`."""
+    """Upsample a layer bilinearly to (height, width); it was drawn at 1 / factor size with a border of one pixel."""
     cpu = fused_kernels(layer.colour)
     upsampled = None if cpu is None else cpu.upsample(layer.colour, layer.transmittance, factor, width, height)
     if upsampled is None:
@@ -58,7 +57,7 @@ class _UpsampleRows(torch.autograd.Function):
         parts = gradient.contiguous().view(-1, ctx.factor, size)
         shares = _interpolation_weights(ctx.factor, gradient).T @ parts
         total = gradient.new_zeros(len(parts) + 2, size)
-        for position, share in enumerate(shares.unbind(1)):  # 0, 1, 2: the row before, the row itself, the row after
+        for position, share in enumerate(shares.unbind(1)):  # for the row before, the row itself, the row after
             total[position : position + len(parts)] += share
         return total.view(-1, *ctx.row), None
 

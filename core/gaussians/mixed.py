@@ -34,10 +34,14 @@ REDUCTIONS = (1, 2, 4)
 
 @torch.no_grad()
 def error_bounds(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -> Tensor:
-    """Return (3, n) error bounds of each Gaussian at each of REDUCTIONS, relative to its peak; see the module head."""
+    """Return (3, n), for each of REDUCTIONS, bounds of the error by bilinear upsampling of each Gaussian, relative to
+    its peak.
+
+    A bound is f²/8 times the curvature plus f / sqrt(2) times the slope at a ring's cusp; see the module head. rings:
+    (n, 2), arcs: (n, 3), or None."""
     xx, xy, yy = covariances.unbind(-1)
     major = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy * xy).sqrt()
-    minor = ((xx * yy - xy * xy) / major).clamp(min=1e-12)  # without cancellation
+    minor = ((xx * yy - xy * xy) / major).clamp(min=1e-12)  # as determinant / major, which does not cancel
     curvature = 2 / minor
     slope = torch.zeros_like(minor)
     if rings is not None:
@@ -62,8 +66,9 @@ def splat_mixed(
     kernels: KernelSet, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
     width: int, height: int, *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """Rasterize by these kernels as `splat` of the package does with resolution "mixed"; it explains arguments and
-    result."""
+    """Rasterize as `splat` of the package does with resolution "mixed"; arguments and result are explained there.
+
+    Gaussians of each reduction are drawn by `kernels` as one layer, upsampled, and merged, full size in front."""
     factors = choose_reductions(covariances, rings, arcs)
     picture = None
     for factor in REDUCTIONS:  # front to back
@@ -96,7 +101,7 @@ def _select_rows(tensor: Tensor, index: Tensor) -> Tensor:
 
 
 def _merge_layers(front: Splats, back: Splats, blend: Blend) -> Splats:
-    """Merge two layers into one."""
+    """Merge two layers into one: their sum with "add", the front one over the back one with "over"."""
     if blend == "add":
         return Splats(front.colour + back.colour, front.transmittance)
     return Splats(over(front, back.colour), front.transmittance * back.transmittance)

@@ -65,12 +65,12 @@ class Adam:
 
     @contextmanager
     def step_in_backward(self) -> Iterator[None]:
-        """Within the context, a backward pass may step the parameters of a scene as soon as it has their gradients,
-        which it then need not write. The CPU kernels do so.
+        """Within the context, a backward pass may step a scene's parameters as soon as it has their gradients, which it
+        then need not write to memory. The CPU kernels do so.
 
-        The steps are the same as in `step`, which then makes the others; gradients of stepped parameters stay None.
-        Only for a scene whose whole gradient comes from one `rasterization`: raises RunError if a parameter gets a
-        gradient after its step.
+        These steps equal those of `step`, which afterwards steps the other parameters; gradients of stepped parameters
+        stay None. Only for a scene whose whole gradient comes from one `rasterization`: raises RunError if a parameter
+        gets a gradient after its step.
         """
         fused: FusedKernels | None = None
         steps: dict[str, Any] = {}
@@ -95,7 +95,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self) -> None:
-        """Step every parameter that has a gradient and a rate."""
+        """Make an Adam step on every parameter that has a gradient and a rate, by the fused kernels where possible."""
         options = self._options
         fused: FusedKernels | None = None
         fused_steps: list[Any] = []
@@ -117,8 +117,9 @@ class Adam:
 
     @torch.no_grad()
     def last_step(self, name: str, rows: Tensor) -> Tensor:
-        """Return the last step (m, ...) of rows (m,) of a parameter, computed from the moments, since a difference of
-        large values loses digits."""
+        """Return by how much the last step changed rows (m,) of a parameter, (m, ...).
+
+        It is computed from the moments, since a difference of large parameter values would lose digits."""
         first, second = (moment[rows] for moment in self.moments[name])
         count = max(self.steps[name], 1)
         root = (second.sqrt() / math.sqrt(1 - BETA2**count)).add_(self.epsilon)
@@ -131,9 +132,9 @@ class Adam:
 
     @torch.no_grad()
     def keep_rows(self, index: Tensor, names: Iterable[str] | None = None) -> None:
-        """Select rows by a boolean mask or by row numbers, which may be a new order, together with their moments.
+        """Keep only some rows of the parameters, with their moments; sets the gradients to None.
 
-        names: of the parameters; all by default. Sets their gradients to None.
+        index: boolean mask, or row numbers, which may be a new order. names: of the parameters; None for all.
         """
         for name in self.parameters if names is None else names:
             parameter, moments = self.parameters[name], self.moments[name]
@@ -176,10 +177,10 @@ class Adam:
 
 
 def replace_rows(parameter: Parameter, rows: Tensor) -> None:
-    """Replace the rows of a parameter, by any number of them; clears its gradient.
+    """Replace the rows of a parameter by any number of new ones; clears its gradient.
 
-    While an old graph is alive, autograd requires the shape that the parameter had. A change of type lifts that
-    requirement: hence the empty tensor in between.
+    While an old graph is alive, autograd requires that the shape stays the same, unless the type changes: hence the
+    empty tensor of another type in between.
     """
     parameter.data = torch.empty(0, dtype=torch.float16, device=rows.device)
     parameter.data = rows
@@ -192,7 +193,7 @@ def adam_step(
 ) -> None:  # fmt: skip
     """Step a parameter and its moments `first` and `second` in place, in torch, by the formula of the module head.
 
-    step: counts from 1; rate: a float, or a tensor of the shape of a row."""
+    step: number of this step, from 1; rate: learning rate, a float or a tensor of the shape of one row."""
     first.lerp_(gradient, 1 - beta1)
     second.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     root = (second.sqrt() / math.sqrt(1 - beta2**step)).add_(epsilon)

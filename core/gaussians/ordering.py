@@ -16,7 +16,8 @@ BLOCK = 128
 
 
 def morton_codes(points: Tensor) -> Tensor:
-    """Return (n,) int64 codes of (n, 3) finite points, relative to their bounding box."""
+    """Return (n,) int64 Morton codes of (n, 3) finite points, relative to their bounding box: the bits of x, y and z,
+    BITS each, interleaved."""
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.int64, device=points.device)
     low, high = points.aminmax(dim=0)
@@ -26,7 +27,7 @@ def morton_codes(points: Tensor) -> Tensor:
         (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
         (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
     ):  # fmt: skip
-        spread = (spread | spread << shift) & mask  # two zeros between each bit and the next, in the end
+        spread = (spread | spread << shift) & mask  # in the end two zeros lie between each bit and the next
     x, y, z = spread.unbind(-1)
     return x | y << 1 | z << 2
 
@@ -56,7 +57,7 @@ def nearest_distances(points: Tensor, neighbours: int = 3) -> Tensor:
     half_width = BLOCK + 2 * k
     for block_number, (start, block) in enumerate(zip(starts, blocks, strict=True)):
         candidates = points[order[max(0, start - half_width) : start + half_width]]  # at least k + 1 points
-        # No k-th neighbour of this block's points is farther.
+        # An upper bound on the distance of the k-th neighbour for all points of this block.
         bound = _other_distances(block, candidates, k)[:, -1].amax()
         # Along each axis, between this block's box and all boxes; 0 where they overlap.
         gaps = (lows - highs[block_number]).clamp(min=0) + (lows[block_number] - highs).clamp(min=0)
@@ -67,7 +68,8 @@ def nearest_distances(points: Tensor, neighbours: int = 3) -> Tensor:
 
 
 def _other_distances(queries: Tensor, points: Tensor, k: int) -> Tensor:
-    """Return (q, k) distances of queries (q, 3) to their nearest points, ascending, without the query itself, which is
-    among the points (p, 3) at distance 0."""
+    """Return (q, k) distances from each query (q, 3) to its k nearest points (p, 3), ascending.
+
+    The points contain every query, at distance 0, which does not count."""
     distances = torch.cdist(queries, points, compute_mode="donot_use_mm_for_euclid_dist")
     return distances.topk(min(k + 1, len(points)), largest=False).values[:, 1:]

@@ -52,9 +52,10 @@ def _rest_names(number: int) -> tuple[str, ...]:
 
 def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, NDArray[np.float32]] | None = None,
               comments: Sequence[str] = ()) -> None:
-    """Write a scene; `read_ply` restores every parameter exactly.
+    """Write a scene atomically as a binary PLY of 3DGS; `read_ply` restores every parameter exactly.
 
-    extra: further properties by name, (n,) each, which other readers ignore. comments: lines of ASCII for the header.
+    extra: further properties by name, (n,) each, which other readers ignore. comments: ASCII lines for the header,
+    before those that store the scene's near plane, white, pixel grid, far sphere and mip filter.
     """
     extra = extra or {}
     rest_names = _rest_names(3 * (COEFFICIENTS - 1))
@@ -90,7 +91,7 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
 
 
 def read_ply(path: Path | str) -> SceneGaussians:
-    """Read a scene; properties may have any order, and unknown ones are ignored.
+    """Read a scene from a PLY, plain or compressed; properties may have any order, and unknown ones are ignored.
 
     Raises FlareFileError for a file that is no PLY of Gaussians, is cut short, or holds numbers that are not finite
     other than the LEGAL_INFINITIES.
@@ -107,7 +108,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
     rest_names = _check_properties(path, set(header.row.names or ()))
 
     def columns(names: tuple[str, ...]) -> torch.Tensor:
-        """Return (n, names) of these properties, with legal infinities replaced."""
+        """Return the values (n, len(names)) of these properties, with LEGAL_INFINITIES replaced by finite numbers."""
         values: NDArray[np.float32] = np.empty((n, len(names)), np.float32)
         for column, name in enumerate(names):
             values[:, column] = table[name]
@@ -143,8 +144,8 @@ def _read_table(path: Path) -> tuple[_Header, NDArray[Any]]:
 
 
 def _check_properties(path: Path, present: set[str]) -> tuple[str, ...]:
-    """Return the names of the f_rest properties among those present. Raises FlareFileError if one of a Gaussian is
-    missing."""
+    """Return the names of the f_rest properties among the properties `present`. Raises FlareFileError if a property
+    that Gaussians need is missing, or for a wrong number of f_rest."""
     rest_names = _rest_names(sum(name.startswith("f_rest_") for name in present))
     if len(rest_names) not in (0, 9, 24, 45):
         raise FlareFileError(
@@ -170,7 +171,8 @@ class _Header(NamedTuple):
 
 
 def _parse_header(path: Path, head: bytes) -> _Header:
-    """Parse the header of a scene's PLY. Raises FlareFileError."""
+    """Parse the header of a scene's PLY, including this package's comments. Raises FlareFileError if it is no binary
+    PLY whose first element is `vertex`. head: first bytes of the file; path: for messages."""
     parsed = ply.read_header(head)
     if parsed is None:
         raise FlareFileError(f"{path} is not a PLY file; name one of a scene of Gaussians.")

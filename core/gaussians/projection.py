@@ -50,7 +50,7 @@ def camera_position(world_to_camera: Tensor) -> Tensor:
 
 
 def frustum_limits(intrinsics: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Return lower and upper bounds (2,) to which (x/z, y/z) are clamped for J; not differentiated."""
+    """Return lower and upper bounds (2,) to which (x/z, y/z) are clamped for the Jacobian J; without gradients."""
     focal, principal = intrinsics.detach().diagonal()[:2], intrinsics.detach()[:2, 2]
     size = torch.tensor([width, height], dtype=focal.dtype, device=focal.device)
     margin = FRUSTUM_MARGIN * size / (2 * focal)
@@ -61,8 +61,9 @@ def project(
     means: Tensor, quats: Tensor, scales: Tensor, world_to_camera: Tensor, intrinsics: Tensor,
     width: int, height: int, near: float, dilation: float,
 ) -> Projected:  # fmt: skip
-    """Project (n, 3) means, (n, 4) quaternions, (n, 3) scales; differentiable by all of them and by the
-    camera's (4, 4) world_to_camera and (3, 3) intrinsics (no skew).
+    """Project n Gaussians to ellipses on the picture by EWA splatting; differentiable by all tensors.
+
+    means (n, 3), quats (n, 4), scales (n, 3); world_to_camera (4, 4); intrinsics (3, 3), without skew.
 
     near: camera depth up to which Gaussians are culled, world units; dilation: low-pass filter, px²."""
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
@@ -103,9 +104,10 @@ def half_sizes(covariances: Tensor, radii: Tensor) -> Tensor:
 def visible_radii(
     centres: Tensor, covariances: Tensor, radii: Tensor, width: int, height: int
 ) -> Tensor:
-    """Return (n,) 3 sigma of the longer axis, px; 0 where the box at Mahalanobis radius `radii` (n,) misses the frame.
+    """Return (n,) three standard deviations of the longer axis, px; 0 for Gaussians that are not visible.
 
-    centres (n, 2) px; covariances (n, 3) xx, xy, yy, px²."""
+    A Gaussian is visible if its bounding box at the Mahalanobis radius `radii` (n,) touches the frame. centres (n, 2)
+    px; covariances (n, 3) xx, xy, yy, px²."""
     half = half_sizes(covariances, radii)
     frame = torch.tensor([width, height], dtype=centres.dtype, device=centres.device)
     inside = ((centres + half > 0) & (centres - half < frame)).all(-1) & (radii > 0)

@@ -79,20 +79,21 @@ def alphas_over(g: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def weights_over(g: Tensor, opacities: Tensor) -> Tensor:
-    """Return weights (n, p) of the Gaussians in the colours of the pixels, for the blend "over"."""
+    """Return weights (n, p) of n Gaussians in the colours of p pixels, for the blend "over"; g: profiles (n, p)."""
     alpha, transmittance = alphas_over(g, opacities)
     return torch.where(transmittance >= TRANSMITTANCE_MIN, alpha * transmittance, 0)
 
 
 def weights_add(g: Tensor, opacities: Tensor) -> Tensor:
-    """Return weights (n, p) of the Gaussians in the colours of the pixels, for the blend "add"."""
+    """Return weights (n, p) of n Gaussians in the colours of p pixels, for the blend "add"; g: profiles (n, p)."""
     return opacities[:, None] * torch.where(g >= PROFILE_MIN, g, 0)
 
 
 def _map_chunks(pixels: Tensor, count: int, shade: Callable[[Tensor], Tensor]) -> Tensor:
-    """Return shade(pixels), computed in chunks of pixels, whose intermediates are recomputed in backward.
+    """Return shade(pixels), computed in chunks of pixels to bound the memory.
 
-    count: number of Gaussians, by which the size of a chunk is bounded."""
+    In the backward pass the intermediates of a chunk are computed again (checkpointing). count: number of Gaussians;
+    the more there are, the smaller the chunks."""
     parts = pixels.split(max(1, CHUNK // max(count, 1)))
     if len(parts) == 1 or not torch.is_grad_enabled():
         return torch.cat([shade(part) for part in parts])
@@ -123,7 +124,8 @@ def rasterize_scene(
     def median(pixels: Tensor) -> Tensor:
         """Return (p,) median depths at p pixels."""
         alpha, transmittance = alphas_over(profiles(pixels, centres, covariances, None, None), opacities)
-        # Gaussians behind which at least half the light passes; the next one is the median, or the appended 0.
+        # Number of Gaussians behind which at least half the light is left; the next one is the median, or the appended
+        # 0.
         num_in_front = (transmittance * (1 - alpha) >= 0.5).sum(0)
         return torch.cat([depths, depths.new_zeros(1)])[num_in_front]
 

@@ -60,7 +60,9 @@ def activate(scales: Tensor, opacities: Tensor, raw: bool) -> tuple[Tensor, Tens
 
 
 def arc_strengths(covariances: Tensor, arcs: Tensor) -> Tensor:
-    """Return (n,) beta = sqrt(b^T covariance b), at least sqrt(STRENGTH2_MIN); arcs (n, 2 or more): b first, px^-1.
+    """Return (n,) strengths of arcs, beta = sqrt(b^T covariance b), at least sqrt(STRENGTH2_MIN).
+
+    arcs: (n, 2 or more), of which the first two columns are b, px^-1. covariances: (n, 3) xx, xy, yy, px².
 
     In double precision if the device has it, since the terms cancel for needles.
     """
@@ -71,8 +73,10 @@ def arc_strengths(covariances: Tensor, arcs: Tensor) -> Tensor:
 
 
 def normalise_arcs(arcs: Tensor, covariances: Tensor, rings: Tensor | None) -> Tensor:
-    """Return (n, 3) b and m from b (n, 2), px^-1; kernels subtract m = beta r0 + beta² w² / 2 from b·d, so that
-    profiles have a peak of 1.
+    """Return (n, 3), b and m, from arcs b (n, 2), px^-1; with m = beta r0 + beta² w² / 2, which kernels subtract from
+    b·d, profiles have a peak of 1.
+
+    beta: strength of the arc; r0, w: of the ring, 0 and 1 without one; r: Mahalanobis distance.
 
     Along a ray at an angle of cosine c to the direction of the peak, the logarithm of the profile is
 
@@ -91,8 +95,9 @@ def cutoff_radii(
 ) -> Tensor:
     """Return (n,) the Mahalanobis radius beyond which a Gaussian is not drawn; 0 if it is not drawn at all.
 
-    peaks: (n,) clamped opacities; rings: (n, 2); strengths: (n,) beta of arcs, see `arc_strengths`. Solves
-    peak * exp(-r²/2) = ALPHA_MIN for r, or exp(-r²/2) = PROFILE_MIN with "add"; for arcs see `normalise_arcs`.
+    For a plain Gaussian r solves peak * exp(-r²/2) = ALPHA_MIN, or exp(-r²/2) = PROFILE_MIN with "add". A ring reaches
+    to r0 + w r, an arc of strength beta w² beta farther. peaks: (n,) clamped opacities; rings: (n, 2) r0 and w;
+    strengths: (n,) beta.
     """
     if blend == "add":
         reach = torch.full_like(peaks, math.sqrt(-2 * math.log(PROFILE_MIN)))
@@ -107,7 +112,7 @@ def cutoff_radii(
 
 
 def record_gradient(centres: Tensor, index: Tensor, n: int) -> Tensor:
-    """Return (n, 2) zeros; the backward pass adds the gradients with respect to `centres` (m, 2) in the rows `index`.
+    """Return (n, 2) zeros, to whose rows `index` (m,) the backward pass will add the gradients by `centres` (m, 2).
     """
     gradients = torch.zeros(n, 2, dtype=torch.float32, device=centres.device)
 

@@ -91,7 +91,9 @@ class SceneGaussians(nn.Module):
 
     @torch.no_grad()
     def add_far_layer(self, points: PointCloud, sphere: FarSphere, opacity: float = INITIAL_OPACITY) -> None:
-        """Add a Gaussian at each point, which lies on the sphere, as `from_points` makes them but for the opacity."""
+        """Add a far layer: a Gaussian at each point, as `from_points` makes them, but of this opacity; sets `far`.
+
+        points: on the sphere."""
         layer = SceneGaussians.from_points(points)
         layer.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
         for name, parameter in self.named_parameters():
@@ -105,11 +107,11 @@ class SceneGaussians(nn.Module):
         return torch.nonzero(self.far.contains(self.means))[:, 0]
 
     def units(self, extent: float) -> Tensor | float:
-        """Return (n,) factors by which Gaussians are larger than near ones that cover the same angle; 1.0 without a far
-        layer.
+        """Return factors (n,) by which densification divides scales and steps, so that far Gaussians count by the angle
+        that they cover; 1.0 without a far layer.
 
-        extent: of the near scene, world units. The factor is 1 for near Gaussians, and for far ones the radius of the
-        far sphere over `extent`. Densification divides scales and steps by it, and so measures far ones as near ones.
+        The factor is 1 for near Gaussians, and the radius of the far sphere over `extent` for far ones. extent: size of
+        the near scene, world units.
         """
         if self.far is None:
             return 1.0
@@ -137,7 +139,12 @@ class SceneGaussians(nn.Module):
         self, camera: Camera, sh_degree: int | None = None, background: Tensor | None = None,
         *, kernels: Kernels = "auto", depth: bool = True,
     ) -> Rendering:  # fmt: skip
-        """Render the scene for a camera; see `rasterization`. Differentiable by the Gaussians."""
+        """Render the scene for a camera, with the scene's low-pass filter and near plane; differentiable by the
+        Gaussians.
+
+        sh_degree: degree of harmonics that is used, None for all. background: (3,), None for black. depth: whether to
+        render depth too.
+        """
         scales: Tensor = self.log_scales
         opacities: Tensor = self.opacity_logits
         world_to_camera = torch.as_tensor(camera.world_to_camera).to(self.means)
@@ -154,8 +161,9 @@ class SceneGaussians(nn.Module):
 
     def _filter_ratios(self, world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
                        filter_size: float) -> Tensor:
-        """Return (n,) square roots of the ratios of the projected covariances' determinants without and with the
-        low-pass filter of filter_size px²; 1 for culled Gaussians."""
+        """Return (n,) ratios of each Gaussian's projected area without to that with the low-pass filter; 1 if culled.
+
+        An area is the root of the projected covariance's determinant. filter_size: variance of the filter, px²."""
         projected = project(self.means, self.quaternions, self.scales, world_to_camera, intrinsics, width, height,
                             self.near, 0.0)
         plain = determinants(projected.covariances).clamp(min=0)

@@ -68,7 +68,7 @@ Differentiable by the Gaussians."""
 
 
 def whitening(covariances: Tensor) -> Tensor:
-    """Return (n, 3) elements xx, yx, yy of the inverse Cholesky factors of (n, 3) covariances."""
+    """Return (n, 3) elements xx, yx, yy of the whitening W, the inverse Cholesky factor of each covariance (n, 3)."""
     xx, xy, yy = covariances.unbind(-1)
     w_xx = xx.rsqrt()
     w_yy = (yy - xy * xy / xx).rsqrt()
@@ -76,7 +76,8 @@ def whitening(covariances: Tensor) -> Tensor:
 
 
 def whiten_arcs(arcs: Tensor, whitening: Tensor) -> Tensor:
-    """Return (n, 3) a_u, a_v and m from b and m, with b·d = a_u u + a_v v: a = M^T b."""
+    """Return arcs (n, 3) in whitened coordinates, a_u, a_v and m, from arcs (n, 3), b and m: b·d = a_u u + a_v v with
+    a = M^T b."""
     w_xx, w_yx, w_yy = whitening.unbind(-1)
     b_x, b_y, m = arcs.to(whitening.dtype).unbind(-1)
     return torch.stack([(b_x - b_y * w_yx / w_yy) / w_xx, b_y / w_yy, m], -1)
@@ -85,7 +86,10 @@ def whiten_arcs(arcs: Tensor, whitening: Tensor) -> Tensor:
 def _tile_span(
     centres: Tensor, half_size: Tensor, radii: Tensor, columns: int, rows: int, tile_size: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the first tile x, y (n, 2) of boxes of a half size (n, 2), px, and their size in tiles (n, 2)."""
+    """Return the first tile x, y (n, 2) that each bounding box touches, and its size in tiles (n, 2).
+
+    centres, half_size (n, 2): of the boxes, px; radii (n,): 0 for a Gaussian that gets no tiles; columns, rows: number
+    of tiles of the picture."""
     # Bounded before the conversion, since large floats overflow int64.
     low = ((centres - half_size) / tile_size).floor().clamp(min=-1, max=2**30).long().clamp(min=0)
     high = ((centres + half_size) / tile_size).floor().clamp(min=-1, max=2**30).long()
@@ -97,15 +101,16 @@ def _tile_span(
 def bin_tiles(
     centres: Tensor, whitening: Tensor, half_size: Tensor, radii: Tensor, width: int, height: int, tile_size: int
 ) -> TileLists:
-    """Return the lists of tiles that ellipses of Mahalanobis radius `radii` (n,) touch.
+    """Return for each tile the list of Gaussians whose ellipse at Mahalanobis radius `radii` (n,) touches the tile.
 
-    half_size (n, 2): of their bounding boxes, px; tile_size: px."""
+    centres (n, 2), whitening (n, 3): of the Gaussians; half_size (n, 2): half size of their bounding boxes, px;
+    tile_size: side of a tile, px."""
     columns, rows = -(-width // tile_size), -(-height // tile_size)
     low, span = _tile_span(centres, half_size, radii, columns, rows, tile_size)
     counts = span.prod(-1)
 
-    # One entry for each tile of each box, numbered row by row within its box; then drop those that the ellipse inside
-    # the box misses.
+    # Entries for all tiles of each Gaussian's bounding box, numbered row by row within the box. Entries whose tile the
+    # ellipse misses are dropped below.
     entries = torch.repeat_interleave(counts)
     tile_number = torch.arange(len(entries), device=centres.device) - (counts.cumsum(0) - counts)[entries]
     box_columns = span[entries, 0]
@@ -122,11 +127,13 @@ def bin_tiles(
 
 
 def _min_squared_distance(centres: Tensor, whitening: Tensor, corners: Tensor, tile_size: int) -> Tensor:
-    """Return (m,) the smallest squared Mahalanobis distance from centres (m, 2) to tiles with these upper left corners
-    (m, 2): 0 if the centre is inside, else attained on one of the two edges that face it."""
+    """Return (m,) the smallest squared Mahalanobis distance from each Gaussian's centre (m, 2) to a tile.
+
+    It is 0 if the centre is inside the tile, else it lies on one of the two edges that face the centre. whitening
+    (m, 3): of the Gaussians; corners (m, 2): upper left corner of each tile, px."""
     low = corners - centres
     high = low + tile_size
-    # The tile's point nearest to the centre, from the centre: its coordinates are those of the lines of the two edges.
+    # Offset of the tile's point nearest to the centre; its x and y are those of the two edges that face the centre.
     nearest_x, nearest_y = torch.zeros_like(low).clamp(low, high).unbind(-1)
     w_xx, w_yx, w_yy = whitening.unbind(-1)
     slope = w_yx / w_yy  # v = w_yy (dy + slope dx)
@@ -144,10 +151,12 @@ def draw_tiles(
     draw: DrawTiles, tile_size: int, gaussians: WhitenedGaussians, radii: Tensor, half_size: Tensor, width: int,
     height: int, *, blend: Blend, median: bool = False,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Return (height, width, c) weighted sums of the values, and (height, width) rows, see `DrawTiles`.
+    """Draw Gaussians by tiles; return (height, width, c), the weighted sums of their values, and (height, width), if
+    `median` the row of the Gaussian at which transmittance falls below 1/2, or -1.
 
-    radii (n,): Mahalanobis distance up to which each Gaussian is drawn; half_size (n, 2): of its bounding box, px;
-    tile_size: px."""
+    draw: draws the tiles; tile_size: side of a tile, px; radii (n,): Mahalanobis distance up to which each Gaussian is
+    drawn; half_size (n, 2): half size of its bounding box, px. Large pictures are drawn in halves, to bound the
+    memory."""
     centres = gaussians.places.detach()[:, :2]
     columns, rows = -(-width // tile_size), -(-height // tile_size)
     entries = int(_tile_span(centres, half_size, radii, columns, rows, tile_size)[1].prod(-1).sum())
@@ -181,8 +190,9 @@ def rasterize_scene(
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
-    """Render as `rasterization` of the package does, which explains arguments and results. draw: draws the tiles;
-    tile_size: px."""
+    """Render as `rasterization` of the package does; the other arguments and the result are explained there.
+
+    draw: draws the tiles; tile_size: side of a tile, px."""
     scales, opacities = activate(scales, opacities, raw)
     dtype = means.dtype
     projected = project(
@@ -229,8 +239,10 @@ def splat(
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
     *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """Rasterize as `splat` of the package does at full resolution; it explains arguments and result. draw: draws the
-    tiles; tile_size: px."""
+    """Rasterize as `splat` of the package does at full resolution; the other arguments and the result are explained
+    there.
+
+    draw: draws the tiles; tile_size: side of a tile, px."""
     centres, covariances = _to_double(centres), _to_double(covariances)
     index = torch.nonzero(determinants(covariances) > 0)[:, 0]  # a degenerate ellipse covers nothing
     centres, covariances, opacities, colours = (

@@ -37,8 +37,10 @@ def _tile_pixels(like: Tensor) -> Tensor:
 
 
 def _tile_groups(lists: TileLists, filler: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield groups of tiles that are processed together, longest lists first: (b,) tile numbers and (b, longest)
-    entries, padded with `filler`, the row of an invisible Gaussian. Tiles without entries are omitted."""
+    """Yield groups of tiles that are processed together, those with the longest lists first.
+
+    A group is (b,), the numbers of its tiles, and (b, longest), their entries, padded with `filler`, the row of an
+    invisible Gaussian. Tiles without entries are omitted."""
     lengths = lists.starts.diff()
     order = torch.argsort(lengths, descending=True, stable=True)
     num_nonempty = int((lengths > 0).sum())
@@ -53,14 +55,16 @@ def _tile_groups(lists: TileLists, filler: int) -> Iterator[tuple[Tensor, Tensor
 class _Chunk:
     """A chunk of k entries of b tiles, evaluated at all pixels; tensors are (b, pixels, k) unless stated otherwise.
 
-    u, v: whitened offsets; g: profiles; of rings r, the distance, w, and t = (r - r0) / w; of arcs a_u and a_v."""
+    u, v: whitened offsets of the pixels; g: profiles. With rings: r, the Mahalanobis distance, w, and t = (r - r0) / w.
+    With arcs: a_u and a_v, coefficients of u and v."""
 
     def __init__(self, gaussians: WhitenedGaussians, index: Tensor, origins: Tensor, pixels: Tensor) -> None:
-        """index (b, k): rows of `gaussians`; origins (b, 2): middles of the tiles, px; pixels: see `_pixels`."""
+        """Evaluate the profiles. index (b, k): rows of `gaussians`; origins (b, 2): middles of the tiles, px; pixels:
+        from `_tile_pixels`."""
         self.gaussians, self.pixels = gaussians, pixels
         places = gaussians.places[index]
         places[..., :2] -= origins[:, None]
-        # (b, k), from the middle of the tile
+        # (b, k) each; centres relative to the middle of the tile
         self.cx, self.cy, self.w_xx, self.w_yx, self.w_yy = places.to(pixels.dtype).unbind(-1)
         values = gaussians.values[index]
         self.peaks, self.values = values[:, None, :, 0], values[..., 1:]  # (b, 1, k), (b, k, c)
@@ -85,8 +89,8 @@ class _Chunk:
         return self.pixels @ torch.stack([along_x, along_y, offset], 1)
 
     def backward(self, h: Tensor) -> list[Tensor]:
-        """Return the gradients, (b, k) each, from h = dL/dlog g (b, pixels, k): five of the places, then those of ring
-        and arc."""
+        """Return the gradients, (b, k) each, by centre x, y, whitening xx, yx, yy, then by r0, w and a_u, a_v, m if
+        there are rings and arcs. h (b, pixels, k): the gradient by log g."""
         d_shapes = []
         scaled = h  # -2 dL/dq
         if self.gaussians.rings is not None:
@@ -97,7 +101,7 @@ class _Chunk:
         if self.gaussians.arcs is not None:
             d_shapes += [(h * self.u).sum(1), (h * self.v).sum(1), -h.sum(1)]
             scaled_u, scaled_v = scaled_u - h * self.a_u, scaled_v - h * self.a_v
-        # Sums over the pixels, times x, y, 1.
+        # Sums over the pixels of both times x, y and 1.
         sx_u, _, s_u = (self.pixels.T @ scaled_u).unbind(1)
         sx_v, sy_v, s_v = (self.pixels.T @ scaled_v).unbind(1)
         d_cx, d_cy = self.w_xx * s_u + self.w_yx * s_v, self.w_yy * s_v
@@ -111,7 +115,7 @@ def _tile_centres(tiles: Tensor, columns: int) -> Tensor:
 
 
 def _append_empty(gaussians: WhitenedGaussians) -> WhitenedGaussians:
-    """Append an invisible Gaussian, which pads the lists: all zeros, but rings of 1, since they are divided by w."""
+    """Append an invisible Gaussian, which pads the lists: all zeros, except r0 = w = 1, since w is a divisor."""
     return WhitenedGaussians(*(  # type: ignore[arg-type]
         None if part is None else torch.cat([part, part.new_full((1, part.shape[1]), fill)])
         for part, fill in zip(gaussians, (0.0, 0.0, 1.0, 0.0), strict=True)
@@ -123,7 +127,10 @@ class _DrawTiles(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, lists: TileLists, blend: Blend, median: bool, *parts: Tensor | None) -> Any:
-        """Return pictures and median rows of the tiles; parts: the fields of `WhitenedGaussians`."""
+        """Return the tiles' pictures (tiles, pixels, c) and median rows (tiles, pixels).
+
+        The lists are blended chunk by chunk, until all pixels of a group of tiles are opaque. parts: the fields of
+        `WhitenedGaussians`."""
         ctx.lists, ctx.blend = lists, blend
         gaussians = _append_empty(WhitenedGaussians(*parts))  # type: ignore[arg-type]
         n, channels = len(gaussians.values) - 1, gaussians.values.shape[1] - 1
@@ -151,17 +158,19 @@ class _DrawTiles(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, _: Tensor) -> Any:
-        """Return the gradients of the parts, from that of the pictures; see the head of `tiled`."""
+        """Return the gradients by `parts` from that by the pictures, front to back; the head of `tiled` has the
+        formulas.
+        """
         picture, *parts = ctx.saved_tensors
         lists: TileLists = ctx.lists
         gaussians = _append_empty(WhitenedGaussians(*parts))
-        # Of values, places, rings and arcs in the rows of `sums`.
+        # Numbers of columns of `sums`: gradients by values, places, rings and arcs.
         widths = [0 if part is None else part.shape[1] for part in (gaussians.values, *gaussians[:1], *gaussians[2:])]
         sums = gaussians.values.new_zeros(len(gaussians.values), sum(widths))
         pixels = _tile_pixels(gaussians.values)
         for tiles, entries in _tile_groups(lists, len(gaussians.values) - 1):
             upstream = gradient[tiles]
-            remaining = (upstream * picture[tiles]).sum(-1, keepdim=True)  # of the sum, behind the entry
+            remaining = (upstream * picture[tiles]).sum(-1, keepdim=True)  # S: the part of the sum behind the entries
             t_before = torch.ones_like(remaining)
             for index in entries.split(ENTRIES_PER_CHUNK, 1):
                 chunk = _Chunk(gaussians, index, _tile_centres(tiles, lists.columns), pixels)
@@ -170,7 +179,7 @@ class _DrawTiles(torch.autograd.Function):
                 h *= weights
                 if ctx.blend == "over":
                     remaining_behind = remaining - h.cumsum(-1)
-                    # weights / after: alpha / (1 - alpha), or 0 if the entry did not count
+                    # weights / t_after is alpha / (1 - alpha), or 0 if the entry did not count
                     h.addcmul_(weights / t_after.clamp(min=MIN_TRANSMITTANCE), remaining_behind, value=-1)
                     remaining, t_before = remaining_behind[..., -1:], t_after[..., -1:]
                 d_peaks = h.sum(1) / chunk.peaks[:, 0].clamp(min=ALPHA_MIN)
@@ -187,8 +196,9 @@ class _DrawTiles(torch.autograd.Function):
 
 
 def _blend_weights(chunk: _Chunk, blend: Blend, t_before: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weights (b, pixels, k) of the entries and the transmittances behind them; t_before (b, pixels, 1): the
-    transmittance in front of the chunk, which "add" returns unchanged."""
+    """Return the entries' weights (b, pixels, k) in the sum, and the transmittances (b, pixels, k) behind them.
+
+    t_before (b, pixels, 1): transmittance in front of the chunk; with the blend "add" it is returned unchanged."""
     if blend == "add":
         return threshold(chunk.g, PROFILE_MIN, 0.0), t_before
     alpha = threshold(chunk.peaks * chunk.g, ALPHA_MIN, 0.0)
@@ -198,9 +208,10 @@ def _blend_weights(chunk: _Chunk, blend: Blend, t_before: Tensor) -> tuple[Tenso
 
 
 def _median_rows(t_before: Tensor, t_after: Tensor, index: Tensor) -> Tensor:
-    """Return (b, pixels) the row at which the transmittance falls below 1/2, -1 if at none of `index` (b, k).
+    """Return (b, pixels), the Gaussian's row at which transmittance falls below 1/2, or -1 if it does not in this chunk.
 
-    t_before (b, pixels, 1): transmittance in front of the chunk; t_after (b, pixels, k): behind each entry."""
+    t_before (b, pixels, 1): transmittance in front of the chunk; t_after (b, pixels, k): behind each entry; index
+    (b, k): rows of the entries."""
     limit = torch.full_like(t_before, -0.5)
     # Negated, since searchsorted needs ascending order.
     place = torch.searchsorted(t_after.neg(), limit, right=True)[..., 0]

@@ -42,9 +42,10 @@ _CHECK_INTERVAL = wp.constant(32)
 
 @wp.func
 def _profile(dx: float, dy: float, place: _Place, shape: _Shape, rings: bool, arcs: bool) -> float:
-    """Return G of `reference.py` at the offset dx, dy from the centre.
+    """Return the profile G of a Gaussian, ring or arc at the offset dx, dy from the centre.
 
-    place: centre x, y and whitening xx, yx, yy; shape: r0, w, and an arc's a_u, a_v, m; see `WhitenedGaussians`."""
+    place: centre x, y and whitening xx, yx, yy; shape: r0 and w of the ring, and of the arc a_u and a_v, coefficients
+    of the whitened offsets u and v, and m; rings, arcs: whether they are used."""
     u = place[2] * dx
     v = place[3] * dx + place[4] * dy
     q = u * u + v * v
@@ -64,7 +65,9 @@ def _kernels(channels: int) -> tuple[Any, Any]:
     Gradients = wp.types.vector(length=1 + channels + PLACES + SHAPES, dtype=wp.float32)
     VALUES, PLACE, SHAPE = 1, 1 + channels, 1 + channels + PLACES  # offsets in Gradients
 
-    # Each thread draws one pixel. entries, starts, columns: see `TileLists`; add: the blend is "add", else "over".
+    # Each thread draws one pixel. entries: Gaussians' rows, tile by tile; starts: offset of each tile's entries;
+    # columns: tiles in a row; add: the blend is "add", else "over"; median_rows: row at which transmittance falls below
+    # 1/2.
     @wp.kernel(enable_backward=False, module="unique")
     def forward(
         entries: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int32), columns: int,
@@ -112,7 +115,7 @@ def _kernels(channels: int) -> tuple[Any, Any]:
         x = float((tile % columns) * TILE + pixel % TILE) + 0.5
         y = float((tile // columns) * TILE + pixel // TILE) + 0.5
         upstream_here = upstream[i]
-        remaining = float(wp.dot(upstream_here, picture[i]))  # of the sum, behind the entry
+        remaining = float(wp.dot(upstream_here, picture[i]))  # S: what lies behind contributes
         transmittance = wp.float32(1.0)
         start = starts[tile]
         # Every thread of a block runs the whole loop, since the block sums together.
@@ -176,7 +179,8 @@ class _DrawTiles(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, lists: TileLists, blend: Blend, *parts: Tensor | None) -> Any:
-        """Return pictures and median rows of the tiles; parts: the fields of `WhitenedGaussians`."""
+        """Return the tiles' pictures (tiles, pixels, c) and median rows (tiles, pixels); parts: the fields of
+        `WhitenedGaussians`."""
         ctx.lists, ctx.blend = lists, blend
         _, values, _, _ = parts
         assert values is not None
@@ -191,7 +195,7 @@ class _DrawTiles(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, _: Tensor) -> Any:
-        """Return the gradients of the parts, from that of the pictures."""
+        """Return the gradients by `parts` from `gradient`, that by the pictures."""
         picture, *parts = ctx.saved_tensors
         places, values, rings, arcs = parts
         channels = values.shape[1] - 1
@@ -215,7 +219,7 @@ def _as_warp_array(tensor: Tensor) -> Any:
 
 def _launch(kernel: Any, lists: TileLists, blend: Blend, parts: Any, other_arrays: list[Any]) -> None:
     """Launch a kernel with one thread for each pixel of each tile. parts: the fields of `WhitenedGaussians`; absent
-    rings and arcs are passed as zeros. other_arrays: Warp arrays behind the common ones, the outputs among them."""
+    rings and arcs are passed as zeros. other_arrays: the kernel's last arguments, which include its outputs."""
     places, values, rings, arcs = parts
     shapes = values.new_zeros(len(values), SHAPES)
     if rings is not None:

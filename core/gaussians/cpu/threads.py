@@ -138,13 +138,13 @@ def _run_call(function: Callable[..., Any], scratch_size: int, arguments: tuple[
 
 
 def parallel(function: Callable[..., Any], *arguments: Any, scratch: int = 0, limit: int | None = None) -> None:
-    """Call function(counter, *arguments) on every thread, at most `limit` of them, and wait for all.
+    """Call function(counter, [workspace,] *arguments) on every thread, at most `limit` of them, and wait for all.
 
     counter: an int64 array shared by all threads, whose first element starts at 0. scratch: number of float32 values of
     workspace for each thread, passed after the counter unless 0. Raises the first error of any thread.
     """
     thread_count = torch.get_num_threads() if limit is None else max(1, min(limit, torch.get_num_threads()))
-    if not getattr(function, "overloads", True):  # compile here, not on all threads at once
+    if not getattr(function, "overloads", True):  # not compiled yet: one thread compiles and runs it
         thread_count = 1
     try:
         pool = _idle_pools.pop()

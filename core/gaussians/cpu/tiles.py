@@ -62,11 +62,11 @@ def bin_gaussians(
 ) -> Bins:  # fmt: skip
     """Sort n Gaussians into tiles, lowest key first; overwrites max_tiles and first_slots, which the result contains.
 
-    records                  flat, see `layout`
+    records                  flat, 16 numbers for each Gaussian (`layout`)
     keys                     (n,) uint32; `binning.CULLED_KEY` for a Gaussian that is not drawn
     small_tiles, small_rows  (n,) results of `binning.small_footprints`; -1 for larger Gaussians
-    max_tiles                (n,) upper bounds on the numbers of tiles
-    first_slots              (n,) exclusive sums of max_tiles within chunks of `layout.CHUNK` Gaussians
+    max_tiles                (n,) upper bound on each Gaussian's number of tiles; becomes slot_counts
+    first_slots              (n,) exclusive sums of max_tiles within chunks of CHUNK Gaussians; become first slots
     chunk_max_tiles          (chunks,) sums of max_tiles by chunk"""
     n, parts = len(keys), min(torch.get_num_threads(), MAX_PARTS)  # each part scans all keys
     chunk_starts, cuts = np.empty(len(chunk_max_tiles), np.int64), np.empty(parts + 1, np.int64)

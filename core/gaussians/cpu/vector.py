@@ -75,7 +75,8 @@ def _as_vector(context: Any, builder: ir.IRBuilder, value: ir.Value, type_: type
 
 
 def _kind_of(args: Sequence[types.Type]) -> str | None:
-    """Return the common kind of the vectors among two arguments; None unless the others are numbers."""
+    """Return the kind of the vectors among two arguments; None if there is no vector, if two have different kinds, or
+    if the other argument is not a number."""
     kinds = {a.kind for a in args if isinstance(a, Vector)}
     others = [a for a in args if not isinstance(a, Vector)]
     if len(kinds) != 1 or not all(isinstance(a, (types.Number, types.Boolean)) for a in others):
@@ -86,7 +87,8 @@ def _kind_of(args: Sequence[types.Type]) -> str | None:
 def _define_operator(symbol: Callable[..., Any], kinds: dict[str, Callable[..., ir.Value]], result: str) -> None:
     """Define the operator `symbol` for two vectors, or a vector and a number.
 
-    kinds: emitter by kind of vector; result: kind of the result, "" for that of the arguments."""
+    kinds: by the vectors' kind, a function that emits the instruction, of (builder, a, b); other kinds are not
+    supported. result: kind of the result, "" for that of the arguments."""
 
     class Typing(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:  # noqa: ARG002
@@ -240,8 +242,8 @@ def store_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
 
 @intrinsic
 def stream_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
-    """Store a tuple of vectors past the caches, for data that is not read soon; see `store_rows`. All addresses must be
-    aligned to cache lines."""
+    """Store a tuple of vectors from a flat index on, each `stride` elements after the one before, past the caches: for
+    data that is not read soon. All addresses must be aligned to cache lines."""
     count = len(rows)
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -257,7 +259,8 @@ def stream_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
 
 
 def _make_prefetch(write: bool, purpose: str) -> Any:
-    """Return the intrinsic that prefetches a cache line for writing (`write`) or reading."""
+    """Return the intrinsic that prefetches a cache line for writing (`write`) or reading. purpose: for its
+    docstring."""
 
     def prefetch(typing_context, array, index):  # noqa: ARG001
         def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -360,9 +363,10 @@ def where(typing_context, mask, a, b):  # noqa: ARG001
 
 
 def _make_min_max(sign: str) -> Callable[..., Any]:
-    """Return the definition of the function of a and b that returns a if a `sign` b, else b, as for NaN.
+    """Return the definition of a function of a and b that returns a if the comparison a `sign` b is true, else b, also
+    if either is NaN.
 
-    A comparison and a select: one instruction everywhere, whereas llvm.minnum adds a test for NaN."""
+    LLVM makes one instruction of comparison and select, whereas llvm.minnum adds a test for NaN."""
     def define(typing_context, a, b):  # noqa: ARG001
         if _kind_of((a, b)) != "float32":
             return None
@@ -484,7 +488,9 @@ def _interleave_halves(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, step: in
 
 
 def _reduce_eight(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
-    """Return 8 lanes, of which lane i is the sum of vector i of up to 8: a transposition that adds at each step."""
+    """Return a vector of 8 lanes, of which lane i is the sum of all lanes of vectors[i], for up to 8 vectors.
+
+    Works as a transposition by halves, which adds the two halves at each step; lanes without a vector are undefined."""
     low, high = range(LANES // 2), range(LANES // 2, LANES)
     partial_sums: list[ir.Value | None] = [
         builder.fadd(_shuffle(builder, v, None, low), _shuffle(builder, v, None, high)) for v in vectors
@@ -519,7 +525,7 @@ def reduce_add(typing_context, a):  # noqa: ARG001
 
 @intrinsic
 def reduce_add_each(typing_context, vectors):  # noqa: ARG001
-    """Return a vector of the sums of up to 16 vectors, in their order (further lanes: undefined)."""
+    """Return a vector whose lane i is the sum of all lanes of vectors[i], for up to 16; further lanes are undefined."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         values = [builder.extract_value(args[0], i) for i in range(len(vectors))]
@@ -556,7 +562,7 @@ def multiply_each(typing_context, a, b):  # noqa: ARG001
 
 @intrinsic
 def transpose(typing_context, vectors):  # noqa: ARG001
-    """Transpose 16 vectors: lane j of result i is lane i of argument j."""
+    """Transpose 16 vectors: lane j of result i is lane i of argument j. Blocks of 1, 2, 4, 8 lanes are exchanged."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         rows = [builder.extract_value(args[0], i) for i in range(LANES)]
@@ -570,7 +576,7 @@ def transpose(typing_context, vectors):  # noqa: ARG001
 
 
 def _permute(context: Any, builder: ir.IRBuilder, vectors: ir.Value, count: int, *, invert: bool) -> ir.Value:
-    """Interleave the lanes of a tuple of `count` vectors, or invert that; see `interleave`."""
+    """Interleave the lanes of `count` vectors a, b, ... to a0 b0 ... a1 b1 ..., or with `invert` do the opposite."""
     inputs = [builder.extract_value(vectors, i) for i in range(count)]
     results = []
     for output in range(count):
@@ -578,7 +584,7 @@ def _permute(context: Any, builder: ir.IRBuilder, vectors: ir.Value, count: int,
             positions = [divmod(i * count + output, LANES) for i in range(LANES)]  # (vector, lane) of each result lane
         else:
             positions = [divmod(output * LANES + i, count)[::-1] for i in range(LANES)]
-        # Each step takes the lanes that come from its vector. Step 1 also puts those of vector 0 into their places.
+        # Step k puts the lanes that come from vector k into their places; step 1 those of vector 0 too.
         result = inputs[0]
         for vector_number in range(1, count):
             source_lanes = [LANES + lane if vector == vector_number else (lane if vector_number == 1 else i)
@@ -623,7 +629,9 @@ _EXP2_MAX = np.float32(126.5)
 
 @inlined
 def exp2_unclamped(x):
-    """Return 2^x for x within -126 .. 126; undefined outside."""
+    """Return 2^x for x within -126 .. 126; undefined outside.
+
+    x is split into the nearest integer and a remainder f; 2^f is a polynomial of degree 5."""
     rounded = x + _ROUND
     f = x - (rounded - _ROUND)
     ff = f * f
@@ -662,7 +670,8 @@ _EXP2M1 = tuple(
 
 @inlined
 def exp2m1(x):
-    """Return 2^x - 1, with the same relative accuracy near 0 as elsewhere."""
+    """Return 2^x - 1, as accurate relatively near 0 as elsewhere: there by f times a polynomial, without a subtraction.
+    """
     f = minimum(maximum(x, np.float32(-0.5)), np.float32(0.5))
     p = fma(f, _EXP2M1[5], _EXP2M1[4])
     p = fma(f, p, _EXP2M1[3])

@@ -208,7 +208,7 @@ def _blend_weights(chunk: _Chunk, blend: Blend, t_before: Tensor) -> tuple[Tenso
 
 
 def _median_rows(t_before: Tensor, t_after: Tensor, index: Tensor) -> Tensor:
-    """Return (b, pixels), the Gaussian's row at which transmittance falls below 1/2, or -1 if it does not in this chunk.
+    """Return (b, pixels), the Gaussian's row at which transmittance falls below 1/2, or -1 if it does not here.
 
     t_before (b, pixels, 1): transmittance in front of the chunk; t_after (b, pixels, k): behind each entry; index
     (b, k): rows of the entries."""

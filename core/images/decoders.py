@@ -318,7 +318,8 @@ def _decode_in_child(decode: Callable[..., NDArray[Any]], path: Path) -> NDArray
 
 
 def _decode_by_opencv(path: Path, _progress: Progress | None = None) -> NDArray[Any]:
-    """Decode a file with OpenCV to (height, width), or B G R with alpha last. Raises FrameError."""
+    """Decode a file with OpenCV to (height, width), or B G R with alpha last; _progress: given by `run_in_child`,
+    unused. Raises FrameError."""
     import cv2
 
     data = np.frombuffer(read_bytes(path, MAX_BYTES), np.uint8)

@@ -84,7 +84,7 @@ def read_exr_header(path: Path | str) -> dict[str, Any]:
 
 
 def non_utf8_strings(path: Path | str) -> dict[str, bytes]:
-    """Return the text attributes of an EXR that are not UTF-8, by name; none where it is no EXR. Raises OSError."""
+    """Return the text attributes of an EXR that are not UTF-8, by name; {} for another file. Raises OSError."""
     with open_regular(path) as stream:
         if stream.read(4) != exr_header.MAGIC:
             return {}
@@ -255,8 +255,8 @@ def read_data_window(path: Path | str) -> DataWindow:
 def read_exr(path: Path | str) -> dict[str, Pixels]:
     """Read every channel of every part of an EXR, by name, as (height, width) float32.
 
-    Of two parts with a channel of one name (left and right eye, render passes) the first counts. Raises FrameError
-    where the file is damaged or holds NaN or infinity.
+    If two parts have a channel of the same name (two eyes, render passes), the first part's is returned. Raises
+    FrameError where the file is damaged or holds NaN or infinity.
     """
     path = Path(path)
     picture_size(path)

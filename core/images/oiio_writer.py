@@ -34,7 +34,8 @@ def needs_oiio_writer(path: Path) -> bool:
 def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[Any] | None, suffix: str) -> None:
     """Write codes (height, width, 1 or 3) and straight alpha (height, width) with the header of `source`.
 
-    suffix: chooses the format, a key of OIIO_FORMATS; the suffix of `path` has no effect. Raises FrameError."""
+    suffix: chooses the format, a key of OIIO_FORMATS; the suffix of `path` has no effect. Raises FrameError.
+    """
     if suffix == ".webp":
         _write_webp(path, source, codes, alpha)
         return

@@ -395,8 +395,8 @@ def _format_suffix(path: Path, plate: Plate) -> str:
 
 
 def _encoder_options(suffix: str, dtype: np.dtype[Any]) -> list[int]:
-    """Return OpenCV's options for a format and a type of pixels: JPEG with chroma at full resolution, floats as they
-    are."""
+    """Return OpenCV's options for a format and a type of pixels: JPEG with chroma at full resolution, TIFF of floats
+    without compression."""
     import cv2
 
     if suffix in _JPEGS:

@@ -120,18 +120,19 @@ class VideoFrame:
         return self.colour.to_signal(stack_planes(arrays, planar))
 
     def stored_codes(self) -> NDArray[Any]:
-        """(height, width, 3): R G B codes of the signal, uint8 or uint16, without its curve and primaries, not turned
-        upright."""
+        """Return the R G B codes of the signal (height, width, 3), uint8 or uint16: neither its curve nor its primaries
+        are converted, and the frame is not turned upright."""
         arrays, planar = self._planes
         return replace(self.colour, transfer="display", primaries=None).to_signal(stack_planes(arrays, planar))
 
     def pixels(self) -> NDArray[Any]:
-        """(height, width, 3): R G B as uint8 or uint16 codes of display values, or float32 linear light."""
+        """Return R G B (height, width, 3), upright: uint8 or uint16 codes of display values, or float32 linear
+        light."""
         return self.orientation.upright(self.colour.to_pixels(self._signal))
 
     def alpha(self) -> NDArray[Any] | None:
-        """(height, width) alpha: codes of the type of `pixels`, or float32 0..1 beside linear light; None where the
-        video has none."""
+        """Return alpha (height, width): codes of the same type as `pixels`, or float32 0..1 if these are linear light;
+        None where the video has no alpha."""
         arrays, planar = self._planes
         if not planar.has_alpha:
             return None
@@ -143,7 +144,7 @@ class VideoFrame:
         return self.orientation.upright(codes.astype(dtype))
 
     def straight_alpha(self) -> NDArray[np.float32] | None:
-        """(height, width) alpha at 0..1, with which the pixels are not multiplied; None where the video has none."""
+        """Return straight alpha (height, width), 0..1; None where the video has no alpha."""
         alpha = self.alpha()
         if alpha is None or alpha.dtype.kind == "f":
             return alpha
@@ -157,8 +158,8 @@ class VideoFrame:
         return Picture(pixels, self.encoding)
 
     def grey(self) -> NDArray[np.float32]:
-        """(height, width) luma, or the green of RGB, upright, for measures of detail. 0..255 spans all codes of the
-        format, also of a limited range."""
+        """Return luma, or the green of RGB, (height, width), upright, for measures of detail. All codes of the format,
+        also those outside a limited range, are scaled to 0..255."""
         arrays, planar = self._planes
         luma = arrays[1 if planar.is_rgb else 0].astype(np.float32)
         return self.orientation.upright(luma * np.float32(255 / ((1 << planar.bits) - 1)))

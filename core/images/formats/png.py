@@ -11,11 +11,11 @@ EXIF = b"eXIf"
 
 
 def chunks(stream: BinaryIO, names: Container[bytes], *, before_pixels: bool = False) -> Iterator[tuple[bytes, bytes]]:
-    """Yield (name, content) of the chunks of these names, in the file's order, without damaged ones; none of other
-    files.
+    """Yield (name, content) of a PNG's chunks of these names, in the file's order, without damaged ones; nothing for
+    other files.
 
-    before_pixels: look no further than the pixels, of which a large picture has a thousand chunks. Chunks that say how
-    pixels are decoded stand before them.
+    before_pixels: stop at the pixels, of which a large picture has a thousand chunks. All chunks that say how pixels
+    are decoded come before.
     """
     for name, length in _chunk_headers(stream):
         if before_pixels and name == b"IDAT":
@@ -44,7 +44,7 @@ def is_truncated(data: bytes) -> bool:
 
 
 def _chunk_headers(stream: BinaryIO) -> Iterator[tuple[bytes, int]]:
-    """Yield (name, length) of each chunk, with the stream at its content; none where it is no PNG."""
+    """Yield (name, length) of each chunk, with the stream at its content; nothing if the file is no PNG."""
     stream.seek(0)
     if stream.read(8) != SIGNATURE:
         return

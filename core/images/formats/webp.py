@@ -11,7 +11,7 @@ _MAX_CHUNK_BYTES = 1 << 20
 
 
 def chunks(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
-    """Yield (name, content) of the Exif block and of the parameters of an animation; none of other files."""
+    """Yield (name, content) of a WebP's Exif block and of its animation parameters; nothing for other files."""
     stream.seek(0)
     head = stream.read(12)
     if head[:4] != b"RIFF" or head[8:] != b"WEBP":

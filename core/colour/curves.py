@@ -79,7 +79,7 @@ def cineon_from_light(light: NDArray[Any]) -> Pixels:
 
 
 def power_curve(gamma: float) -> tuple[Callable[[NDArray[Any]], Pixels], Callable[[NDArray[Any]], Pixels]]:
-    """Return (decode, encode) of a power, mirrored below 0."""
+    """Return (decode, encode) of the curve light = value**gamma, mirrored below 0."""
     def decode(values: NDArray[Any]) -> Pixels:
         return (np.sign(values) * np.power(np.abs(values), np.float32(gamma))).astype(np.float32)
 

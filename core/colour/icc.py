@@ -99,7 +99,7 @@ def _invert_curve(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) ->
 
 
 def _read_tags(profile: bytes) -> dict[bytes, bytes]:
-    """Read the tag table. Raises UnreadableProfile."""
+    """Return the tags of a profile by name. Raises UnreadableProfile where it is damaged."""
     if len(profile) < 132 or profile[36:40] != b"acsp":  # the header of 128 bytes has this signature
         raise UnreadableProfile("is damaged")
     count = int.from_bytes(profile[128:132], "big")

@@ -33,8 +33,8 @@ def is_exr(path: Path) -> bool:
 
 
 def channel_names(path: Path | str) -> list[str]:
-    """Return the names of the channels of an EXR's first part, by its header alone. Raises FrameError where the header
-    is no EXR's."""
+    """Return the names of the channels of an EXR's first part, from the header alone. Raises FrameError where the file
+    is no EXR or its header is damaged."""
     path = Path(path)
     try:
         with open_regular(path) as stream:

@@ -70,8 +70,8 @@ def _view_of_part(header: Mapping[str, Any]) -> str:
 def stereo_views(header: Mapping[str, Any], names: Collection[str]) -> list[StereoView]:
     """Return the views in one part of an EXR, the one at the root first; empty for a picture of one view.
 
-    names: of the channels. Without the attribute multiView, views are the channel prefixes "left" and "right". The
-    channels without a prefix are then named after the missing eye; "root" if both eyes have a prefix.
+    names: names of the channels. Without the attribute multiView, views are the channel prefixes "left" and "right".
+    The channels without a prefix are then named after the missing eye; "root" if both eyes have a prefix.
     """
     listed_views = [str(name) for name in header.get("multiView", ())]
     prefixes = dict.fromkeys(name.rpartition(".")[0] for name in names if name.count(".") == 1)

@@ -87,8 +87,8 @@ def copy_metadata(encoded: bytes, source: Path, *, has_alpha: bool) -> bytes:
 def with_colour_chunks(encoded: bytes, profile: bytes, code_points: tuple[int, int] | None) -> bytes:
     """Return an encoded PNG with the colour space of the picture of another format that it was made from.
 
-    profile: its ICC profile, written if it is for the PNG's number of channels; else code_points: its primaries and
-    transfer (ITU-T H.273), written unless they are sRGB or unspecified.
+    profile: ICC profile of that picture, written if it is for the PNG's number of channels. code_points: its primaries
+    and transfer function (ITU-T H.273), written instead if the profile is not, unless they are sRGB or unspecified.
     """
     is_colour = encoded[_COLOUR_TYPE_OFFSET] & 2 > 0
     if profile and is_colour == (profile[16:20] == b"RGB "):

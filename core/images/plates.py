@@ -229,8 +229,8 @@ def finite_light(codes: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def read_plate(path: Path | str, space: ColourSpace | None = None) -> Plate:
-    """Read a picture as stored, with the colour space that it declares, or `space` in its place. NaN and infinity are
-    kept.
+    """Read a picture as stored; NaN and infinity are kept. space: the colour space of its codes; None for the one that
+    the file declares.
 
     Raises FrameError where the file is missing, damaged, of another kind, or has no colour.
     """
@@ -280,7 +280,7 @@ def _is_animated(path: Path) -> bool:
 def _read_transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
     """Return alpha (height, width) of a grey PNG with one transparent code (PNG specification, 11.3.2.1), or None.
 
-    OpenCV reads such files without it.
+    OpenCV reads such files without their alpha.
     """
     with open_regular(path) as stream:
         depth = stream.read(25)[24:]  # bits of a code (PNG specification, 11.2.1)

@@ -165,7 +165,7 @@ def _is_corrupt_tiff(path: Path) -> bool:
 def _decode_jpeg(path: Path) -> NDArray[Any]:
     """Decode a JPEG to (height, width) or B G R.
 
-    Raises FrameError for one whose data end early or are corrupt, of which OpenCV and OpenImageIO make grey areas.
+    Raises FrameError if the data end early or are corrupt; OpenCV and OpenImageIO would fill in grey areas.
     """
     import simplejpeg
 

@@ -15,9 +15,9 @@ from .formats.kinds import HEAD_BYTES, holds_video
 
 
 def picture_size(path: Path | str) -> tuple[int, int]:
-    """Read (width, height) from the header alone; an EXR's is its displayWindow.
+    """Read (width, height) from the header alone; for an EXR, those of its displayWindow.
 
-    Raises FrameError where the header is no picture's.
+    Raises FrameError where the file is missing or its header is not that of a picture.
     """
     path = Path(path)
     if not path.is_file():

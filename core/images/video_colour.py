@@ -115,7 +115,7 @@ class VideoColour:
         return (np.clip(srgb_from_linear(light), 0, 1) * 65535 + 0.5).astype(np.uint16)
 
     def from_pixels(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the signal, 0..1, of display values 0..1 or of linear light (height, width, 3), float32.
+        """Convert display values 0..1, or linear light, (height, width, 3) to the signal, 0..1, float32.
 
         The inverse of `to_pixels`; light below 0 becomes 0.
         """

@@ -54,7 +54,7 @@ def plane_format(name: str) -> PlaneFormat | None:
 def nearest_planar_name(frame: Any) -> str:
     """Return the name of the planar format, without subsampling, that holds all components of a PyAV frame.
 
-    It is R G B for palettes, and for sensor (Bayer), XYZ and one bit pictures, which swscale converts.
+    The format is R G B for RGB frames, palettes, sensor (Bayer), XYZ and one bit pictures, else Y Cb Cr.
     """
     components = frame.format.components
     has_alpha = any(component.is_alpha for component in components) or frame.format.has_palette

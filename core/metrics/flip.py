@@ -38,7 +38,7 @@ _RELATIVE_XYZ_FROM_RGB = (_XYZ_FROM_RGB / _WHITE[:, None]).astype(np.float32)
 
 
 def flip_map(image: Planes, target: Planes) -> Plane:
-    """Return the error (height, width), 0 to 1, of sRGB pictures (height, width, 3) at 67 pixels per degree.
+    """Return the FLIP error (height, width), 0 to 1, between sRGB pictures (height, width, 3), at 67 pixels per degree.
 
     Values beyond 0..1 are clipped.
     """
@@ -119,7 +119,8 @@ def _redistribute(distance: Plane) -> Plane:
 
 
 def _feature_difference(first: Plane, second: Plane) -> Plane:
-    """Return the difference of edges and points of two luminances 0..1, section 4.2."""
+    """Return how much edges and points differ between two luminances 0..1, (height, width), by section 4.2: first and
+    second derivatives of a Gaussian."""
     sigma = 0.5 * _EDGE_WIDTH * PIXELS_PER_DEGREE
     offsets = np.arange(-math.ceil(3 * sigma), math.ceil(3 * sigma) + 1)
     gaussian = np.exp(-offsets ** 2 / (2 * sigma ** 2))

@@ -29,7 +29,8 @@ class Lpips:
     """LPIPS distance of two pictures of display values 0..1; 0 is equal."""
 
     def __init__(self, folder: Path | str) -> None:
-        """Raises SettingsError if the folder lacks weights or holds others."""
+        """Read the weights from a folder. Raises SettingsError if some are missing, or a file holds more than
+        weights."""
         self._weights: dict[str, Tensor] = {}
         for path in sorted(Path(folder).glob("*")):
             self._weights.update(_read_weights(path))

@@ -58,8 +58,8 @@ class Case:
 
 
 def read_cases(folder: Path | str) -> list[Case]:
-    """Return the cases of a folder in the layout that the module's docstring describes. Raises SettingsError where it
-    holds none, or a picture has no counterpart."""
+    """Return the cases of a folder, which has the layout that the top of this module describes. Raises SettingsError
+    where it holds none, or a picture has no counterpart."""
     folder = Path(folder)
     cases: list[Case] = []
     if not folder.is_dir():
@@ -198,8 +198,8 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def format_table(scores: dict[str, Any]) -> str:
-    """Return the means as text, a line per category: the result, in brackets the input. scores: what `evaluate`
-    returned."""
+    """Return the means as text, a line for each category: scores of the result, and in brackets those of the untouched
+    input. scores: what `evaluate` returned."""
     lines = [f"{'category':24}{'n':>5}{'PSNR':>16}{'gain':>7}{'SSIM':>18}{'LPIPS':>8}{'FLIP':>8}{'worse':>7}"]
     for name, means in [*scores["categories"].items(), ("all", scores["mean"])]:
         after, before = means["result"], means["input"]

@@ -78,7 +78,8 @@ def without_thumbnail(block: bytes) -> bytes:
     """Return an Exif block without its second directory, which holds a small copy of the picture; damaged ones
     unchanged.
 
-    The copy is cut off at the end of the block, and overwritten with zeros elsewhere, so that no offset changes.
+    If the copy is the end of the block, it is cut off; elsewhere it is overwritten with zeros, so that no offset
+    changes.
     """
     order: Literal["little", "big"] = "little" if block[:2] == b"II" else "big"
     first_directory = int.from_bytes(block[4:8], order)

@@ -10,7 +10,7 @@ _THUMBNAILS = (1033, 1036)
 
 
 def without_thumbnails(resources: bytes) -> bytes:
-    """Return image resources without thumbnails; what cannot be parsed stays byte for byte."""
+    """Return image resources without thumbnails; from the first resource that cannot be parsed, all bytes stay."""
     others, offset = [], 0
     while resources[offset:offset + 4] in _SIGNATURES and len(resources) >= offset + 12:
         length_offset = offset + 7 + resources[offset + 6]  # after the name, padded to an even size

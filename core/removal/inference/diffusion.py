@@ -69,8 +69,11 @@ class DiffusionRemoval(nn.Module):
     prompt: Tensor
 
     def __init__(self, base: Path | str, rank: int = RANK) -> None:
-        """base: folder of the base model, or its name in the local cache. rank: rank of the LoRAs. Raises EngineError
-        where packages are missing, RunError where the base cannot be read."""
+        """Load the base model, frozen, and add the LoRAs and skip convolutions to train.
+
+        base: folder of the base model, or its name in the local cache. rank: rank of the LoRAs. Raises EngineError
+        where packages are missing, RunError where the base cannot be read.
+        """
         super().__init__()
         check_packages()
         from diffusers import AutoencoderKL, DDPMScheduler, UNet2DConditionModel
@@ -112,7 +115,8 @@ class DiffusionRemoval(nn.Module):
         return layers
 
     def forward(self, display: Tensor) -> Tensor:
-        """Return the frames (n, 3, h, w) without flare, not clipped."""
+        """Return frames (n, 3, h, w) of display values without their flare, not clipped: one denoising step on the
+        latents."""
         latents, features = self._encode(display * 2 - 1)
         prompt = self.prompt.expand(len(display), -1, -1)
         step = torch.full((len(display),), NOISE_STEP, dtype=torch.long, device=display.device)
@@ -214,8 +218,11 @@ class DiffusionRemover(Remover):
     min_mean_flare = 0.0
 
     def __init__(self, base: Path | str, lora: Path | str, *, working_size: int = WORKING_SIZE) -> None:
-        """base: folder of the base model, or its name in the local cache. lora: the file that `DiffusionRemoval.save`
-        wrote. working_size: long side of the model's input, pixels. Raises EngineError, RunError."""
+        """Load the base model and its trained tensors.
+
+        base: folder of the base model, or its name in the local cache. lora: the file that `DiffusionRemoval.save`
+        wrote. working_size: long side of the model's input, pixels. Raises EngineError, RunError.
+        """
         # Remover.__init__ would load the network. The model does not separate the glow, so all of it is removed.
         self.working_size, self.glow = working_size, "remove"
         self.model = DiffusionRemoval(base, read_rank(lora))

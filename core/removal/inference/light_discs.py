@@ -118,7 +118,7 @@ def _retained_glow_fraction(discs: _LightDiscs, clean: Pixels) -> NDArray[Any]:
 
 
 def _find_light_discs(observed: Pixels, clean: Pixels, flare: Pixels, glow: Pixels) -> _LightDiscs:
-    """Find the bright regions that may be light discs.
+    """Find the bright regions (connected components) that may be light discs.
 
     observed, clean: brightness as filmed and without the flare. flare, glow: brightness of the flare and of its glow.
     All (h, w).

@@ -35,7 +35,8 @@ class ShotPredictor:
     """
 
     def __init__(self, remover: Remover, paths: Iterable[Path]) -> None:
-        """paths: every picture that may be a neighbour. A plate that is not among them is predicted by itself."""
+        """Find the neighbours of each plate. paths: every picture that may be a neighbour; a plate that is not among
+        them is predicted by itself."""
         self._remover = remover
         self._before: dict[Path, Sequence[Path]] = {}
         self._after: dict[Path, Sequence[Path]] = {}

@@ -78,7 +78,8 @@ class Remover:
 
     def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
                  glow: Glow = "keep at lights") -> None:
-        """weights: None for `default_weights`. Raises RunError, SettingsError."""
+        """Load the network. weights: its file; None for `default_weights`. working_size: long side of the network's
+        largest input, pixels. glow: what to do with the glow about lights. Raises RunError, SettingsError."""
         if not 64 <= working_size <= 8192:
             raise SettingsError(f"A working size of {working_size} pixels is outside 64 to 8192.")
         weights = weights or default_weights()
@@ -133,8 +134,8 @@ class Remover:
         """Return the codes without flare, in the plate's own type, and the flare in linear light (height, width, 3).
 
         matte: (height, width), 0..1, where an artist has marked a flare: that share of the predicted flare is removed
-        there, whatever its confidence. prediction: for the plate, where it is known (`neighbours.ShotPredictor`); None
-        to predict it here.
+        there, whatever its confidence. prediction: the prediction for this plate, if there is one already; None to
+        predict here.
 
         If the network can take the plate's own codes, the flare is subtracted from them. If they had to be converted,
         exposed, filled or wrapped for the network, the flare is converted back and subtracted from the plate's light.
@@ -171,7 +172,7 @@ class Remover:
         return self._scale_to_input(wrap_plate(to_network_plate(fill_hidden(plate))[0], wrap_margin(plate)))
 
     def _scale_to_input(self, plate: Plate) -> Pixels:
-        """Scale what `to_network_plate` returns to the network's input."""
+        """Scale a plate of `to_network_plate`, without its black borders, to the network's input (h, w, 3)."""
         import cv2
 
         codes, encoding, max_code = plate.codes[plate.picture_area.slices], plate.encoding, plate.max_code

@@ -46,8 +46,8 @@ MIN_MEAN_PER_CHANNEL = 0.004
 def predict_with_tta(display: Pixels, predict: PredictFn) -> TtaPrediction:
     """Predict the flare of display values 0..1 (h, w, 3), h and w multiples of SIZE_MULTIPLE.
 
-    predict: one pass of the network. Channels are predicted one by one in dark frames only, and features computed only
-    where the mean exceeds MIN_MEAN.
+    predict: one pass of the network (`PredictFn`). Channels are predicted one by one in dark frames only, and features
+    computed only where the mean exceeds MIN_MEAN.
     """
     flares, glows = map(np.concatenate, zip(*(_predict_rotated(predict, display, scale) for scale in SCALES),
                                             strict=True))

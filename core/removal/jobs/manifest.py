@@ -62,8 +62,8 @@ class Manifest:
     def reason_to_keep(self, name: Path, source: Path, digest: str, results: Sequence[Path]) -> KeepReason | None:
         """Return why the files of a frame are kept, or None if they are to be made.
 
-        "up to date": they would come out the same. "edited": someone changed them after they were made, and `source`
-        has not changed since.
+        "up to date": making them again would give the same files. "edited": someone changed them after they were made,
+        and `source` has not changed since.
         """
         tables = self._read_tables()
         if self._is_up_to_date(tables, name, digest, results):

@@ -23,8 +23,8 @@ class Mattes:
     """One matte for all plates, or a folder with one for each plate under its name with any suffix."""
 
     def __init__(self, source: Path) -> None:
-        """source: the matte or the folder. Raises SettingsError where nothing exists there, and where a folder has two
-        mattes for one name."""
+        """Index the mattes by name. source: the matte or the folder. Raises SettingsError where nothing exists there,
+        and where a folder has two mattes for one name."""
         self.source = source
         self._by_name: dict[Path, Path] | None = None
         if source.is_dir():
@@ -106,8 +106,8 @@ def _read_matte_values(path: Path) -> NDArray[np.float32]:
 
 
 def _index_by_name(folder: Path) -> dict[Path, Path]:
-    """Return every matte of the folder by its name there without the suffix. Raises SettingsError where two mattes have
-    one name."""
+    """Return the mattes below a folder, by their path below it without suffix. Raises SettingsError where two mattes
+    have one name."""
     mattes: dict[Path, Path] = {}
     for path in pictures_below(folder):
         name = path.relative_to(folder).with_suffix("")

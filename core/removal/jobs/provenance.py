@@ -16,7 +16,7 @@ def has_exact_clean_frames(capture: Capture) -> bool:
     """Return whether a capture has clean frames that a fit may take as exact.
 
     Files that `remove` made and nobody has edited since are estimates, all others in removed/ are exact. Without
-    removed/, the exact layers of a rendered scene count.
+    removed/, a rendered capture has them in its exact layers.
     """
     if not capture.has_clean_frames:
         return capture.has_truth

@@ -62,7 +62,7 @@ class Recipe:
     lifted_black_share: float = 0.25     # of the frames: graded so that black is grey
 
     def __post_init__(self) -> None:
-        """Check every number. Raises SettingsError."""
+        """Raise SettingsError for a number that is out of its range."""
         if min(self.iterations, self.pixels_per_iteration, self.bank_size, self.renew_every,
                self.warmup_iterations) < 1:
             raise SettingsError("A recipe needs at least one iteration, pixel and flare.")
@@ -121,7 +121,7 @@ def as_dict(recipe: Recipe) -> dict[str, Any]:
 
 
 def from_dict(data: dict[str, Any]) -> Recipe:
-    """Return the recipe of a dictionary; the inverse of `as_dict`.
+    """Make a recipe from a dictionary; the inverse of `as_dict`.
 
     Raises SettingsError for unknown names and for values of another type. Retired names are read:
     if a retired and a present name of one setting occur, the later one in `data` counts.

@@ -84,7 +84,7 @@ def _not_weights_error(path: Path | str) -> RunError:
 
 @lru_cache(maxsize=2)
 def load_network(path: Path) -> RemovalNetwork:
-    """Load the network of a weights file on the CPU, in evaluation mode. Raises RunError."""
+    """Load the network of a weights file on the CPU, in evaluation mode; the last two are cached. Raises RunError."""
     tensors, metadata = read_weights(path)
     if not all(bool(value.isfinite().all()) for value in tensors.values()):
         raise RunError(f"{path} holds weights that are no finite numbers; get it again, or train it anew.")

@@ -90,7 +90,8 @@ def _draw_light_flare(random: Random, lens_seed: int, kind: str, position: Point
                       lenses: Sequence[Prescription]) -> tuple[Array, Array]:
     """Return (rest, glow) of one light, each (size, size, 3): the parts of its class, each at a random brightness.
 
-    random: for what differs between the lights of a picture. lens_seed: for what they share. x, y: `canvas_grid`.
+    random: draws what differs between the lights of a picture. lens_seed: seed of what all of them share. x, y:
+    `canvas_grid`.
     """
     lens_random = np.random.default_rng(lens_seed)
     rest, glow = (np.zeros((size, size, 3), np.float32) for _ in range(2))
@@ -129,8 +130,8 @@ def _draw_light_flare(random: Random, lens_seed: int, kind: str, position: Point
 
 def _draw_ghosts(random: Random, position: Point, size: int, x: Array, y: Array,
                  lenses: Sequence[Prescription]) -> Array:
-    """Return (size, size, 3), traced or freehand ghosts of one light. Some lenses show nothing of some lights, so up to
-    six are tried."""
+    """Return (size, size, 3), traced or freehand ghosts of one light. Through some lenses a light makes no
+    visible ghost, so up to six draws are tried."""
     for _ in range(6):
         if random.random() < 0.7:
             layer = ghosts.draw_traced(random, ghosts.choose_lens(random, lenses), position, size)

@@ -30,7 +30,7 @@ def _ghost_paths(lens: Prescription) -> list[GhostPath]:
 def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> Array:
     """Return the ghosts of one light through a lens: (size, size, 3), the brightest parts around 1.
 
-    light: on the canvas, where radius 1 is the corner of the sensor.
+    light: position on the canvas, where radius 1 is the corner of the sensor.
 
     The lens determines where ghosts lie, how large they are, how they are clipped and how their colours separate. The
     stop's blades and opening, the coatings' colours, and the number and brightness of weak ghosts are random.
@@ -144,8 +144,8 @@ def _brightness_and_radius(ghost: GhostPath, coating_wavelengths: NDArray[np.flo
 
 
 def draw_freehand(random: Random, light: Point, size: int) -> Array:
-    """Return ghosts as film effects and phones show them: a chain of discs, polygons and rings on the line through the
-    middle, of random positions and colours."""
+    """Return ghosts (size, size, 3) as film effects and phones show them: a chain of discs, polygons and rings on the
+    line through the light and the middle, with random positions and colours."""
     layer = np.zeros((size, size, 3), np.float32)
     blades, rotation = int(random.integers(5, 10)), random.uniform(0, 2 * math.pi)
     same_shape = random.random() < 0.6  # all of one shape, or each of another
@@ -175,11 +175,11 @@ def draw_freehand(random: Random, light: Point, size: int) -> Array:
 
 
 def draw_mirrored_light(random: Random, source: Array, light: Point) -> Array:
-    """Return the light's own image, reflected between sensor and lens: rotated by 180 degrees about the middle, scaled
-    and coloured, as phones show it at night.
+    """Return images of the light itself, reflected between sensor and lens: mostly rotated by 180 degrees about the
+    middle, scaled and coloured, as phones show them at night.
 
-    source: (n, n, 3), the layer of the light. Dai et al. 2023, "Nighttime Smartphone Reflective Flare Removal Using
-    Optical Center Symmetry Prior", describe the symmetry.
+    source: (n, n, 3), the layer of the light. light: its position. Dai et al. 2023, "Nighttime Smartphone Reflective
+    Flare Removal Using Optical Center Symmetry Prior", describe the symmetry.
     """
     import cv2
 

@@ -164,7 +164,7 @@ def _draw_polygon(corners: NDArray[np.float64], width: int, height: int) -> Pixe
 
 
 def _random_grade(random: Random, scene: Pixels) -> Pixels:
-    """Change contrast, saturation and colour balance; exchange channels in a few."""
+    """Change contrast, saturation and colour balance, each in half of the scenes; permute the channels of a fifth."""
     level = np.float32(max(float(scene.mean()), 1e-4))  # contrast changes about the mean
     if random.random() < 0.5:
         scene = level * (scene / level) ** np.float32(math.exp(random.normal(0, 0.25)))
@@ -247,7 +247,8 @@ def _add_bright_objects(random: Random, scene: Pixels) -> Pixels:
 
 
 def _draw_reflection(random: Random, height: int, width: int) -> Pixels:
-    """Return the mask (height, width) 0..1 of a lamp's reflection on a floor: long, upright, broken up by `waves`."""
+    """Return the mask (height, width) 0..1 of a lamp's reflection on a floor or water: an upright streak that waves
+    break up."""
     import cv2
 
     half_width = math.hypot(width, height) * log_uniform(random, 0.004, 0.03)

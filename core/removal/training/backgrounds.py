@@ -120,8 +120,8 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", max_side
 @contextmanager
 def open_shared_backgrounds(folders: Iterable[Path | str], part: Part = "all", max_side: int = 720, *,
                             augmented: bool = False) -> Iterator[Backgrounds]:
-    """Read as `read_backgrounds` does, into temporary files that all processes map: one copy in memory. Raises RunError
-    where they cannot be written."""
+    """Read backgrounds as `read_backgrounds` does, into temporary files that all processes map, so that one copy is in
+    memory. Raises also RunError where the files cannot be written."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         backgrounds = read_backgrounds(folders, part, max_side, augmented=augmented)
         try:

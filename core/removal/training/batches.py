@@ -48,7 +48,7 @@ class Batches:
             self._bank = MixedBank(self._synthesis_bank, user_flares, recipe.user_flare_share)
 
     def __getitem__(self, iteration: int) -> Batch:
-        """Return the worker's frames of an iteration."""
+        """Return the batch of an iteration: the frames that this worker is responsible for, drawn now."""
         random = np.random.default_rng((self.recipe.seed, iteration))
         count, width, height = self.recipe.draw_batch_shape(random, iteration)
         pairs = [self.draw_pair(iteration, number, width, height)
@@ -60,7 +60,8 @@ class Batches:
         return Batch(frame, scene, scene_with_glow, len(pairs) / count)
 
     def draw_pair(self, iteration: int, number: int, width: int, height: int) -> Pair:
-        """Return frame `number` of an iteration, of this size in pixels, with and without its flare."""
+        """Return frame `number` of an iteration, of this size in pixels, with and without its flare. First renews the
+        flare bank as far as the iteration requires."""
         self._synthesis_bank.renew(self.recipe.bank_size + iteration // self.recipe.renew_every, iteration)
         # number + 1, since seeds (1, 2) and (1, 2, 0) are equal
         random = np.random.default_rng((self.recipe.seed, iteration, number + 1))

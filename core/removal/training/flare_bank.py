@@ -47,7 +47,9 @@ class SynthesisBank:
 
     def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription], coloured_share: float = 0,
                  aspheric_share: float = 0, part_count: int = 1) -> None:
-        """count: number of flares. size: side of the canvas, pixels. part_count: number of parts of the bank.
+        """Make an empty bank; flares are synthesised when they are drawn.
+
+        count: number of flares. size: side of the canvas, pixels. part_count: number of parts of the bank.
 
         coloured_share: share of flares whose lights have a saturated colour (traffic lights, tail lamps, neon).
         aspheric_share: share of flares that also get the ghosts of moulded lenses. Both apply to every flare class.
@@ -120,8 +122,8 @@ class UserFlares:
     """The user's flare layers, as pictures or video frames, read when they are drawn."""
 
     def __init__(self, folder: Path | str, size: int) -> None:
-        """size: side of the canvas, pixels. Raises SettingsError where the folder holds neither pictures nor videos, or
-        none that can be read."""
+        """List the flares below a folder, and try to read some. size: side of the canvas, pixels. Raises SettingsError
+        where the folder holds neither pictures nor videos, or none that can be read."""
         folder = Path(folder)
         # Keyed by the parent of Light_Source/ too: another set of flares may have the same names.
         light_paths = {(path.parent.parent, path.stem): path for path in folder.glob("**/Light_Source/*")

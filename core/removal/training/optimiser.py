@@ -29,8 +29,8 @@ class MuonAdamW:
     """Optimises all parameters of a network in place, without moving them in memory."""
 
     def __init__(self, network: nn.Module, weight_decay: float) -> None:
-        """weight_decay: per step, relative to the learning rate. Raises ValueError where the weights are not channels
-        last in memory."""
+        """Assign the parameters to Muon or AdamW. weight_decay: per step, relative to the learning rate. Raises
+        ValueError where the weights are not channels last in memory."""
         self._weight_decay = weight_decay
         self._parameters = dict(network.named_parameters())
         self._matrices = {name: _as_matrix(weight.detach()) for name, weight in self._parameters.items()
@@ -78,7 +78,7 @@ class MuonAdamW:
         return result
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Load a state; moments that it lacks begin at zero."""
+        """Load what `state` returned; moments that are missing in it begin at zero."""
         for key, value in state.items():
             kind, _, rest = key.partition(".")
             moment, _, name = rest.partition(".")

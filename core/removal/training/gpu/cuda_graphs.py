@@ -31,7 +31,8 @@ class GraphedFunction:
         self._graphs: dict[tuple[torch.Size, ...], _CapturedGraph] = {}
 
     def __call__(self, *inputs: Tensor) -> list[Tensor]:
-        """Return the function's outputs; on a GPU they are overwritten by the next call."""
+        """Return the function's outputs. On a GPU the first call with inputs of new shapes captures a graph, and each
+        call overwrites the outputs of the call before."""
         if not inputs[0].is_cuda:
             return list(self._function(*inputs))
         input_shapes = tuple(value.shape for value in inputs)

@@ -38,7 +38,7 @@ def simulate_jpeg(codes: Tensor, quality: Tensor) -> Tensor:
 def _quantise_blocks(planes: Tensor, scale: Tensor, table: tuple[int, ...]) -> Tensor:
     """Return planes (n, c, h, w) whose DCT coefficients are quantised, in blocks of BLOCK_SIZE.
 
-    scale: (n,), per cent, of the steps in `table`, which has them row by row.
+    table: quantisation steps, row by row. scale: factor on these steps, per cent, (n,).
     """
     n, c, h, w = planes.shape
     dct = _dct_matrix(planes)

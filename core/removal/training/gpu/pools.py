@@ -104,7 +104,8 @@ class Pools:
 
     def __init__(self, shapes: Sequence[FrameShape], canvas_size: int, device: torch.device, scene_count: int,
                  flare_count: int) -> None:
-        """scene_count, flare_count: how many to hold. Each frame shape has its share of the scenes, in whole blocks.
+        """Allocate the pools. scene_count, flare_count: how many to hold. Each frame shape has its share of the scenes,
+        in whole blocks.
 
         A flare has FLARE_CHANNELS planes of canvas_size x canvas_size pixels and METADATA_SIZE numbers.
         """

@@ -47,8 +47,8 @@ class ColourSpace:
     """A colour space relative to scene-linear Rec. 709.
 
     to_linear, from_linear: convert pixels (..., 3) to and from scene-linear Rec. 709, float32. matrix: (3, 3) to linear
-    Rec. 709, of a linear space; None for one with a curve. chromaticities: for the header of a file, where they are
-    known. has_headroom: True for a curve whose signal 0..1 holds light above white, 1.
+    Rec. 709, of a linear space; None for one with a curve. chromaticities: for the header of a file; None if
+    unknown. has_headroom: True for a curve whose signal 0..1 holds light above white, 1.
     """
 
     name: str

@@ -34,8 +34,11 @@ class _Features:
 
 @dataclass(frozen=True)
 class FrameMatch:
-    """A homography (3, 3) from one frame's pixels to another's, None where none fits, and its share of inliers, None
-    with too few matches."""
+    """The match of two frames.
+
+    matrix: homography (3, 3) from the first frame's pixels to the second's; None where none fits. inlier_share: share
+    of the matched features that fit it; None with too few matches.
+    """
 
     matrix: Matrix | None
     inlier_share: float | None

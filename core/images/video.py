@@ -86,7 +86,7 @@ def import_av() -> ModuleType:
 class VideoFrame:
     """One decoded frame; pixels are converted when they are read.
 
-    number: from 0, in the order of display. raw: PyAV's frame as stored, before it is turned upright.
+    number: index from 0, in the order of display. raw: PyAV's frame as stored, before it is turned upright.
     """
 
     number: int

@@ -42,8 +42,8 @@ LOG_ODDS_RAMP = (-0.25, 0.25)
 class Sensitivity(NamedTuple):
     """How much evidence the removal of a flare needs.
 
-    log_odds_bias: added to the log odds of a flare before they become the confidence. gate: factor on the mean of a
-    predicted flare up to which it counts as none (`gate_by_mean`).
+    log_odds_bias: added to the log odds of a flare before they become the confidence. gate: factor on the
+    smallest mean that a predicted flare needs in order to count (`gate_by_mean`).
     """
 
     log_odds_bias: float

@@ -14,8 +14,8 @@ from .confidence import FlareFeatures
 class TtaPrediction(NamedTuple):
     """The flare of a frame as predicted with test-time augmentation; flares are what is added to display values.
 
-    mean: over the augmentations, (h, w, 3).
-    per_channel: predicted from each channel alone, shown as a grey frame, (h, w, 3).
+    mean: the predicted flare, averaged over the augmentations, (h, w, 3).
+    per_channel: the flare predicted from each channel alone, given as a grey frame, (h, w, 3).
     per_channel_weight: weight of what per_channel exceeds the mean by, 0..1.
     glow_fraction: share of the mean that is glow about lights, 0..1, (h, w, 3).
     features: what the confidence is computed from; None where the mean is too faint to need one.

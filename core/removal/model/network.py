@@ -107,8 +107,8 @@ POSITION_OCTAVES = 4
 class Attention(nn.Module):
     """Multi-head self-attention over positions with a skip connection; the identity before training.
 
-    octaves: of sines and cosines of the position. Without them a query can select only what changes slowly over the
-    frame, and a ghost has to be located to within its width.
+    octaves: number of octaves of sines and cosines in the positional encoding. Without them a query can select only
+    what changes slowly over the frame, and a ghost has to be located to within its width.
     """
 
     def __init__(self, width: int, heads: int, octaves: int = 0) -> None:

@@ -25,7 +25,8 @@ are obvious."""
 
 @dataclass(frozen=True)
 class SynthesisedFlare:
-    """Layers (size, size, 3), linear light >= 0, and the positions of the lights on the canvas."""
+    """A flare by layers (size, size, 3), linear light >= 0: what is always removed (`rest`), the glow round the lights,
+    and the lights themselves (`light`). kind: its flare class. lights: positions of the lights on the canvas."""
 
     kind: str
     lights: tuple[Point, ...]

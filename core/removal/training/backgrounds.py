@@ -45,8 +45,8 @@ def is_held_out(name: str) -> bool:
 class Backgrounds:
     """Decoded pictures: photos as uint8 (h, w, 3) display values, maps as float16 equirectangular linear light.
 
-    augmented: few pictures are made to look like many (`background_augmentation`), for training. unusable: files in the
-    folders that cannot be used.
+    augmented: change the pictures when they are drawn, so that few look like many (`background_augmentation`).
+    unusable: files in the folders that cannot be used.
     """
 
     photos: Sequence[NDArray[np.uint8]]

@@ -234,7 +234,7 @@ def _read_random_frame(path: Path, random: Random) -> NDArray[np.float32]:
 
 
 class MixedBank:
-    """A share of the user's flares among synthesised ones."""
+    """A bank that draws a share of its flares from the user's bank, and the others from a synthesised one."""
 
     def __init__(self, synthesised: FlareSource, user_flares: FlareSource, share: float) -> None:
         self._synthesised, self._user_flares, self._share = synthesised, user_flares, share

@@ -91,8 +91,8 @@ def draw_second_strength(random: Random) -> float:
 
 
 class FlareAppearance(NamedTuple):
-    """How a flare shines. blur: pixels, 0 for none. max_mean: mean light over the frame that it is limited to, since
-    nothing is learned from frames that are washed out completely."""
+    """The appearance of a flare. blur: standard deviation in pixels, 0 for none. max_mean: limit of its mean light over
+    the frame, since nothing is learned from frames that are washed out completely."""
 
     blur: float
     colour: Triple

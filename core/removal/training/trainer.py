@@ -46,7 +46,7 @@ def default_device() -> torch.device:
 
 
 class RemovalTrainer:
-    """Network and optimiser at an iteration, of one worker."""
+    """The network and the optimiser of one worker, and the iteration that they have reached."""
 
     def __init__(self, recipe: Recipe, worker: Worker = SINGLE_WORKER) -> None:
         """Build a network with random weights by the recipe's seed, the same for all workers, at iteration 0."""

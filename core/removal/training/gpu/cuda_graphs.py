@@ -23,8 +23,9 @@ class _CapturedGraph(NamedTuple):
 
 
 class GraphedFunction:
-    """A function of GPU tensors that is captured as a CUDA graph when first called with inputs of their shapes.
-    Whatever else it reads and writes must keep its memory. On a CPU it is called as usual."""
+    """A function of GPU tensors that is captured as a CUDA graph at the first call with inputs of new shapes, and
+    replayed at later ones. All other tensors that it reads or writes must stay at the same addresses. On a CPU it is
+    called as usual."""
 
     def __init__(self, function: Callable[..., Sequence[Tensor]]) -> None:
         self._function = function

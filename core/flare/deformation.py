@@ -75,6 +75,7 @@ class DeformationNetwork(nn.Module):
 
     def __init__(self, heads: Mapping[str, int], query_range: QueryRange, *, positions: int = 1, latent: int = 0,
                  levels: int = 16, base: int = 16) -> None:
+        """Make grids, backbone and heads. heads: width of each parameter's offset, by the parameter's name."""
         super().__init__()
         self.light_grid = HashGrid(LIGHT_BITS, LIGHT_GROWTH, levels, base=base)
         self.camera_grid = HashGrid(CAMERA_BITS, CAMERA_GROWTH, levels, base=base)

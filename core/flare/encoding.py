@@ -33,6 +33,8 @@ class HashGrid(nn.Module):
     _corners: Tensor
 
     def __init__(self, table_bits: int, growth: float, levels: int = 16, features: int = 2, base: int = 16) -> None:
+        """Make a table of zeros. table_bits: log2 of the most rows of a level; growth: ratio of successive levels'
+        resolutions; base: the coarsest resolution; features: numbers of a row."""
         super().__init__()
         self.levels, self.features = levels, features
         size = 1 << table_bits

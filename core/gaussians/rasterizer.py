@@ -27,7 +27,7 @@ def rasterization(
     kernels: Kernels = "auto", near: float = NEAR, dilation: float = DILATION, depth: bool = True,
     raw: bool = False,
 ) -> Rendering:  # fmt: skip
-    """Renders n 3D Gaussians (Kerbl et al. 2023), nearest first; `reference.py` has the definition.
+    """Render n 3D Gaussians (Kerbl et al. 2023), nearest first; `reference.py` has the definition.
 
     means            (n, 3) world coordinates
     quats            (n, 4) rotations w, x, y, z of any length
@@ -37,8 +37,8 @@ def rasterization(
     world_to_camera  (4, 4) x right, y down, z forward
     intrinsics       (3, 3) focal lengths and principal point, px; no skew
     background       (3,)   shows where the Gaussians leave transmittance; black by default
-    sh_degree        how much of sh is used: 0 to 3, all of it by default
-    kernels          see `kernels.py`
+    sh_degree        degree of the harmonics that are used, 0 to 3; all of sh by default
+    kernels          "torch", "tiles", "cpu" or "cuda"; "auto" takes the fastest that is installed
     near             camera depth up to which Gaussians are culled, world units
     dilation         px², added to both diagonal elements of the projected covariances
     depth            False leaves depth and median_depth empty, (0, 0), which saves time
@@ -74,7 +74,7 @@ def splat(
     *, rings: Tensor | None = None, arcs: Tensor | None = None,
     blend: Blend = "over", resolution: Resolution = "full", kernels: Kernels = "auto",
 ) -> Splats:  # fmt: skip
-    """Rasterizes n 2D Gaussians, such as those of a flare; `reference.py` has the definition.
+    """Rasterize n 2D Gaussians, such as those of a flare; `reference.py` has the definition.
 
     centres      (n, 2) px, pixel centres at + 1/2
     covariances  (n, 3) xx, xy, yy, px²; taken as they are, without dilation; those that are not positive
@@ -86,7 +86,7 @@ def splat(
     blend        "over": front to back in the order given; "add": a sum, for scene-linear light
     resolution   "mixed": Gaussians much larger than a pixel are drawn at 1/4 or 1/2 size and enlarged
                  (behind the small ones, if "over"); see `mixed.py` for the error
-    kernels      see `kernels.py`
+    kernels      "torch", "tiles", "cpu" or "cuda"; "auto" takes the fastest that is installed
 
     Differentiable by every tensor. Raises SettingsError for shapes and values that do not fit,
     EngineError for kernels that are not installed.

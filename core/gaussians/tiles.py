@@ -220,7 +220,7 @@ def _median_rows(t_before: Tensor, t_after: Tensor, index: Tensor) -> Tensor:
 
 
 def draw(lists: TileLists, blend: Blend, median: bool, gaussians: WhitenedGaussians) -> tuple[Tensor, Tensor]:
-    """Draw tiles; see `tiled.DrawTiles`."""
+    """Draw the tiles of `lists`; return their pictures and median rows, in the form of `tiled.DrawTiles`."""
     return _DrawTiles.apply(lists, blend, median, *gaussians)
 
 

@@ -242,5 +242,5 @@ def _launch(kernel: Any, lists: TileLists, blend: Blend, parts: Any, other_array
 def draw(
     lists: TileLists, blend: Blend, median: bool, gaussians: WhitenedGaussians  # noqa: ARG001
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Draw tiles; see `tiled.DrawTiles`."""
+    """Draw the tiles of `lists`; return their pictures and median rows, in the form of `tiled.DrawTiles`."""
     return _DrawTiles.apply(lists, blend, *gaussians)

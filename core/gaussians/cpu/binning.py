@@ -221,7 +221,7 @@ def _list_column(column, top_row, bottom_row, tiles_x, i, slot_offset, tile_list
 
     tiles_x: tiles in a row of the picture; slot_offset: slot of an entry minus its place; place: next free place of
     tile_list, of which the new value is returned; tile_counts: entries by tile, which are increased."""
-    tile_row, opaque_one = top_row >> TILE_SHIFT_Y, opaque(1)
+    tile_row, opaque_one = top_row >> TILE_SHIFT_Y, opaque(1)  # opaque: the loop is not unrolled
     while tile_row << TILE_SHIFT_Y <= bottom_row:
         tile_top = tile_row << TILE_SHIFT_Y
         first_row = top_row - tile_top if top_row > tile_top else 0
@@ -255,7 +255,7 @@ def _list_gaussian(records, i, width, height, tiles_x, slot_offset, tile_list, p
     major, k = load_scalar(records, record + A), load_scalar(records, record + K)
     minor = load_scalar(records, record + D)
     tip = k * half_y  # X of the ellipse's smallest y; its largest y lies at -tip
-    inverse, opaque_one = ONE / (major * k * k + minor), opaque(1)
+    inverse, opaque_one = ONE / (major * k * k + minor), opaque(1)  # opaque: the loop is not unrolled
     root_squared, shear = load_scalar(records, record + REACH) * inverse, -major * k * inverse
     root_falloff = major * inverse * (minor * inverse)
     left = np.float32(column << TILE_SHIFT_X) - x

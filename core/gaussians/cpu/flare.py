@@ -276,7 +276,7 @@ def _add_row(state, state_row, e, records, record):
 def _add_plain(state, records, record, left, top, first_row, end_row, run_start):
     """Add a plain Gaussian to rows first_row .. end_row - 1, by the recurrence unless it is a needle (see
     `raster_forward`). The opacity in its record is 1."""
-    step, opaque_one = load_scalar(records, record + STEP), opaque(1)
+    step, opaque_one = load_scalar(records, record + STEP), opaque(1)  # opaque: the loop is not unrolled
     is_narrow, run = is_needle(records, record, end_row - first_row), run_length(records, record)
     e, r, _ = run_start
     row, run_end = first_row, first_row if is_narrow else min(first_row + run, end_row)
@@ -300,7 +300,7 @@ def _draw_shaped(state, records, record, shapes, shape, left, top, first_row, en
     shape: index of its first number in `shapes`; arcs: whether there are arcs; add: the blend is "add", else "over"."""
     lane0_u, row_dy, k = _row_start(records, record, left, top + first_row)
     r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
-    row, opaque_one = first_row, opaque(1)
+    row, opaque_one = first_row, opaque(1)  # opaque: the loop is not unrolled
     while row < end_row:
         dy, u = np.float32(row_dy), lane_index() + np.float32(lane0_u)
         power = _negative_log2_profile(shapes, shape, _distance(records, record, u, dy) - r0, u, dy, arcs)
@@ -407,7 +407,7 @@ def _needle_backward(state, records, record, left, top, first_row, end_row):
     so that each row has its own exponential: sums of g by the five moments of `_add_moments`, a zero, then R, G, B."""
     zero = splat(ZERO)
     sums, colours = (zero, zero, zero, zero, zero), (zero, zero, zero)
-    row, opaque_one = first_row, opaque(1)
+    row, opaque_one = first_row, opaque(1)  # opaque: the loop is not unrolled
     while row < end_row:
         u, dy = needle_offsets(records, record, left, top + row)
         g, w = _add_gradient(state, row * ROW_BACKWARD, falloff(records, record, u, dy), records, record)
@@ -420,7 +420,7 @@ def _needle_backward(state, records, record, left, top, first_row, end_row):
 @inlined
 def _plain_backward(state, records, record, left, top, first_row, end_row, run_start):
     """Return the gradient row of `_needle_backward` by the recurrence and three sums per lane (`raster_backward`)."""
-    step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)
+    step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)  # not unrolled
     zero = splat(ZERO)
     m0, m1, m2, colours = zero, zero, zero, (zero, zero, zero)
     e, r, dy = run_start
@@ -454,7 +454,7 @@ def _shaped_backward(state, records, record, shapes, shape, left, top, first_row
     zero = splat(ZERO)
     sums, colours, g_sum = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
     d_r0, d_w, arc_u, arc_y = zero, zero, zero, zero
-    row, opaque_one = first_row, opaque(1)
+    row, opaque_one = first_row, opaque(1)  # opaque: the loop is not unrolled
     while row < end_row:
         dy, u = np.float32(row_dy), lane_index() + np.float32(lane0_u)
         r = _distance(records, record, u, dy)

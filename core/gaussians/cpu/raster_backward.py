@@ -128,7 +128,9 @@ def row_gradient(state, state_row, e, records, record, with_depth):
 
 @inlined
 def _add_colours(state, state_row, w, sums, with_depth):
-    """Return the sums for red, green, blue and depth with w v added; state_row: as in `row_gradient`."""
+    """Return the sums for red, green, blue and depth with w v added.
+
+    v: gradient of the pixels in this row; state_row: index of the row's first number in the state."""
     d_red = fma(w, load(state, state_row + V_RED), sums[0])
     d_green = fma(w, load(state, state_row + V_GREEN), sums[1])
     d_blue = fma(w, load(state, state_row + V_BLUE), sums[2])
@@ -143,7 +145,7 @@ def _needle_sums(state, records, record, left, top, first_row, end_row, with_dep
     zero = splat(ZERO)
     m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
     colours = (zero, zero, zero, zero)
-    row, opaque_one = first_row, opaque(1)
+    row, opaque_one = first_row, opaque(1)  # opaque: the loop is not unrolled
     while row < end_row:
         u, dy = needle_offsets(records, record, left, top + row)
         e = falloff(records, record, u, dy) * load_scalar(records, record + OPACITY)
@@ -173,7 +175,7 @@ def _recurrence_sums(state, records, record, left, top, first_row, end_row, run_
     """Return the sums of `_needle_sums` by the recurrence and three running sums per lane: after each row g is added to
     m0, then m0 to m1, then m1 to m2. In the end the row that is j rows above end_row counts 1, j and j (j + 1) / 2
     times in them, from which the moments follow."""
-    step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)
+    step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)  # not unrolled
     zero = splat(ZERO)
     m0, m1, m2 = zero, zero, zero
     colours = (zero, zero, zero, zero)
@@ -222,7 +224,7 @@ def _pad_row(padded, pixel, count, image, alphas, depths, d_image, d_alphas, d_d
     pixel: flat index of the first. Rows of `padded`: image, its gradient, then alpha and depth, each with its
     gradient."""
     padded[:, :] = ZERO
-    i, opaque_one = 0, opaque(1)
+    i, opaque_one = 0, opaque(1)  # opaque: the loop is not unrolled
     while i < 3 * count:
         padded[0, i], padded[1, i] = image[3 * pixel + i], d_image[3 * pixel + i]
         i += opaque_one
@@ -244,7 +246,7 @@ def init_tile_backward(
 
     padded: workspace (6, PADDED_ROW) for tiles that reach beyond the right edge of the picture."""
     init_tile(state, ROW, left, top, width, height)
-    row, opaque_one = 0, opaque(1)
+    row, opaque_one = 0, opaque(1)  # opaque: the loop is not unrolled
     while row < min(TILE_HEIGHT, height - top):
         pixel = (top + row) * width + left
         if left + TILE_WIDTH <= width:

@@ -143,13 +143,13 @@ def init_tile(state, row_stride, left, top, width, height):
     all else to 0.
 
     row_stride: numbers of a row of the state, ROW here or that of `raster_backward`."""
-    index, vector_stride = 0, opaque(TILE_WIDTH)
+    index, vector_stride = 0, opaque(TILE_WIDTH)  # opaque: the loop is not unrolled
     while index < row_stride * TILE_HEIGHT:
         store(state, index, splat(ZERO))
         index += vector_stride
     x = lane_index() + np.float32(left)
     transmittance_in_frame = where(x < np.float32(width), splat(ONE), ZERO)
-    row, opaque_one = 0, opaque(1)
+    row, opaque_one = 0, opaque(1)  # opaque: the loop is not unrolled
     while row < TILE_HEIGHT:
         store(state, T_PLANE + row * row_stride, transmittance_in_frame if top + row < height else splat(ZERO))
         row += opaque_one
@@ -211,7 +211,7 @@ def next_entry(entries, index, end, records, left, top):
 @inlined
 def _blend_needle(state, records, record, left, top, first_row, end_row, with_depth):
     """Blend a Gaussian into rows first_row .. end_row - 1 of the tile, with an exponential for each row."""
-    row, opaque_one = first_row, opaque(1)
+    row, opaque_one = first_row, opaque(1)  # opaque: the loop is not unrolled
     while row < end_row:
         u, dy = needle_offsets(records, record, left, top + row)
         e = falloff(records, record, u, dy) * load_scalar(records, record + OPACITY)
@@ -222,7 +222,7 @@ def _blend_needle(state, records, record, left, top, first_row, end_row, with_de
 @inlined
 def _blend(state, records, record, left, top, first_row, end_row, run_start, with_depth):
     """Blend a Gaussian into rows first_row .. end_row - 1 of the tile by the recurrence."""
-    step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)
+    step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)  # not unrolled
     e, r, _ = run_start
     row, run_end = first_row, min(first_row + run, end_row)
     while True:
@@ -244,7 +244,7 @@ def _copy_pixels(source, source_index, target, target_index, count):
     if count >= TILE_WIDTH:
         store(target, target_index, load(source, source_index))
         return
-    lane, opaque_one = 0, opaque(1)
+    lane, opaque_one = 0, opaque(1)  # opaque: the loop is not unrolled
     while lane < count:
         target[target_index + lane] = source[source_index + lane]
         lane += opaque_one
@@ -254,7 +254,7 @@ def _copy_pixels(source, source_index, target, target_index, count):
 def write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth):
     """Write the finished tile, over the background, to the pictures; overwrites the state."""
     visible_columns = width - left
-    row, opaque_one = 0, opaque(1)
+    row, opaque_one = 0, opaque(1)  # opaque: the loop is not unrolled
     while row < min(TILE_HEIGHT, height - top):
         state_row, pixel = row * ROW, (top + row) * width + left
         t = load(state, state_row + T_PLANE)

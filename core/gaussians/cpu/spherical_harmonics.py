@@ -32,7 +32,7 @@ ZERO, HALF, TWO, THREE, FOUR, EIGHT = (np.float32(number) for number in (0, 0.5,
 def load_transposed(sh, first_gaussian, width, used_width, transposed):
     """Write the first used_width of the `width` numbers of 16 Gaussians, from row first_gaussian of sh (n, width) on,
     to `transposed`, one vector for each number."""
-    opaque_one = opaque(1)
+    opaque_one = opaque(1)  # opaque: the loop is not unrolled
     column = 0
     while column < used_width:
         if column + LANES <= width:
@@ -52,7 +52,7 @@ def store_transposed(transposed, first_gaussian, width, sh, keep_cached):
     """Invert `load_transposed`: write all `width` numbers of 16 Gaussians to sh (n, width), from row first_gaussian on.
 
     keep_cached: whether they are read soon; else they are written past the caches."""
-    opaque_one = opaque(1)
+    opaque_one = opaque(1)  # opaque: the loop is not unrolled
     column = 0
     while column < width:
         if column + LANES <= width:

@@ -80,7 +80,7 @@ def _flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _nest(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Undo `_flatten`. Raises ValueError where a name is both a value and a table."""
+    """Return nested tables from values by dotted name. Raises ValueError if a name is both a value and a table."""
     tables: dict[str, Any] = {}
     for name, value in flat.items():
         *keys, last = name.split(".")

@@ -318,8 +318,8 @@ def _camera_spread(cameras: list[Camera]) -> float:
 def _visible_directions(cameras: list[Camera], pitch: float) -> Floats:
     """Return unit vectors (n, 3) that some camera sees, about `pitch` radians from each other.
 
-    The directions are those of a Fibonacci lattice (Swinbank and Purser 2006) about the mean viewing direction, which
-    is even on the sphere.
+    The directions are those of a Fibonacci lattice (Swinbank and Purser 2006), which covers the sphere evenly, about
+    the mean viewing direction.
     """
     forwards = np.array([camera.forward for camera in cameras])
     axis = forwards.mean(0)

@@ -162,7 +162,7 @@ class FlareTrainer(abc.ABC):
         return state
 
     def _load_flare_state(self, state: State) -> None:
-        """Restore the entries of `_flare_state`."""
+        """Restore iteration, losses, flare and moments from a state with the entries of `_flare_state`."""
         self.iteration = int(state["iteration"])
         self.losses = {name: float(loss) for name, loss in state.get("losses", [])}
         if self.flare is not None:

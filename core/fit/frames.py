@@ -152,7 +152,8 @@ class Frames:
         return None
 
     def mask(self, view: View) -> Tensor | None:
-        """Return (height, width) which pixels of a view count in the losses, without borders; None if all do."""
+        """Return (height, width), True for pixels of a view that count in the losses, without borders; None if all
+        do."""
         if self.capture.mask_path(view) is None:
             return None
         name = f"mask/{view.name}"

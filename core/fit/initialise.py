@@ -159,7 +159,10 @@ def has_frame_lights(capture: Capture) -> bool:
 
 def _static_positions(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings,
                       generator: torch.Generator) -> torch.Tensor:
-    """Return the places (lights, 3) of static lights, world units, moved to their flares if the settings say so."""
+    """Return the places (lights, 3) of static lights, world units, moved to their flares if the settings say so.
+
+    Without `flare.detection`, an ablation, every light is at the centroid of the points plus uniform noise.
+    """
     positions = torch.tensor([list(map(float, light.xyz)) for light in capture.lights], dtype=torch.float64)
     if not settings.flare.detection:
         # Paper, appendix: the centroid of the points, offset by uniform noise in [0, 1) along each axis.

@@ -34,7 +34,8 @@ def scene_only_iterations(settings: SplitSettings, views: int, iterations: int) 
 
 def scene_loss(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
                settings: SplitSettings, progress: float) -> Tensor:
-    """Return the loss on the scene alone, (height, width, 3) display values; `trainer` adds it to the composite's loss.
+    """Return the loss on the picture of the scene alone, (height, width, 3) display values, beside the composite's
+    loss.
 
     It is a quantile loss, plus a penalty on the scene's light near the lights, plus an L1 loss in the discs. With
     `progress`, 0..1, brighter frames pull the scene up less and the penalty grows. lights: (n, 3), world. discs:
@@ -62,13 +63,12 @@ def estimate_loss(scene: Tensor, estimate: Tensor, ssim_share: float, progress: 
 
 def far_flare_penalty(added: Tensor, estimated_flare: Tensor | None, ratio: float, camera: Camera, lights: ArrayLike,
                       settings: SplitSettings) -> Tensor:
-    """Return the penalty on the light that a flare adds, (height, width, 3) display values, far from the lights (n, 3),
-    world.
+    """Return the penalty on `added`, the light that a flare adds, far from the lights (n, 3), world.
 
-    It is for a scene that has not converged. Missing a ghost costs more than this penalty, so ghosts, which the scene
-    cannot reproduce, stay in the flare; other light moves to the scene. estimated_flare: frame minus estimated clean
-    frame, or None. ratio: the scene's `excess_ratio`; from `settings.diverged_ratio` to `settings.converged_ratio` the
-    exempt share of the estimated flare rises from 0 to 1.
+    added: (height, width, 3), display values. The penalty is for a scene that has not converged. Missing a ghost costs
+    more than this penalty, so ghosts, which the scene cannot reproduce, stay in the flare; other light moves to the
+    scene. estimated_flare: frame minus estimated clean frame, or None. ratio: the scene's `excess_ratio`; from
+    `settings.diverged_ratio` to `settings.converged_ratio` the exempt share of the estimated flare rises from 0 to 1.
     """
     if estimated_flare is not None:
         confidence = (ratio - settings.diverged_ratio) / max(settings.converged_ratio - settings.diverged_ratio, 1e-9)

@@ -92,8 +92,8 @@ class PlateEstimator:
     def estimate(self, name: str, cleaned: Mapping[str, Pixels] | None = None) -> Pixels:
         """Return the plate of a frame, display values; the network's plate if no neighbour can be aligned.
 
-        Where nothing hides the background, the median of the aligned plates times a smooth gain, the network's plate is
-        replaced by it; where the camera moves, the plate is only made darker, in small parts. cleaned: frames minus the
+        The background is the median of the aligned plates, times a smooth gain. Where nothing hides it, it replaces the
+        network's plate; if the camera moves, it only makes the plate darker, in small parts. cleaned: frames minus the
         fitted flare, which replace the network's plates in the median. The frame itself is used as filmed: a flare
         subtracted from the frame that it was fitted to would hide its own errors.
         """
@@ -175,8 +175,8 @@ def hidden_share(frame: Pixels, expected: Pixels, gain: Pixels, test: HidingTest
 
     The largest of three likelihoods counts: a channel is darker than expected, the background's texture is absent, or
     the gain is far from 1. frame: (height, width, 3), linear light. expected: the frame expected without flare,
-    background times gain. gain: `smooth_gain` times `local_gain`. test: thresholds
-    for a camera that stands or moves.
+    background times gain. gain: `smooth_gain` times `local_gain`. test: thresholds,
+    for a camera that stands or for one that moves.
     """
     import cv2
 

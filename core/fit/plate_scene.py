@@ -36,7 +36,7 @@ class PlateScene:
                     space: ColourSpace | None = None) -> PlateScene:
         """Open the plates of a folder: for each frame a picture of the same name with any suffix.
 
-        space: colour space of the pictures; None for the one that their format implies.
+        space: colour space of the pictures; None for the space that each file declares.
         """
         files = {path.with_suffix("").relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.*"))}
 

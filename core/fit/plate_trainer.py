@@ -126,7 +126,7 @@ class PlateTrainer(FlareTrainer):
 
     @property
     def scene(self) -> PlateScene:
-        """The plates."""
+        """The plates as a scene: one for each frame, by the frame's name."""
         cameras = {view.name: self.frames.camera(view) for view in self.capture.views}
         views = {view.name: view for view in self.capture.views}
 

@@ -253,8 +253,8 @@ class FitSettings:
         return 1.0 if self.white is None else float(srgb_from_linear(np.array(self.white)))
 
     def validated(self) -> FitSettings:
-        """Return the settings. Raises SettingsError if a number is outside its `BOUNDS`, or values contradict each
-        other."""
+        """Return these settings unchanged. Raises SettingsError if a number is outside its `BOUNDS`, or values
+        contradict each other."""
         for name, bounds in BOUNDS.items():
             value = attrgetter(name)(self)
             if isinstance(value, int | float) and not bounds.contains(value):

@@ -208,7 +208,7 @@ def trace(settings: TracedFlareSettings, setup: LensSetup, places: Places, progr
 
 
 def _fit_settings(settings: TracedFlareSettings) -> FitSettings:
-    """Return the settings of the flare model: those of a short fit that adds light."""
+    """Return the fit's settings: the preset "draft" with the blend "add", for a light whose position is known."""
     fit = settings.fit
     base = preset("draft", blend="add", iterations=fit.iterations)
     density = replace(base.flare.density, start=max(fit.iterations // 10, 10), stop=int(fit.iterations * 0.7),

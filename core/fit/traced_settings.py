@@ -122,7 +122,7 @@ class TracedFlareSettings:
     fit: TracedFit = field(default_factory=TracedFit)
 
     def validated(self) -> TracedFlareSettings:
-        """Return the settings. Raises SettingsError if a number is outside its BOUNDS."""
+        """Return these settings unchanged. Raises SettingsError if a number is outside its BOUNDS."""
         for name, bounds in BOUNDS.items():
             values = attrgetter(name)(self)
             for value in values if isinstance(values, tuple) else (values,):

@@ -237,7 +237,8 @@ class Trainer(FlareTrainer):
 
     @torch.no_grad()
     def _measure_excess_ratio(self) -> None:
-        """Measure `_excess_ratio` in the iteration in which the flare starts, in a fit by parallax; else do nothing."""
+        """In a fit by parallax, in the iteration in which the flare starts, measure `_excess_ratio`, which tells
+        whether the scene has converged; else do nothing."""
         if not self.settings.uses_parallax or not 1 <= self._scene_only_iterations == self.iteration - 1:
             return
 

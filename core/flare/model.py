@@ -89,7 +89,8 @@ class LightFlare(nn.Module):
 
     def __init__(self, form: FlareForm, query_range: QueryRange, count: int, generator: torch.Generator,
                  opacity: float = 0.05, scale: float = 1.0) -> None:
-        """count, opacity: of the initial Gaussians. scale: the `plane_scale` of the frames that the flare is fitted to.
+        """count, opacity: number and opacity of the initial Gaussians. scale: the `plane_scale` of the frames that the
+        flare is fitted to.
         """
         super().__init__()
         self.form, self.query_range, self.scale = form, query_range, scale

@@ -91,7 +91,7 @@ def opacity_gain(arcs: Tensor, rings: Tensor) -> Tensor:
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Convert quaternions (n, 4) wxyz, any length but zero, to (n, 3, 3)."""
+    """Convert quaternions (n, 4) wxyz, any length but zero, to rotation matrices (n, 3, 3)."""
     w, x, y, z = functional.normalize(quaternions, dim=-1, eps=1e-12).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

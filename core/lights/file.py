@@ -130,7 +130,8 @@ def _is_same_path(path: dict[str, Any], other: dict[str, Any], camera: Camera) -
 
 
 def _read_earlier_paths(data: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """Return the paths that earlier runs wrote. Raises CaptureError where the list is invalid."""
+    """Return the paths that earlier runs wrote, from the contents `data` of lights.json. Raises CaptureError if their
+    list is invalid."""
     paths = data.get("found_paths", [])
     valid = isinstance(paths, list) and all(
         isinstance(each, dict) and all(isinstance(place, list) and len(place) in (2, 3) and all(map(is_finite, place))
@@ -141,7 +142,8 @@ def _read_earlier_paths(data: dict[str, Any], path: Path) -> list[dict[str, Any]
 
 
 def _read_earlier_places(data: dict[str, Any], path: Path) -> list[list[float]]:
-    """Return the places that earlier runs wrote. Raises CaptureError where the list is invalid."""
+    """Return the places that earlier runs wrote, from the contents `data` of lights.json. Raises CaptureError if their
+    list is invalid."""
     places = data.get("found", [])
     if not isinstance(places, list) or not all(is_point(place) for place in places):
         raise CaptureError(f"{path}: found should be a list of places, each of three finite numbers; remove that "
@@ -159,7 +161,7 @@ def _check_writable(entry: dict[str, Any], path: Path) -> None:
 
 
 def _to_entry(light: FoundLight, name: str) -> dict[str, Any]:
-    """Return the entry of a light with one place in the world."""
+    """Return the entry in lights.json of a light with one place in the world."""
     return {"name": name, "xyz": [round_for_text(float(x)) for x in light.xyz],
             "colour": [round(float(c), 3) for c in light.colour], "support": len(light.support),
             "views": light.visible, "residual_px": round(light.residual, 3),
@@ -167,7 +169,7 @@ def _to_entry(light: FoundLight, name: str) -> dict[str, Any]:
 
 
 def _to_track_entry(light: TrackedLight, name: str) -> dict[str, Any]:
-    """Return the entry of a light on a path on the picture."""
+    """Return the entry in lights.json of a light with a path on the picture: its places and brightness by frame."""
     frames = {}
     for frame, key in light.keys.items():
         place = key.place

@@ -41,7 +41,7 @@ def is_compressed(path: Path) -> bool:
 
 
 def read_compressed(path: Path) -> SceneGaussians:
-    """Read a compressed PLY. Raises FlareFileError for a damaged file."""
+    """Read a compressed PLY, in the layout of the module head. Raises FlareFileError for a damaged file."""
     try:
         elements = _read_elements(read_bytes(path))
         chunks, vertices = elements["chunk"], elements["vertex"]

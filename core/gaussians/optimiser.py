@@ -134,7 +134,7 @@ class Adam:
     def keep_rows(self, index: Tensor, names: Iterable[str] | None = None) -> None:
         """Keep only some rows of the parameters, with their moments; sets the gradients to None.
 
-        index: boolean mask, or row numbers, which may be a new order. names: of the parameters; None for all.
+        index: boolean mask, or row numbers, which may be a new order. names: names of these parameters; None for all.
         """
         for name in self.parameters if names is None else names:
             parameter, moments = self.parameters[name], self.moments[name]

@@ -403,8 +403,10 @@ def _add_moments(sums, h, u, dy):
 
 @inlined
 def _needle_backward(state, records, record, left, top, first_row, end_row):
-    """Return the gradient row of a plain Gaussian with the blend "add" that is too narrow for the recurrence over rows,
-    so that each row has its own exponential: sums of g by the five moments of `_add_moments`, a zero, then R, G, B."""
+    """Return the gradient row of a needle, blend "add": sums of g times u, d_y, u², u d_y, d_y², a zero, then the sums
+    for red, green and blue.
+
+    A needle is a plain Gaussian too narrow for the recurrence over rows, so each row has its own exponential."""
     zero = splat(ZERO)
     sums, colours = (zero, zero, zero, zero, zero), (zero, zero, zero)
     row, opaque_one = first_row, opaque(1)  # opaque: the loop is not unrolled
@@ -419,7 +421,8 @@ def _needle_backward(state, records, record, left, top, first_row, end_row):
 
 @inlined
 def _plain_backward(state, records, record, left, top, first_row, end_row, run_start):
-    """Return the gradient row of `_needle_backward` by the recurrence and three sums per lane (`raster_backward`)."""
+    """Return the same gradient row for a plain Gaussian that is no needle, blend "add": by the recurrence over rows,
+    with three sums per lane, from which `moments` computes the five."""
     step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)  # not unrolled
     zero = splat(ZERO)
     m0, m1, m2, colours = zero, zero, zero, (zero, zero, zero)

@@ -174,7 +174,7 @@ def _add_scaled(a, s, b):
 
 @inlined
 def _rotation(w, x, y, z):
-    """Return the rows of the rotation of a unit quaternion w, x, y, z."""
+    """Return the rows of the rotation matrix of a unit quaternion w, x, y, z."""
     x2, y2, z2 = x * TWO, y * TWO, z * TWO
     xx, yy, zz = x * x2, y * y2, z * z2
     xy, xz, yz = x * y2, x * z2, y * z2
@@ -188,7 +188,7 @@ def _rotation(w, x, y, z):
 
 @inlined
 def _rotation_backward(w, x, y, z, g):
-    """Return the gradient of the unit quaternion w, x, y, z from g, that of the rotation's rows."""
+    """Return the gradient by the unit quaternion w, x, y, z from g, the gradient by the rows of its rotation matrix."""
     # Sums and differences of mirrored elements.
     s01, s02, s12 = g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][2] + g[2][1]
     d10, d02, d21 = g[1][0] - g[0][1], g[0][2] - g[2][0], g[2][1] - g[1][2]
@@ -505,8 +505,8 @@ def _project_block_backward(
     transposed, rows, d_means, d_quats, d_scales, d_opacities, d_sh, target_row, keep_cached, d_centres, sums,
     with_camera,
 ):  # fmt: skip
-    """Write the gradients (d_...) of the 16 Gaussians from `first` on to rows from target_row on; d_centres from
-    `first` on.
+    """Write the gradients (d_...) of the 16 Gaussians from `first` on: d_centres to rows from `first` on, the others to
+    rows from target_row on.
 
     fields: the summed gradient rows, one vector per field; colour_slopes: of this block; keep_cached: keep the
     gradients of sh in the cache, since they are read soon; with_camera, is_new, sums: for the camera, see

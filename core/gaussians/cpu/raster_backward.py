@@ -83,8 +83,9 @@ def _init_row(
 ):  # fmt: skip
     """Write one row of a tile's state before its first Gaussian: S and the gradients of the pixels.
 
-    row: of the tile; pixel: flat index of its first pixel. Alpha hides the background, so v . background is
-    subtracted from the gradient of alpha. Depth adds nothing to S, since the sum of w (depth - mean depth) is 0."""
+    row: number of the row in the tile; pixel: flat index of its first pixel. Alpha hides the background, so v .
+    background is subtracted from the gradient of alpha. Depth adds nothing to S, since the sum of w (depth - mean
+    depth) is 0."""
     state_row = row * ROW
     colour_index = 3 * pixel
     colour = deinterleave((load(image, colour_index), load(image, colour_index + 16), load(image, colour_index + 32)))
@@ -140,8 +141,8 @@ def _add_colours(state, state_row, w, sums, with_depth):
 
 @inlined
 def _needle_sums(state, records, record, left, top, first_row, end_row, with_depth):
-    """Return sums of g u, g d_y, g u², g u d_y, g d_y², g, and a tuple of those for red, green, blue and depth, by
-    lane, with an exponential for each row."""
+    """Return, by lane, a needle's sums of g u, g d_y, g u², g u d_y, g d_y² and g, and a tuple of those for red, green,
+    blue and depth; with an exponential for each row."""
     zero = splat(ZERO)
     m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
     colours = (zero, zero, zero, zero)
@@ -205,7 +206,8 @@ def _recurrence_sums(state, records, record, left, top, first_row, end_row, run_
 
 @inlined
 def _gradient_row(state, records, record, left, top, first_row, end_row, run_start, with_depth):
-    """Return the gradient row (see `layout`) of one Gaussian in one tile."""
+    """Return the gradient row of one Gaussian in one tile: sums of g times u, d_y, u², u d_y, d_y² and 1, then those
+    for red, green, blue and depth."""
     if is_needle(records, record, end_row - first_row):
         mu, my, muu, muy, myy, m, colours = _needle_sums(
             state, records, record, left, top, first_row, end_row, with_depth
@@ -242,7 +244,7 @@ def _pad_row(padded, pixel, count, image, alphas, depths, d_image, d_alphas, d_d
 def init_tile_backward(
     state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth, padded
 ):  # fmt: skip
-    """Write the state of a tile before its first Gaussian.
+    """Write the state of a tile before its first Gaussian: T, S and the gradients of its pixels.
 
     padded: workspace (6, PADDED_ROW) for tiles that reach beyond the right edge of the picture."""
     init_tile(state, ROW, left, top, width, height)

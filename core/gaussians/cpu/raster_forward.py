@@ -196,8 +196,8 @@ def start_run(records, record, left, y):
 
 @inlined
 def next_entry(entries, index, end, records, left, top):
-    """Return the entry's record, first row, end row and run_start (see the module head) for the entry of this index, or
-    for the last one if there are no more.
+    """Return the record's index, first row, end row and run_start (e, r and d_y in the first row) of the entry `index`,
+    or of the tile's last entry if there are no more.
 
     end: the index after the tile's last entry. Called before the previous entry is drawn, to hide the latency of the
     exponentials."""

@@ -91,7 +91,8 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None, *_: Any) -> Any:
-        """Return the gradients of all inputs, or step the parameters by them if steps are pending (`stepping`)."""
+        """Return the gradients of all inputs. If Adam steps of the parameters are pending (`stepping`), make these
+        steps and return None for the parameters."""
         means, quats, scales, opacities, sh, _, alpha, _ = ctx.saved_tensors  # raises if they were changed in place
         options, bins = ctx.options, ctx.bins
         records, camera, colour_slopes, ends, background_flat, inputs, pictures = ctx.arrays

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ class _Features:
     """Points (n, 2), pixels, and their descriptors."""
 
     points: NDArray[np.float32]
-    descriptors: Any
+    descriptors: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -96,12 +95,15 @@ class HomographyMatcher:
             grey = np.clip(self._read(name) @ LUMINANCE * 255 + 0.5, 0, 255).astype(np.uint8)
             keys, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(grey, np.array([]))
             points = np.array([key.pt for key in keys], np.float32).reshape(-1, 2)
-            self._features_by_name[name] = _Features(points, descriptors)
+            # SIFT's values are whole numbers up to 255; of a picture without features there are none.
+            codes = np.zeros((0, 128), np.uint8) if descriptors is None else descriptors.astype(np.uint8)
+            self._features_by_name[name] = _Features(points, codes)
         return self._features_by_name[name]
 
 
 def project(matrix: Matrix, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points (n, 2) under a homography (3, 3); NaN for points behind the camera of the target."""
-    mapped = np.column_stack([points, np.ones(len(points))]) @ matrix.T
-    depth = np.where(mapped[:, 2:] > 0, mapped[:, 2:], np.nan) * np.sign(matrix[2, 2])
+    """Return points (n, 2) under a homography (3, 3), pixels; NaN for points that are behind the target's camera, if
+    the pixel (0, 0) is before it."""
+    mapped = np.column_stack([points, np.ones(len(points))]) @ (matrix / matrix[2, 2]).T
+    depth = np.where(mapped[:, 2:] > 0, mapped[:, 2:], np.nan)
     return np.asarray(mapped[:, :2] / depth)

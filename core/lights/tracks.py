@@ -118,7 +118,7 @@ def track_lights(capture: Capture, progress: Progress | None = None) -> TrackFin
     progress.stage("follow lights", len(lamps) + len(doubtful_chains))
     tracked, motion = [], BackgroundMotion(capture)
     for chain in [*lamps, *doubtful_chains]:
-        tracked.append(_to_light(chain, capture, diagonal, motion))
+        tracked.append(_to_light(chain, capture, diagonal, motion if chain in lamps else None))
         progress.advance()
     lights, doubtful = tracked[:len(lamps)], tracked[len(lamps):]
     return TrackFindings(lights, doubtful, sources, _messages(lights, doubtful, len(ghosts), sources))
@@ -186,7 +186,7 @@ def _is_ghost(chain: Chain, others: Sequence[Chain], centre: Floats, diagonal: f
     return False
 
 
-def _to_light(chain: Chain, capture: Capture, diagonal: float, motion: BackgroundMotion) -> TrackedLight:
+def _to_light(chain: Chain, capture: Capture, diagonal: float, motion: BackgroundMotion | None) -> TrackedLight:
     """Return the light of a chain with its keys in all frames that its path reaches.
 
     diagonal: length of the frame's diagonal, pixels. motion: carries a static light to frames that do not show it.

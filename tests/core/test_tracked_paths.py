@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.colour.srgb import linear_from_srgb
+from core.images.homographies import HomographyMatcher, project
 from core.lights import path_interpolation
 from core.lights.tracks import track_lights
 from tests.core.test_light_tracks import SIZE, Lamp, lit, make_shot
@@ -86,3 +87,22 @@ class TestInterpolation:
         assert sorted(between) == sorted({*range(frames[0], frames[-1] + 1)} - {*frames})
         for frame, place in between.items():
             np.testing.assert_allclose(place, [4 * frame, 7], atol=0.2)
+
+
+class TestHomography:
+    def test_maps_points_and_leaves_out_those_behind_the_camera(self) -> None:
+        focal, turn = 300.0, np.radians(40)
+        intrinsics = np.array([[focal, 0, 160], [0, focal, 90], [0, 0, 1]])
+        rotation = np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
+        matrix = intrinsics @ rotation @ np.linalg.inv(intrinsics)
+        points = np.array([[160.0, 90.0], [300.0, 40.0], [-2000.0, 90.0]])
+        rays = (rotation @ np.linalg.inv(intrinsics) @ np.column_stack([points, np.ones(3)]).T).T
+        expected = (rays / rays[:, 2:]) @ intrinsics.T
+        mapped = project(-2.5 * matrix, points)  # a homography has no scale and no sign
+        np.testing.assert_allclose(mapped[:2], expected[:2, :2], atol=1e-9)
+        assert np.isnan(mapped[2]).all() and rays[2, 2] < 0
+
+    def test_of_pictures_without_features_is_none(self) -> None:
+        black = np.zeros((60, 80, 3), np.float32)
+        match = HomographyMatcher(lambda _: black, 0.4).match("a", "b")
+        assert match.matrix is None and match.inlier_share is None

@@ -136,7 +136,8 @@ class PlateTrainer(FlareTrainer):
         return PlateScene(cameras, read, self.frames.display_white)
 
     def step(self) -> dict[str, float]:
-        """Run one iteration on the next view; return {"loss": loss of the composite}, or {} if no light is in front."""
+        """Run one iteration on the next view; return "loss", that of the composite, or nothing if no light is in front
+        of the camera. Raises RunError if it is not finite."""
         self.iteration += 1
         assert self.flare is not None
         settings, view = self.settings, self._pick_view()

@@ -152,7 +152,7 @@ def draw_tiles(
     height: int, *, blend: Blend, median: bool = False,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Draw Gaussians by tiles; return (height, width, c), the weighted sums of their values, and (height, width), the
-    row of the Gaussian at which transmittance falls below 1/2, or -1 (filled in only if `median`).
+    row of the Gaussian at which transmittance falls below 1/2, or -1 (valid only if `median`).
 
     draw: draws the tiles; tile_size: side of a tile, px; radii (n,): Mahalanobis distance up to which each Gaussian is
     drawn; half_size (n, 2): half size of its bounding box, px. Large pictures are drawn in halves, to bound the

@@ -56,15 +56,15 @@ def is_placed(item: Any, scene: Any) -> bool:
 
 
 def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add: bool = False) -> Look:
-    """Show a .flare in the scene; return its look. Raises FlareFileError.
+    """Set the scene's .flare and match its flares to the lights of the new look. Raises FlareFileError.
 
-    A flare that the scene has keeps its light object and its sliders. It shows the look's light of the same name as
-    before; if there is none, the light with the same number, counted over the lights of the earlier look. Sliders that
-    the artist has not moved follow the edits in the file.
+    Each existing flare is matched to a light of the new look: by the name of the light that it showed before, else by
+    that light's number among those shown before. It keeps its light object and its sliders; sliders that the artist has
+    not moved follow the edits in the file.
 
     A light of the look without a flare gets one if a light object has its name, or if the scene had no flare at all.
     Flares without a light object are placed at the objects `targets`. add: each remaining target gets a flare of its
-    own. Targets that have a flare already are skipped.
+    own. Targets that have a flare already are skipped. Returns the look.
     """
     path = Path(path)
     look = read_look(path)
@@ -72,17 +72,18 @@ def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add:
     is_first = not state.lights
     _change_look(scene, _stored_edits(scene), look)
     state.flare = blend_relative(path)
-    objects = {light_name(item): item for item in scene_lights(scene)}
+    objects = {light_name(lamp): lamp for lamp in scene_lights(scene)}
     for light in look.lights:
-        item = next((entry for entry in state.lights if entry.source == light.name), None)
-        if item is None and (is_first or light.name in objects):
-            item = _new_flare(state, look, light)
-            item.name = free_name(light.name, {entry.name for entry in state.lights})
+        flare = next((entry for entry in state.lights if entry.source == light.name), None)
+        if flare is None and (is_first or light.name in objects):
+            flare = _new_flare(state, look, light)
+            flare.name = free_name(light.name, {entry.name for entry in state.lights})
         lamp = objects.get(light.name)
-        if item is not None and item.target is None and lamp is not None and lamp not in _used_targets(state):
-            item.target = lamp
+        if flare is not None and flare.target is None and lamp is not None and lamp not in _used_targets(state):
+            flare.target = lamp
     _place_flares(scene, look, targets, add)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
+    # The label of `native` is Of This Capture.
     state.native = _is_of_this_capture(look, state, objects, depsgraph_of(scene))
     return look
 

@@ -290,7 +290,7 @@ def working_space() -> NDArray[np.float64]:
     return np.array([Color(axis).from_rec709_linear_to_scene_linear()[:] for axis in np.eye(3).tolist()]).T
 
 
-def composite_levels(buffers: list[Any], box: tuple[float, float, float, float], blend: str, window: DrawnRegion,
+def composite_levels(buffers: list[Any], box: tuple[float, float, float, float], blend: str, region: DrawnRegion,
                      space: NDArray[np.float64]) -> None:
     """Add rendered levels to the bound framebuffer, inside box (left, bottom, right, top; 0..1 of its size).
 
@@ -304,7 +304,7 @@ def composite_levels(buffers: list[Any], box: tuple[float, float, float, float],
     shader = _shader("sum")
     shader.bind()
     shader.uniform_float("box", box)
-    shader.uniform_float("extent", (window.width, window.height))
+    shader.uniform_float("extent", (region.width, region.height))
     shader.uniform_float("is_display", 1.0 if blend == "over" else 0.0)
     shader.uniform_float("working_space", Matrix(space.tolist()).to_4x4())
     for number, offscreen in enumerate(buffers):

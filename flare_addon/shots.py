@@ -100,7 +100,8 @@ class ShotReading:
         return Shot(flare, tuple(self._shot_frames), looks.query_of(state), run, state.bake_live)
 
 
-def scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int], flare: Path, run: Path | None) -> Shot:
+def read_scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int], flare: Path,
+                    run: Path | None) -> Shot:
     """Return the shot of these camera objects at these frames, as `ShotReading` reads it; the scene's current frame is
     restored.
 
@@ -262,7 +263,7 @@ def replacement_warning(folder: Path, frames: Sequence[int]) -> str:
 
 def _panel_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int]) -> Shot:
     """Return the shot that the panel is set to bake, at these frames."""
-    shot = scene_shot(scene, camera_objects, frames, looks.look_of(scene).path.resolve(), run_to_bake(scene))
+    shot = read_scene_shot(scene, camera_objects, frames, looks.look_of(scene).path.resolve(), run_to_bake(scene))
     return replace(shot, own_folder=bool(camera_objects))
 
 

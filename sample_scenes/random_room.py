@@ -55,7 +55,7 @@ class Room:
         self.width, self.depth, self.height = random.uniform((4, 6, 2.5), (10, 16, 5))
         self.indoors, self.dark = random.random() < 0.6, random.random() < 0.55
         self._add_sky()
-        self._add_walls()
+        self._add_floor_and_walls()
         for _ in range(int(random.integers(2, 10))):
             self._add_object()
         for _ in range(int(random.integers(1, 8) if self.dark else random.integers(0, 4))):
@@ -81,8 +81,9 @@ class Room:
         links.new(texture.outputs["Color"], background.inputs["Color"])
         background.inputs["Strength"].default_value = random.uniform(0, 0.02) if self.dark else random.uniform(0.3, 1)
 
-    def _add_walls(self) -> None:
-        """Add a floor, and indoors most of the walls and the ceiling."""
+    def _add_floor_and_walls(self) -> None:
+        """Add a floor; indoors also the side and back walls and the ceiling, each left out now and then."""
+        # The room reaches from y = -2, behind the camera, to y = depth.
         random, middle = self.random, self.depth / 2 - 1
         polished = random.random() < 0.65
         floor_size = (self.width, self.depth + 2) if self.indoors else (60, 60)

@@ -176,7 +176,7 @@ def add_monkey(name: str, size: float, location: Vec, material: Any, turn: float
 
 
 def add_lamp(light: LightSource) -> Any:
-    """Add a light: a sphere that only the camera sees, and, if it has power, a lamp in its place (a sun, if distant).
+    """Add a light: a sphere that only the camera sees, and, if it has power, a lamp at its place (a sun, if distant).
 
     The sphere has the property `light_source`, so that the ray casts of the visible share can skip it.
     """

@@ -103,7 +103,7 @@ class Camera:
         """Return the camera of the part of its picture with this corner and size, pixels."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
-    def normalised(self, xyz: ArrayLike) -> tuple[Floats, Floats]:
+    def project_normalised(self, xyz: ArrayLike) -> tuple[Floats, Floats]:
         """Project world points (n, 3) to ((n, 2) of x/z and y/z, (n,) depth z).
 
         A point in the camera's plane (z = 0) has no image: its coordinates are not finite. The coordinates of a point
@@ -116,8 +116,11 @@ class Camera:
             return local[:, :2] / depth[:, None], depth
 
     def project(self, xyz: ArrayLike) -> tuple[Floats, Floats]:
-        """Project world points (n, 3) to (pixels (n, 2), depth (n,)); see `normalised` for points not in front."""
-        plane, depth = self.normalised(xyz)
+        """Project world points (n, 3) to (pixels (n, 2), depth (n,)).
+
+        See `project_normalised` for points that are not in front.
+        """
+        plane, depth = self.project_normalised(xyz)
         return plane * (self.fx, self.fy) + (self.cx, self.cy), depth
 
     def jacobian(self, xyz: ArrayLike) -> Floats:

@@ -97,7 +97,7 @@ def write_nuke_capture(camera: NukeCamera, plates: Mapping[int, Path], folder: P
         keyed = sorted(camera.poses)
         raise CaptureError(f"None of the plates has a pose: the camera has the frames {keyed[0]} to {keyed[-1]}, and "
                            f"the plates {min(plates)} to {max(plates)}.")
-    lenses: dict[Lens, Lens] = {}
+    lenses: dict[Lens, Lens] = {}  # frames of one lens share the object
     frames = []
     progress.stage("copy the plates", len(numbers))
     for number in numbers:

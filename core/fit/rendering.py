@@ -94,7 +94,7 @@ def render(scene: Scene, flare: FlareModel | None, blend: Blend, camera: Camera,
         if look is None or edits is None:
             gaussians = flare(pose, visibilities, camera.frame)
         else:
-            gaussians = _evaluate_edited(look, flare, edits, camera, visibilities)
+            gaussians = _evaluate_look_with_edits(look, flare, edits, camera, visibilities)
         flares = {name: splat_flare(light_gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels,
                                     pixel_grid=pixel_grid, exposure=camera.exposure)
                   for name, light_gaussians in gaussians.items()}
@@ -137,16 +137,17 @@ def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels
                    median_depth=large.median_depth[middle, middle])
 
 
-def _evaluate_edited(look: Look, flare: FlareModel, edits: LookEdits, camera: Camera,
-                     visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
+def _evaluate_look_with_edits(look: Look, flare: FlareModel, edits: LookEdits, camera: Camera,
+                              visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
     """Return the look's Gaussians of each light under an artist's edits, by the light's name.
 
-    The lights have the places and brightness that `flare` has for the camera's frame.
+    `flare` gives the lights' positions and brightness for the camera's frame. visibilities: 0..1 by light, None where
+    nothing hides them; times brightness they scale the flare.
     """
-    shares = flare.shares(visibilities, camera.frame) or {}
-    places = dict(zip(flare.names, flare.positions_in(camera.frame).numpy(), strict=True))
-    gaussians_by_light = look.evaluate(camera.world_to_camera, lights=places, edits=edits,
-                                       visibilities={name: float(share) for name, share in shares.items()})
+    visible_brightness = flare.shares(visibilities, camera.frame) or {}
+    positions = dict(zip(flare.names, flare.positions_in(camera.frame).numpy(), strict=True))
+    gaussians_by_light = look.evaluate(camera.world_to_camera, lights=positions, edits=edits,
+                                       visibilities={name: float(value) for name, value in visible_brightness.items()})
     return {name: as_tensors(gaussians) for name, gaussians in gaussians_by_light.items()}
 
 

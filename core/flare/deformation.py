@@ -65,16 +65,16 @@ def light_input(light: Tensor) -> Tensor:
 class DeformationNetwork(nn.Module):
     """Offsets of `heads` (name: width) for n Gaussians, and delta_l, from one light and one camera.
 
-    `positions` is the width of the canonical position (1 on the line, 2 for the free plane of mode `2d`); `latent` the
-    width of a code for each Gaussian, 0 in the paper's form. levels, base: of both `HashGrid`.
+    position_width: of the canonical position, 1 on the line, 2 for the free plane of mode `2d`. latent_width: of a code
+    for each Gaussian, 0 in the paper's form. levels, base: number of levels and coarsest resolution of both hash grids.
     """
 
     camera_low: Tensor
     camera_extent: Tensor
     light_high: Tensor
 
-    def __init__(self, heads: Mapping[str, int], query_range: QueryRange, *, positions: int = 1, latent: int = 0,
-                 levels: int = 16, base: int = 16) -> None:
+    def __init__(self, heads: Mapping[str, int], query_range: QueryRange, *, position_width: int = 1,
+                 latent_width: int = 0, levels: int = 16, base: int = 16) -> None:
         """Make grids, backbone and heads. heads: width of each parameter's offset, by the parameter's name."""
         super().__init__()
         self.light_grid = HashGrid(LIGHT_BITS, LIGHT_GROWTH, levels, base=base)
@@ -82,7 +82,7 @@ class DeformationNetwork(nn.Module):
         view_width = 2 * 2 * levels  # two grids of two features on each level
         # The two halves of the first layer add up, so one bias is enough.
         self.view_layer = nn.Linear(view_width, HIDDEN_WIDTH)
-        self.gaussian_layer = nn.Linear(2 * BANDS * positions + latent, HIDDEN_WIDTH, bias=False)
+        self.gaussian_layer = nn.Linear(2 * BANDS * position_width + latent_width, HIDDEN_WIDTH, bias=False)
         self.layers = nn.ModuleList(nn.Linear(HIDDEN_WIDTH, HIDDEN_WIDTH) for _ in range(HIDDEN_LAYERS - 1))
         self.names, self.widths = list(heads), list(heads.values())
         # One matrix holds every head: the same function, one product instead of many.

@@ -101,8 +101,8 @@ class LightFlare(nn.Module):
         heads = {name: self.gaussians[name].shape[1] for name in deformed}
         if form.line and form.plane_offset:
             heads["plane_offset"] = 2
-        self.network = DeformationNetwork(heads, query_range, positions=1 if form.line else 2,
-                                          latent=form.latent, levels=form.levels, base=form.base)
+        self.network = DeformationNetwork(heads, query_range, position_width=1 if form.line else 2,
+                                          latent_width=form.latent, levels=form.levels, base=form.base)
 
     @property
     def count(self) -> int:

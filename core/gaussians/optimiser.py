@@ -73,16 +73,16 @@ class Adam:
         gets a gradient after its step.
         """
         fused: FusedKernels | None = None
-        steps: dict[str, Any] = {}
+        offered_steps: dict[str, Any] = {}
         for name, rate in self.rates.items():
             parameter = self.parameters[name]
             if kernels := self._kernels_for(parameter):
                 fused = kernels
-                steps[name] = kernels.AdamStep(parameter, None, *self.moments[name], self.steps[name] + 1, rate)
+                offered_steps[name] = kernels.AdamStep(parameter, None, *self.moments[name], self.steps[name] + 1, rate)
         if fused is None:
             yield
             return
-        with fused.offer_steps(steps, **self._options) as offer:
+        with fused.offer_steps(offered_steps, **self._options) as offer:
             yield
         for name in offer.claimed:
             self.steps[name] += 1

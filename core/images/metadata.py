@@ -39,9 +39,9 @@ _COLOUR_TYPE_OFFSET, _HEADER_END = 25, 33
 """Offsets in a PNG of the colour type, whose bit 2 means colour, and of the end of the first chunk, IHDR."""
 _SRGB_POINTS, _UNSPECIFIED = (1, 13), 2
 """Code points (ITU-T H.273): primaries and transfer of sRGB, and that for an unspecified one."""
-_MARKERS = frozenset({jpeg.APP1, jpeg.APP2, jpeg.APP13, jpeg.COMMENT, *range(0xE3, 0xED), 0xEF})
+_KEPT_MARKERS = frozenset({jpeg.APP1, jpeg.APP2, jpeg.APP13, jpeg.COMMENT, *range(0xE3, 0xED), 0xEF})
 """JPEG segments that are kept; APP14 says how the encoder stores its colours, and APP0 is replaced as a whole."""
-_INDEX, _ISO_GAIN_MAP = b"MPF\0", b"urn:iso:std:iso:ts:21496:-1"
+_MULTI_PICTURE_INDEX, _ISO_GAIN_MAP = b"MPF\0", b"urn:iso:std:iso:ts:21496:-1"
 """Segments that describe the pictures behind a JPEG's first one."""
 _HEIF_GAIN_MAPS = (b"aux:hdrgainmap", b"urn:iso:std:iso:ts:21496:-1", b"tmap")
 """Names of gain maps in the header of HEIC and AVIF: Apple's, and that of ISO 21496-1."""
@@ -121,7 +121,8 @@ def dropped_parts_warning(path: Path) -> str:
         if head[:2] != b"\xff\xd8":
             return ""
         for _, content in jpeg.segments(stream):
-            if content.startswith((_INDEX, _ISO_GAIN_MAP)) or (content.startswith(jpeg.XMP) and _has_claims(content)):
+            if content.startswith((_MULTI_PICTURE_INDEX, _ISO_GAIN_MAP)) or (content.startswith(jpeg.XMP)
+                                                                             and _has_claims(content)):
                 return (f"{path} holds more than one picture (a gain map, a clip or a preview), which would show its "
                         "own pixels; the result goes without them, and without the tags that claim them.")
         stream.seek(-min(_TAIL_BYTES, stream.seek(0, 2)), 2)
@@ -131,14 +132,17 @@ def dropped_parts_warning(path: Path) -> str:
     return ""
 
 
-def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
-    """Return the encoded JPEG with the segments of the source `data`, in their order, behind a JFIF header: the
-    source's if it has one, else that of the encoded JPEG."""
+def _copy_to_jpeg(encoded: bytes, source: bytes) -> bytes:
+    """Return the encoded JPEG with the descriptive segments of the source (`_KEPT_MARKERS`), in their order, without
+    thumbnails, gain maps and the XMP that claims them.
+
+    The segments follow a JFIF header: the source's if it has one, else that of the encoded JPEG.
+    """
     header, header_end = b"", 2
-    if encoded[2:4] == b"\xff\xe0":
+    if encoded[2:4] == b"\xff\xe0":  # APP0
         header_end = 4 + int.from_bytes(encoded[4:6], "big")
         header = encoded[2:header_end]
-    segments = list(jpeg.segments(io.BytesIO(data)))
+    segments = list(jpeg.segments(io.BytesIO(source)))
     has_refocus_original = any(content.startswith(jpeg.XMP) and _ORIGINAL.encode() in content
                                for _, content in segments)
     copied = []
@@ -147,7 +151,7 @@ def _copy_to_jpeg(encoded: bytes, data: bytes) -> bytes:
             header = jpeg.make_segment(marker, content[:12] + b"\0\0")  # density, and a thumbnail of 0 x 0
         elif has_refocus_original and content.startswith(jpeg.EXTENDED_XMP):
             continue  # it holds that original, which shows the flare
-        elif marker in _MARKERS and not content.startswith((_INDEX, _ISO_GAIN_MAP)):
+        elif marker in _KEPT_MARKERS and not content.startswith((_MULTI_PICTURE_INDEX, _ISO_GAIN_MAP)):
             if content.startswith(jpeg.XMP):
                 content = _without_claims(content)
             elif content.startswith(jpeg.EXIF):

@@ -112,7 +112,9 @@ def _extent_and_colour(gaussians: PlaneGaussians, energy: Floats) -> tuple[float
     weights = energy / energy.sum()
     offsets = gaussians.means - weights @ gaussians.means
     spread = gaussians.covariances[:, 0] + gaussians.covariances[:, 2]
-    if gaussians.rings is not None:  # about the mean of r² over a ring; exact for r0 = 0
+    if gaussians.rings is not None:
+        # Over a ring of radius r0 and width w (Mahalanobis), the mean of r² is approximately r0² + 2 w² (exact for
+        # r0 = 0); a plain Gaussian has 2.
         r0, w = np.maximum(gaussians.rings[:, 0], 0), gaussians.rings[:, 1]
         spread = spread * (r0 * r0 + 2 * w * w) / 2
     extent = float(np.sqrt(weights @ ((offsets * offsets).sum(-1) + spread)))

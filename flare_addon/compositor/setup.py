@@ -277,7 +277,7 @@ def _undo_set_up(scene: Any, tree: Any, source: Any, node_settings: dict[str, An
             setattr(source, name, value)
     else:
         tree.nodes.remove(source)
-        if not state["tree"]:
+        if not state["tree"]:  # the scene had no tree before
             trees.discard_tree(scene, tree, bool(state["use_nodes"]))
         elif not GROUPS_ARE_TREES:
             scene.use_nodes = bool(state["use_nodes"])
@@ -315,6 +315,7 @@ def _scene_state(scene: Any) -> dict[str, Any]:
     tree: whether there is a tree, also one that is switched off. use_nodes: whether it is on. viewer: whether the file
     has the image of a Viewer node.
     """
+    # "tree" is a bool, despite its name; .blend files store it under this key.
     viewer = any(image.type == "COMPOSITING" for image in bpy.data.images)  # Blender makes one for a Viewer node
     return {"tree": trees.has_tree(scene), "use_nodes": GROUPS_ARE_TREES or bool(scene.use_nodes), "viewer": viewer}
 

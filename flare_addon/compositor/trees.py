@@ -11,6 +11,7 @@ from typing import Any
 import bpy
 
 GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
+"""From Blender 5.0 a scene's compositor is a node group; before, it is the scene's own tree, switched by use_nodes."""
 HAS_EFFECTS = "compositor_effects" in bpy.types.Scene.bl_rna.properties
 OUTPUT_TYPE = "NodeGroupOutput" if GROUPS_ARE_TREES else "CompositorNodeComposite"
 NODE = "Fit Flare"

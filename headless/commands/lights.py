@@ -66,7 +66,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise SettingsError("--focal is for frames without a camera solve, and this capture has one; leave it out.")
     tallies.report_capture(capture, progress)
     if not capture.has_cameras:
-        return _follow(capture, args, progress)
+        return _run_without_solve(capture, args, progress)
     detector = make_detector(args.method, args.threshold, args.boxes, args.masks)
     settings = TriangulationSettings(min_views=args.min_views, seed=args.seed)
     gaussians = _read_gaussians(args.scene) if args.scene else None
@@ -79,8 +79,9 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             **tallies.report_tally(tallies.tally_capture(capture, "searched"), progress)}
 
 
-def _follow(capture: Capture, args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Follow the lights of frames without a camera solve as the arguments say, and return the command's result."""
+def _run_without_solve(capture: Capture, args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Run the command on frames without a camera solve: record --focal in CAMERA, track the lights from frame to frame,
+    return the command's result. Raises SettingsError for options that need a solve."""
     from ...core.lights.file import check_replaceable
 
     unusable_options = {"--method": args.method != "exposure", "--threshold": args.threshold is not None,
@@ -94,13 +95,13 @@ def _follow(capture: Capture, args: argparse.Namespace, progress: Progress) -> d
         write_json(capture.folder / CAMERA, {"focal_px": args.focal, "width": camera.width, "height": camera.height})
     if not args.keep:
         check_replaceable(capture.folder / LIGHTS)
-    report = _follow_and_record(capture, progress, keep=args.keep)
+    report = _track_and_record(capture, progress, keep=args.keep)
     return {"lights": report["lights"], "file": str(capture.folder / LIGHTS),
             "sheets": [str(capture.folder / sheet) for sheet in report["sheets"]],
             **tallies.report_tally(tallies.tally_capture(capture, "searched"), progress)}
 
 
-def _follow_and_record(capture: Capture, progress: Progress, keep: bool = False) -> dict[str, Any]:
+def _track_and_record(capture: Capture, progress: Progress, keep: bool = False) -> dict[str, Any]:
     """Follow the lights of a shot, write lights.json and the sheets, and report them; return the report.
 
     keep: keep the entries of lights.json. Raises CaptureError where the folder cannot be written.
@@ -127,7 +128,7 @@ def with_lights(capture: Capture, progress: Progress) -> Capture:
         return capture
     progress.say(f"{capture.folder} has no {LIGHTS}; searching for its lights.")
     if not capture.has_cameras:
-        _follow_and_record(capture, progress)
+        _track_and_record(capture, progress)
         return capture.reopen()
     _find_and_record(capture, make_detector("exposure"), progress)
     return capture.reopen()

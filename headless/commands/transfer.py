@@ -155,12 +155,12 @@ def _check_ranges(args: argparse.Namespace) -> None:
 
 
 def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, target: Target, flare: Path,
-                training: list[Floats] | None, progress: Progress) -> dict[str, Any]:
+                training_poses: list[Floats] | None, progress: Progress) -> dict[str, Any]:
     """Render the layers of a flare for a target, as a step of `transfer` or `bake`.
 
-    args: the command's, with the options of layers, --frames, --size and --jobs. step: its name, for --jobs. flare:
-    the .flare. training: poses of training views, for a .flare that does not store its own. Returns the command's
-    result.
+    args: the command's, with the options of layers, --frames, --size and --jobs. step: name of the command's step,
+    which --jobs starts. flare: the .flare. training_poses: of training views, for a .flare that does not store its own.
+    Returns the command's result.
     """
     from ...core.transfer.target import resized
     from ...core.transfer.transfer import Transfer, TransferSettings
@@ -175,20 +175,20 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     settings = TransferSettings(options.query, options.scale, options.smooth, options.plate_space,
                                 fall_off=options.fall_off, highlights=options.highlights,
                                 highlight_gain=1.0 if options.highlight_gain is None else options.highlight_gain)
-    transfer = Transfer(flare, target, settings, training, args.ocio)
+    transfer = Transfer(flare, target, settings, training_poses, args.ocio)
     selected = frames.select_task([target_frame.frame for target_frame in target.frames], args, progress)
     if not selected:
         return layers.empty_result(args.out)
     if args.jobs != 1:
         extra = ["--shot", str(targets.shot_path(options))] if targets.is_blend(options) else []
         jobs.run_jobs(args, step, [frame.number for frame in selected], progress, extra)
-    # After jobs, this keeps their finished frames and returns the record of all.
     bake_settings = layers.bake_settings(args)
     sources = {light.name: light.source for frame in target.frames for light in frame.shot.lights}
-    stored = () if targets.is_shot_file(options) else transfer.look.edits.for_placed_lights(sources).texts()
-    if stored:
-        progress.say(f"The edits that {flare} stores are applied: {', '.join(stored)}.")
-        bake_settings = replace(bake_settings, edits=(*stored, *bake_settings.edits))
+    stored_edits = () if targets.is_shot_file(options) else transfer.look.edits.for_placed_lights(sources).texts()
+    if stored_edits:
+        progress.say(f"The edits that {flare} stores are applied: {', '.join(stored_edits)}.")
+        bake_settings = replace(bake_settings, edits=(*stored_edits, *bake_settings.edits))
+    # After `run_jobs`, this skips the frames that the jobs finished, and returns the record of all.
     record = transfer.bake(args.out, selected, bake_settings, progress, overwrite=args.overwrite)
     return layers.report_layers(selected, args.out, len(record["frames"]), progress, targets.left_out(options, target))
 

@@ -32,7 +32,7 @@ def a_flare(path: Path, *names: str) -> Path:
     """
     generator = torch.Generator().manual_seed(4)
     place = cameras(5)
-    seen = torch.tensor(np.array([camera.normalised(LIGHT)[0][0] for camera in place])).float()
+    seen = torch.tensor(np.array([camera.project_normalised(LIGHT)[0][0] for camera in place])).float()
     reach = QueryRange.of(torch.tensor(np.array([camera.position for camera in place])).float(), seen)
     light = LightFlare(replace(OURS, arcs=True), reach, 60, generator)
     with torch.no_grad():

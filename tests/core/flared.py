@@ -41,7 +41,7 @@ def cameras(count: int) -> list[Camera]:
 def flare(camera: Camera) -> NDArray[np.float32]:
     """Return the flare of LIGHT as a camera sees it, (height, width, 3) linear: soft discs on the line from the light
     through the optical axis."""
-    plane, depth = camera.normalised(LIGHT)
+    plane, depth = camera.project_normalised(LIGHT)
     if depth[0] <= 0:
         return np.zeros((HEIGHT, WIDTH, 3), np.float32)
     x = (np.arange(WIDTH) + 0.5 - camera.cx) / camera.fx

@@ -112,7 +112,7 @@ def test_frames_are_undistorted(tmp_path: Path, model: str, scale: int) -> None:
     view = Capture.open(folder).views[0]
     world = view.camera.position + rng.uniform(1, 3, (40, 1)) * view.camera.rays(
         rng.uniform(0.1, 0.9, (40, 2)) * view.camera.size)
-    plane, _ = view.camera.normalised(world)
+    plane, _ = view.camera.project_normalised(world)
     size = (ours.width * scale, ours.height * scale)
     v, u = np.mgrid[:size[1], :size[0]] + 0.5
     for at in range(0, 40, 8):  # a few dots a picture, so that none hides another

@@ -62,7 +62,7 @@ for frame, energy in ((1, 20), (9, 60)):
     lamp.data.energy = energy
     lamp.data.keyframe_insert("energy", frame=frame)
 facts["keyed"] = [factor(scene, 1), factor(scene, 9)]
-shot = shots.scene_shot(scene, [], [1, 9], Path(flare), None)
+shot = shots.read_scene_shot(scene, [], [1, 9], Path(flare), None)
 facts["keyed, in a bake"] = [round(frame.lights[0].factor[0], 4) for frame in shot.frames]
 lamp.data.animation_data_clear()
 driver = lamp.data.driver_add("energy").driver
@@ -86,7 +86,7 @@ def baked(scene, numbers):
     """Return the sum of the flare in each of these frames, computed as a bake of the scene does."""
     look, sums = looks.look_of(scene), []
     k = np.array([[48.0, 0, 24], [0, 48.0, 13.5], [0, 0, 1]])
-    for frame in shots.scene_shot(scene, [], numbers, look.path, None).frames:
+    for frame in shots.read_scene_shot(scene, [], numbers, look.path, None).frames:
         gaussians = look.evaluate_lights(frame.camera.world_to_camera, frame.lights, looks.edits_of(scene.fit_flare),
                                          looks.query_of(scene.fit_flare))
         sums.append(float(core_look.draw(gaussians.values(), k, 48, 27).sum()) if gaussians else 0.0)

@@ -36,7 +36,7 @@ def linked(name: str, data: object = None) -> object:
 
 def places(frames: list[int]) -> list[list[float]]:
     """Where the only flare's light is in a shot."""
-    shot = shots.scene_shot(scene, [], frames, flare, None)
+    shot = shots.read_scene_shot(scene, [], frames, flare, None)
     return [np.round(frame.lights[0].xyz, 3).tolist() for frame in shot.frames]
 
 
@@ -132,7 +132,7 @@ scene.fit_flare.lights[0].target = scene.objects["Lamp On"]
 scene.camera = linked("No Camera")
 facts["no camera"] = ops.pick_light.poll()
 try:
-    shots.scene_shot(scene, [], [1], flare, None)
+    shots.read_scene_shot(scene, [], [1], flare, None)
 except errors.FitFlareError as problem:
     facts["an empty"] = str(problem)
 overlay, points = part("flare_addon.overlay"), part("flare_addon.points")

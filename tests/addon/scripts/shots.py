@@ -102,7 +102,7 @@ begun: list[list[object]] = []
 engine = part("flare_addon.engine")
 engine.run = lambda _kind, _folder, words: begun.append(words)
 engine.find_engine = lambda: Path("python")
-recorded(shots.scene_shot(scene, [], [0, 1, 2], flare, None), range(5))
+recorded(shots.read_scene_shot(scene, [], [0, 1, 2], flare, None), range(5))
 state.bake_range = "current"
 facts["as it was baked"] = [refusal(ops.bake), len(begun)]
 state.bake_live = False
@@ -118,7 +118,7 @@ facts["renamed"] = refusal(ops.bake)
 unplaced = state.lights.add()
 unplaced.name, unplaced.source, unplaced.mute = "sun", "sun", True
 state.lights[0].intensity, state.bake_live = 2.0, False
-(one,) = shots.scene_shot(scene, [], [0], flare, None).frames
+(one,) = shots.read_scene_shot(scene, [], [0], flare, None).frames
 facts["edits"] = [[light.name for light in one.lights], list(one.edits)]
 state.lights[0].intensity, state.bake_live = 1.0, True
 state.lights.remove(len(state.lights) - 1)

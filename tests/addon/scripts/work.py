@@ -293,20 +293,20 @@ scene.camera.fit_flare.exposure = 2.0
 brighter = overlay.concatenate(list(looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(),
                                                           scene.camera).values()))
 facts["brighter"] = [far_off(brighter.colours, 2 * gaussians.colours), float(np.abs(gaussians.colours).max())]
-exposed_shot = shots.scene_shot(scene, [scene.camera], [2], Path(flare), None)
+exposed_shot = shots.read_scene_shot(scene, [scene.camera], [2], Path(flare), None)
 exposed_shot.write(Path(out) / "exposed.json")
 scene.camera.fit_flare.exposure = 1.0
 
 # ---- a shot, and the same by hand ------------------------------------------------------------------
 state.occlusion = True
-shot = shots.scene_shot(scene, [scene.camera], [1, 3], Path(flare), None)
+shot = shots.read_scene_shot(scene, [scene.camera], [1, 3], Path(flare), None)
 pose = original.views[1].camera.world_to_camera
 facts["pose off"] = float(np.abs(shot.frames[0].camera.world_to_camera - pose).max())
 facts["place off"] = float(np.abs(shot.frames[0].lights[0].xyz - original.lights[0].xyz).max())
 facts["shares"] = [light.visibility for light in shot.frames[0].lights]
 root = state.root
 root.rotation_euler, root.scale, root.location = (0.3, 0.2, 0.1), (2, 2, 2), (1, 2, 3)
-moved = shots.scene_shot(scene, [scene.camera], [1, 3], Path(flare), None)
+moved = shots.read_scene_shot(scene, [scene.camera], [1, 3], Path(flare), None)
 facts["moved root off"] = float(np.abs(moved.frames[0].camera.world_to_camera - pose).max())
 root.rotation_euler, root.scale, root.location = (0, 0, 0), (1, 1, 1), (0, 0, 0)
 
@@ -318,7 +318,7 @@ angle.matrix_world = first.matrix_world
 angle.location.x += 3
 for frame, camera in ((1, first), (3, angle)):
     scene.timeline_markers.new("cut", frame=frame).camera = camera
-cut = shots.scene_shot(scene, [], [1, 2, 3], Path(flare), None)
+cut = shots.read_scene_shot(scene, [], [1, 2, 3], Path(flare), None)
 facts["cut"] = [sorted({one.name for one in cut.frames}), *(float(np.abs(one.camera.world_to_camera - np.linalg.inv(
     np.array(angle.matrix_world) @ cameras.FLIP_YZ)).max()) for one in cut.frames)]
 scene.timeline_markers.clear()

@@ -257,7 +257,7 @@ if facts["has effects"]:
     again = float(np.abs(rendered(scene) - under - flare_light).max() / flare_light.max())
     part("flare_addon.compositor.trees").effect_of(scene).enable_for_render = False
     operator = MagicMock()
-    part("flare_addon.operators.bake").set_up(operator, scene, layers_folder, keep_image=True, plate=False)
+    part("flare_addon.operators.bake").set_up_compositor(operator, scene, layers_folder, keep_image=True, plate=False)
     said = [call.args[1] for call in operator.report.mock_calls if call.args[0] == {"WARNING"}]
     second.enable_for_render = True
     ops.remove_compositor()

@@ -389,7 +389,7 @@ def _poll_safely(job: Job) -> bool:
 def redraw_bars() -> None:
     """Redraw what shows progress: the sidebars with our tab, and the preferences.
 
-    The 3D views are left out, since they are expensive to draw; properties that change them redraw them.
+    The 3D views are left out, since they are expensive to draw: the update callbacks of the properties redraw them.
     """
     for area in (area for window in bpy.context.window_manager.windows for area in window.screen.areas):
         if area.type == "PREFERENCES":

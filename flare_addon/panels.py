@@ -307,7 +307,7 @@ class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
 
 
 def _draw_view_hint(layout: Any, context: bpy.types.Context) -> None:
-    """Draw why this 3D view shows no flare, or not this one alone, and a button that helps."""
+    """Draw why this 3D view shows no flare, the baked one, or one over that of the frames, and a button that helps."""
     scene, state = context.scene, context.scene.fit_flare
     view = context.space_data if getattr(context.space_data, "type", "") == "VIEW_3D" else None
     if scene.camera is None:

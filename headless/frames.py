@@ -33,10 +33,10 @@ def select(known: Sequence[NumberedFrame], text: str | None, progress: Progress)
 
 
 def select_task(known: Sequence[NumberedFrame], args: argparse.Namespace, progress: Progress) -> list[NumberedFrame]:
-    """Return the frames of `known` for --frames and --job-frames (`select_task_frames`), and report missing numbers.
+    """Return the frames of `known` that --frames selects for one task of a farm, and report missing numbers.
 
-    Empty where the task has nothing to do, which is reported too. Raises SettingsError where none of the job's frames
-    exists.
+    --job-frames lists the frames of the whole job: a task none of whose frames exists gets an empty list, which is
+    reported. Raises SettingsError where none of the job's frames exists.
     """
     frames = select_task_frames(known, args.frames, args.job_frames)
     _report_missing(known, args.frames, progress)

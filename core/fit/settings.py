@@ -416,9 +416,10 @@ def _scale_schedule(settings: FitSettings, factor: float) -> FitSettings:
 
 
 def _shorten_schedule(settings: FitSettings, count: int, max_gaussians: int) -> FitSettings:
-    """Return a schedule for a short fit: events at the same shares of the whole, and higher rates.
+    """Return the settings with the schedule and learning rates of a short fit.
 
-    A light starts with `count` Gaussians; the scene has at most `max_gaussians`. If the scene is fitted alone first,
+    Density control and harmonics begin, end and repeat at fixed shares of `iterations`; rates are above the paper's. A
+    light starts with `count` Gaussians; the scene has at most `max_gaussians`. If the scene is fitted alone first,
     the flare's density changes later.
     """
     length = settings.iterations

@@ -98,19 +98,20 @@ def _to_light(observations: Observations, place: Floats, inliers: NDArray[np.int
     """Return a refined place (4,) with its covariance (3, 3) and inliers as a light.
 
     covariance: of two angles of the direction, radians, and the inverse distance. extent: size of the cameras' path,
-    world units. allow_out_of_frame: count all views with the place in front of the camera as showing it.
+    world units. allow_out_of_frame: the number of visible views
+    includes those that have the place out of frame, if it is in front of the camera.
     """
     view = observations.view[inliers]
     origin, direction, inverse = parametrise(observations, place, inliers)
     spread = float(np.sqrt(covariance[2, 2]))
-    # Far: infinity lies within two standard deviations, and nothing nearer than 20 extents is likelier.
+    # Far: infinity lies within two standard deviations, and the estimate itself is farther than 20 extents.
     far = inverse - 2 * spread <= 0 and inverse * extent < 0.05
     angle = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
     if far:
-        xyz, uncertainty = origin + FAR * extent * direction, float(np.degrees(angle))
+        xyz, uncertainty = origin + FAR * extent * direction, float(np.degrees(angle))  # degrees
     else:
         xyz = origin + direction / inverse
-        # Errors of the inverse distance (d(1/x) = dx / x²) along the ray, and of the angle across it.
+        # World units. Errors of the inverse distance (d(1/x) = dx / x²) along the ray, and of the angle across it.
         uncertainty = max(spread / inverse ** 2, angle / inverse)
     homogeneous = np.array([[*(direction if far else xyz), 0.0 if far else 1.0]])
     pixels, front = observations.project(homogeneous)

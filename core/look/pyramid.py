@@ -52,7 +52,10 @@ def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, 
 
 
 def draw_added(gaussians: PlaneGaussians, look: Look, intrinsics: ArrayLike, width: int, height: int) -> Floats:
-    """Return the scene-linear light (height, width, 3) of Gaussians of a look with the blend "add"."""
+    """Return the scene-linear light (height, width, 3) of Gaussians of a look with the blend "add".
+
+    0 or more: enlarging a grid by cubic interpolation can fall below 0, which is clipped at the end.
+    """
     centres, covariances = to_pixels(gaussians, intrinsics, look.pixel_grid)
     arcs, radii = arcs_to_pixels(gaussians, intrinsics), cutoff_radii(gaussians)
     indices = level_indices(covariances, gaussians.rings)
@@ -61,7 +64,7 @@ def draw_added(gaussians: PlaneGaussians, look: Look, intrinsics: ArrayLike, wid
         divisor = LEVELS[index]
         level_rows = np.flatnonzero(indices == index)
         if picture is None and not len(level_rows) and index:
-            continue  # no grid is needed above the coarsest with a Gaussian; the finest is always made
+            continue  # grids coarser than the coarsest that has a Gaussian are skipped; the finest is always made
         size = -(-height // divisor) + 2 * _MARGIN, -(-width // divisor) + 2 * _MARGIN
         grid = np.zeros((*size, 3), np.float32) if picture is None else _enlarge(picture, size)
         for row in level_rows.tolist():

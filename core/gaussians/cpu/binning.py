@@ -326,7 +326,7 @@ def _collect_part(keys, max_tiles, low, high, cursors, pairs):
     upper 32 bits of a pair, the Gaussian's index in the lower.
 
     max_tiles: upper bound on the number of tiles of each Gaussian; cursors[0]: next free place of pairs, shared by the
-    threads. Return the range's begin and length, the largest key that was written, and an upper bound on the number of
+    threads. Return the range's begin and length, the largest key less the smallest, and an upper bound on the number of
     the Gaussians' tiles."""
     count, max_entries, smallest, largest = 0, 0, high, low
     for i in range(keys.size):

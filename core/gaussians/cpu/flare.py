@@ -421,8 +421,10 @@ def _needle_backward(state, records, record, left, top, first_row, end_row):
 
 @inlined
 def _plain_backward(state, records, record, left, top, first_row, end_row, run_start):
-    """Return the same gradient row for a plain Gaussian that is no needle, blend "add": by the recurrence over rows,
-    with three sums per lane, from which `moments` computes the five."""
+    """Return the gradient row of a plain Gaussian that is no needle, blend "add", in the form of `_needle_backward`.
+
+    e follows the recurrence over rows (head of `raster_forward`), with the ratio r of one row to the row before. Each
+    lane sums g, g d_y and g d_y², from which `moments` computes the five moments."""
     step, opaque_one, run = load_scalar(records, record + STEP), opaque(1), run_length(records, record)  # not unrolled
     zero = splat(ZERO)
     m0, m1, m2, colours = zero, zero, zero, (zero, zero, zero)

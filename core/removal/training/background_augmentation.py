@@ -217,8 +217,8 @@ def _add_haze(random: Random, scene: Pixels) -> Pixels:
 def _optical_depth(random: Random, scene: Pixels, below_horizon: Pixels) -> Pixels:
     """Return the optical depth of haze (height, width), 0 where the scene is near.
 
-    Distance is guessed: it grows with height above the horizon and with brightness, and follows the edges of the
-    picture. below_horizon: (height, width) in picture heights, negative above it.
+    Distance is guessed: it grows up the picture as far as the horizon, and with brightness. A guided filter smooths it
+    along the edges of the picture. below_horizon: (height, width) in picture heights, negative above it.
     """
     import cv2
 

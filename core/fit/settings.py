@@ -419,9 +419,8 @@ def _shorten_schedule(settings: FitSettings, count: int, max_gaussians: int) -> 
     """Return the settings with the schedule and learning rates of a short fit.
 
     Density control and harmonics begin, end and repeat at fixed shares of `iterations`; rates are above the paper's. A
-    light starts with `count` Gaussians; the scene has at most `max_gaussians`. If the scene is fitted alone first,
-    the flare's density changes later.
-    """
+    light starts with `count` Gaussians. If the scene, with at most `max_gaussians`, is first fitted alone, the flare's
+    density changes later."""
     length = settings.iterations
     every = max(round(length / 40), 20)
     scene_only_until = settings.flare.scene_only_until

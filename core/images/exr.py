@@ -133,10 +133,10 @@ def is_utf8(text: bytes) -> bool:
 
 @contextlib.contextmanager
 def _readable_path(path: Path | str) -> Iterator[str]:
-    """Yield the path of an EXR that the library can read: the file itself, or a copy without what is not UTF-8, since
-    the library would refuse the whole file.
+    """Yield the path of an EXR that the library can read: the file itself, or a temporary copy if it has text or names
+    that are not UTF-8, since the library would refuse the whole file.
 
-    In the copy, text attributes have "?" for each byte above 127, and names are those of `non_utf8_names`.
+    In the copy, other bytes stand for those above 127: "?" in texts, and in names those that `non_utf8_names` gives.
     """
     check_regular(path)
     names = non_utf8_names(path)

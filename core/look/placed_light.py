@@ -190,7 +190,8 @@ def _blur(gaussians: PlaneGaussians, motions: NDArray[np.float64], spread: NDArr
     same.
 
     motions (n, 2, 2): derivative of each Gaussian's centre by the light's position. low_pass: variance that the
-    rasterizer adds. A ring keeps its ellipse; its width w grows by the blur's mean variance relative to the ellipse.
+    rasterizer adds. A ring has radius r and width w in standard deviations of its ellipse. It keeps the ellipse, and w
+    grows by the blur's mean variance in units of the ellipse. Where r is at most w, the ellipse grows instead.
     """
     xx, xy, yy = gaussians.covariances.T.astype(np.float64)
     blur = motions @ spread @ motions.transpose(0, 2, 1)

@@ -75,7 +75,10 @@ def new_tree(scene: Any) -> Any:
 
 
 def discard_tree(scene: Any, tree: Any, use_nodes: bool) -> None:
-    """Remove the compositor tree of the scene, with its effect. use_nodes: whether it was on (until 4.5)."""
+    """Remove the compositor tree of the scene, with its effect.
+
+    Until Blender 4.5 the tree cannot be removed: it is emptied, and `use_nodes` is set back to this earlier value.
+    """
     if not GROUPS_ARE_TREES:
         tree.nodes.clear()
         scene.use_nodes = use_nodes

@@ -137,7 +137,8 @@ class _CleanView(NamedTuple):
 def _clean_view(renderer: ViewRenderer, capture: Capture, view: View, above_white: bool) -> _CleanView:
     """Subtract the fitted flare from a view's plate.
 
-    Raises FrameError for a plate that the fit's cameras do not match: turned by Exif, or with several views.
+    above_white: whether the fit had light above white; then the scene fills the discs of lights. Raises FrameError for
+    a plate that the fit's cameras do not match: turned by Exif, or with several views.
     """
     if view.upright:
         raise FrameError(f"{capture.frame_path(view)} was solved as viewers show it, and its pixels are stored turned; "
@@ -147,8 +148,8 @@ def _clean_view(renderer: ViewRenderer, capture: Capture, view: View, above_whit
         names = " and ".join(name for name, _ in views)
         raise FrameError(f"{stored.path} holds the views {names}, and the fit has the "
                          "cameras of one; export each view as a file of its own.")
-    # From these codes the flare is subtracted directly. Others are converted to Rec. 709, and the light that is removed
-    # there is then subtracted from the stored plate.
+    # A plate in Rec. 709 or linear light is changed directly. Any other is cleaned as Rec. 709, and what was removed
+    # there is subtracted from it.
     is_direct = stored.is_rec709 or (stored.encoding == "linear" and stored.space.is_linear)
     plate = stored if is_direct else stored.in_rec709
     height, width = plate.codes.shape[:2]

@@ -42,8 +42,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import report
 from benchmarks.bilateral import BilateralTrainer
+from benchmarks.exact_scene import ExactSceneTrainer, score_flare
 from benchmarks.hidden_lights import hidden_flare
-from benchmarks.known_scene import KnownScene, score_flare
 from core.capture import Camera, Capture, Light
 from core.choices import ITERATIONS, OUR_PRESETS, Preset
 from core.fit import fit
@@ -155,7 +155,7 @@ def experiments(make_preset: PresetFactory) -> list[Experiment]:
     for mode, title in (("default", "exact flare-free frames"), ("split", "none: split")):
         result += _variants("far layer", {
             title: ours(mode), f"{title}, without a far layer": ours(mode, scene__far_layer=False)})
-    result += _known_scene_experiments(make_preset)
+    result += _exact_scene_experiments(make_preset)
     result += [Experiment("extrapolation", "every n-th view", ours()),
                Experiment("extrapolation", "a stretch", ours(), stretch=True),
                Experiment("extrapolation", "a stretch, the paper's", papers(), stretch=True)]
@@ -183,7 +183,7 @@ def _robustness_experiments(make_preset: PresetFactory) -> list[Experiment]:
     return result
 
 
-def _known_scene_experiments(make_preset: PresetFactory) -> list[Experiment]:
+def _exact_scene_experiments(make_preset: PresetFactory) -> list[Experiment]:
     """Return fits of the flare alone over the exact scene, with 900 Gaussians for each light in all iterations."""
     counts = {"flare.count": 900, "flare.density.max_gaussians": 900}
     ours = override_settings(our_settings(make_preset), {**counts, "flare.occlusion": False})
@@ -227,7 +227,7 @@ def run_experiment(experiment: Experiment, folder: Path, capture: Path, width: i
         settings = replace(settings, holdout=str(split))
     start = time.monotonic()
     if experiment.known_scene:
-        scores = _fit_known_scene(fit_capture, settings, progress)
+        scores = _fit_over_exact_scene(fit_capture, settings, progress)
     elif experiment.frames == "graded":
         scores = _fit_with_grids(fit_capture, settings, progress)
     else:
@@ -242,16 +242,17 @@ def run_experiment(experiment: Experiment, folder: Path, capture: Path, width: i
     return scores
 
 
-def _run_iterations(trainer: KnownScene | BilateralTrainer, stage: str, iterations: int, progress: Progress) -> None:
+def _run_iterations(trainer: ExactSceneTrainer | BilateralTrainer, stage: str, iterations: int,
+                    progress: Progress) -> None:
     progress.stage(stage, iterations)
     for _ in range(iterations):
         trainer.step()
         progress.advance()
 
 
-def _fit_known_scene(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
+def _fit_over_exact_scene(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
     """Fit the flare alone over the exact scene; return its scores."""
-    trainer = KnownScene(capture, settings)
+    trainer = ExactSceneTrainer(capture, settings)
     _run_iterations(trainer, "flare alone", settings.iterations, progress)
     return score_flare(trainer, capture.split(settings.holdout)[1])
 

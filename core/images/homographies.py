@@ -101,7 +101,7 @@ class HomographyMatcher:
         return self._features_by_name[name]
 
 
-def project(matrix: Matrix, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def apply_homography(matrix: Matrix, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points (n, 2) under a homography (3, 3), pixels; NaN for points that are behind the target's camera, if
     the pixel (0, 0) is before it."""
     mapped = np.column_stack([points, np.ones(len(points))]) @ (matrix / matrix[2, 2]).T

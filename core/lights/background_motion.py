@@ -14,7 +14,7 @@ import numpy as np
 
 from ..capture import Capture
 from ..capture.camera import Floats
-from ..images.homographies import HomographyMatcher, Pixels, project
+from ..images.homographies import HomographyMatcher, Pixels, apply_homography
 
 WORKING_WIDTH, MIN_INLIER_SHARE = 480, 0.2
 """Largest width of the pictures that are matched, pixels, and the share of their matches that a homography has to
@@ -68,7 +68,7 @@ class BackgroundMotion:
         for target in targets:
             nearest = sorted(range(len(frames)), key=lambda index: abs(frames[index] - target))[:CARRIED_FROM]
             estimates = [place for index in nearest if abs(frames[index] - target) <= MAX_DISTANCE
-                         and (place := self._project(frames[index], target, places[index])) is not None]
+                         and (place := self._carry_place(frames[index], target, places[index])) is not None]
             if estimates:
                 place = np.median(estimates, axis=0)
                 spread = float(np.median(np.linalg.norm(np.array(estimates) - place, axis=1)))
@@ -83,7 +83,7 @@ class BackgroundMotion:
                  if other < len(frames) and frames[other] - frames[index] <= MAX_DISTANCE]
         residuals, motions = [], []
         for index, other in pairs[::max(len(pairs) // TEST_PAIRS, 1)]:
-            place = self._project(frames[index], frames[other], places[index])
+            place = self._carry_place(frames[index], frames[other], places[index])
             if place is not None:
                 residuals.append(float(np.linalg.norm(place - places[other])))
                 motions.append(float(np.linalg.norm(place - places[index])))
@@ -92,10 +92,10 @@ class BackgroundMotion:
         residual = float(np.median(residuals))
         return residual if residual <= STATIC_ERROR * self._diagonal else None
 
-    def _project(self, source: int, target: int, place: Floats) -> Floats | None:
+    def _carry_place(self, source: int, target: int, place: Floats) -> Floats | None:
         """Return where the background at a place (2,) of a frame lies in another frame; None if no homography fits."""
         matrix = self._matcher.match(self._views[source].name, self._views[target].name).matrix
         if matrix is None:
             return None
-        projected = project(matrix, np.asarray(place)[None] * self._scale)[0] / self._scale
+        projected = apply_homography(matrix, np.asarray(place)[None] * self._scale)[0] / self._scale
         return projected if np.isfinite(projected).all() else None

@@ -21,7 +21,7 @@ MIN_SIGNAL = 0.02
 """Least variance of the differences of the true path, as a share of the variance that noise adds to them."""
 
 
-def interpolate(frames: Floats, places: Floats, noise: float) -> dict[int, Floats]:
+def interpolate_path(frames: Floats, places: Floats, noise: float) -> dict[int, Floats]:
     """Return, by frame, the places (2,) in all gaps between measured frames, on the path of least squared jerk.
 
     frames: (n,) the measured frames, whole numbers, ascending. places: (n, 2), pixels. noise: standard deviation of

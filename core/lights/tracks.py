@@ -25,7 +25,7 @@ from ..capture.lights import DOUBTFUL, LightKey
 from ..system.progress import Progress
 from .association import Chain, follow_sources
 from .background_motion import BackgroundMotion, CarriedPlace
-from .path_interpolation import interpolate
+from .path_interpolation import interpolate_path
 from .sources import CLIPPED, REFERENCE, Source, find_sources, measure_profile
 
 MIN_EVIDENCE = 0.3
@@ -209,15 +209,15 @@ def _to_light(chain: Chain, capture: Capture, diagonal: float, motion: Backgroun
     keys = {}
     for frame, place, error, value, inside in zip(frames, places, errors, brightness, is_inside, strict=True):
         confidence = 1 / (1 + (error / tolerated) ** 2)
-        known_brightness = _known_brightness(value, source_by_frame.get(frame), confidence, inside)
-        keys[capture.views[frame].name] = LightKey(None, place, known_brightness, float(confidence))
+        resolved = _resolve_brightness(value, source_by_frame.get(frame), confidence, inside)
+        keys[capture.views[frame].name] = LightKey(None, place, resolved, float(confidence))
     colour = np.median([source.detection.colour for source in chain.sources], axis=0)
     return TrackedLight(keys, tuple(capture.views[frame].name for frame in chain.frames), chain.evidence,
                         colour / max(float(colour.max()), 1e-6),
                         float(np.median([source.detection.radius for source in chain.sources])))
 
 
-def _known_brightness(fitted: float, source: Source | None, confidence: float, is_inside: bool) -> float | None:
+def _resolve_brightness(fitted: float, source: Source | None, confidence: float, is_inside: bool) -> float | None:
     """Return the brightness of a light in a frame; None where it is not known.
 
     fitted: brightness from the light's profile, NaN if unknown. source: the light's source in the frame, None if it was
@@ -289,7 +289,7 @@ def _fill_path(chain: Chain, count: int, size: Floats, diagonal: float,
     first, last = max(chain.frames[0] - MAX_BEYOND, 0), min(chain.frames[-1] + MAX_BEYOND, count - 1)
     frames, places, errors = [], [], []
     knots, points = np.array(uncut.frames), uncut.places
-    between = interpolate(knots, points, PLACE_ERROR)
+    between = interpolate_path(knots, points, PLACE_ERROR)
     carried: Mapping[int, CarriedPlace] = {}
     if motion is not None:
         carried = motion.carry(uncut.frames, points, sorted({*range(first, last + 1)} - {*uncut.frames}))

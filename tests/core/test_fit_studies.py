@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks.bilateral import BilateralTrainer
-from benchmarks.known_scene import KnownScene
+from benchmarks.exact_scene import ExactSceneTrainer
 from core.capture import Capture
 from core.fit import preset
 from core.fit.settings import override_settings
@@ -21,7 +21,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def test_the_flare_alone_is_fitted_over_the_exact_scene(capture: Capture) -> None:
     settings = override_settings(preset("draft", iterations=4),
                                  {"flare.count": 60, "flare.occlusion": False, "holdout": 4})
-    trainer = KnownScene(capture, settings)
+    trainer = ExactSceneTrainer(capture, settings)
     assert trainer.flare is not None
     before = _values(trainer.flare)
     scene = _values(trainer.scene)

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.colour.srgb import linear_from_srgb
-from core.images.homographies import HomographyMatcher, project
+from core.images.homographies import HomographyMatcher, apply_homography
 from core.lights import path_interpolation
 from core.lights.tracks import track_lights
 from tests.core.test_light_tracks import SIZE, Lamp, lit, make_shot
@@ -54,7 +54,7 @@ class TestStaticLight:
             i, (*path[i], 0.0 if 6 <= i < 9 else 1.0)))).lights
         np.testing.assert_allclose([key.xy for key in list(light.keys.values())[:16]], path[:16], atol=2.5)
 
-    def test_without_texture_follows_its_own_motion(self, tmp_path: Path) -> None:
+    def test_without_texture_continues_at_its_own_velocity(self, tmp_path: Path) -> None:
         path = [(230.0 - TURN_PX * i, 80.0) for i in range(16)]
         (light,) = track_lights(make_shot(tmp_path, 16, lambda i: lit([(*path[i], 1.0)]))).lights
         assert light.doubtful
@@ -68,7 +68,7 @@ class TestInterpolation:
         noisy = path + np.random.default_rng(1).normal(0, 0.3, path.shape)
         missing = range(12, 12 + gap)
         measured = np.array([frame for frame in frames if frame not in missing])
-        between = path_interpolation.interpolate(measured, noisy[measured], 0.5)
+        between = path_interpolation.interpolate_path(measured, noisy[measured], 0.5)
         errors = [float(np.linalg.norm(between[frame] - path[frame])) for frame in missing]
         straight = np.linalg.norm(path[12 + gap // 2] - (path[11] + path[12 + gap]) / 2)
         assert sorted(between) == list(missing) and max(errors) < 0.2 * straight + 1
@@ -76,14 +76,14 @@ class TestInterpolation:
     def test_of_a_steady_motion_is_the_straight_line(self) -> None:
         frames = np.array([0, 1, 2, 3, 12, 13, 14])
         places = np.stack([10 + 5.0 * frames, 80 - 2.0 * frames], 1)
-        between = path_interpolation.interpolate(frames, places, 0.5)
+        between = path_interpolation.interpolate_path(frames, places, 0.5)
         for frame in range(4, 12):
             np.testing.assert_allclose(between[frame], [10 + 5 * frame, 80 - 2 * frame], atol=0.2)
 
     @pytest.mark.parametrize("frames", [[3], [3, 9], [2, 5, 9]])
     def test_of_few_measured_frames_stays_between_them(self, frames: list[int]) -> None:
         places = np.stack([4.0 * np.array(frames), np.full(len(frames), 7.0)], 1)
-        between = path_interpolation.interpolate(np.array(frames), places, 0.5)
+        between = path_interpolation.interpolate_path(np.array(frames), places, 0.5)
         assert sorted(between) == sorted({*range(frames[0], frames[-1] + 1)} - {*frames})
         for frame, place in between.items():
             np.testing.assert_allclose(place, [4 * frame, 7], atol=0.2)
@@ -98,7 +98,7 @@ class TestHomography:
         points = np.array([[160.0, 90.0], [300.0, 40.0], [-2000.0, 90.0]])
         rays = (rotation @ np.linalg.inv(intrinsics) @ np.column_stack([points, np.ones(3)]).T).T
         expected = (rays / rays[:, 2:]) @ intrinsics.T
-        mapped = project(-2.5 * matrix, points)  # a homography has no scale and no sign
+        mapped = apply_homography(-2.5 * matrix, points)  # a homography has no scale and no sign
         np.testing.assert_allclose(mapped[:2], expected[:2, :2], atol=1e-9)
         assert np.isnan(mapped[2]).all() and rays[2, 2] < 0
 

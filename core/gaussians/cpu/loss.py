@@ -75,7 +75,7 @@ def _apply_window(rows):
 
 
 @inlined
-def _window_along_row(row, column):
+def _window_horizontally(row, column):
     """Return the window's weighted sums along a padded row of scratch, at 16 numbers of the picture's row from `column`
     on.
 
@@ -91,7 +91,7 @@ def _window_along_row(row, column):
 
 
 @inlined
-def _window_down_band(vectors, rows, column):
+def _window_vertically(vectors, rows, column):
     """Apply the window down 16 columns of a band, and write them to rows of scratch from `column` on.
 
     vectors: the 16 columns in the band's 6 rows and in 5 more rows on each side."""
@@ -123,7 +123,7 @@ def _column_moments(x, y, row, column, row_length, height):
 
 
 @inlined
-def _moments_down_columns(x, y, first_row, end_row, row_length, height, rows):
+def _write_vertical_moments(x, y, first_row, end_row, row_length, height, rows):
     """Write the column moments of rows first_row .. end_row - 1 of the pictures x and y to `rows` of scratch (3, BAND,
     padded). Within the picture each row is loaded once for all windows. row_length: numbers in a row."""
     for block in range(0, row_length, LANES):
@@ -131,9 +131,9 @@ def _moments_down_columns(x, y, first_row, end_row, row_length, height, rows):
         if _is_interior(first_row, height):
             top = (first_row - HALO) * row_length + column
             x_rows, y_rows = load_rows(x, top, row_length), load_rows(y, top, row_length)
-            _window_down_band(x_rows, rows[0], column)
-            _window_down_band(multiply_each(x_rows, x_rows), rows[1], column)
-            _window_down_band(multiply_each(x_rows, y_rows), rows[2], column)
+            _window_vertically(x_rows, rows[0], column)
+            _window_vertically(multiply_each(x_rows, x_rows), rows[1], column)
+            _window_vertically(multiply_each(x_rows, y_rows), rows[2], column)
         else:
             for row in range(first_row, end_row):
                 mean, xx, xy = _column_moments(x, y, row, column, row_length, height)
@@ -146,7 +146,7 @@ def _moments_down_columns(x, y, first_row, end_row, row_length, height, rows):
 
 
 @inlined
-def _maps_down_columns(maps_above, maps_here, maps_below, row_length, rows):
+def _window_maps_vertically(maps_above, maps_here, maps_below, row_length, rows):
     """Apply the window down the columns of each of three maps (3, BAND, row_length), for the band of maps_here, and
     write them to `rows` of scratch."""
     for i in range(3):
@@ -161,7 +161,7 @@ def _maps_down_columns(maps_above, maps_here, maps_below, row_length, rows):
                 load(below[0], column), load(below[1], column), load(below[2], column), load(below[3], column),
                 load(below[4], column),
             )  # fmt: skip
-            _window_down_band(vectors, rows[i], column)
+            _window_vertically(vectors, rows[i], column)
 
 
 @inlined
@@ -184,7 +184,7 @@ def _compute_maps(x, y, mu_y, s_y, first_row, row_length, height, rows, maps, su
 
     x, y: image and target, flat; mu_y, s_y: moments of the target; row_length: numbers in a row, 3 w; rows: scratch."""
     end_row = min(first_row + BAND, height)
-    _moments_down_columns(x, y, first_row, end_row, row_length, height, rows)
+    _write_vertical_moments(x, y, first_row, end_row, row_length, height, rows)
     if end_row < first_row + BAND:
         maps[:, :, :] = ZERO
     for row in range(first_row, end_row):
@@ -196,8 +196,8 @@ def _compute_maps(x, y, mu_y, s_y, first_row, row_length, height, rows, maps, su
             i = row * row_length + column
             prefetch(mu_y, i + row_length)
             prefetch(s_y, i + row_length)
-            mu, xx = _window_along_row(rows[0, band_row], column), _window_along_row(rows[1, band_row], column)
-            xy = _window_along_row(rows[2, band_row], column)
+            mu, xx = _window_horizontally(rows[0, band_row], column), _window_horizontally(rows[1, band_row], column)
+            xy = _window_horizontally(rows[2, band_row], column)
             similarity, by_mu, by_xx, by_xy = _ssim_derivatives(mu, xx, xy, load(mu_y, i), load(s_y, i))
             store(maps[0, band_row], column, by_mu)
             store(maps[1, band_row], column, by_xx)
@@ -215,7 +215,7 @@ def _write_gradient(
 
     x, y, out: flat; maps_above, maps_here, maps_below: derivatives of S in the band above, in this one and in the one
     below; rows: scratch; row_length: numbers in a row."""
-    _maps_down_columns(maps_above, maps_here, maps_below, row_length, rows)
+    _window_maps_vertically(maps_above, maps_here, maps_below, row_length, rows)
     for row in range(first_row, min(first_row + BAND, height)):
         band_row = row - first_row
         for block in range(0, row_length, LANES):
@@ -223,9 +223,9 @@ def _write_gradient(
             i = row * row_length + column
             prefetch(out, i + row_length)
             vx, vy = load(x, i), load(y, i)
-            by_mu = _window_along_row(rows[0, band_row], column)
-            gradient = fma(vx * TWO, _window_along_row(rows[1, band_row], column), by_mu)
-            gradient = fma(vy, _window_along_row(rows[2, band_row], column), gradient) * by_similarity
+            by_mu = _window_horizontally(rows[0, band_row], column)
+            gradient = fma(vx * TWO, _window_horizontally(rows[1, band_row], column), by_mu)
+            gradient = fma(vy, _window_horizontally(rows[2, band_row], column), gradient) * by_similarity
             sign = where(vx > vy, splat(by_l1), where(vx < vy, splat(-by_l1), ZERO))
             store(out, i, gradient + sign)
 
@@ -286,9 +286,9 @@ def target_moments_kernel(counter, scratch, y, width, height, mu_y, s_y):
             store(rows[1], PAD + column, yy)
         for block in range(0, row_length, LANES):
             column = min(block, row_length - LANES)
-            mu = _window_along_row(rows[0], column)
+            mu = _window_horizontally(rows[0], column)
             store(mu_y, row * row_length + column, mu)
-            store(s_y, row * row_length + column, _window_along_row(rows[1], column) - mu * mu)
+            store(s_y, row * row_length + column, _window_horizontally(rows[1], column) - mu * mu)
 
 
 def _scratch_size(width: int) -> int:

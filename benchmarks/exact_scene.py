@@ -20,7 +20,7 @@ from core.metrics.evaluation import unscored_mask
 from core.metrics.pictures import psnr, relative_l2
 
 
-class KnownScene(Trainer):
+class ExactSceneTrainer(Trainer):
     """A trainer whose scene is the clean frame of each view; all lights count as visible."""
 
     def step(self) -> dict[str, float]:

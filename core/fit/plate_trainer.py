@@ -148,16 +148,16 @@ class PlateTrainer(FlareTrainer):
             return {}
         picture = composite(self._background(view, targets), flare, settings.blend, self.frames.display_white)
         loss = self._loss(masked(picture, targets.frame, mask), targets.frame)
-        figures = {"loss": float(loss.detach())}
-        self.losses[view.name] = figures["loss"]
-        if not math.isfinite(figures["loss"]):
+        metrics = {"loss": float(loss.detach())}
+        self.losses[view.name] = metrics["loss"]
+        if not math.isfinite(metrics["loss"]):
             raise RunError(f"The fit diverged at iteration {self.iteration}; start it anew with lower learning rates.")
         pose = torch.from_numpy(targets.camera.world_to_camera)
         (loss + self._flare_penalty(pose, targets.camera.frame)).backward()
         self.optimisers.step(scene=False)
         self._change_flare_density()
         self._refine()
-        return figures
+        return metrics
 
     def _refine(self) -> None:
         """At intervals, solve the brightness of the lights in all frames and, from `refine_at` of the fit on, estimate

@@ -25,7 +25,7 @@ STATIC_ERROR = 0.004
 """Largest median distance of a static light from the place to which the background carries it, diagonals."""
 MIN_MOTION = 0.012
 """Median motion of the background between the tested frames, diagonals, below which the test says nothing."""
-CARRIED_FROM, MAX_DISTANCE = 3, 25
+CARRYING_FRAMES, MAX_OFFSET = 3, 25
 """Number of measured frames from which a place is carried, and their largest distance in frames."""
 
 
@@ -56,7 +56,7 @@ class BackgroundMotion:
     def carry(self, frames: Sequence[int], places: Floats, targets: Iterable[int]) -> dict[int, CarriedPlace]:
         """Return the places of a light in target frames to which homographies carry it; none for a moving light.
 
-        Each is the median of the places carried from the CARRIED_FROM nearest frames that show the light.
+        Each is the median of the places carried from the CARRYING_FRAMES nearest frames that show the light.
 
         frames: indices of the frames that show the light, ascending. places: (n, 2), pixels.
         """
@@ -66,8 +66,8 @@ class BackgroundMotion:
             return {}
         carried = {}
         for target in targets:
-            nearest = sorted(range(len(frames)), key=lambda index: abs(frames[index] - target))[:CARRIED_FROM]
-            estimates = [place for index in nearest if abs(frames[index] - target) <= MAX_DISTANCE
+            nearest = sorted(range(len(frames)), key=lambda index: abs(frames[index] - target))[:CARRYING_FRAMES]
+            estimates = [place for index in nearest if abs(frames[index] - target) <= MAX_OFFSET
                          and (place := self._carry_place(frames[index], target, places[index])) is not None]
             if estimates:
                 place = np.median(estimates, axis=0)
@@ -80,7 +80,7 @@ class BackgroundMotion:
         frame; None if the light moves, or if too few frames or too little motion of the background decide it."""
         partners = [(index, int(np.searchsorted(frames, frame + TEST_OFFSET))) for index, frame in enumerate(frames)]
         pairs = [(index, other) for index, other in partners
-                 if other < len(frames) and frames[other] - frames[index] <= MAX_DISTANCE]
+                 if other < len(frames) and frames[other] - frames[index] <= MAX_OFFSET]
         residuals, motions = [], []
         for index, other in pairs[::max(len(pairs) // TEST_PAIRS, 1)]:
             place = self._carry_place(frames[index], frames[other], places[index])

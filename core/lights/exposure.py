@@ -146,9 +146,9 @@ def _attached_share(core: NDArray[np.bool_], region: NDArray[np.bool_]) -> float
     return float(np.pad(region, room)[ring].mean())
 
 
-def smoothstep(value: float, low: float, high: float) -> float:
-    """Return 0 below `low`, 1 above `high`, a cubic between; reversed for low > high."""
-    t = min(max((value - low) / (high - low), 0.0), 1.0)
+def smoothstep(value: Any, low: float, high: float) -> Any:
+    """Return 0 below `low`, 1 above `high`, a cubic between; reversed for low > high. value: a number or an array."""
+    t = np.clip((value - low) / (high - low), 0.0, 1.0)
     return t * t * (3 - 2 * t)
 
 

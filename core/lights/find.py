@@ -30,7 +30,7 @@ SHEETS, REPORT = "lights", "report.json"
 MAX_POINT_DISTANCE = 0.05
 """Distance from a detection, diagonals, up to which points give the depth of a light in a single view."""
 MAX_STATIC_DISTANCE = 0.006
-"""Median distance of a light from the projections of one place, diagonals, below which it stands."""
+"""Median distance of a light from the projections of one place, diagonals, below which it is static."""
 
 
 @dataclass(frozen=True, eq=False)

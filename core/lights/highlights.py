@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..colour.srgb import LUMINANCE
+from .exposure import smoothstep
 
 Floats = NDArray[np.float64]
 
@@ -48,13 +49,13 @@ def find_highlights(linear: NDArray[np.float32], threshold: float = 0.95, gain: 
     if not len(rows):
         return Highlights(np.zeros((0, 2)), np.zeros((0, 3)))
     # Weights rise smoothly above the threshold, so that no pixel appears suddenly.
-    weights = _smoothstep((luminance[rows, columns].astype(np.float64) / threshold - 1) / SOFTNESS)
+    weights = smoothstep(luminance[rows, columns].astype(np.float64) / threshold - 1, 0, SOFTNESS)
     colours = np.maximum(linear[rows, columns], 0).astype(np.float64) * weights[:, None]
     xy = np.stack([columns + 0.5, rows + 0.5], -1)
     light, places, strengths = _share_among_nodes(xy, colours, width, height)
     # Faint nodes fade out in the same way.
     shares = strengths / strengths.sum() if strengths.any() else strengths
-    node_weights = _smoothstep((shares - FAINTEST[0]) / (FAINTEST[1] - FAINTEST[0]))
+    node_weights = smoothstep(shares, *FAINTEST)
     chosen = np.flatnonzero(node_weights > 0)
     scale = gain * node_weights[chosen, None] / (REFERENCE_AREA * width * height)
     return Highlights(places[chosen] / strengths[chosen, None], light[chosen] * scale)
@@ -85,9 +86,3 @@ def _share_among_nodes(xy: Floats, colours: Floats, width: int, height: int) -> 
             places[:, column] += np.bincount(node, strength * xy[:, column], len(light))
         strengths += np.bincount(node, strength, len(light))
     return light, places, strengths
-
-
-def _smoothstep(values: Floats) -> Floats:
-    """Return 0 for values of 0 and below, 1 for 1 and above, smooth between."""
-    t = np.clip(values, 0, 1)
-    return np.asarray(t * t * (3 - 2 * t))

@@ -10,9 +10,9 @@ import numpy as np
 from ..capture.camera import Camera
 from .found_light import FoundLight
 
-GHOST_TOLERANCE, RADIUS_SHARE = 0.006, 0.25
+GHOST_TOLERANCE, GHOST_RADIUS_SHARE = 0.006, 0.25
 """Distance of a ghost from its predicted place, frame diagonals, to which this share of its radius is added."""
-MIN_VIEWS, MIN_MOTION = 3, 8
+MIN_VIEWS, MIN_GHOST_MOTION = 3, 8
 """Smallest number of views of a ghost, and its motion in tolerances: a spot that hardly moves fits any ratio."""
 MIN_RATIO_OFFSET = 0.05
 """Distance of a ghost's ratio from 1, which is that of the light itself."""
@@ -66,7 +66,7 @@ def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) 
             centre = np.array([camera.cx, camera.cy])
             ghosts.append(detection.xy - centre)
             sources.append(pixel[0] - centre)
-            tolerances.append(GHOST_TOLERANCE * float(np.hypot(*camera.size)) + RADIUS_SHARE * detection.radius)
+            tolerances.append(GHOST_TOLERANCE * float(np.hypot(*camera.size)) + GHOST_RADIUS_SHARE * detection.radius)
     if len(ghosts) < MIN_VIEWS:
         return False
     # Both are offsets from the principal point; the ratio of ghost to source is fitted by least squares.
@@ -74,7 +74,7 @@ def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) 
     ratio = float((ghost * source).sum() / (source * source).sum())
     distances = np.linalg.norm(ghost - ratio * source, axis=1) / tolerances
     motion = float(np.linalg.norm(np.ptp(ghost, axis=0))) / float(np.median(tolerances))
-    return bool(np.median(distances) < 1 and motion > MIN_MOTION and abs(ratio - 1) > MIN_RATIO_OFFSET)
+    return bool(np.median(distances) < 1 and motion > MIN_GHOST_MOTION and abs(ratio - 1) > MIN_RATIO_OFFSET)
 
 
 def _is_same_light(light: FoundLight, other: FoundLight, views: Sequence[tuple[str, Camera]], extent: float) -> bool:

@@ -157,18 +157,18 @@ def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], 
     return messages
 
 
-def _is_ghost(chain: Chain, others: Sequence[Chain], centre: Floats, diagonal: float) -> bool:
-    """Return whether a chain is a ghost of one of `others` with larger spots, which move.
+def _is_ghost(chain: Chain, lamps: Sequence[Chain], centre: Floats, diagonal: float) -> bool:
+    """Return whether a chain is a ghost of another one of `lamps`, whose spots are larger and move.
 
     A ghost keeps to one ratio of the way from the principal point to its light. centre: principal point (2,), pixels.
     diagonal: length of the frame's diagonal, pixels.
     """
-    for light in others:
+    for light in lamps:
         shared = sorted(set(chain.frames) & set(light.frames))
         if light is chain or len(shared) < max(3, 0.7 * len(chain.frames)):
             continue
-        ghost_sources, light_sources = ([path.sources[path.frames.index(frame)] for frame in shared]
-                                        for path in (chain, light))
+        ghost_sources, light_sources = ([each.sources[each.frames.index(frame)] for frame in shared]
+                                        for each in (chain, light))
         ghost, source = (np.array([spot.xy for spot in sources]) - centre for sources in (ghost_sources, light_sources))
         radius, light_radius = (np.median([spot.detection.radius for spot in sources])
                                 for sources in (ghost_sources, light_sources))

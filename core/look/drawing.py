@@ -102,19 +102,29 @@ def profile_in_box(box: Box, centre: Floats, covariance: Floats, ring: NDArray[A
     centre (2,), px. covariance (3,), px². ring (2,): radius r0 and width w of a ring-shaped profile
     exp(-(r - r0)²/(2 w²)), in standard deviations like the distance r; None for exp(-r²/2). pixel_arc (2,): vector to
     the ring's brighter side, px, 0 for an even ring; it tilts the profile's logarithm, see `arcs_to_pixels`."""
-    xx, xy, yy = covariance
     left, top, right, bottom = box
     dx = np.arange(left, right, dtype=np.float32) + 0.5 - centre[0]
     dy = (np.arange(top, bottom, dtype=np.float32) + 0.5 - centre[1])[:, None]
-    squared_distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
+    has_arc = ring is not None and pixel_arc.any()
+    log_peak = arc_log_peak(arc_strengths(pixel_arc[None], covariance[None])[0], ring) if has_arc else None
+    return np.asarray(np.exp(-profile_exponent(dx, dy, covariance, ring, pixel_arc, log_peak)), np.float32)
+
+
+def profile_exponent(dx: Any, dy: Any, covariance: Any, ring: Any, pixel_arc: Any, log_peak: Any) -> Any:
+    """Return -log of the profile of Gaussians at offsets (dx, dy) from their centres, px; all arguments broadcast.
+
+    covariance: its xx, xy, yy. ring: its r0 and w, or None. pixel_arc: its x and y. log_peak: `arc_log_peak` of the
+    arc, None for an even ring. See `profile_in_box`."""
+    xx, xy, yy = covariance
+    determinant = xx * yy - xy * xy
+    squared_distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant
     if ring is None:
-        return np.asarray(np.exp(-squared_distance / 2), np.float32)
+        return squared_distance / 2
     r0, w = ring
     exponent = (np.sqrt(np.maximum(squared_distance, 1e-12)) - r0) ** 2 / (2 * w * w)
-    if pixel_arc.any():
-        arc_x, arc_y = pixel_arc
-        # An arc multiplies the profile by exp(slope . d), d the offset from the centre; its peak is scaled to 1.
-        slope = np.array([yy * arc_x - xy * arc_y, xx * arc_y - xy * arc_x]) / (xx * yy - xy * xy)
-        log_peak = arc_log_peak(arc_strengths(pixel_arc[None], covariance[None])[0], ring)
-        exponent = exponent - (slope[0] * dx + slope[1] * dy - log_peak)
-    return np.asarray(np.exp(-exponent), np.float32)
+    if log_peak is None:
+        return exponent
+    # An arc multiplies the profile by exp(slope . d), d the offset from the centre; its peak is scaled to 1.
+    arc_x, arc_y = pixel_arc
+    slope_x, slope_y = (yy * arc_x - xy * arc_y) / determinant, (xx * arc_y - xy * arc_x) / determinant
+    return exponent - (slope_x * dx + slope_y * dy - log_peak)

@@ -162,8 +162,8 @@ class HashGrid:
         weights = np.where(CORNERS.astype(bool), fraction, 1 - fraction).prod(-1)
         side = resolutions + 1
         dense = corners[..., 0] + side * (corners[..., 1] + side * corners[..., 2])
-        scaled_corners = corners * PRIMES
-        hashed = (scaled_corners[..., 0] ^ scaled_corners[..., 1] ^ scaled_corners[..., 2]) % self._sizes[:, None]
+        scrambled = corners * PRIMES
+        hashed = (scrambled[..., 0] ^ scrambled[..., 1] ^ scrambled[..., 2]) % self._sizes[:, None]
         # A level all of whose corners fit its table needs no hash.
         rows = np.where(side**3 <= self._sizes[:, None], dense, hashed) + self._starts[:, None]
         return np.asarray((self._row_values(rows) * weights[..., None]).sum(1).reshape(-1), np.float32)

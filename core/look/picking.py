@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..choices import Blend
 from ..colour.srgb import LUMINANCE
 from ..conventions.pixel_grid import PixelGrid
-from ..conventions.splatting import ALPHA_MIN, PROFILE_MIN
-from .drawing import OPACITY_MAX
+from ..conventions.splatting import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN
+from .drawing import profile_exponent
 from .edits import LookEdits
 from .look import LightLook, Look
 from .placed_light import PlacedLight
@@ -48,20 +48,11 @@ def _profiles(gaussians: PlaneGaussians, offsets: NDArray[np.float64], covarianc
     0 for degenerate Gaussians. covariances (n, 3), px². pixel_arcs (n, 2): px, towards the brighter side of a ring."""
     xx, xy, yy = covariances.T.astype(np.float64)
     dx, dy = offsets.T
+    rings = None if gaussians.rings is None else gaussians.rings.T.astype(np.float64)
     with np.errstate(all="ignore"):
-        determinant = xx * yy - xy * xy
-        # Squared Mahalanobis distance.
-        q = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant
-        if gaussians.rings is None:
-            exponents = q / 2
-        else:
-            r0, w = gaussians.rings.T.astype(np.float64)
-            x, y = pixel_arcs.T.astype(np.float64)
-            slopes = ((yy * x - xy * y) * dx + (xx * y - xy * x) * dy) / determinant
-            log_peaks = arc_log_peak(arc_strengths(pixel_arcs, covariances), gaussians.rings)
-            exponents = (np.sqrt(np.maximum(q, 1e-12)) - r0) ** 2 / (2 * w * w) - (slopes - log_peaks)
-        profiles = np.exp(-exponents)
-        return np.where((determinant > 0) & np.isfinite(profiles), profiles, 0)
+        log_peaks = None if rings is None else arc_log_peak(arc_strengths(pixel_arcs, covariances), gaussians.rings)
+        profiles = np.exp(-profile_exponent(dx, dy, (xx, xy, yy), rings, pixel_arcs.T.astype(np.float64), log_peaks))
+        return np.where((xx * yy - xy * xy > 0) & np.isfinite(profiles), profiles, 0)
 
 
 def brightest_element(look: Look, lights: Sequence[PlacedLight], flares: Mapping[str, PlaneGaussians],
@@ -71,17 +62,17 @@ def brightest_element(look: Look, lights: Sequence[PlacedLight], flares: Mapping
 
     lights: the placed lights. flares: their Gaussians by name, as `Look.evaluate_lights` returns them with these edits.
     """
-    gaussians_of_all = concatenate(list(flares.values()))
-    if gaussians_of_all is None:
+    all_gaussians = concatenate(list(flares.values()))
+    if all_gaussians is None:
         return None
     sources = {light.name: light for light in look.lights}
-    source_of = {light.name: sources[light.source] for light in lights if light.source in sources}
-    luminance = light_at(gaussians_of_all, intrinsics, point, look.blend, look.pixel_grid)
+    source_by_light = {light.name: sources[light.source] for light in lights if light.source in sources}
+    luminance = light_at(all_gaussians, intrinsics, point, look.blend, look.pixel_grid)
     brightest, max_sum, start = None, MIN_LIGHT, 0
     for name, gaussians in flares.items():
         light_luminance = luminance[start:start + len(gaussians)]
         start += len(gaussians)
-        source = source_of[name]
+        source = source_by_light[name]
         indices = _element_indices(source, name, edits, len(gaussians))
         has_element = indices >= 0
         sums = np.bincount(indices[has_element], light_luminance[has_element], len(source.elements))

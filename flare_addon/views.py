@@ -31,3 +31,11 @@ def largest_view(context: Any) -> tuple[Any, Any, Any] | None:
 def camera_of(space: Any, scene: Any) -> Any:
     """Return the camera that a 3D view looks through: its own where it has one, else the scene's; None without."""
     return space.camera if space.use_local_camera and space.camera else scene.camera
+
+
+def view_region_at(area: Any, x: float, y: float) -> Any | None:
+    """Return the region of a 3D view at a position in the window, px; None outside, and where a sidebar lies over it.
+    """
+    regions = [region for region in area.regions
+               if 0 <= x - region.x < region.width and 0 <= y - region.y < region.height]
+    return regions[0] if [region.type for region in regions] == ["WINDOW"] else None

@@ -15,14 +15,13 @@ from ..errors import CaptureError
 from ..system.file_names import canonical_name, natural_key
 from ..system.files import safe_join
 from ..system.steps import FRAMES_PER_STEP, Steps
+from ..system.tally import list_first
 from .colmap import PointCloud, PosedFrame, read_model_in_steps
 from .frame_files import PictureIndex
 from .layout import LATER_MODEL_PLACES, choose_model, find_deeper_model, find_models, frames_folder
 from .transforms import FILE as TRANSFORMS
 from .transforms import read_transforms, transforms_files
 
-MAX_NAMES = 3
-"""Number of names in a sentence."""
 SAMPLED_POINTS, SAMPLED_VIEWS = 4000, 40
 """Approximate numbers of points and views by which the solve is checked."""
 MIN_SHARE_IN_VIEW = 0.5
@@ -176,18 +175,12 @@ def _describe_matches(solve: CameraSolve, files: dict[str, Path], missing: list[
     warnings = []
     if files and (missing or unposed):
         text = f"{len(files)} of {len(files) + len(unposed)} frames in {solve.root} have a pose"
-        text += f", not {list_names(unposed)}" if unposed else ""
-        text += f"; {len(missing)} poses have no frame: {list_names(missing)}" if missing else ""
+        text += f", not {list_first(unposed)}" if unposed else ""
+        text += f"; {len(missing)} poses have no frame: {list_first(missing)}" if missing else ""
         warnings.append(f"{text}. What has no counterpart is left out.")
     if renamed:
-        warnings.append(f"{len(renamed)} frames have other names than in the camera solve: {list_names(renamed)}.")
+        warnings.append(f"{len(renamed)} frames have other names than in the camera solve: {list_first(renamed)}.")
     return warnings
-
-
-def list_names(names: list[str]) -> str:
-    """Return the first names, and how many more there are."""
-    more = len(names) - MAX_NAMES
-    return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def geometry_warnings(solve: CameraSolve) -> list[str]:

@@ -29,13 +29,12 @@ from ..conventions.frame_numbers import number_views
 from ..errors import CaptureError, SettingsError
 from ..system.file_names import canonical_name
 from ..system.files import read_json
+from ..system.tally import list_first
 from .camera import Camera, Floats
 from .light_extent import LightExtent
 
 DOUBTFUL = 0.5
 """Confidence below which a light's place in a frame is doubtful."""
-MAX_LISTED = 3
-"""Number of names in a sentence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,10 +263,10 @@ class LightPath:
         interpolated, warnings = self.interpolated_views(), []
         if interpolated:
             warnings.append(f"The light {self.light.name!r} has no place in {len(interpolated)} of {len(self._times)} "
-                            f"frames ({_list_first(interpolated)}); it is interpolated there.")
+                            f"frames ({list_first(interpolated)}); it is interpolated there.")
         if self.unknown_frames:
             warnings.append(f"lights.json has entries of the light {self.light.name!r} for {len(self.unknown_frames)} "
-                            f"frames that are not in the capture ({_list_first(self.unknown_frames)}); they are left "
+                            f"frames that are not in the capture ({list_first(self.unknown_frames)}); they are left "
                             "out.")
         return warnings
 
@@ -316,12 +315,6 @@ def _canonical(name: str) -> str:
     text = canonical_name(name)
     text = text[len("images/"):] if text.casefold().startswith("images/") else text
     return str(PurePosixPath(text).with_suffix("")) if PurePosixPath(text).name else text
-
-
-def _list_first(names: Sequence[str]) -> str:
-    """Return the first names, and how many more there are."""
-    more = len(names) - MAX_LISTED
-    return ", ".join(names[:MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _to_list(values: Floats | None) -> list[float] | None:

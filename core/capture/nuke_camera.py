@@ -126,7 +126,7 @@ def _read_chan(path: Path, text: str) -> NukeCamera:
         if not fields:
             continue
         try:
-            numbers = [_parse_finite(field) for field in fields]
+            numbers = [_parse_finite(number) for number in fields]
             frame = int(numbers[0])
         except (ValueError, OverflowError) as problem:
             raise CaptureError(f"{path} is not a .chan file: {line.strip()!r:.60}.") from problem

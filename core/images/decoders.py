@@ -116,7 +116,7 @@ def decode_foreign(path: Path, kind: Kind) -> NDArray[Any]:
     if kind == "raw":
         return _decode_raw(path)
     if kind == "jp2":
-        return _decode_in_child(_decode_by_opencv, path)
+        return _decode_in_child(_decode_jp2, path)
     if kind == "heif":
         return _decode_heif(path)
     with _open_by_pillow(path, kind) as picture:
@@ -317,7 +317,7 @@ def _decode_in_child(decode: Callable[..., NDArray[Any]], path: Path) -> NDArray
         raise _damaged_error(path, problem) from problem
 
 
-def _decode_by_opencv(path: Path, _progress: Progress | None = None) -> NDArray[Any]:
+def _decode_jp2(path: Path, _progress: Progress | None = None) -> NDArray[Any]:
     """Decode a file with OpenCV to (height, width), or B G R with alpha last; _progress: given by `run_in_child`,
     unused. Raises FrameError."""
     import cv2

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..colour.srgb import LUMINANCE
+from ..colour.srgb import LUMINANCE, Pixels
 
-Pixels = NDArray[np.float32]
 Matrix = NDArray[np.float64]
 
 FEATURES, MATCH_RATIO, MIN_INLIERS, MAX_ERROR_PX = 800, 0.8, 25, 1.5
@@ -93,8 +92,8 @@ class HomographyMatcher:
 
         if name not in self._features_by_name:
             grey = np.clip(self._read(name) @ LUMINANCE * 255 + 0.5, 0, 255).astype(np.uint8)
-            keys, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(grey, np.array([]))
-            points = np.array([key.pt for key in keys], np.float32).reshape(-1, 2)
+            keypoints, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(grey, np.array([]))
+            points = np.array([keypoint.pt for keypoint in keypoints], np.float32).reshape(-1, 2)
             # SIFT's values are whole numbers up to 255; of a picture without features there are none.
             codes = np.zeros((0, 128), np.uint8) if descriptors is None else descriptors.astype(np.uint8)
             self._features_by_name[name] = _Features(points, codes)

@@ -39,7 +39,7 @@ _COLOUR_TYPE_OFFSET, _HEADER_END = 25, 33
 """Offsets in a PNG of the colour type, whose bit 2 means colour, and of the end of the first chunk, IHDR."""
 _SRGB_POINTS, _UNSPECIFIED = (1, 13), 2
 """Code points (ITU-T H.273): primaries and transfer of sRGB, and that for an unspecified one."""
-_KEPT_MARKERS = frozenset({jpeg.APP1, jpeg.APP2, jpeg.APP13, jpeg.COMMENT, *range(0xE3, 0xED), 0xEF})
+_COPIED_MARKERS = frozenset({jpeg.APP1, jpeg.APP2, jpeg.APP13, jpeg.COMMENT, *range(0xE3, 0xED), 0xEF})
 """JPEG segments that are kept; APP14 says how the encoder stores its colours, and APP0 is replaced as a whole."""
 _MULTI_PICTURE_INDEX, _ISO_GAIN_MAP = b"MPF\0", b"urn:iso:std:iso:ts:21496:-1"
 """Segments that describe the pictures behind a JPEG's first one."""
@@ -133,7 +133,7 @@ def dropped_parts_warning(path: Path) -> str:
 
 
 def _copy_to_jpeg(encoded: bytes, source: bytes) -> bytes:
-    """Return the encoded JPEG with the descriptive segments of the source (`_KEPT_MARKERS`), in their order, without
+    """Return the encoded JPEG with the descriptive segments of the source (`_COPIED_MARKERS`), in their order, without
     thumbnails, gain maps and the XMP that claims them.
 
     The segments follow a JFIF header: the source's if it has one, else that of the encoded JPEG.
@@ -151,7 +151,7 @@ def _copy_to_jpeg(encoded: bytes, source: bytes) -> bytes:
             header = jpeg.make_segment(marker, content[:12] + b"\0\0")  # density, and a thumbnail of 0 x 0
         elif has_refocus_original and content.startswith(jpeg.EXTENDED_XMP):
             continue  # it holds that original, which shows the flare
-        elif marker in _KEPT_MARKERS and not content.startswith((_MULTI_PICTURE_INDEX, _ISO_GAIN_MAP)):
+        elif marker in _COPIED_MARKERS and not content.startswith((_MULTI_PICTURE_INDEX, _ISO_GAIN_MAP)):
             if content.startswith(jpeg.XMP):
                 content = _without_claims(content)
             elif content.startswith(jpeg.EXIF):

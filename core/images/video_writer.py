@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError, SettingsError
 from ..system.files import atomic_path
 from .video import Video, VideoFrame, import_av
-from .video_colour import BT_601, BT_709, FULL_RANGE, LIMITED_RANGE, MAX_601_HEIGHT, RGB, UNSPECIFIED
+from .video_colour import FULL_RANGE, LIMITED_RANGE, RGB, UNSPECIFIED, usual_matrix
 from .video_mastering import x265_options
 from .video_planes import PlaneFormat, plane_arrays, plane_format, shrink_plane, to_planar
 
@@ -219,7 +219,7 @@ def _add_video_stream(out: Any, video: Video, source: Any, encoder: Encoder, lef
     for name, value in tags.items():  # a tag that the frame lacks is taken from the container
         setattr(context, name, value if value not in (0, UNSPECIFIED) else getattr(original.codec_context, name))
     if not planar.is_rgb and video.colour.matrix == RGB:
-        context.colorspace = BT_709 if min(video.stored_size) > MAX_601_HEIGHT else BT_601  # converted from RGB
+        context.colorspace = usual_matrix(*video.stored_size)  # converted from RGB
     context.color_range = LIMITED_RANGE if _is_limited(planar, video, encoder) else FULL_RANGE
     if video.matrix is not None:
         stream.set_display_matrix(video.matrix)

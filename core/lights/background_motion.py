@@ -14,7 +14,8 @@ import numpy as np
 
 from ..capture import Capture
 from ..capture.camera import Floats
-from ..images.homographies import HomographyMatcher, Pixels, apply_homography
+from ..colour.srgb import Pixels
+from ..images.homographies import HomographyMatcher, apply_homography
 
 WORKING_WIDTH, MIN_INLIER_SHARE = 480, 0.2
 """Largest width of the pictures that are matched, pixels, and the share of their matches that a homography has to

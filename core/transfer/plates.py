@@ -19,6 +19,7 @@ from ..images.formats.tiff import UPRIGHT
 from ..images.picture import Picture
 from ..images.plates import Plate, read_plate, write_plate
 from ..images.read import read_picture
+from ..images.write import MAX_HALF
 
 AUTO = "auto"
 
@@ -110,7 +111,7 @@ class ColouredPlate:
         values, dtype = undo_orientation(values, self.orientation), self.plate.codes.dtype
         if dtype.kind == "u":
             return np.clip(np.round(values * self.plate.max_code), 0, self.plate.max_code).astype(dtype)
-        limit = 65504 if dtype == np.float16 else np.finfo(np.float32).max
+        limit = MAX_HALF if dtype == np.float16 else np.finfo(np.float32).max
         return np.clip(values, -limit, limit).astype(dtype)
 
     def write(self, path: Path, light: Pixels) -> None:

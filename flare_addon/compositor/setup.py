@@ -15,6 +15,7 @@ from ...core.bake.folder import LayerFolder
 from ...core.colour.ocio import CONFIGURED_NAMES
 from ...core.errors import FrameError
 from ...core.images.exr import exr_colour_space
+from ...core.images.window import DataWindow
 from .. import fcurves
 from ..images import load_image
 from ..paths import absolute
@@ -85,9 +86,9 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
     drivers.disconnect_node(scene)
     _change_inputs(tree, node, names)
     _remove_crops(tree)
-    if not layers.window().is_frame:  # the layers have overscan
+    if not (window := layers.window()).is_frame:  # the layers have overscan
         shown_names = names if plate is not None or keep_image else ["scene", *names]
-        sockets.update(_crop_overscan(tree, layers, {name: sockets[name] for name in shown_names}))
+        sockets.update(_crop_overscan(tree, window, {name: sockets[name] for name in shown_names}))
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
     end = _final_input(tree)
@@ -138,9 +139,9 @@ def _change_inputs(tree: Any, node: Any, layer_names: Sequence[str]) -> None:
                 tree.links.new(feeder, node.inputs[name])
 
 
-def _crop_overscan(tree: Any, layers: LayerFolder, sockets: dict[str, Any]) -> dict[str, Any]:
+def _crop_overscan(tree: Any, window: DataWindow, sockets: dict[str, Any]) -> dict[str, Any]:
     """Add nodes that cut the overscan of layers off; return their output sockets. sockets: of the layers, by name."""
-    return {name: _set_name(crop_to_frame(tree, socket, layers.window(), -3.2, -0.7 * row), f"{CROP} {name}").outputs[0]
+    return {name: _set_name(crop_to_frame(tree, socket, window, -3.2, -0.7 * row), f"{CROP} {name}").outputs[0]
             for row, (name, socket) in enumerate(sockets.items())}
 
 

@@ -12,7 +12,7 @@ from ...core.errors import FlareFileError
 from .. import asset_browser, cameras, lamp_drive, library, lights, looks, overlay, render_settings
 from ..compositor import setup
 from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator
-from ..views import look_through_camera
+from ..views import look_through_camera, view_region_at
 
 SENSOR = 36.0  # mm, width of the sensor of a picture's camera
 
@@ -166,13 +166,10 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
 
         area: the 3D view, as `invoke` turned it to the camera.
         """
-        regions_under_mouse = [region for region in area.regions if 0 <= event.mouse_x - region.x < region.width
-                               and 0 <= event.mouse_y - region.y < region.height]
         space = area.spaces.active
-        # The sidebar may lie over the view.
-        if space.type != "VIEW_3D" or [region.type for region in regions_under_mouse] != ["WINDOW"]:
+        region = view_region_at(area, event.mouse_x, event.mouse_y) if space.type == "VIEW_3D" else None
+        if region is None:
             return False
-        region = regions_under_mouse[0]
         x, y = event.mouse_x - region.x, event.mouse_y - region.y
         with context.temp_override(area=area, region=region, space_data=space, region_data=space.region_3d):
             frame = overlay.camera_frame(bpy.context, context.scene, context.scene.camera)

@@ -6,11 +6,10 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import FitFlareError
 from ...core.look.picking import brightest_element
 from .. import looks, overlay
-from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator
-from ..views import camera_of
+from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator, report_errors
+from ..views import camera_of, view_region_at
 
 _VIEW_EVENTS = ("MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "TRACKPADPAN", "TRACKPADZOOM", "TIMER", "MOUSEMOVE",
                 "INBETWEEN_MOUSEMOVE")
@@ -58,21 +57,17 @@ class FITFLARE_OT_pick_element(GuardedOperator, bpy.types.Operator):
             return {"RUNNING_MODAL"}
         self.cancel(context)
         area, region = view
-        with context.temp_override(area=area, region=region):
-            try:
-                is_picked = choose_element_at(bpy.context, (event.mouse_x - region.x, event.mouse_y - region.y))
-            except FitFlareError as problem:
-                self.report({"ERROR"}, str(problem))
+        with report_errors(self) as outcome, context.temp_override(area=area, region=region):
+            if not choose_element_at(bpy.context, (event.mouse_x - region.x, event.mouse_y - region.y)):
+                self.report({"INFO"}, "No element of the flare shines there")
                 return {"CANCELLED"}
-        if not is_picked:
-            self.report({"INFO"}, "No element of the flare shines there")
-            return {"CANCELLED"}
-        return {"FINISHED"}
+        return outcome.status
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Restore cursor and status bar."""
-        context.window.cursor_modal_restore()
-        context.workspace.status_text_set(None)
+        """Restore cursor and status bar; Blender also calls this when it closes the window."""
+        if context.window is not None:  # the window may be closed
+            context.window.cursor_modal_restore()
+            context.workspace.status_text_set(None)
 
 
 def _is_camera_view(area: Any) -> bool:
@@ -84,10 +79,9 @@ def view_at(screen: Any, x: float, y: float) -> tuple[Any, Any] | None:
     """Return area and region of the camera view at a position in the window, px; None outside, and on its sidebars."""
     for area in screen.areas:
         if _is_camera_view(area):
-            regions = [region for region in area.regions
-                       if region.x <= x < region.x + region.width and region.y <= y < region.y + region.height]
-            if regions and all(region.type == "WINDOW" for region in regions):  # sidebars lie over the view
-                return area, regions[0]
+            region = view_region_at(area, x, y)
+            if region is not None:
+                return area, region
     return None
 
 

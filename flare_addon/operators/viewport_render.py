@@ -119,9 +119,8 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
             scene.frame_set(frame, subframe=subframe)
 
     def _report_result(self, context: bpy.types.Context) -> None:
-        """Report what was rendered, and move the timeline back."""
+        """Report what was rendered."""
         path = viewport_render.output_path(context.scene, context.scene.frame_current)
-        self._restore_frame(context.scene)
         subject = f"{self._frame_count} frames are" if self.animation else f"{path.name} is"
         self.report({"INFO"}, f"{subject} in {path.parent}")
 

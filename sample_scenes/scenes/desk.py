@@ -52,7 +52,7 @@ def build_scene(scene: SceneDescription) -> None:
                     tilt=(90, 0))
 
     _add_books(rng)
-    _add_things(rng)
+    _add_props(rng)
     _add_lamps(scene)
     s.add_softbox("window", (-4.5, -4.0, 5.0), (0, 0.8, 0.6), (3.0, 3.0), 215, (1.0, 0.96, 0.9))
     s.add_softbox("room", (5.0, -3.0, 4.5), (0, 0.8, 0.6), (4.0, 4.0), 100, (0.75, 0.86, 1.0))
@@ -91,7 +91,7 @@ def _add_books(rng: np.random.Generator) -> None:
                  turn=18)
 
 
-def _add_things(rng: np.random.Generator) -> None:
+def _add_props(rng: np.random.Generator) -> None:
     """Add a vase that the lantern passes behind, a globe, a mug, cubes, pages and a plant."""
     from .. import patterns as p
     from .. import stage as s

@@ -57,7 +57,7 @@ def media() -> Iterator[Medium]:
                               ("a.tif", "TIFF with tags", _write_zip_tiff),
                               ("a.png", "PNG with tags", _write_tagged_png),
                               ("a.exr", "EXR of two eyes", _write_eyes),
-                              ("b.exr", "EXR with foreign names", _write_foreign_names)):
+                              ("b.exr", "EXR with names that are not UTF-8", _write_non_utf8_names)):
         yield Medium(f"clean plate of {name}", file, write, _clean_plate)
 
 
@@ -114,7 +114,7 @@ def _write_eyes(path: Path) -> None:
         file.write(str(path))
 
 
-def _write_foreign_names(path: Path) -> None:
+def _write_non_utf8_names(path: Path) -> None:
     """Write an EXR with names and a text that are not UTF-8."""
     light = scene(WIDTH, HEIGHT)
     write_exr(path, {"H\x7fhe": light[..., 0], **{name: light[..., k] for k, name in enumerate("RGB")}},

@@ -28,8 +28,8 @@ from ...images.video import Video, is_video, write_frame
 from ...images.write import write_png
 from ...system.files import read_json, write_json
 from ...system.progress import Progress
+from ...system.tally import list_first
 from ...typed import parse_table, parse_value
-from ..camera_solve import list_names
 
 RECORD_FILE = "stills.json"
 """File of the chosen frames, below the work folder."""
@@ -162,8 +162,8 @@ def _prepare_folder(source: Path, work: Path, number: int, size: int,
         names = [name for reason, names in unlisted_entries(source) if reason.startswith(("a subfolder", "a video"))
                  for name in names]
         raise CaptureError(f"{source} holds no frames; " + (
-            f"{list_names(names)} in it does: name that." if len(names) == 1 else
-            f"{list_names(names)} in it do: name one of them." if names else
+            f"{list_first(names)} in it does: name that." if len(names) == 1 else
+            f"{list_first(names)} in it do: name one of them." if names else
             "give a folder with PNG, JPEG, TIFF or EXR files, or a video."))
     left_out: list[str] = []
     if 0 < number < len(files):

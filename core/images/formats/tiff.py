@@ -197,10 +197,10 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
         new_entries.append(struct.pack(order + "HHI", number, kind, count) + value_field)
     result += b"\0" * (len(result) % 2)
     directory_offset = struct.unpack(order + "I", data[4:8])[0]
-    next_page = data[directory_offset + 2 + 12 * len(entries):][:4].ljust(4, b"\0")  # offset of the next page
+    next_offset = data[directory_offset + 2 + 12 * len(entries):][:4].ljust(4, b"\0")  # offset of the next page
     new_entries.sort(key=lambda entry: struct.unpack(order + "H", entry[:2])[0])
     result[4:8] = struct.pack(order + "I", len(result))
-    result += struct.pack(order + "H", len(new_entries)) + b"".join(new_entries) + next_page
+    result += struct.pack(order + "H", len(new_entries)) + b"".join(new_entries) + next_offset
     return bytes(result)
 
 

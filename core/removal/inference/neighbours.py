@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -137,6 +136,6 @@ class ShotPredictor:
                        and not (source in before and target in before)}
 
 
-def shot_sort_key(path: Path) -> tuple[Path, Any]:
+def shot_sort_key(path: Path) -> tuple[Path, object]:
     """Return a sort key for plates of any folders: in this order `ShotPredictor` computes nothing twice."""
     return path.parent, natural_key(path)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...colour.srgb import LUMINANCE, Pixels, linear_from_srgb
 from ...images.picture import Encoding
 from ...images.plates import Plate, finite_light
+from ...images.write import MAX_HALF
 from ..model import image_formation
 from ..model.image_formation import GAMMA
 
@@ -22,8 +23,6 @@ CLIPPING_LEVEL = 0.97
 """Display value from which on a pixel counts as clipped."""
 STRIP_ROWS = 256
 """Rows of a plate that are converted at a time, which bounds the memory."""
-MAX_FLOAT16 = 65504
-"""Greatest finite value of a flare as it is written."""
 
 _LINEAR_FROM_UINT8 = np.power(np.arange(256, dtype=np.float32) / 255, np.float32(GAMMA)).astype(np.float32)
 
@@ -108,13 +107,13 @@ def subtract_flare(codes: NDArray[Any], flare: Pixels, encoding: Encoding, max_c
 
 def removed_light(codes: NDArray[Any], clean: NDArray[Any], flare: Pixels, encoding: Encoding,
                   max_code: float) -> Pixels:
-    """Return the flare to write, in scene-linear light, at most MAX_FLOAT16.
+    """Return the flare to write, in scene-linear light, at most MAX_HALF.
 
     For linear codes that is `flare`, the linear flare that was subtracted. For display codes it is the light of the
     codes minus the light of the clean codes, both by the sRGB curve; `flare` itself is by another curve
     (`image_formation.GAMMA`).
     """
     if encoding == "linear":
-        return np.minimum(flare, MAX_FLOAT16)
+        return np.minimum(flare, MAX_HALF)
     before, after = (linear_from_srgb(part.astype(np.float32) / np.float32(max_code)) for part in (codes, clean))
     return np.where(flare > 0, before - after, 0)

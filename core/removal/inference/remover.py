@@ -19,6 +19,7 @@ from ...colour import ColourSpace
 from ...colour.srgb import Pixels
 from ...errors import SettingsError
 from ...images.plates import Plate
+from ...images.write import MAX_HALF
 from ...system.reading import read_bytes
 from ..model.image_formation import flare_to_linear
 from ..model.network import RemovalNetwork
@@ -38,7 +39,6 @@ from .framing import (
 from .guided_filter import GuidedFilterMaps, fit_guided_filter, upsample_flare
 from .light_discs import retained_fraction
 from .plate_light import (
-    MAX_FLOAT16,
     downscale_linear,
     removed_light,
     subtract_flare,
@@ -155,7 +155,7 @@ class Remover:
         alpha = plate.straight_alpha
         if alpha is not None:
             light = np.where(alpha[..., None] > 0, light, 0)  # codes under alpha 0 are arbitrary, and stay
-        written_flare = np.minimum(plate.light_in_plate_primaries(light), MAX_FLOAT16)
+        written_flare = np.minimum(plate.light_in_plate_primaries(light), MAX_HALF)
         if alpha is not None:
             written_flare = written_flare * alpha[..., None]  # as much as shows when the plate is composited
         return plate.without_light(light), written_flare.astype(np.float16)

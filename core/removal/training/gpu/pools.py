@@ -43,7 +43,7 @@ SLOTS_PER_PROCESS = 4
 """Items that each process may have drawn and not yet transferred."""
 START_TIMEOUT_S = 300.0
 """How long to wait for the first items; the processes have the program to load."""
-MAX_HALF = 6e4
+MAX_STORED_LIGHT = 6e4
 """Largest light that is stored in half precision."""
 BYTES_PER_HALF = 2
 METADATA_SIZE = 3 * MAX_LIGHTS + 3
@@ -305,4 +305,4 @@ def _draw_flares(seed: tuple[int, int], path: Path, memory_shape: tuple[int, int
 def _to_half_planes(picture: NDArray[np.float32]) -> NDArray[np.float16]:
     """Return (h, w, 3) as (3, h, w) float16; by torch, in a tenth of numpy's time."""
     planes = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)
-    return np.asarray(planes.clamp(max=MAX_HALF).half().numpy())
+    return np.asarray(planes.clamp(max=MAX_STORED_LIGHT).half().numpy())

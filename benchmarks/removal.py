@@ -158,7 +158,7 @@ def score_sample(capture: Path = DESK, weights: Path | None = None, cleaned: Pat
 def sheet_frames(count: int) -> list[int]:
     """Return the indices of the frames on a sheet of a sample with `count` frames: up to SHOWN_FRAMES, evenly spaced.
 
-    They begin at the sixth frame where there are as many as that, else at the first.
+    They begin at the end of the first of as many equal parts, at the sixth frame at the latest.
     """
     step = max(count // SHOWN_FRAMES, 1)
     return list(range(min(5, step - 1), count, step))[:SHOWN_FRAMES]

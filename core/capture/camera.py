@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import CaptureError
+
 Floats = NDArray[np.float64]
 ASPECT_TOLERANCE = 0.02
 """Difference from 1 within which a pixel aspect ratio counts as 1."""
@@ -144,17 +146,19 @@ class Camera:
             return np.asarray((np.asarray(depth) > 0) & (points >= 0).all(axis=1) & (points <= self.size).all(axis=1))
 
 
-def count_blind_cameras(cameras: Sequence[Camera], points: Floats) -> int:
-    """Return how many cameras have no point of a scene (n, 3) on their frames.
+def check_in_view(cameras: Sequence[Camera], points: Floats, scene: str, world: str, hint: str = "") -> None:
+    """Raise CaptureError if most cameras have no point of a scene (n, 3) on their frames: it is of another world.
 
-    If it is at most MAX_BLIND_SHARE of the cameras, it may be too high, counted with a sample of the points.
+    scene, world: what the message calls the scene, and whose world it should be in. hint: on how to export it.
     """
     blind = 0
+    # All points are looked for only if too few cameras see a sample of them.
     for some_points in (points[::max(len(points) // SAMPLED_POINTS, 1)], points):
         blind = sum(not camera.contains(*camera.project(some_points)).any() for camera in cameras)
         if blind <= MAX_BLIND_SHARE * len(cameras):
-            break
-    return blind
+            return
+    raise CaptureError(f"{scene} is of another world than {world}: {blind} of {len(cameras)} views have none of its "
+                       f"{len(points)} Gaussians before them; export it in the world of the cameras{hint}.")
 
 
 def is_rotation(matrix: Floats) -> bool:

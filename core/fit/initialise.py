@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ..capture import LIGHTS, Capture, View
-from ..capture.camera import MAX_BLIND_SHARE, count_blind_cameras
+from ..capture.camera import check_in_view
 from ..errors import CaptureError
 from ..flare.deformation import QueryRange
 from ..flare.frame_lights import FrameLights
@@ -91,11 +91,8 @@ def _scene_from_points(capture: Capture, settings: FitSettings, views: tuple[Vie
 
 def _check_in_view(scene: SceneGaussians, views: tuple[View, ...], path: str) -> None:
     """Raise CaptureError where few views have a Gaussian of the scene on their frames: it is of another world."""
-    blind = count_blind_cameras([view.camera for view in views], scene.means.detach().numpy())
-    if blind > MAX_BLIND_SHARE * len(views):
-        raise CaptureError(f"{path} is of another world than the capture: {blind} of {len(views)} views have none of "
-                           f"its {len(scene)} Gaussians before them; export it in the world of the cameras (for "
-                           "nerfstudio: --orientation-method none --center-method none --auto-scale-poses False).")
+    check_in_view([view.camera for view in views], scene.means.detach().numpy(), path, "the capture",
+                  " (for nerfstudio: --orientation-method none --center-method none --auto-scale-poses False)")
 
 
 def _check_has_lights(capture: Capture) -> None:

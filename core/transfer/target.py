@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Camera, Capture, View, read_lights
-from ..capture.camera import MAX_BLIND_SHARE, count_blind_cameras
+from ..capture.camera import check_in_view
 from ..colour import ColourSpace
 from ..conventions.frame_numbers import NumberedFrame, layers_file, number_views, plates_by_number
 from ..errors import CaptureError, FrameError, SettingsError
@@ -241,10 +241,7 @@ def capture_target(capture: Capture, look: Look, requested: SourceNames, *, ligh
 def _read_scene_in_view(path: Path, frames: Sequence[TargetFrame]) -> SceneGaussians:
     """Read a 3DGS PLY. Raises CaptureError where fewer than half of the cameras have any of its Gaussians in view."""
     scene = read_ply(path)
-    blind = count_blind_cameras([frame.shot.camera for frame in frames], scene.means.detach().numpy())
-    if blind > MAX_BLIND_SHARE * len(frames):
-        raise CaptureError(f"{path} is of another world than the cameras: {blind} of {len(frames)} views have none of "
-                           f"its {len(scene)} Gaussians before them; export it in the world of the cameras.")
+    check_in_view([frame.shot.camera for frame in frames], scene.means.detach().numpy(), str(path), "the cameras")
     return scene
 
 

@@ -71,7 +71,7 @@ def _add_dirt(random: Random, stop: Array, dirt: float) -> Array:
     """Return a stop (STOP_SAMPLES, STOP_SAMPLES) with dust and scratches. dirt: amount, 0 (clean) to 1."""
     import cv2
 
-    mask = stop
+    mask = stop.copy()
     for _ in range(int(random.poisson(60 * dirt))):  # dust
         middle = (random.uniform(0.25, 0.75, 2) * STOP_SAMPLES).astype(int)
         spot = np.ones_like(mask)

@@ -156,10 +156,10 @@ class PlateTrainer(FlareTrainer):
         (loss + self._flare_penalty(pose, targets.camera.frame)).backward()
         self.optimisers.step(scene=False)
         self._change_flare_density()
-        self._refine()
+        self._update_brightness_and_plates()
         return metrics
 
-    def _refine(self) -> None:
+    def _update_brightness_and_plates(self) -> None:
         """At intervals, solve the brightness of the lights in all frames and, from `refine_at` of the fit on, estimate
         the plates again with the flare subtracted; in other iterations do nothing."""
         every = max(round(self.settings.brightness.solve_every * self.settings.iterations), 1)

@@ -93,11 +93,12 @@ def normalise_arcs(arcs: Tensor, covariances: Tensor, rings: Tensor | None) -> T
 def cutoff_radii(
     peaks: Tensor, blend: Blend = "over", rings: Tensor | None = None, strengths: Tensor | None = None
 ) -> Tensor:
-    """Return (n,) the Mahalanobis radius beyond which a Gaussian is not drawn; 0 if it is not drawn at all.
+    """Return (n,) Mahalanobis radii beyond which Gaussians are not drawn; with "over", 0 for peaks below ALPHA_MIN.
 
-    For a plain Gaussian r solves peak * exp(-r²/2) = ALPHA_MIN, or exp(-r²/2) = PROFILE_MIN with "add". A ring reaches
-    to r0 + w r, an arc of strength beta w² beta farther. peaks: (n,) clamped opacities; rings: (n, 2) r0 and w;
-    strengths: (n,) beta.
+    peaks: (n,) opacities, at most OPACITY_MAX. rings: (n, 2) r0 and w. strengths: (n,) strengths beta of arcs.
+
+    The radius r of a plain Gaussian solves peak * exp(-r²/2) = ALPHA_MIN with "over", exp(-r²/2) = PROFILE_MIN with
+    "add". The radius of a ring is r0 + w r. An arc adds w² beta to it, where w is 1 without a ring.
     """
     if blend == "add":
         reach = torch.full_like(peaks, math.sqrt(-2 * math.log(PROFILE_MIN)))

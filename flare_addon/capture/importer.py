@@ -231,7 +231,7 @@ def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, se
         render.pixel_aspect_x, render.pixel_aspect_y = aspect
         scene.frame_start, scene.frame_end = min(frame_numbers.values()), max(frame_numbers.values())
         scene.frame_set(scene.frame_start)
-    notes += camera_differences([view.camera for view in capture.views])
+    notes += camera_warnings([view.camera for view in capture.views])
     camera_objects: list[Any] = []
     for folder, views in folders.items():
         name = "Camera" if folder == "." else f"Camera {folder}"
@@ -258,8 +258,10 @@ def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, se
     return tuple(camera_objects)
 
 
-def camera_differences(all_cameras: Sequence[Camera]) -> Iterator[str]:
-    """Yield warnings where the cameras of a capture differ in what a scene has only once."""
+def camera_warnings(all_cameras: Sequence[Camera]) -> Iterator[str]:
+    """Yield a warning if the cameras of a capture differ in size, and one if they differ in pixel aspect.
+
+    A scene of Blender has one size and one pixel aspect."""
     if len({camera.size for camera in all_cameras}) > 1:
         yield "The frames differ in size; the scene has the size of the first frame."
     aspect = all_cameras[0].fx / all_cameras[0].fy

@@ -63,12 +63,12 @@ def test_batched_warping_equals_that_of_single_pairs() -> None:
         random = np.random.default_rng(seed)
         matrices.append(random_cameras.draw_placement(random, CANVAS, WIDTH, HEIGHT))
         shining.append(random_cameras.draw_appearance(random, 0.8))
-        expected.append(pairs._warp_to_frame(one, shining[-1], matrices[-1], WIDTH, HEIGHT))
+        expected.append(pairs._flare_on_frame(one, shining[-1], matrices[-1], WIDTH, HEIGHT))
     blurs, colours, gains, mosts = (np.array(part) for part in zip(*shining, strict=True))
     assert 1 < (blurs > 0).sum() < len(some) - 1
     how = composition.FlarePlacements(np.array(matrices), blurs, colours[..., None, None], gains[:, None, None, None],
                                       mosts[:, None, None, None]).to(CPU)
-    found = composition._warp_to_frame(together(some), how, how.matrices, HEIGHT, WIDTH)
+    found = composition._flare_on_frame(together(some), how, how.matrices, HEIGHT, WIDTH)
     for row, apart in enumerate(expected):
         for one, other in zip(found, apart, strict=True):
             batched = one[row].permute(1, 2, 0).numpy()
@@ -119,7 +119,7 @@ def test_a_composed_frame_is_scene_light_rest_and_glow() -> None:
         filmed = replace(replace(plain, **numbers).to(CPU), **changes)
         return composition.compose(scene, gamma, filmed, [(flares, how)])
 
-    rest, glow, light = composition._warp_to_frame(flares, how, how.matrices[:, 0], HEIGHT, WIDTH)
+    rest, glow, light = composition._flare_on_frame(flares, how, how.matrices[:, 0], HEIGHT, WIDTH)
     frame, clear, gentle = compose()
     assert torch.allclose(clear, (scene + light).clamp(0, 1).sqrt(), atol=1e-6)
     assert torch.allclose(gentle, (scene + light + glow).clamp(0, 1).sqrt(), atol=1e-6)

@@ -122,8 +122,8 @@ def _draw_flares(random: Random, bank: FlareSource, scene: Pixels, *,
                 exposure = np.clip(target_light / max(light_level, 1e-3), *random_cameras.EXPOSURE_LIMITS)
                 scene = scene * np.float32(exposure)
         appearance = random_cameras.draw_appearance(random, strength)
-        warped_rest, warped_glow, warped_light = _warp_to_frame(layers, appearance, matrix, width, height)
-        rest, glow, light = rest + warped_rest, glow + warped_glow, np.maximum(light, warped_light)
+        frame_rest, frame_glow, frame_light = _flare_on_frame(layers, appearance, matrix, width, height)
+        rest, glow, light = rest + frame_rest, glow + frame_glow, np.maximum(light, frame_light)
     return scene, rest, glow, light
 
 
@@ -170,10 +170,13 @@ def _canvas_to_frame(matrix: NDArray[Any], layers: FlareLayers, position: tuple[
     return matrix[:, :2] @ ((np.array(position) + 1) * layers.size / 2) + matrix[:, 2]
 
 
-def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearance, matrix: NDArray[Any], width: int,
-                   height: int) -> tuple[Pixels, Pixels, Pixels]:
-    """Return rest, glow and light, (height, width, 3) each, warped from canvas to frame and coloured. Near a light,
-    flare that is bright enough to clip is moved into the light layer. matrix: (2, 3), from canvas to frame, pixels."""
+def _flare_on_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearance, matrix: NDArray[Any], width: int,
+                    height: int) -> tuple[Pixels, Pixels, Pixels]:
+    """Return the flare's layers rest, glow and light on the frame, linear light (height, width, 3) each.
+
+    The canvas is warped by `matrix` (2, 3), canvas to frame in pixels, then blurred, coloured and dimmed as
+    `appearance` says. Near a light, flare that is bright enough to clip moves into the layer light.
+    """
     import cv2
 
     half_diagonal = math.hypot(width, height) / 2

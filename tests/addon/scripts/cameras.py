@@ -55,7 +55,7 @@ for fx, fy in ((70.0, 50.0), (50.0, 70.0)):
 
 # ---- what a scene has one of ----------------------------------------------------------------------
 Camera = part("core.capture").Camera
-facts["unlike"] = [list(part("flare_addon.capture.importer").camera_differences(
+facts["unlike"] = [list(part("flare_addon.capture.importer").camera_warnings(
     [Camera(64, 40, 70.0, 70.0, 32, 20, np.eye(4)), Camera(64, height, 70.0, fy, 32, 20, np.eye(4))]))
     for height, fy in ((40, 70.1), (44, 70.0), (40, 71.4))]
 

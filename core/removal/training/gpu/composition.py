@@ -151,10 +151,10 @@ def compose(scene: Tensor, gamma: Tensor, frames: FrameParameters,
             exposure = (frames.target_light / light_level.clamp(min=1e-3)).clamp(*random_cameras.EXPOSURE_LIMITS)
             keeps_exposure = (frames.target_light == 0) | ~flares.is_light[:, 0]
             scene = scene * exposure.masked_fill(keeps_exposure, 1)[:, None, None, None]
-        warped_rest, warped_glow, warped_light = _warp_to_frame(flares, placement, matrix, *scene.shape[2:])
-        rest[flared_frames] += warped_rest
-        glow[flared_frames] += warped_glow
-        light[flared_frames] = torch.maximum(light[flared_frames], warped_light)
+        frame_rest, frame_glow, frame_light = _flare_on_frame(flares, placement, matrix, *scene.shape[2:])
+        rest[flared_frames] += frame_rest
+        glow[flared_frames] += frame_glow
+        light[flared_frames] = torch.maximum(light[flared_frames], frame_light)
     rest, glow = rest * frames.has_flare, glow * frames.has_flare
     scene = scene + light * frames.has_lights
     grain = (scene.clamp(min=0) * SHOT_NOISE + READ_NOISE).sqrt() * frames.grain * GRAIN
@@ -229,10 +229,13 @@ def _choose_placement(flares: FlareBatch, matrices: Tensor, scene: Tensor,
     return matrices[frame_indices, best], light_levels[frame_indices, best]
 
 
-def _warp_to_frame(flares: FlareBatch, placement: FlarePlacements, matrix: Tensor, height: int,
-                   width: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return rest, glow and light, (n, 3, height, width) each, warped from canvas to frame and coloured. Near a light,
-    flare that is bright enough to clip is moved into the light layer."""
+def _flare_on_frame(flares: FlareBatch, placement: FlarePlacements, matrix: Tensor, height: int,
+                    width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the flares' layers rest, glow and light on the frames, linear light (n, 3, height, width) each.
+
+    The canvases are warped by `matrix` (n, 2, 3), canvas to frame in pixels, then blurred, coloured and dimmed as
+    `placement` says. Near a light, flare that is bright enough to clip moves into the layer light.
+    """
     grid = _canvas_grid(matrix, height, width, flares.size)
     layers = F.grid_sample(flares.layers.float(), grid, "bilinear", "zeros", align_corners=True)
     rest, glow, light = layers.split(FLARE_CHANNELS // 3, 1)

@@ -252,10 +252,11 @@ def _initialise_drawing() -> None:
 
 def _draw_scenes(seed: tuple[int, int], path: Path, memory_shape: tuple[int, int], free_slots: Any, drawn: Any,
                  backgrounds: Backgrounds, shapes: Sequence[FrameShape]) -> None:
-    """Draw blocks of scenes without end, each of one of the shapes; runs in a process of its own.
+    """Draw blocks of scenes into free slots of a memory-mapped file, without end; the main function of a process.
 
-    path, memory_shape: file and shape of the memory, a row for each slot. free_slots: queue of slots to draw into.
-    drawn: queue of DrawnItems.
+    seed: of the training, and number of the process. path, memory_shape: the file and its shape, a row of float16 for
+    each slot: SCENES_PER_BLOCK scenes (3, height, width) of one of the shapes. free_slots: queue of slots to draw into.
+    drawn: queue that gets a DrawnItem for each block, with the gammas of its scenes.
     """
     _initialise_drawing()
     memory = np.memmap(path, np.float16, "r+", shape=memory_shape)
@@ -273,10 +274,12 @@ def _draw_scenes(seed: tuple[int, int], path: Path, memory_shape: tuple[int, int
 
 def _draw_flares(seed: tuple[int, int], path: Path, memory_shape: tuple[int, int], free_slots: Any, drawn: Any,
                  recipe: Recipe, lenses: Sequence[Prescription], user_flares: UserFlares | None) -> None:
-    """Draw flares without end; runs in a process of its own.
+    """Draw random flares into free slots of a memory-mapped file, without end; the main function of a process.
 
-    path, memory_shape: file and shape of the memory, a row for each slot. free_slots: queue of slots to draw into.
-    drawn: queue of DrawnItems.
+    seed: of the training, and number of the process. path, memory_shape: the file and its shape, a row of float16 for
+    each slot: planes (9, size, size) of the layers rest, glow and light. free_slots: queue of slots to draw into.
+    drawn: queue that gets a DrawnItem for each flare, with its lights and its colour. user_flares: a share of
+    `recipe.user_flare_share` is drawn from them.
     """
     _initialise_drawing()
     memory = np.memmap(path, np.float16, "r+", shape=memory_shape)

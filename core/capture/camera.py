@@ -146,6 +146,25 @@ class Camera:
             return np.asarray((np.asarray(depth) > 0) & (points >= 0).all(axis=1) & (points <= self.size).all(axis=1))
 
 
+def triangulate_midpoints(origins: Floats, rays: Floats, other_origins: Floats, other_rays: Floats
+                          ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return midpoints (n, 3) of the shortest segments between two rays, and cosines (n,) of the angles of the rays.
+
+    The third result (n,) is true where both ends of the segment lie on the rays, not behind their origins. Parallel
+    rays have no midpoint: where a cosine is near 1 or -1, the other results mean nothing.
+
+    origins, other_origins: (n, 3) or (3,), world units. rays, other_rays: unit directions (n, 3).
+    """
+    baseline = other_origins - origins
+    cosines = (rays * other_rays).sum(axis=1)
+    along_rays, along_other_rays = (baseline * rays).sum(axis=1), (baseline * other_rays).sum(axis=1)
+    squared_sines = np.maximum(1 - cosines ** 2, 1e-12)
+    distances = (along_rays - cosines * along_other_rays) / squared_sines
+    other_distances = (cosines * along_rays - along_other_rays) / squared_sines
+    midpoints = 0.5 * (origins + distances[:, None] * rays + other_origins + other_distances[:, None] * other_rays)
+    return midpoints, cosines, (distances > 0) & (other_distances > 0)
+
+
 def check_in_view(cameras: Sequence[Camera], points: Floats, scene: str, world: str, hint: str = "") -> None:
     """Raise CaptureError if most cameras have no point of a scene (n, 3) on their frames: it is of another world.
 

@@ -8,12 +8,13 @@ drawn at random in the cameras' view, as 3DGS does for synthetic scenes.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Camera, Capture, PointCloud
+from ..capture.camera import triangulate_midpoints
+from ..images.features import Features, detect_features, match_features
 from ..images.picture import Picture
 from ..system.progress import Progress
 from .frames import subsample
@@ -21,10 +22,8 @@ from .settings import FitSettings
 
 MATCHED_VIEWS = 60
 """Approximate number of frames that are matched."""
-MATCHED_WIDTH, FEATURES = 1000, 4000
+MATCHED_WIDTH, MAX_FEATURES = 1000, 4000
 """Largest width in pixels of the matched frames, and the number of features of each."""
-MATCH_RATIO = 0.8
-"""Ratio of the distances to the nearest and the second nearest descriptor up to which a match counts (Lowe 2004)."""
 MAX_ERROR_PX, MIN_ANGLE = 2.0, np.deg2rad(1.5)
 """Largest reprojection error and smallest angle between the rays of a point."""
 MIN_TRIANGULATED = 200
@@ -34,14 +33,6 @@ NEAR_FACTOR, FAR_FACTOR = 0.3, 3.0
 """Depths of random points relative to the distance of what the cameras look at."""
 
 Floats = NDArray[np.float64]
-
-
-class _Features(NamedTuple):
-    """Features of a frame: places (n, 2), pixels, SIFT descriptors, None without features, and colours (n, 3)."""
-
-    places: Floats
-    descriptors: Any
-    colours: NDArray[np.uint8]
 
 
 def ensure_points(capture: Capture, settings: FitSettings, progress: Progress) -> tuple[Capture, tuple[str, ...]]:
@@ -69,28 +60,30 @@ def _triangulate_matches(capture: Capture,
     SIFT features of each frame are matched with those of the next two; every sound match gives a point, in the colour
     of the first frame.
     """
-    import cv2
-
     views = subsample(capture.views, MATCHED_VIEWS)
     progress.stage("match frames for points", len(views))
-    sift, matcher = cv2.SIFT.create(FEATURES), cv2.BFMatcher(cv2.NORM_L2)
     cameras: list[Camera] = []
-    features: list[_Features] = []
+    features: list[Features] = []
+    colours: list[NDArray[np.uint8]] = []
     for view in views:
         cameras.append(view.camera.scaled(min(MATCHED_WIDTH, view.camera.width)))
-        features.append(_detect_features(sift, capture.frame(view, cameras[-1].size)))
+        frame_features, frame_colours = _detect_coloured_features(capture.frame(view, cameras[-1].size))
+        features.append(frame_features)
+        colours.append(frame_colours)
         progress.advance()
     xyz, rgb, observed = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], dict[str, list[NDArray[np.int64]]]()
     count = 0
     pairs = [*pairwise(range(len(views))), *((i, i + 2) for i in range(len(views) - 2))]
     for first, second in pairs:
-        matches = _match_features(matcher, features[first].descriptors, features[second].descriptors)
+        matches = match_features(features[first], features[second], mutual=True)
         if not len(matches):
             continue
-        points, is_sound = triangulate_pair(cameras[first], cameras[second], features[first].places[matches[:, 0]],
-                                            features[second].places[matches[:, 1]])
+        # A camera's pixel centres are at + 0.5, those of features are whole numbers.
+        pixels, other_pixels = (features[view].positions[matches[:, column]].astype(np.float64) + 0.5
+                                for column, view in enumerate((first, second)))
+        points, is_sound = triangulate_pair(cameras[first], cameras[second], pixels, other_pixels)
         xyz.append(points[is_sound])
-        rgb.append(features[first].colours[matches[is_sound, 0]])
+        rgb.append(colours[first][matches[is_sound, 0]])
         indices = np.arange(count, count + int(is_sound.sum()))
         count += len(indices)
         for index in (first, second):
@@ -99,29 +92,14 @@ def _triangulate_matches(capture: Capture,
             {name: np.unique(np.concatenate(parts)) for name, parts in observed.items() if count})
 
 
-def _detect_features(sift: Any, picture: Picture) -> _Features:
-    """Return the SIFT features of a frame."""
+def _detect_coloured_features(frame: Picture) -> tuple[Features, NDArray[np.uint8]]:
+    """Return the features of a frame, and their sRGB colours (n, 3)."""
     import cv2
 
-    codes = (picture.display() * 255 + 0.5).astype(np.uint8)
-    keys, descriptors = sift.detectAndCompute(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), None)
-    places = np.array([key.pt for key in keys], np.float64).reshape(-1, 2)
-    x, y = np.minimum(np.rint(places).astype(int), np.array(picture.size) - 1).T
-    return _Features(places + 0.5, descriptors, codes[y, x])  # OpenCV's pixel centres are whole numbers
-
-
-def _match_features(matcher: Any, first: Any, second: Any) -> NDArray[np.int64]:
-    """Return (n, 2) indices of the features of two frames that match.
-
-    The descriptors of a match are nearest to each other, and that in `second` is nearer than MATCH_RATIO times the
-    second nearest (Lowe's ratio test). first, second: descriptors of the frames, None without features.
-    """
-    if first is None or second is None or min(len(first), len(second)) < 2:
-        return np.zeros((0, 2), np.int64)
-    forward = [(nearest.queryIdx, nearest.trainIdx) for nearest, second_nearest in matcher.knnMatch(first, second, 2)
-               if nearest.distance < MATCH_RATIO * second_nearest.distance]
-    backward = {nearest.queryIdx: nearest.trainIdx for nearest in matcher.match(second, first)}
-    return np.array([pair for pair in forward if backward.get(pair[1]) == pair[0]], np.int64).reshape(-1, 2)
+    codes = (frame.display() * 255 + 0.5).astype(np.uint8)
+    features = detect_features(np.asarray(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), np.uint8), MAX_FEATURES)
+    x, y = np.minimum(np.rint(features.positions).astype(int), np.array(frame.size) - 1).T
+    return features, codes[y, x]
 
 
 def triangulate_pair(first: Camera, second: Camera, pixels: Floats, other_pixels: Floats
@@ -129,17 +107,12 @@ def triangulate_pair(first: Camera, second: Camera, pixels: Floats, other_pixels
     """Return points (n, 3) from pixels (n, 2) of the first and other pixels (n, 2) of the second camera, and which (n,)
     are sound.
 
-    A point is where the two rays are nearest to each other. It is sound if it lies before both cameras, the rays differ
-    by more than MIN_ANGLE, and it projects to less than MAX_ERROR_PX from both pixels.
+    A point is sound if it lies before both cameras, its rays differ by more than MIN_ANGLE, and it projects to less
+    than MAX_ERROR_PX from both pixels.
     """
-    rays, other_rays = first.rays(pixels), second.rays(other_pixels)
-    baseline = second.position - first.position
-    cosine = (rays * other_rays).sum(axis=1)
-    denominator = np.maximum(1 - cosine * cosine, 1e-12)
-    along = ((rays @ baseline) - cosine * (other_rays @ baseline)) / denominator
-    along_other = (cosine * (rays @ baseline) - (other_rays @ baseline)) / denominator
-    points = 0.5 * (first.position + along[:, None] * rays + second.position + along_other[:, None] * other_rays)
-    is_sound = (along > 0) & (along_other > 0) & (np.arccos(cosine.clip(-1, 1)) > MIN_ANGLE)
+    points, cosines, is_before = triangulate_midpoints(first.position, first.rays(pixels),
+                                                       second.position, second.rays(other_pixels))
+    is_sound = is_before & (np.arccos(cosines.clip(-1, 1)) > MIN_ANGLE)
     for camera, observed in ((first, pixels), (second, other_pixels)):
         places, depth = camera.project(points)
         with np.errstate(invalid="ignore"):

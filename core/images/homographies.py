@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds homographies between frames of a shot by matched features (SIFT, Lowe 2004; RANSAC, Fischler & Bolles 1981).
+"""Finds homographies between frames of a shot by matched features and RANSAC (Fischler & Bolles 1981).
 
 A homography aligns two frames of a camera that stands or turns, and frames of what is far away. `core.lights` carries
 static lights by it, and `core.fit` aligns plates.
@@ -13,21 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..colour.srgb import LUMINANCE, Pixels
+from .features import Features, detect_features, match_features
 
 Matrix = NDArray[np.float64]
 
-FEATURES, MATCH_RATIO, MIN_INLIERS, MAX_ERROR_PX = 800, 0.8, 25, 1.5
-"""Features of a frame, ratio test, and what a homography between two frames needs; errors in pixels of the pictures."""
+MAX_FEATURES, MIN_INLIERS, MAX_ERROR_PX = 800, 25, 1.5
+"""Number of features of a frame, and what a homography between two frames needs; errors in pixels of the pictures."""
 STANDING_PX = 0.1
 """Median motion of the matches, pixels, below which the camera stands."""
-
-
-@dataclass(frozen=True)
-class _Features:
-    """Points (n, 2), pixels, and their descriptors."""
-
-    points: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -51,7 +44,7 @@ class HomographyMatcher:
 
     def __init__(self, read: Callable[[str], Pixels], min_inlier_share: float) -> None:
         self._read, self._min_inlier_share = read, min_inlier_share
-        self._features_by_name: dict[str, _Features] = {}
+        self._features_by_name: dict[str, Features] = {}
         self._matches: dict[tuple[str, str], FrameMatch] = {}
 
     def match(self, source: str, target: str) -> FrameMatch:
@@ -68,15 +61,13 @@ class HomographyMatcher:
         camera stands."""
         import cv2
 
-        first, second = self._sift_features(source), self._sift_features(target)
-        if min(len(first.points), len(second.points)) < MIN_INLIERS:
+        first, second = self._features(source), self._features(target)
+        if min(len(first.positions), len(second.positions)) < MIN_INLIERS:
             return FrameMatch(None, None)
-        matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, 2)
-        pairs = [(near.queryIdx, near.trainIdx) for near, *other in matches
-                 if other and near.distance < MATCH_RATIO * other[0].distance]
+        pairs = match_features(first, second)
         if len(pairs) < MIN_INLIERS:
             return FrameMatch(None, None)
-        ends = first.points[[pair[0] for pair in pairs]], second.points[[pair[1] for pair in pairs]]
+        ends = first.positions[pairs[:, 0]], second.positions[pairs[:, 1]]
         cv2.setRNGSeed(0)  # RANSAC gives the same result each time
         matrix, inliers = cv2.findHomography(*ends, cv2.RANSAC, MAX_ERROR_PX)
         share = 0.0 if matrix is None else float(inliers.mean())
@@ -86,17 +77,11 @@ class HomographyMatcher:
         stands = np.median(motion) < STANDING_PX
         return FrameMatch(np.eye(3) if stands else np.asarray(matrix, np.float64), share)
 
-    def _sift_features(self, name: str) -> _Features:
-        """Return the SIFT features of a frame."""
-        import cv2
-
+    def _features(self, name: str) -> Features:
+        """Return the features of a frame, cached."""
         if name not in self._features_by_name:
             grey = np.clip(self._read(name) @ LUMINANCE * 255 + 0.5, 0, 255).astype(np.uint8)
-            keypoints, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(grey, np.array([]))
-            points = np.array([keypoint.pt for keypoint in keypoints], np.float32).reshape(-1, 2)
-            # SIFT's values are whole numbers up to 255; of a picture without features there are none.
-            codes = np.zeros((0, 128), np.uint8) if descriptors is None else descriptors.astype(np.uint8)
-            self._features_by_name[name] = _Features(points, codes)
+            self._features_by_name[name] = detect_features(grey, MAX_FEATURES)
         return self._features_by_name[name]
 
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture.camera import Floats
+from ..capture.camera import Floats, triangulate_midpoints
 from .observations import Observations
 
 MAX_PAIRS = 60000
@@ -23,6 +23,8 @@ FIRST_BATCH = 512
 """Candidates scored together: memory is this times the number of detections."""
 BATCH = 32
 """Candidates scored together once each has an upper bound."""
+MIN_SQUARED_SINE = 1e-8
+"""Squared sine of the angle between two rays up to which they are parallel."""
 
 
 class Candidates:
@@ -118,16 +120,11 @@ def _triangulate(observations: Observations, first: NDArray[np.int64], second: N
     first, second: indices (n,) of the detections. All zeros for rays that are parallel, or whose nearest points lie
     behind a camera.
     """
-    origin, other_origin = (observations.position[observations.view[index]] for index in (first, second))
-    ray, other_ray = observations.ray[first], observations.ray[second]
-    cosine, baseline = (ray * other_ray).sum(axis=1), other_origin - origin
-    squared_sine = 1.0 - cosine ** 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = ((baseline * ray).sum(axis=1) - cosine * (baseline * other_ray).sum(axis=1)) / squared_sine
-        along_other = (cosine * (baseline * ray).sum(axis=1) - (baseline * other_ray).sum(axis=1)) / squared_sine
-        midpoint = 0.5 * (origin + along[:, None] * ray + other_origin + along_other[:, None] * other_ray)
-    valid = (squared_sine > 1e-8) & (along > 0) & (along_other > 0)
-    return np.concatenate([np.where(valid[:, None], midpoint, 0.0), valid[:, None].astype(float)], axis=1)
+    origins, other_origins = (observations.position[observations.view[index]] for index in (first, second))
+    midpoints, cosines, is_before = triangulate_midpoints(origins, observations.ray[first],
+                                                          other_origins, observations.ray[second])
+    valid = is_before & (1 - cosines ** 2 > MIN_SQUARED_SINE)
+    return np.concatenate([np.where(valid[:, None], midpoints, 0.0), valid[:, None].astype(float)], axis=1)
 
 
 def _at_infinity(observations: Observations, first: NDArray[np.int64], second: NDArray[np.int64]) -> Floats:

@@ -2,7 +2,7 @@
 """Finds the element of a flare that is brightest at a point of the picture; the add-on picks elements by a click."""
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,6 @@ from ..conventions.splatting import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN
 from .drawing import profile_exponent
 from .edits import LookEdits
 from .look import LightLook, Look
-from .placed_light import PlacedLight
 from .plane import Floats, PlaneGaussians, arc_log_peak, arc_strengths, arcs_to_pixels, concatenate, to_pixels
 
 MIN_LIGHT = 3e-4
@@ -55,24 +54,24 @@ def _profiles(gaussians: PlaneGaussians, offsets: NDArray[np.float64], covarianc
         return np.where((xx * yy - xy * xy > 0) & np.isfinite(profiles), profiles, 0)
 
 
-def brightest_element(look: Look, lights: Sequence[PlacedLight], flares: Mapping[str, PlaneGaussians],
+def brightest_element(look: Look, source_names: Mapping[str, str], flares: Mapping[str, PlaneGaussians],
                       edits: LookEdits, intrinsics: ArrayLike, point: ArrayLike) -> tuple[str, str] | None:
     """Return the names of the placed light and of its element that has most light at a point (2,), px; None where no
     element has MIN_LIGHT.
 
-    lights: the placed lights. flares: their Gaussians by name, as `Look.evaluate_lights` returns them with these edits.
+    source_names: name of the look's light whose flare each placed light shows, by the placed light's name. flares:
+    Gaussians of the placed lights by name, as `Look.evaluate_lights` returns them with these edits.
     """
     all_gaussians = concatenate(list(flares.values()))
     if all_gaussians is None:
         return None
     sources = {light.name: light for light in look.lights}
-    source_by_light = {light.name: sources[light.source] for light in lights if light.source in sources}
     luminance = light_at(all_gaussians, intrinsics, point, look.blend, look.pixel_grid)
     brightest, max_sum, start = None, MIN_LIGHT, 0
     for name, gaussians in flares.items():
         light_luminance = luminance[start:start + len(gaussians)]
         start += len(gaussians)
-        source = source_by_light[name]
+        source = sources[source_names[name]]
         indices = _element_indices(source, name, edits, len(gaussians))
         has_element = indices >= 0
         sums = np.bincount(indices[has_element], light_luminance[has_element], len(source.elements))

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..choices import Follows
 from ..errors import FlareFileError
+from ..lights.exposure import smoothstep
 from ..look import LightLook, LookEdits, PlaneGaussians, ViewOfLight
 from ..look.look import read_description
 
@@ -124,8 +125,7 @@ def extrapolation_fade(light: LightLook, view: ViewOfLight) -> float:
 
     The network has learned nothing farther out, and a light that goes behind the camera passes through there."""
     trained_distance = float(light.query_range.light_high[2])
-    t = min(max(2 - float(np.linalg.norm(view.light)) / max(trained_distance, 1e-6), 0.0), 1.0)
-    return t * t * (3 - 2 * t)
+    return float(smoothstep(float(np.linalg.norm(view.light)) / max(trained_distance, 1e-6), 2, 1))
 
 
 def _weighted_queries(light: LightLook, view: ViewOfLight, xyz: Floats, query: Follows, training: TrainingViews | None,

@@ -102,8 +102,8 @@ def choose_element(scene: Any, depsgraph: Any, camera: Any, intrinsics: Any, poi
     which highlights it; return whether there is one. Raises FitFlareError."""
     state, look, edits = scene.fit_flare, looks.look_of(scene), looks.edits_of(scene.fit_flare)
     flares = looks.evaluate_flares(scene, depsgraph, camera)
-    lights = looks.place_lights(scene, depsgraph, camera)[1]
-    names = brightest_element(look, lights, flares, edits, intrinsics, point)
+    source_names = {item.name: item.source for item in state.lights}
+    names = brightest_element(look, source_names, flares, edits, intrinsics, point)
     if names is None:
         return False
     flare_name, element_name = names

@@ -19,6 +19,7 @@ from tests.core.test_look_layers import gaussians
 
 CAMERA = cameras(1)[0].scaled(96)
 LIGHTS = (PlacedLight("a", "lamp 0", np.array(LIGHT)), PlacedLight("b", "lamp 0", 0.8 * np.array(LIGHT)))
+SOURCES = {light.name: light.source for light in LIGHTS}
 POINTS = [(x, y) for x in range(3, CAMERA.width, 9) for y in range(3, CAMERA.height, 9)]
 
 
@@ -62,7 +63,7 @@ def test_the_brightest_element_is_that_of_the_brightest_picture(is_extended: boo
     for x, y in POINTS:
         by_light = sorted(pictures, key=lambda key: pictures[key][y, x], reverse=True)
         first, second = (float(pictures[key][y, x]) for key in by_light[:2])
-        found = brightest_element(look, lights, flares, edits, CAMERA.intrinsics, (x + 0.5, y + 0.5))
+        found = brightest_element(look, SOURCES, flares, edits, CAMERA.intrinsics, (x + 0.5, y + 0.5))
         if first < 0.9 * MIN_LIGHT:
             assert found is None
         elif first > 1.01 * second and first > 1.1 * MIN_LIGHT:
@@ -74,6 +75,6 @@ def test_the_brightest_element_is_that_of_the_brightest_picture(is_extended: boo
 def test_nothing_is_picked_without_a_flare(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
     look = read_look(tmp_path / "a.flare")
-    assert brightest_element(look, LIGHTS, {}, LookEdits(), CAMERA.intrinsics, (5, 5)) is None
+    assert brightest_element(look, SOURCES, {}, LookEdits(), CAMERA.intrinsics, (5, 5)) is None
     flares = look.evaluate_lights(CAMERA.world_to_camera, LIGHTS)
-    assert brightest_element(look, LIGHTS, flares, LookEdits(), CAMERA.intrinsics, (1e6, 1e6)) is None
+    assert brightest_element(look, SOURCES, flares, LookEdits(), CAMERA.intrinsics, (1e6, 1e6)) is None

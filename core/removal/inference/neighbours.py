@@ -137,5 +137,8 @@ class ShotPredictor:
 
 
 def shot_sort_key(path: Path) -> tuple[Path, object]:
-    """Return a sort key for plates of any folders: in this order `ShotPredictor` computes nothing twice."""
-    return path.parent, natural_key(path)
+    """Return a sort key for plates of any folders: in this order `ShotPredictor` computes nothing twice.
+
+    The plates of a folder follow each other. `natural_key` alone would put those of its subfolders between them.
+    """
+    return path.parent, natural_key(path.name)

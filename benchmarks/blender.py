@@ -226,7 +226,7 @@ def main() -> None:
         lines += time_lamp_overlay(looks, overlay, library.BOX / "Anamorphic Blue.flare", window)
     print("\n".join(lines))
     sys.stdout.flush()
-    os._exit(0)
+    os._exit(0)  # Blender as a module may crash at the end of its process
 
 
 if __name__ == "__main__":

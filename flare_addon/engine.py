@@ -26,7 +26,7 @@ ENGINE_VARIABLE = "FIT_FLARE_ENGINE"
 TESTED_FILE = "python.txt"  # holds the path of the Python that was tested last
 
 
-def set_up_folder() -> Path:
+def engine_folder() -> Path:
     """Return the folder of the engine that Set Up Engine installs.
 
     On Windows it is not in Blender's user folder, whose long path would push torch's files over the limit of 260
@@ -40,7 +40,7 @@ def set_up_folder() -> Path:
 
 def virtual_environment() -> Path:
     """Return the virtual environment that Set Up Engine makes; it may not exist yet."""
-    return set_up_folder() / "python"
+    return engine_folder() / "python"
 
 
 def configured_engine() -> tuple[str, str]:
@@ -114,7 +114,7 @@ def last_test() -> Job | None:
 
 
 def set_up_engine() -> Job:
-    """Install the engine into a virtual environment in `set_up_folder`, and the weights where they are offered.
+    """Install the engine into a virtual environment in `engine_folder`, and the weights where they are offered.
 
     Raises EngineError where Blender's online access is off, or where a damaged earlier engine cannot be removed.
     """
@@ -122,7 +122,7 @@ def set_up_engine() -> Job:
     if is_set_up() and not (virtual_environment() / "pyvenv.cfg").is_file():  # damaged
         _remove_environment(virtual_environment())
     command_line = [*weights.SET_UP, str(virtual_environment()), *weights.download_args()]
-    return jobs.start_job("set up", set_up_folder(), command_line, child_environment())
+    return jobs.start_job("set up", engine_folder(), command_line, child_environment())
 
 
 def is_set_up() -> bool:
@@ -132,14 +132,14 @@ def is_set_up() -> bool:
 
 def set_up_job() -> Job | None:
     """Return the job of the current or last set-up; None without one."""
-    return jobs.find_job(set_up_folder())
+    return jobs.find_job(engine_folder())
 
 
 def remove_engine() -> None:
     """Remove the installed engine. Raises FitFlareError while a job runs, EngineError where a file is in use."""
     if any(job.running for job in jobs.running()):
         raise FitFlareError("The engine is running; wait for it, or cancel it before you remove it.")
-    folder = set_up_folder()
+    folder = engine_folder()
     _remove_environment(folder)
     jobs.stop_watching(folder)
 

@@ -327,17 +327,17 @@ def _remember_buffer() -> None:
 
 def _draw() -> None:
     """Draw the overlay in the current 3D view; an error is stored in `last_error`."""
-    _draw_with(draw_region)
+    _draw_in_camera_view(draw_region)
 
 
 def _draw_outlines() -> None:
     """Draw the outline of the highlighted element in the current 3D view."""
     if highlight.current_highlight(bpy.context.scene) is not None:
-        _draw_with(draw_outline)
+        _draw_in_camera_view(draw_outline)
 
 
-def _draw_with(draw: Callable[[Any, Any, Any], None]) -> None:
-    """Call a function with context, scene and camera where the current 3D view shows the flare.
+def _draw_in_camera_view(draw: Callable[[Any, Any, Any], None]) -> None:
+    """Call `draw` with context, scene and camera if the current 3D view shows the flare through a camera.
 
     Nothing is drawn while a bake reads the scene, since that moves the timeline. A FitFlareError is stored in
     `last_error`.

@@ -249,7 +249,10 @@ def _median_distance(light: LightLook, views: TrainingViews | None) -> float:
 
 
 def _parse_lights(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Parse each "[name=]x,y"; return the pixels by name. Raises SettingsError."""
+    """Parse the values "[name=]x,y" of --light; return the positions, px, by the light's name. Raises SettingsError.
+
+    A light without a name gets light1, light2, ... by its number among the values.
+    """
     positions: dict[str, tuple[float, float]] = {}
     for number, text in enumerate(texts, 1):
         prefix, equals, position_text = text.rpartition("=")

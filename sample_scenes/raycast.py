@@ -161,8 +161,9 @@ def _intersect(rectangle: Quad, eye: Array, rays: Pixels) -> tuple[Pixels, Pixel
 def shade(hits: Hits, eye: Array, rays: Pixels, lamps: Sequence[Lamp], ambient: Array) -> Pixels:
     """Return the radiance (n, 3) along rays: emission, and ambient and lamp light that the surface reflects.
 
-    Where a lamp's disc is nearer than the surface, the ray has the lamp's radiance. ambient: light
-    (3,) that reaches every surface evenly.
+    Where a lamp's disc is nearer than the surface, the ray has the lamp's radiance. hits: the surfaces that the rays
+    meet. eye: origin of the rays, (3,). rays: unit directions, (n, 3). ambient: light (3,) that reaches every surface
+    evenly.
     """
     has_hit = np.isfinite(hits.distance)
     points = eye.astype(np.float32) + np.where(has_hit, hits.distance, 0)[:, None] * rays

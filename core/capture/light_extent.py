@@ -162,7 +162,8 @@ class LightExtent:
                            self.one_sided, self.factors)._checked()
 
     def sampled(self, xyz: ArrayLike, world_to_camera: ArrayLike) -> SampledExtent:
-        """Return the samples of the extent around a light at xyz (3,) for a camera of this pose (4, 4)."""
+        """Return sample points of the extent around a light at xyz (3,), and their cells, as a camera with this pose
+        (4, 4) sees it."""
         centre, pose = np.asarray(xyz, np.float64), np.asarray(world_to_camera, np.float64)
         eye = -pose[:3, :3].T @ pose[:3, 3]
         if self.shape == "points":
@@ -181,14 +182,14 @@ class LightExtent:
         return SampledExtent(centre + square @ axes, cells, emission)
 
     def _checked(self) -> LightExtent:
-        """Return the extent. Raises ValueError if a number of its shape is not valid."""
+        """Return this extent, or raise ValueError if the numbers of its shape are not valid."""
         if self.shape == "points":
             if self.points.ndim != 2 or self.points.shape[1:] != (3,) or not 1 <= len(self.points) <= MAX_POINTS:
                 raise ValueError(f"an extent of points needs 1 to {MAX_POINTS} points of three numbers")
             is_valid = bool((np.abs(self.points) < MAX_LENGTH).all())
             factors = np.zeros((len(self.points), 3)) if self.factors is None else self.factors
             if factors.shape != self.points.shape or (self.factors is not None and len(factors) > MAX_FACTORS):
-                raise ValueError(f"factors of points are three numbers for each of {MAX_FACTORS} points at most")
+                raise ValueError(f"factors are three numbers for each point, of at most {MAX_FACTORS} points")
             is_valid = is_valid and bool(((factors >= 0) & (factors < MAX_LENGTH)).all())
         elif self.shape == "sphere":
             is_valid = 0 <= self.radius < MAX_LENGTH

@@ -27,7 +27,14 @@ profiles round their numbers."""
 
 
 class UnreadableProfile(ValueError):
-    """A profile that is damaged, or of tables; the text says which."""
+    """A profile that cannot be honoured; the text says why, after the words "has a profile that"."""
+
+
+class DamagedProfile(UnreadableProfile):
+    """A profile that is incomplete or contradicts its format."""
+
+    def __init__(self) -> None:
+        super().__init__("is damaged")
 
 
 def space_of_profile(profile: bytes) -> ColourSpace:
@@ -101,16 +108,16 @@ def _invert_curve(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) ->
 def _read_tags(profile: bytes) -> dict[bytes, bytes]:
     """Return the tags of a profile by name. Raises UnreadableProfile where it is damaged."""
     if len(profile) < 132 or profile[36:40] != b"acsp":  # the header of 128 bytes has this signature
-        raise UnreadableProfile("is damaged")
+        raise DamagedProfile
     count = int.from_bytes(profile[128:132], "big")
     tags = {}
     for index in range(min(count, _MAX_TAGS)):
         entry = profile[132 + 12 * index:144 + 12 * index]
         if len(entry) < 12:
-            raise UnreadableProfile("is damaged")
+            raise DamagedProfile
         name, offset, length = struct.unpack(">4sII", entry)
         if offset + length > len(profile):
-            raise UnreadableProfile("is damaged")
+            raise DamagedProfile
         tags[name] = profile[offset:offset + length]
     return tags
 
@@ -129,7 +136,7 @@ def _read_description(tags: dict[bytes, bytes]) -> str:
 def _parse_xyz(data: bytes) -> tuple[float, float, float]:
     """Return X, Y, Z of a tag of type `XYZ`, in fixed-point numbers of 16.16 bits. Raises UnreadableProfile."""
     if len(data) < 20:
-        raise UnreadableProfile("is damaged")
+        raise DamagedProfile
     x, y, z = struct.unpack(">3i", data[8:20])
     return x / 65536, y / 65536, z / 65536
 
@@ -139,7 +146,7 @@ def _parse_curve(data: bytes) -> Table:
     if data[:4] == b"curv" and len(data) >= 12:
         count = int.from_bytes(data[8:12], "big")
         if len(data) < 12 + 2 * count:
-            raise UnreadableProfile("is damaged")
+            raise DamagedProfile
         values = np.frombuffer(data[12:12 + 2 * count], ">u2")
         if count == 0:
             return lambda x: np.asarray(x, np.float32)  # linear
@@ -154,7 +161,7 @@ def _parse_curve(data: bytes) -> Table:
             if len(data) >= 12 + 4 * parameter_count:
                 numbers = struct.unpack(f">{parameter_count}i", data[12:12 + 4 * parameter_count])
                 return _parametric_function(function_type, [number / 65536 for number in numbers])
-    raise UnreadableProfile("is damaged")
+    raise DamagedProfile
 
 
 def _power_function(gamma: float) -> Table:

@@ -54,9 +54,11 @@ def pixel_centres(width: int, height: int, like: Tensor) -> Tensor:
 def profiles(
     pixels: Tensor, centres: Tensor, covariances: Tensor, rings: Tensor | None, arcs: Tensor | None
 ) -> Tensor:
-    """Return G of n Gaussians at p pixels: (n, p), 0..1.
+    """Return the profiles G of n Gaussians at p pixels: (n, p), 0..1; the head of this module has the equations.
 
-    pixels: (p, 2) x, y; rings: (n, 2) r0 and w; arcs: (n, 3) b and m; None if there are none."""
+    pixels: (p, 2) x, y. centres: (n, 2), px. covariances: (n, 3) xx, xy, yy, px². rings: (n, 2) r0 and w, or None.
+    arcs: (n, 3) b and m, or None.
+    """
     dx, dy = (pixels[None] - centres[:, None]).unbind(-1)
     xx, xy, yy = covariances[:, :, None].unbind(1)
     q = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinants(covariances)[:, None]

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..colour import ColourSpace, colour_space
 from ..colour.cicp import space_of_code_points
-from ..colour.icc import UnreadableProfile, space_of_profile
+from ..colour.icc import DamagedProfile, UnreadableProfile, space_of_profile
 from ..errors import EngineError, FrameError
 from ..system.child import ChildDied, run_in_child
 from ..system.progress import Progress
@@ -164,9 +164,9 @@ def profile_space(path: Path, profile: bytes) -> ColourSpace | None:
         return None
     try:
         return space_of_profile(profile)
+    except DamagedProfile:
+        return None  # viewers ignore it too
     except UnreadableProfile as problem:
-        if "damaged" in str(problem):
-            return None  # viewers ignore a damaged profile too
         raise FrameError(f"{path} has a colour profile that {problem}; convert it to sRGB, or name its space with "
                          "--plate-space.") from problem
 

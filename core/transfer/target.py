@@ -123,12 +123,7 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
 
     Raises SettingsError if no picture has a light, and for two pictures of one name.
     """
-    paths = list(dict.fromkeys(paths))
-    path_by_name = {path.name: path for path in paths}
-    if len(path_by_name) < len(paths):
-        duplicate = next(path for path in paths if path_by_name[path.name] != path)
-        raise SettingsError(f"{duplicate} and {path_by_name[duplicate.name]} have one name; put the flare on them one "
-                            "after the other, each with an --out of its own.")
+    path_by_name = _unique_names(paths)
     frames, unlit = [], []
     for frame in number_views(path_by_name):
         path = path_by_name[frame.view]
@@ -138,16 +133,13 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
         positions = dict(lights) or _detect_positions(path, detector, orientation, space)
         if not positions:
             unlit.append(path.name)
-        sources_by_light = {name: source for name, source in requested.items() if name in positions}
         plane_positions = {name: ((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
                            for name, (x, y) in positions.items()}
-        if not lights:
-            sources_by_light = {**_most_similar_sources(plane_positions, training or {}), **sources_by_light}
+        similar = {} if lights else _most_similar_sources(plane_positions, training or {})
+        sources_by_light = similar | {name: source for name, source in requested.items() if name in positions}
         sources = assign_sources(list(positions), look.names, sources_by_light)
-        placed = []
-        for name, plane_position in plane_positions.items():
-            ray = np.array([*plane_position, 1.0])
-            placed.append(PlacedLight(name, sources[name], ray / np.linalg.norm(ray) * distances[sources[name]]))
+        placed = [PlacedLight(name, sources[name], _point_on_ray(plane_position, distances[sources[name]]))
+                  for name, plane_position in plane_positions.items()]
         frames.append(TargetFrame(frame, ShotFrame(frame.number, frame.view, camera, tuple(placed)), path,
                                   window=window, orientation=orientation))
     if len(unlit) == len(frames):
@@ -158,6 +150,23 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
     if missing := set(requested) - set(target.lights):
         raise SettingsError(f"The pictures have no light {min(missing)!r}; they have {', '.join(target.lights)}.")
     return target
+
+
+def _unique_names(paths: Sequence[Path]) -> dict[str, Path]:
+    """Return paths by their file names. Raises SettingsError for two different paths of one name."""
+    path_by_name: dict[str, Path] = {}
+    for path in paths:
+        other = path_by_name.setdefault(path.name, path)
+        if other != path:
+            raise SettingsError(f"{other} and {path} have one name; put the flare on them one after the other, each "
+                                "with an --out of its own.")
+    return path_by_name
+
+
+def _point_on_ray(plane_position: tuple[float, float], distance: float) -> NDArray[np.float64]:
+    """Return the point (3,) at a distance from the camera that projects to a position on the normalised plane."""
+    ray = np.array([*plane_position, 1.0])
+    return np.asarray(ray / np.linalg.norm(ray) * distance)
 
 
 def _picture_camera(look: Look, window: DataWindow, focal: float | None,

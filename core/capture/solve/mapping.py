@@ -12,7 +12,7 @@ import signal
 import sqlite3
 import threading
 import traceback
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -353,12 +353,19 @@ def _run_mapper(pycolmap: Any, work: Path, database: Path, frames: int, settings
     if failures:  # an incomplete result must not be recorded for the next solve
         raise failures[0]
     progress.check()
-    for number, model in models.items():
-        (folder / str(number)).mkdir(exist_ok=True)
-        model.write(str(folder / str(number)))
-        read_model(folder / str(number))  # pycolmap does not report a write that fails
-    write_json(work / MODELS_FILE, [str(number) for number in models])
+    _write_models(work, models)
     return list(models.values())
+
+
+def _write_models(work: Path, models: Mapping[int, Any]) -> None:
+    """Write pycolmap reconstructions into a folder each, then the list of their folders, which records the end of
+    mapping. Raises CaptureError."""
+    for number, model in models.items():
+        folder = work / MODELS_FOLDER / str(number)
+        folder.mkdir(exist_ok=True)
+        model.write(str(folder))
+        read_model(folder)  # pycolmap does not report a write that fails
+    write_json(work / MODELS_FILE, [str(number) for number in models])
 
 
 def _model_folders(work: Path) -> list[Path] | None:

@@ -20,10 +20,11 @@ INK, PATH, PAPER = (0.15, 0.15, 0.15), (0.85, 0.2, 0.1), 1.0
 
 def make_report(sources: Sequence[SourceFrame], solved: Solved, left_out: list[str], request: dict[str, Any],
                 seconds: float) -> dict[str, Any]:
-    """Return the report, JSON-able. Errors are in pixels of the small pictures.
+    """Return the figures of a camera solve as JSON values; errors in pixels of the pictures that were matched.
 
-    left_out: sentences about frames that were not used. request: source and settings of the solve, by which a later run
-    recognises it.
+    sources: all frames of the footage; `solved` has those that the solve registered. left_out: sentences about frames
+    that were not used. request: source and settings of the solve; a later run compares them with its own.
+    seconds: duration of the solve.
     """
     registered = {frame.index for frame in solved.frames}
     model = solved.model

@@ -237,12 +237,16 @@ def _list_column(column, top_row, bottom_row, tiles_x, i, slot_offset, tile_list
 
 
 @inlined
-def _list_gaussian(records, i, width, height, tiles_x, slot_offset, tile_list, place, tile_counts):
+def _list_tiles(records, i, width, height, tiles_x, slot_offset, tile_list, place, tile_counts):
     """Append the tiles of Gaussian i, of any size, to tile_list from `place` on; return the next free place.
 
-    In each column of tiles, those between the ellipse's smallest and largest y (see the module head). width, height:
-    size of the picture, px; tiles_x: tiles in a row of it; slot_offset: slot of an entry minus its place; tile_counts:
-    entries by tile, which are increased."""
+    In each column of tiles these are the tiles between the ellipse's smallest and largest y there; the module head has
+    the equations. The loop goes from column to column and reuses the rows at the edge that two columns share.
+
+    records: a record of RECORD numbers for each Gaussian (`layout`). width, height: size of the picture, px. tiles_x:
+    tiles in a row of it. slot_offset: slot of an entry minus its place. tile_counts: entries by tile, which are
+    increased.
+    """
     record = i * RECORD
     x, half_x = load_scalar(records, record + X), load_scalar(records, record + HALF_X)
     padded_half_x = half_x + ROW_MARGIN
@@ -259,15 +263,15 @@ def _list_gaussian(records, i, width, height, tiles_x, slot_offset, tile_list, p
     root_squared, shear = load_scalar(records, record + REACH) * inverse, -major * k * inverse
     root_falloff = major * inverse * (minor * inverse)
     left = np.float32(column << TILE_SHIFT_X) - x
-    low0, high0 = _ellipse_rows(half_x, root_squared, root_falloff, shear, left)
+    left_low, left_high = _ellipse_rows(half_x, root_squared, root_falloff, shear, left)
     while column <= last_column:
         right = left + np.float32(TILE_WIDTH)
-        low1, high1 = _ellipse_rows(half_x, root_squared, root_falloff, shear, right)
-        low = -half_y if left <= tip <= right else _max(_min(low0, low1), -half_y)
-        high = half_y if left <= -tip <= right else _min(_max(high0, high1), half_y)
+        right_low, right_high = _ellipse_rows(half_x, root_squared, root_falloff, shear, right)
+        low = -half_y if left <= tip <= right else _max(_min(left_low, right_low), -half_y)
+        high = half_y if left <= -tip <= right else _min(_max(left_high, right_high), half_y)
         top_row, bottom_row = _pixel_rows(y, low, high, height)
         place = _list_column(column, top_row, bottom_row, tiles_x, i, slot_offset, tile_list, place, tile_counts)
-        left, low0, high0 = right, low1, high1
+        left, left_low, left_high = right, right_low, right_high
         column += opaque_one
     return place
 
@@ -418,7 +422,7 @@ def _list_part(
             tile += np.int64(end_row > 0)
             place = _list_two_tiles(tile, first_row, end_row, tiles_x, i, slot_offset, tile_list, place, tile_counts)
         else:
-            place = _list_gaussian(records, i, width, height, tiles_x, slot - place, tile_list, place, tile_counts)
+            place = _list_tiles(records, i, width, height, tiles_x, slot - place, tile_list, place, tile_counts)
         first_slots[i] = slot
         max_tiles[i] = place - first_place
     return place

@@ -305,7 +305,10 @@ def atomic_add(typing_context, array, index, amount):  # noqa: ARG001
 
 @intrinsic
 def load_acquire(typing_context, array):  # noqa: ARG001
-    """Load the first element of an int64 array, which another thread may change, with acquire order."""
+    """Load the first element of an int64 array, which another thread may change, with acquire order.
+
+    The caller repeats this until the element changes; a pause instruction before the load spares the processor.
+    """
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         if _PAUSE:

@@ -122,7 +122,7 @@ def _blend(first: Pixels, second: Pixels, weight: Pixels) -> Pixels:
 
 
 def _draw_leaf(random: Random, width: int, height: int) -> Pixels:
-    """Return the mask (height, width) 0..1 of a blob, a polygon or an ellipse, sharp in two of three."""
+    """Draw the mask (height, width), 0..1, of a dead leaf: a blob, a polygon or an ellipse; a third of them blurred."""
     import cv2
 
     shape = ("blob", "polygon", "ellipse")[random.integers(3)]

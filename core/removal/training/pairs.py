@@ -208,7 +208,7 @@ def _flare_on_frame(layers: FlareLayers, appearance: random_cameras.FlareAppeara
 
 
 def _develop(development: random_cameras.Development, displayed: Sequence[Pixels]) -> list[Pixels]:
-    """Apply a camera's curve and saturation to all pictures, display values 0..1."""
+    """Apply a camera's curve, saturation and lift to each picture, (height, width, 3) display values 0..1."""
     contrast, saturation, lift = development
     result = []
     for picture in displayed:

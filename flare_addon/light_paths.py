@@ -19,6 +19,7 @@ from ..core.capture.lights import DOUBTFUL
 from ..core.conventions.frame_numbers import number_views
 from ..core.errors import CaptureError
 from ..core.system.files import follow_link, read_json, round_for_text, write_json
+from ..core.system.steps import FRAMES_PER_STEP, Steps
 from . import lamp_drive
 from .paths import absolute
 
@@ -138,16 +139,18 @@ def merge_entry(known_entry: Mapping[str, Any], name: str, xyz: Sequence[float],
     return entry
 
 
-def key_light_path(item: Any, light: Light, capture: Capture, scene_frames: Mapping[str, int]) -> None:
-    """Key the location of an empty, a child of the root, along the path of a light of lights.json.
+def key_light_path(item: Any, light: Light, capture: Capture, scene_frames: Mapping[str, int]) -> Steps[None]:
+    """Key the location of an empty, a child of the root, along the path of a light of lights.json, in steps.
 
     A light that is known on the picture alone is put on the rays of its pixels (`Capture.light_state`). scene_frames:
     frame of each view, by its name.
     """
-    for view in capture.views:
+    for number, view in enumerate(capture.views, 1):
         state = capture.light_state(light, view)
         item.location = [float(value) for value in state.xyz]
         item.keyframe_insert("location", frame=scene_frames[view.name])
+        if number % FRAMES_PER_STEP == 0:
+            yield
 
 
 def capture_of_moving_lights(folder: Path, lights: Sequence[Light]) -> tuple[Capture, dict[str, int]] | None:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..core.capture import LIGHTS, read_lights
 from ..core.errors import CaptureError
 from ..core.system.files import follow_link, read_json, round_for_text, write_json
+from ..core.system.steps import finish
 from . import cameras, light_paths
 from .capture.importer import add_light
 from .objects import depsgraph_of, view_layer_of, world_matrix
@@ -190,7 +191,7 @@ def import_new_lights(scene: Any, folder: Path) -> int:
         # The position of a light that moves is NaN; its keys place it.
         item = add_light(collection, scene.fit_flare.root, light.name, np.nan_to_num(light.xyz), size)
         if capture_and_frames is not None and light.moves:
-            light_paths.key_light_path(item, light, *capture_and_frames)
+            finish(light_paths.key_light_path(item, light, *capture_and_frames))
     remember_names(scene)
     return len(new_lights)
 

@@ -6,32 +6,81 @@ from typing import Any
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
+
+from .properties import redraw_viewports
 
 ATTRIBUTE = "Col"
 MAX_VERTICES = 400_000  # that are drawn; larger clouds are thinned to every second, third, ... vertex
+VERTICES_PER_DRAWING = 25_000
+"""Vertices that one drawing sends to the GPU at most."""
+REFINE_S = 0.02
+"""Time after which a drawing of a part of a cloud is followed by another."""
 
-_batches: dict[tuple[str, int], Any] = {}
+Floats = NDArray[np.float32]
+
+
+class _Cloud:
+    """The GPU batches of a point cloud, made over several drawings so that none takes long.
+
+    The first drawing of a cloud often follows its import, for which Blender computes much of its own; it makes nothing.
+    The second reads the mesh, and each later one makes one batch until all vertices are in one.
+    """
+
+    def __init__(self) -> None:
+        self._vertices: tuple[Floats, Floats] | None = None  # positions (n, 3) and linear colours (n, 4)
+        self._batches: list[Any] = []
+        self._sent = 0  # vertices in the batches
+        self._is_new = True
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all vertices are on the GPU."""
+        return self._vertices is not None and self._sent == len(self._vertices[0])
+
+    def prepare(self, mesh: Any) -> None:
+        """Do the next part of the work on the cloud of a mesh."""
+        from gpu_extras.batch import batch_for_shader
+
+        if self._is_new:
+            self._is_new = False
+        elif self._vertices is None:
+            self._vertices = _read_vertices(mesh)
+        elif not self.is_complete:
+            rows = slice(self._sent, self._sent + VERTICES_PER_DRAWING)
+            positions, colours = (np.ascontiguousarray(values[rows]) for values in self._vertices)
+            self._batches.append(batch_for_shader(_shader(), "POINTS", {"pos": positions, "color": colours}))
+            self._sent += len(positions)
+
+    def draw(self) -> None:
+        """Draw the batches."""
+        for batch in self._batches:
+            batch.draw(_shader())
+
+
+def _read_vertices(mesh: Any) -> tuple[Floats, Floats]:
+    """Return positions (n, 3) and linear colours (n, 4) of the vertices of a mesh, thinned to MAX_VERTICES."""
+    count = len(mesh.vertices)
+    positions, colours = np.empty(3 * count, np.float32), np.empty(4 * count, np.float32)
+    mesh.vertices.foreach_get("co", positions)
+    mesh.color_attributes[ATTRIBUTE].data.foreach_get("color", colours)
+    step = max(-(-count // MAX_VERTICES), 1)
+    return positions.reshape(-1, 3)[::step], colours.reshape(-1, 4)[::step]
+
+
+_clouds: dict[tuple[str, int], _Cloud] = {}
+"""By the name of the mesh and its number of vertices."""
 _handle: Any = None
 
 
-def _point_batch(mesh: Any) -> Any:
-    """Return the shader and the GPU batch of a point cloud, cached by mesh and size."""
-    from gpu_extras.batch import batch_for_shader
-
+def _cloud_of(mesh: Any) -> _Cloud:
+    """Return the cloud of a mesh, cached by its name and size."""
     key = (mesh.name, len(mesh.vertices))
-    if key not in _batches:
-        for outdated in [other for other in _batches if other[0] == mesh.name]:
-            del _batches[outdated]
-        count = len(mesh.vertices)
-        coordinates, colours = np.empty(3 * count, np.float32), np.empty(4 * count, np.float32)
-        mesh.vertices.foreach_get("co", coordinates)
-        mesh.color_attributes[ATTRIBUTE].data.foreach_get("color", colours)
-        step = max(-(-count // MAX_VERTICES), 1)
-        shader = _shader()
-        _batches[key] = shader, batch_for_shader(shader, "POINTS", {
-            "pos": np.ascontiguousarray(coordinates.reshape(-1, 3)[::step]),
-            "color": np.ascontiguousarray(colours.reshape(-1, 4)[::step])})
-    return _batches[key]
+    if key not in _clouds:
+        for outdated in [other for other in _clouds if other[0] == mesh.name]:
+            del _clouds[outdated]
+        _clouds[key] = _Cloud()
+    return _clouds[key]
 
 
 def _shader() -> Any:
@@ -56,18 +105,21 @@ def _draw() -> None:
             continue
         if not item.fit_flare.is_points or not len(item.data.vertices):
             continue
-        shader, batch = _point_batch(item.data)
+        cloud = _cloud_of(item.data)
+        cloud.prepare(item.data)
         gpu.state.depth_test_set("LESS_EQUAL")
         gpu.state.point_size_set(3.0)
         with gpu.matrix.push_pop():
             gpu.matrix.multiply_matrix(item.matrix_world)
-            batch.draw(shader)
+            cloud.draw()
         gpu.state.depth_test_set("NONE")
+        if not cloud.is_complete and not bpy.app.timers.is_registered(redraw_viewports):
+            bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
 
 
 def clear_cache() -> None:
     """Free the batches of the clouds that were drawn."""
-    _batches.clear()
+    _clouds.clear()
 
 
 def register() -> None:

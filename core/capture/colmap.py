@@ -368,7 +368,7 @@ Points = tuple[PointCloud, NDArray[np.int64]]
 
 _POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 """A point of points3D.bin, before its track of 8 bytes an entry."""
-_POINTS_PER_STEP = 1 << 15
+_POINTS_PER_STEP = 1 << 13
 _TRACK_AT = 43
 """Offset of the length of the track in a point, bytes."""
 _TRACK_LENGTH = struct.Struct("<Q")
@@ -397,6 +397,7 @@ def _read_points_bin(file: _ByteReader) -> Steps[Points]:
         yield
         byte_indices = starts[first:first + _POINTS_PER_STEP, None] + np.arange(_POINT.itemsize)
         points[first:first + len(byte_indices)] = data_bytes[byte_indices].view(_POINT)[:, 0]
+    yield
     values = np.concatenate([points["xyz"], points["error"][:, None]], 1)
     return _to_cloud(file.path, values, points["rgb"].copy()), points["id"].copy()
 

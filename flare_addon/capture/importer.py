@@ -44,8 +44,8 @@ PIXEL_ASPECT_TOLERANCE = 2e-3
 CAMERAS_PER_STEP = 10
 """Cameras with a picture each that one step adds."""
 
-CAMERAS_PER_LINK = 100
-"""Cameras that the scene gets in one step."""
+OBJECTS_PER_LINK = 100
+"""Objects that the scene gets in one step."""
 
 CameraLayout = Literal["animated", "each"]
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")
@@ -83,21 +83,21 @@ class _SceneState:
         self._current_frame, self._subframe = scene.frame_current, scene.frame_subframe
         self._render = {name: getattr(render, name) for name in (
             "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y")}
+        self._images, self._actions = set(bpy.data.images), set(bpy.data.actions)
 
     def restore(self, *collections: Any) -> None:
-        """Restore size and frames of the scene, and remove collections with their objects and the objects' data."""
+        """Restore size and frames of the scene, and remove collections with their objects and what only these used."""
         scene = self._scene
         scene.frame_start, scene.frame_end = self._range
         for name, value in self._render.items():
             setattr(scene.render, name, value)
         scene.frame_set(self._current_frame, subframe=self._subframe)
-        for collection in collections:
-            for item in list(collection.objects):
-                data = item.data
-                bpy.data.objects.remove(item)
-                if data is not None and not data.users:
-                    bpy.data.batch_remove([data])
-            bpy.data.collections.remove(collection)
+        objects = [item for collection in collections for item in collection.objects]
+        data = {item.data for item in objects if item.data is not None}
+        bpy.data.batch_remove([*objects, *collections])
+        bpy.data.batch_remove([block for block in data if not block.users])
+        added = [*(set(bpy.data.images) - self._images), *(set(bpy.data.actions) - self._actions)]
+        bpy.data.batch_remove([block for block in added if not block.users])
 
 
 def find_capture(path: Path | str) -> Path:
@@ -127,7 +127,7 @@ def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) ->
     folder = find_capture(folder)
     capture = yield from Capture.open_in_steps(folder, need_frames=settings.frames)
     collection = bpy.data.collections.new(folder.resolve().name)
-    unlinked = bpy.data.collections.new("Imported Cameras")
+    unlinked = bpy.data.collections.new("Imported Objects")
     previous_state = _SceneState(scene)
     try:
         imported = yield from _add_capture(scene, folder, settings, capture, collection, unlinked)
@@ -142,34 +142,34 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
                  ) -> Steps[Imported]:
     """Add the objects of a capture, in steps, to a new collection.
 
-    After each object that the scene gets, Blender builds its dependency graph and draws anew, which takes longer the
-    more objects there are. The points therefore come first, and the cameras are made in the collection `unlinked`,
-    which no scene has, and moved over a few times CAMERAS_PER_LINK.
+    After each step in which the scene gets objects, Blender builds its dependency graph and draws anew, which takes
+    longer the more objects there are. All objects are therefore made in the collection `unlinked`, which no scene has,
+    and moved over OBJECTS_PER_LINK at a time; the last ones in one step with the scene's new camera.
     """
     notes: list[str] = []
     extent = capture.extent
-    scene.collection.children.link(collection)
-    root = _add_object(collection, f"{collection.name} Root", None, None)
+    root = _add_object(unlinked, f"{collection.name} Root", None, None)
     root.empty_display_type, root.empty_display_size = "ARROWS", 0.2 * extent
     root.rotation_euler, root.scale = UP_ROTATIONS[settings.up], (settings.scale,) * 3
     yield
-    if settings.points and len(capture.points):
-        mesh = _make_points_mesh(capture.points)
-        yield PAUSE
-        _add_points(collection, root, mesh)
-        yield PAUSE
-    camera_objects = yield from _add_cameras(unlinked, root, capture, extent, settings, scene, notes)
-    for number, camera in enumerate(camera_objects, 1):
-        collection.objects.link(camera)
-        unlinked.objects.unlink(camera)
-        if number % CAMERAS_PER_LINK == 0 or number == len(camera_objects):
-            yield PAUSE
-    lights = tuple(add_light(collection, root, light.name, np.nan_to_num(light.xyz), 0.02 * extent)
+    frame_numbers = {frame.view: frame.number for frame in number_views(view.name for view in capture.views)}
+    yield
+    camera_objects = yield from _add_cameras(unlinked, root, capture, frame_numbers, settings, scene, notes)
+    lights = tuple(add_light(unlinked, root, light.name, np.nan_to_num(light.xyz), 0.02 * extent)
                    for light in capture.lights)
-    scene_frames = {frame.view: frame.number for frame in number_views(view.name for view in capture.views)}
     for item, light in zip(lights, capture.lights, strict=True):
         if light.moves:
-            light_paths.key_light_path(item, light, capture, scene_frames)
+            yield from light_paths.key_light_path(item, light, capture, frame_numbers)
+    points = []
+    if settings.points and len(capture.points):
+        mesh = yield from _make_points_mesh(capture.points)
+        points.append(_add_points(unlinked, root, mesh))
+    scene.collection.children.link(collection)
+    for number, item in enumerate((root, *camera_objects, *lights, *points), 1):
+        collection.objects.link(item)
+        unlinked.objects.unlink(item)
+        if number % OBJECTS_PER_LINK == 0:
+            yield PAUSE
     yield  # the last place at which a cancel finds the scene's own state unchanged
     _assign_to_scene(scene, folder, settings, capture, root)
     scene.camera = camera_objects[0]
@@ -211,17 +211,17 @@ def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> A
 # ---- cameras --------------------------------------------------------------------------------------
 
 
-def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, settings: ImportSettings, scene: Any,
-                 notes: list[str]) -> Steps[tuple[Any, ...]]:
+def _add_cameras(collection: Any, root: Any, capture: Capture, frame_numbers: Mapping[str, int],
+                 settings: ImportSettings, scene: Any, notes: list[str]) -> Steps[tuple[Any, ...]]:
     """Add the cameras, with animation and frames as the settings say, in steps; append warnings to `notes`.
 
-    extent: size of the capture, world units, relative to which the cameras are drawn.
+    frame_numbers: frame of the scene of each view by its name, ordered by folder and number.
     """
-    numbered_views = number_views(view.name for view in capture.views)
-    frame_numbers = {frame.view: frame.number for frame in numbered_views}
+    extent = capture.extent  # the cameras are drawn relative to it
     folders: dict[str, list[View]] = {}
-    for frame in numbered_views:
-        folders.setdefault(Path(frame.view).parent.as_posix(), []).append(capture.view(frame.view))
+    for name in frame_numbers:
+        folders.setdefault(Path(name).parent.as_posix(), []).append(capture.view(name))
+    yield
     first = capture.views[0].camera
     aspect = cameras.pixel_aspect(first.fx, first.fy)
     if settings.match_scene:
@@ -429,16 +429,24 @@ def _add_background(camera: Any, image: Any) -> Any:
 # ---- points and objects -------------------------------------------------------------------------------------
 
 
-def _make_points_mesh(cloud: PointCloud) -> Any:
-    """Return the point cloud as a new mesh of vertices with the colour attribute "Col"."""
-    mesh = bpy.data.meshes.new("Points")
-    mesh.vertices.add(len(cloud))
-    mesh.vertices.foreach_set("co", np.ascontiguousarray(cloud.xyz, np.float32).ravel())
-    colours = mesh.color_attributes.new("Col", "BYTE_COLOR", "POINT")
+def _make_points_mesh(cloud: PointCloud) -> Steps[Any]:
+    """Return the point cloud as a new mesh of vertices with the colour attribute "Col", in steps."""
     rgba = np.ones((len(cloud), 4), np.float32)
     rgba[:, :3] = cloud.rgb / np.float32(255)
-    colours.data.foreach_set("color_srgb", rgba.ravel())
-    mesh.update()
+    xyz = np.ascontiguousarray(cloud.xyz, np.float32).ravel()
+    yield
+    mesh = bpy.data.meshes.new("Points")
+    try:
+        mesh.vertices.add(len(cloud))
+        mesh.vertices.foreach_set("co", xyz)
+        yield
+        colours = mesh.color_attributes.new("Col", "BYTE_COLOR", "POINT")
+        colours.data.foreach_set("color_srgb", rgba.ravel())
+        mesh.update()
+        yield
+    except BaseException:  # GeneratorExit too, before an object has the mesh
+        bpy.data.meshes.remove(mesh)
+        raise
     return mesh
 
 

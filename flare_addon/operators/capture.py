@@ -7,10 +7,10 @@ from pathlib import Path
 
 import bpy
 
-from ...core.system.steps import PAUSE, finish
+from ...core.system.steps import PAUSE, Steps, finish
 from .. import fits
 from ..capture import exporter
-from ..capture.importer import Imported, ImportSettings, import_in_steps
+from ..capture.importer import ImportSettings, import_in_steps
 from ..reports import NO_CAMERA, GuardedOperator, report_errors
 
 STEP_S = 0.01
@@ -52,8 +52,10 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
 
     _in_steps = False
     """Whether a person called the operator, who sees the window; a script waits for the end."""
-    _is_shown = False
-    """Whether the import is complete."""
+    _is_complete = False
+    """Whether all is imported, after which ESC cancels nothing."""
+    _rests = False
+    """Whether the present turn is the window's own."""
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         self._in_steps = True
@@ -76,9 +78,9 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
             if not path.exists() and self.directory:
                 path = Path(bpy.path.abspath(self.directory))
             settings = ImportSettings(self.cameras, self.up, self.scale, self.frames, self.points, self.match_scene)
-            self._name, self._steps = path.name, import_in_steps(context.scene, path, settings)
+            self._name, self._steps = path.name, self._import_and_show(context, path, settings)
             if not self._in_steps:
-                self._report_imported(context, finish(self._steps))
+                finish(self._steps)
                 return outcome.status
             manager = context.window_manager
             self._timer = manager.event_timer_add(INTERVAL_S, window=context.window)
@@ -88,25 +90,28 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         return outcome.status
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Go on with the import; other events wait, so that nothing else changes the scene meanwhile."""
-        if self._is_shown:  # in a turn of its own, since Blender stores the undo step at the end
-            self.cancel(context)
-            return {"FINISHED"}
-        if event.type == "ESC":
+        """Go on with the import; other events wait, so that nothing else changes the scene meanwhile.
+
+        Every other turn is left to the window, so that what Blender computes and draws after a step does not add to the
+        next step.
+        """
+        if event.type == "ESC" and not self._is_complete:
             self.cancel(context)
             self.report({"INFO"}, "The import was cancelled")
             return {"CANCELLED"}
         if event.type != "TIMER":
+            return {"RUNNING_MODAL"}
+        self._rests = not self._rests
+        if self._rests:
             return {"RUNNING_MODAL"}
         start = time.perf_counter()
         with report_errors(self) as outcome:
             try:
                 while next(self._steps) != PAUSE and time.perf_counter() - start < STEP_S:
                     pass
-            except StopIteration as end:
-                self._report_imported(context, end.value)
-                self._is_shown = True
-            return {"RUNNING_MODAL"}
+                return {"RUNNING_MODAL"}
+            except StopIteration:
+                pass
         self.cancel(context)
         return outcome.status
 
@@ -116,14 +121,32 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         context.window_manager.event_timer_remove(self._timer)
         context.workspace.status_text_set(None)
 
-    def _report_imported(self, context: bpy.types.Context, imported: Imported) -> None:
-        """Report what was imported, and turn the view to its camera. Raises RunError."""
+    def _import_and_show(self, context: bpy.types.Context, path: Path, settings: ImportSettings) -> Steps[None]:
+        """Import the capture at `path`, report it, and turn the view to its camera, in steps. Raises FitFlareError.
+
+        Blender builds its dependency graph for the new camera, loads the first picture, draws it, and stores an undo
+        step at the end: each in a turn of its own.
+        """
+        imported = yield from import_in_steps(context.scene, path, settings)
+        self._is_complete = True
         fits.clear_other_run(context.scene)
         fits.expose_cameras(context.scene, fits.run_folder(context.scene))
         for note in imported.notes:
             self.report({"WARNING"}, note)
         self.report({"INFO"}, f"{self._name}: cameras {len(imported.cameras)}, lights {len(imported.lights)}")
+        yield PAUSE
+        if self._in_steps:
+            _load_footage(context.scene)
+            yield PAUSE
         _look_through_camera(context)
+        yield PAUSE
+
+
+def _load_footage(scene: bpy.types.Scene) -> None:
+    """Load the picture behind the scene's camera at the current frame to the GPU; one that is missing is left out."""
+    for background in scene.camera.data.background_images:
+        if background.image is not None:
+            background.image.gl_load(frame=scene.frame_current)
 
 
 def _look_through_camera(context: bpy.types.Context) -> None:

@@ -79,14 +79,25 @@ def test_footage_moves_with_its_project(facts: Any) -> None:
 
 def test_a_cancelled_import_leaves_nothing(facts: Any) -> None:
     """Block of projects.py: "an import that is cancelled"."""
-    assert facts["cancelled import"] == [True, True, True]
+    assert facts["cancelled import"] == [True] * 5
 
 
-def test_the_scene_gets_the_cameras_of_a_capture_in_portions(facts: Any) -> None:
+def test_the_scene_gets_the_objects_of_a_capture_in_portions(facts: Any) -> None:
     """Block of projects.py: "an import that is cancelled"."""
-    portions, count, unused_collections = facts["portions of cameras"]
-    assert count > 2 and portions == [*range(0, count, 2), count]
+    portions, count, unused_collections = facts["portions of objects"]
+    assert count > 4 and portions == list(range(2, count + 1, 2))
     assert unused_collections == []
+
+
+def test_an_import_leaves_every_other_turn_to_the_window(facts: Any) -> None:
+    """Block of projects.py: "an import that is cancelled". Steps that were done after each turn."""
+    assert facts["turns"] == [0, 1, 1, 2, 2, 3, 3]
+
+
+def test_a_cloud_is_sent_to_the_gpu_over_several_drawings(facts: Any) -> None:
+    """Block of projects.py: "a large cloud"."""
+    drawings, most = facts["cloud"]
+    assert drawings == [[], [], [most], [most, most], [most, most, 5]]
 
 
 def test_lights_follow_a_fit_in_a_scene_that_no_window_shows(facts: Any) -> None:

@@ -136,9 +136,9 @@ try:
 except errors.FitFlareError as problem:
     facts["an empty"] = str(problem)
 overlay, points = part("flare_addon.overlay"), part("flare_addon.points")
-overlay.last_error, points._batches["Points", 3] = "That is wrong.", None
+overlay.last_error, points._clouds["Points", 3] = "That is wrong.", None
 empty()
-facts["another file"] = [overlay.last_error, len(points._batches)]
+facts["another file"] = [overlay.last_error, len(points._clouds)]
 
 # ---- lamps of a linked asset ------------------------------------------------------------------------
 scene = empty()

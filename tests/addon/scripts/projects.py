@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import shutil
 import sys
+from functools import partial
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import bpy
 
@@ -160,7 +162,8 @@ importer, scene = part("flare_addon.capture.importer"), empty()
 def all_of_it():
     return [scene.frame_end, scene.frame_current, scene.frame_subframe, scene.render.resolution_x,
             scene.fit_flare.capture,
-            *(len(getattr(bpy.data, kind)) for kind in ("objects", "collections", "cameras", "meshes"))]
+            *(len(getattr(bpy.data, kind)) for kind in ("objects", "collections", "cameras", "meshes", "images",
+                                                                "actions"))]
 
 
 scene.frame_set(3, subframe=0.25)
@@ -173,13 +176,48 @@ for _ in steps:
 grown = all_of_it()
 steps.close()
 facts["cancelled import"] = [before == all_of_it(), grown != before, steps_before_cameras > 5]
-importer.CAMERAS_PER_LINK, portions = 2, []
-for pause in importer.import_in_steps(scene, capture, importer.ImportSettings("each")):
-    count = sum(item.type == "CAMERA" for item in scene.objects)
-    if pause is not None and (not portions or count > portions[-1]):
-        portions.append(count)
-facts["portions of cameras"] = [portions, len(bpy.data.cameras),
+for kind in ("each", "animated"):
+    for _ in (steps := importer.import_in_steps(scene, capture, importer.ImportSettings(kind))):
+        if any(item.type == "MESH" for item in scene.objects):  # all objects are in the scene
+            break
+    steps.close()
+    facts["cancelled import"].append(before == all_of_it())
+importer.OBJECTS_PER_LINK = 2
+portions = [len(scene.objects) for pause in importer.import_in_steps(scene, capture, importer.ImportSettings("each"))
+            if pause is not None]
+facts["portions of objects"] = [portions, len(scene.objects),
                                 [item.name for item in bpy.data.collections if not item.users]]
+
+operators = part("flare_addon.operators.capture")
+done = []
+
+
+def three_steps():
+    for number in range(3):
+        done.append(number)
+        yield operators.PAUSE
+
+
+operator = SimpleNamespace(_steps=three_steps(), _rests=False, _is_complete=False, cancel=lambda _context: None,
+                           report=lambda *_words: None)
+turns, turn = [], partial(operators.FITFLARE_OT_import_capture.modal, operator, bpy.context,
+                         SimpleNamespace(type="TIMER"))
+while "FINISHED" not in turn():
+    turns.append(len(done))
+facts["turns"] = turns
+
+# ---- a large cloud -------------------------------------------------------------------------------------
+points, batch = part("flare_addon.points"), sys.modules.setdefault("gpu_extras.batch", ModuleType("batch"))
+batch.batch_for_shader = lambda _shader, _kind, content: len(content["pos"])
+points._shader = lambda: None
+mesh = bpy.data.meshes.new("Cloud")
+mesh.vertices.add(2 * points.VERTICES_PER_DRAWING + 5)
+mesh.color_attributes.new(points.ATTRIBUTE, "BYTE_COLOR", "POINT")
+cloud, drawings = points._Cloud(), []
+while not cloud.is_complete:
+    cloud.prepare(mesh)
+    drawings.append(list(cloud._batches))
+facts["cloud"] = [drawings, points.VERTICES_PER_DRAWING]
 
 # ---- a fit that ends while its scene is not the one in the window ---------------------------------------
 looks, lights = part("flare_addon.looks"), part("flare_addon.lights")

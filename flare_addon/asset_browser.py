@@ -44,8 +44,8 @@ def library_entry() -> Any:
                  if Path(entry.path).resolve() == folder().resolve()), None)
 
 
-def list_looks() -> int:
-    """Write the asset library, and list it in Blender's preferences; return the number of looks.
+def add_asset_library() -> int:
+    """Write the asset library, and add it to Blender's preferences; return the number of looks.
 
     Raises FlareFileError where no look can be read.
     """
@@ -57,7 +57,7 @@ def list_looks() -> int:
     return count
 
 
-def unlist_looks() -> None:
+def remove_asset_library() -> None:
     """Remove the asset library from Blender's preferences."""
     entry = library_entry()
     if entry is not None:

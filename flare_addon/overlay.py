@@ -226,8 +226,11 @@ def _shader(name: str) -> Any:
     return _shaders[name]
 
 
-def _offscreen(divisor: int, width: int, height: int, texture_format: str) -> Any:
-    """Return the buffer of a level for a region of this size; one of another size or format is freed."""
+def _offscreen_buffer(divisor: int, width: int, height: int, texture_format: str) -> Any:
+    """Return the cached buffer of a level, whose size is that of the region (pixels) divided by `divisor`, rounded up.
+
+    A buffer of this level with another size or format is freed.
+    """
     import gpu
 
     size = max(-(-width // divisor), 1), max(-(-height // divisor), 1)
@@ -264,7 +267,7 @@ def render_levels(gaussians: PlaneGaussians | None, window: DrawnRegion, look: L
     texture_format = "RGBA16F" if gaussians is None or len(gaussians) <= MAX_IN_HALF_FLOAT else "RGBA32F"
     buffers = []
     for divisor in LEVELS:
-        offscreen = _offscreen(divisor, window.width, window.height, texture_format)
+        offscreen = _offscreen_buffer(divisor, window.width, window.height, texture_format)
         with offscreen.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
             if divisor in by_level:

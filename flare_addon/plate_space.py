@@ -57,8 +57,11 @@ def show_recorded(scene: Any, capture: Path) -> None:
     scene.fit_flare.plate_space = recorded_name(capture)
 
 
-def clear_record(state: Any, _context: Any) -> None:
-    """Remove the space that the capture keeps when the field is emptied; show it again where it cannot be removed."""
+def clear_recorded_space(state: Any, _context: Any) -> None:
+    """Remove the colour space that a capture records if the artist has emptied the field `plate_space`.
+
+    If it cannot be removed, the field shows it again. Blender calls this after each change of the field.
+    """
     if state.plate_space.strip() or not state.capture:
         return
     capture = absolute(state.capture, state.id_data.library)

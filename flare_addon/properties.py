@@ -25,7 +25,7 @@ from bpy.props import (
 from ..core.choices import ITERATIONS, Mode, Preset
 from ..core.conventions.exposures import MIN_EXPOSURE
 from ..core.look import Edit
-from .plate_space import clear_record, search_names
+from .plate_space import clear_recorded_space, search_names
 
 # From 4.5 on this option permits paths relative to the .blend; earlier versions do not know it.
 PATH_OPTIONS = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
@@ -225,7 +225,7 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     plate_space: StringProperty(  # type: ignore[valid-type]
         name="Colour Space", description="Colour space of the frames, where their files do not declare it: a camera's "
         "logarithm (logc4, slog3, vlog, ...) or a colour space of Blender. If empty, the capture or the files declare "
-        "it", search=search_names, search_options={"SUGGESTION"}, update=clear_record)
+        "it", search=search_names, search_options={"SUGGESTION"}, update=clear_recorded_space)
     matte: StringProperty(  # type: ignore[valid-type]
         name="Matte", description="Where the flares are, roughly painted in white on black: one picture for all "
         "frames, or a folder with one of the same name for each. In white areas, faint flares are removed too; in "

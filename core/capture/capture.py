@@ -136,12 +136,9 @@ class Capture:
         yield
         matched = yield from match_frames_in_steps(solve)
         yield
-        turned = list(filter(None, (turned_frame(frame, matched.files.get(frame.name)) for frame in solve.frames)))
-        upright, orientation_warnings = (find_upright(turned, solve.points) if has_cameras
-                                         else ({frame.posed.name for frame in turned}, []))  # without a solve
-        turned_by_name = {frame.posed.name: frame for frame in turned if frame.posed.name in upright}
+        upright_frames, orientation_warnings = _upright_frames(solve, matched.files, has_cameras)
         yield
-        opened = yield from _open_views_in_steps(folder, solve, matched.files, upright, turned_by_name, need_frames)
+        opened = yield from _open_views_in_steps(folder, solve, matched.files, upright_frames, need_frames)
         names = opened.names
         lights = read_lights(find_entry(folder, LIGHTS) or folder / LIGHTS)
         yield
@@ -462,12 +459,25 @@ class _OpenedViews:
     names: dict[str, str] = field(default_factory=dict)
 
 
-def _open_views_in_steps(folder: Path, solve: CameraSolve, files: Mapping[str, Path], upright: set[str],
-                         turned: Mapping[str, TurnedFrame], need_frames: bool) -> Steps[_OpenedViews]:
+def _upright_frames(solve: CameraSolve, files: Mapping[str, Path],
+                    has_cameras: bool) -> tuple[dict[str, TurnedFrame], list[str]]:
+    """Return the frames that were solved from the picture as its Exif orientation turns it, by the name of the pose,
+    and sentences for the user.
+
+    files: pictures by pose name. has_cameras: if False, there was no solve, and all turned frames count.
+    """
+    turned = [frame for pose in solve.frames if (frame := turned_frame(pose, files.get(pose.name))) is not None]
+    upright, warnings = (find_upright(turned, solve.points) if has_cameras
+                         else ({frame.posed.name for frame in turned}, []))
+    return {frame.posed.name: frame for frame in turned if frame.posed.name in upright}, warnings
+
+
+def _open_views_in_steps(folder: Path, solve: CameraSolve, files: Mapping[str, Path],
+                         upright_frames: Mapping[str, TurnedFrame], need_frames: bool) -> Steps[_OpenedViews]:
     """Check the pictures of the poses, and make views of them. Raises CaptureError and FrameError.
 
-    files: pictures by pose name. upright: names of the poses solved from the picture as its Exif orientation turns it;
-    turned: these frames by name. need_frames: if False, a view without a picture gets the size of its model.
+    files: pictures by pose name. upright_frames: those of `_upright_frames`. need_frames: if False, a view without a
+    picture gets the size of its model.
     """
     opened = _OpenedViews()
     for number, frame in enumerate(solve.frames):
@@ -478,11 +488,11 @@ def _open_views_in_steps(folder: Path, solve: CameraSolve, files: Mapping[str, P
             continue  # left out; if no pose has a picture, the check of the first size says so
         path = path or safe_join(solve.root, frame.name, CaptureError)
         read_size = checked_size if need_frames else size_or_model_size
-        size = read_size(path, frame.lens, turned.get(frame.name))
+        size = read_size(path, frame.lens, upright_frames.get(frame.name))
         name = view_name(frame.name, solve.root == folder)
         if name in opened.files:
             raise CaptureError(f"{folder}: the frame {name} has two poses; remove one of them.")
-        opened.views.append(_to_view(name, frame, size, frame.name in upright))
+        opened.views.append(_to_view(name, frame, size, frame.name in upright_frames))
         # The order counts poses without a picture as well, so that a missing one does not change the split.
         opened.files[name], opened.order[name], opened.names[frame.name] = path, number, name
     return opened

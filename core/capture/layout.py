@@ -37,7 +37,10 @@ def check_is_folder(folder: Path) -> None:
 
 
 def find_models(folder: Path, places: Iterable[str] = MODEL_PLACES) -> list[Path]:
-    """Return the folders of the COLMAP models of a capture, in natural order within each place."""
+    """Return the folders of the COLMAP models of a capture: place after place, numbered ones in natural order.
+
+    places: paths relative to `folder`, of which a last part * stands for all numbered folders.
+    """
     models: list[Path] = []
     for place in places:
         parent = find_entry(folder, place.removesuffix("/*"))

@@ -136,15 +136,16 @@ def initial_flare(capture: Capture, views: tuple[View, ...], frames: Frames, set
     return FlareModel(names, positions, flares, frame_lights)
 
 
-def _views_in_front(number: int, views: tuple[View, ...], positions: torch.Tensor, frame_lights: FrameLights | None
+def _views_in_front(light_index: int, views: tuple[View, ...], positions: torch.Tensor, frame_lights: FrameLights | None
                     ) -> list[ViewOfLight]:
-    """Return the light of this number as seen from each of the views that have it in front of the camera.
+    """Return how each view sees a light, for the views that have it in front of the camera.
 
-    positions: (lights, 3), world units, used if `frame_lights` is None. frame_lights: the lights' places by frame.
+    light_index: number of the light, from 0. positions: (lights, 3), world units, used if `frame_lights` is None.
+    frame_lights: the lights' positions by frame.
     """
     light_views = []
     for view in views:
-        xyz = (positions if frame_lights is None else frame_lights.positions[frame_lights.rows[view.name]])[number]
+        xyz = (positions if frame_lights is None else frame_lights.positions[frame_lights.rows[view.name]])[light_index]
         light_views.append(ViewOfLight.of(torch.from_numpy(view.camera.world_to_camera), xyz))
     return [light_view for light_view in light_views if light_view.depth > 0]
 

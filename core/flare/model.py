@@ -89,8 +89,10 @@ class LightFlare(nn.Module):
 
     def __init__(self, form: FlareForm, query_range: QueryRange, count: int, generator: torch.Generator,
                  opacity: float = 0.05, scale: float = 1.0) -> None:
-        """count, opacity: number and opacity of the initial Gaussians. scale: the `plane_scale` of the frames that the
-        flare is fitted to.
+        """Make random initial Gaussians and their deformation network.
+
+        count, opacity: number and opacity (0..1) of the Gaussians. scale: `plane_scale` of the frames that the flare is
+        fitted to.
         """
         super().__init__()
         self.form, self.query_range, self.scale = form, query_range, scale

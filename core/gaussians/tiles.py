@@ -59,8 +59,11 @@ class _Chunk:
     With arcs: a_u and a_v, coefficients of u and v."""
 
     def __init__(self, gaussians: WhitenedGaussians, index: Tensor, origins: Tensor, pixels: Tensor) -> None:
-        """Evaluate the profiles. index (b, k): rows of `gaussians`; origins (b, 2): middles of the tiles, px; pixels:
-        from `_tile_pixels`."""
+        """Evaluate the profiles of Gaussians at the pixels of tiles.
+
+        index: (b, k) rows of `gaussians`. origins: (b, 2) middles of the tiles, px. pixels: (TILE², 3) of
+        `_tile_pixels`.
+        """
         self.gaussians, self.pixels = gaussians, pixels
         places = gaussians.places[index]
         places[..., :2] -= origins[:, None]

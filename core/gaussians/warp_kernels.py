@@ -65,9 +65,8 @@ def _kernels(channels: int) -> tuple[Any, Any]:
     Gradients = wp.types.vector(length=1 + channels + PLACES + SHAPES, dtype=wp.float32)
     VALUES, PLACE, SHAPE = 1, 1 + channels, 1 + channels + PLACES  # offsets in Gradients
 
-    # Each thread draws one pixel. entries: Gaussians' rows, tile by tile; starts: offset of each tile's entries;
-    # columns: tiles in a row; add: the blend is "add", else "over"; median_rows: row at which transmittance falls below
-    # 1/2.
+    # Both kernels run a thread for each pixel. entries: Gaussians' rows, tile by tile. starts: offset of each tile's
+    # entries. columns: tiles in a row. add: the blend is "add", else "over".
     @wp.kernel(enable_backward=False, module="unique")
     def forward(
         entries: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int32), columns: int,
@@ -75,6 +74,7 @@ def _kernels(channels: int) -> tuple[Any, Any]:
         shapes: wp.array(dtype=_Shape), rings: bool, arcs: bool, add: bool,
         picture: wp.array(dtype=Values), median_rows: wp.array(dtype=wp.int32),
     ):  # fmt: skip
+        """Draw one pixel, front to back; store its values, and the row at which transmittance falls below 1/2."""
         i = wp.tid()
         tile, pixel = i // BLOCK, i % BLOCK
         x = float((tile % columns) * TILE + pixel % TILE) + 0.5
@@ -101,8 +101,6 @@ def _kernels(channels: int) -> tuple[Any, Any]:
         picture[i] = total
         median_rows[i] = median_row
 
-    # Adds the gradients of each Gaussian to its row of `sums`, whose columns are: peak, values, place, shape.
-    # upstream: gradient of the picture.
     @wp.kernel(enable_backward=False, module="unique")
     def backward(
         entries: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int32), columns: int,
@@ -110,6 +108,8 @@ def _kernels(channels: int) -> tuple[Any, Any]:
         shapes: wp.array(dtype=_Shape), rings: bool, arcs: bool, add: bool,
         picture: wp.array(dtype=Values), upstream: wp.array(dtype=Values), sums: wp.array(dtype=Gradients),
     ):  # fmt: skip
+        """Add the gradients of one pixel to each Gaussian's row of `sums`, whose columns are: peak, values, place,
+        shape. upstream: gradient of the picture."""
         i = wp.tid()
         tile, pixel = i // BLOCK, i % BLOCK
         x = float((tile % columns) * TILE + pixel % TILE) + 0.5

@@ -87,7 +87,8 @@ def _png_space(path: Path) -> ColourSpace | None:
 
 
 def _parse_chromaticities(chunk: bytes) -> Chromaticities | None:
-    """Return the primaries of cHRM in EXR's order; None where it is missing, spans no space, or is Rec. 709."""
+    """Return the chromaticities of a PNG's cHRM in EXR's order; None if it is missing, spans no space or is Rec. 709.
+    """
     if len(chunk) != 32:
         return None
     white_x, white_y, *primaries = (np.frombuffer(chunk, ">u4") / 100_000).tolist()

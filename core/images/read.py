@@ -163,7 +163,7 @@ def _is_corrupt_tiff(path: Path) -> bool:
 
 
 def _decode_jpeg(path: Path) -> NDArray[Any]:
-    """Decode a JPEG to (height, width) or B G R.
+    """Decode a JPEG to 8 bit codes: grey (height, width), or B G R (height, width, 3).
 
     Raises FrameError if the data end early or are corrupt; OpenCV and OpenImageIO would fill in grey areas.
     """

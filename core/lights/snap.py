@@ -240,7 +240,8 @@ def _are_merged(views: Sequence[FlareView], positions: Floats) -> NDArray[np.boo
 
 
 def _are_in_reach(views: Sequence[FlareView], initial: Floats, positions: Floats) -> NDArray[np.bool_]:
-    """Return (n,), True for each position within MAX_OFFSET of the initial one in the median view.
+    """Return (n,), true for each position that in the median view lies within MAX_OFFSET widest windows of the initial
+    one.
 
     A position farther away would be that of a ghost of a light out of frame.
     """

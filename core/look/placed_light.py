@@ -215,10 +215,13 @@ def _blur(gaussians: PlaneGaussians, motions: NDArray[np.float64], spread: NDArr
 
 
 def _profile_integrals(gaussians: PlaneGaussians, low_pass: float) -> NDArray[np.float64]:
-    """Return the integrals (n,) of the profiles as they are drawn, but for their arcs, which a blur hardly changes.
+    """Return the integrals (n,) of the profiles over the plane, in units of the covariances.
 
-    low_pass: variance that the rasterizer adds. The integral of exp(-(r - r0)^2 / (2 w^2)) over the plane is 2 pi times
-    w^2 exp(-r0^2 / (2 w^2)) + r0 w sqrt(pi / 2) (1 + erf(r0 / (w sqrt 2)))."""
+    Arcs are left out, since a blur hardly changes them. low_pass: variance that the rasterizer adds.
+
+    The integral of exp(-(r - r0)^2 / (2 w^2)) over the plane is 2 pi times
+    w^2 exp(-r0^2 / (2 w^2)) + r0 w sqrt(pi / 2) (1 + erf(r0 / (w sqrt 2))).
+    """
     xx, xy, yy = gaussians.covariances.T.astype(np.float64)
     areas = 2 * np.pi * np.sqrt(np.maximum((xx + low_pass) * (yy + low_pass) - xy * xy, 1e-30))
     if gaussians.rings is None:

@@ -160,8 +160,8 @@ def _score_picture(picture: Pixels, truth: Pixels, mask: Pixels | None,
                    lpips: Perceptual | None) -> Scores:
     """Return the scores of a picture against the truth; None for a score that is infinite or cannot be computed.
 
-    mask: display values (height, width, 3); masked_psnr is over the pixels with a channel above 0.5. None: no such
-    score.
+    mask: display values (height, width, 3); masked_psnr is the PSNR over the pixels with a channel above 0.5. Without
+    a mask the scores have no masked_psnr.
     """
     small = min(picture.shape[:2]) < 11  # SSIM's window does not fit
     scores: Scores = {"psnr": psnr(picture, truth), "ssim": None if small else ssim(picture, truth),

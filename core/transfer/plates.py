@@ -86,24 +86,30 @@ class ColouredPlate:
         is_lit = undo_orientation((light != 0).any(-1, keepdims=True), self.orientation)
         alpha, stored_alpha = self.alpha, self.plate.alpha
         if stored_alpha is not None and alpha is not None:
-            lit_picture = np.maximum(self.linear + light, 0)
-            lit_alpha = alpha_with_light(alpha, lit_picture)
-            max_value = np.float32(np.iinfo(stored_alpha.dtype).max if stored_alpha.dtype.kind == "u" else 1)
-            if stored_alpha.dtype.kind == "u":  # the colours belong to the alpha as it is stored
-                # A rounding error must not add a code.
-                lit_alpha = np.ceil(lit_alpha * max_value - np.float32(1e-3)) / max_value
-            values = self.space.from_linear(lit_picture / np.maximum(lit_alpha, 1e-6)[..., None])
-            if self.plate.straight_alpha is None:  # the file's colours are multiplied by its alpha
-                values = values * lit_alpha[..., None]
-            new_alpha = undo_orientation(lit_alpha, self.orientation) * max_value
-            new_alpha = np.round(new_alpha) if max_value > 1 else new_alpha
-            stored_alpha = np.where(is_lit[..., 0], np.maximum(new_alpha.astype(stored_alpha.dtype), stored_alpha),
-                                    stored_alpha)
+            values, lit_alpha = self._lit_values_and_alpha(light, alpha, stored_alpha.dtype)
+            stored_alpha = np.where(is_lit[..., 0], np.maximum(lit_alpha, stored_alpha), stored_alpha)
         elif self.space.is_linear:
             values = self.values + self.space.from_linear(light)
         else:
             values = self.space.from_linear(self.linear + light)
         return np.where(is_lit, self._to_codes(values), self.plate.codes), stored_alpha
+
+    def _lit_values_and_alpha(self, light: Pixels, alpha: Pixels, dtype: np.dtype[Any]) -> tuple[Pixels, NDArray[Any]]:
+        """Return values (height, width, 3), and alpha as stored, of a PNG or TIFF whose alpha grows under the light.
+
+        alpha: (height, width), 0..1, of the plate. dtype: type of the stored alpha.
+        """
+        lit_picture = np.maximum(self.linear + light, 0)
+        lit_alpha = alpha_with_light(alpha, lit_picture)
+        max_value = np.float32(np.iinfo(dtype).max if dtype.kind == "u" else 1)
+        if dtype.kind == "u":  # the colours belong to the alpha as it is stored
+            # A rounding error must not add a code.
+            lit_alpha = np.ceil(lit_alpha * max_value - np.float32(1e-3)) / max_value
+        values = self.space.from_linear(lit_picture / np.maximum(lit_alpha, 1e-6)[..., None])
+        if self.plate.straight_alpha is None:  # the file's colours are multiplied by its alpha
+            values = values * lit_alpha[..., None]
+        stored_alpha = undo_orientation(lit_alpha, self.orientation) * max_value
+        return values, (np.round(stored_alpha) if max_value > 1 else stored_alpha).astype(dtype)
 
     def _to_codes(self, values: Pixels) -> NDArray[Any]:
         """Return upright values in the plate's space as codes, in the orientation and type of the file, clipped to its

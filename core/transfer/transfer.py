@@ -165,8 +165,11 @@ class Transfer:
                                  lambda neighbour: self._frame_visibility(neighbour, light)[0])
 
     def _frame_visibility(self, index: int, light: str) -> tuple[float, tuple[float, ...] | None]:
-        """Return a light's visibility in one frame, not smoothed: the shot's times that through the target's scene; and
-        the visible shares of the cells of its extent. Results are cached."""
+        """Return a light's visibility in one frame, 0..1, and the visible share of each cell of its extent, or None.
+
+        The visibility is that in the shot, multiplied by that behind the target's scene, and not smoothed along the
+        path. Results are cached.
+        """
         key = (index, light)
         if key not in self._visibilities:
             shot = self.target.frames[index].shot
@@ -174,7 +177,7 @@ class Transfer:
             visibility, shares = (0.0, None) if placed is None else (placed.visibility, placed.shares)
             if placed is not None and visibility > 0 and self.target.scene is not None:
                 source = self.sources[placed.source]
-                # A light in the very place that it had in the fit: the scene is taken for that of the fit.
+                # If the light is exactly where it was in the fit, the scene is probably that of the fit.
                 is_fit_scene = np.allclose(placed.xyz, source.xyz, rtol=1e-6, atol=1e-9)
                 scene_visibility, shares = visibility_behind(self.target.scene, shot.camera.world_to_camera, placed,
                                                              self.settings.visibility,

@@ -61,7 +61,7 @@ class FITFLARE_OT_list_assets(GuardedOperator, bpy.types.Operator):
         return asset_browser.why_not()
 
     def act(self, _context: bpy.types.Context) -> None:
-        count = asset_browser.list_looks()
+        count = asset_browser.add_asset_library()
         self.report({"INFO"}, f"{count} looks are in the asset library {asset_browser.NAME}: open an Asset Browser and "
                     "drag one into the view")
 
@@ -78,7 +78,7 @@ class FITFLARE_OT_unlist_assets(GuardedOperator, bpy.types.Operator):
         return "" if asset_browser.library_entry() is not None else "The looks are not in the Asset Browser"
 
     def act(self, _context: bpy.types.Context) -> None:
-        asset_browser.unlist_looks()
+        asset_browser.remove_asset_library()
 
 
 class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):

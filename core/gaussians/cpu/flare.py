@@ -295,9 +295,11 @@ def _add_plain(state, records, record, left, top, first_row, end_row, run_start)
 
 @inlined
 def _draw_shaped(state, records, record, shapes, shape, left, top, first_row, end_row, arcs, add):
-    """Draw a ring or arc in rows first_row .. end_row - 1; rows that it does not reach cost little.
+    """Draw a ring or arc in rows first_row .. end_row - 1 of a tile; rows that it does not reach cost little.
 
-    shape: index of its first number in `shapes`; arcs: whether there are arcs; add: the blend is "add", else "over"."""
+    shape: index of the Gaussian's first number in `shapes`. left, top: corner of the tile, px. arcs: whether there are
+    arcs. add: the blend is "add", else "over".
+    """
     lane0_u, row_dy, k = _row_start(records, record, left, top + first_row)
     r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
     row, opaque_one = first_row, opaque(1)  # opaque: the loop is not unrolled
@@ -450,10 +452,13 @@ def _plain_backward(state, records, record, left, top, first_row, end_row, run_s
 
 @inlined
 def _shaped_backward(state, records, record, shapes, shape, left, top, first_row, end_row, arcs, add):
-    """Return the gradient row of a ring or arc: moments of h (see the module head), sums of g and of colours, the
-    gradients of r0 and w, and sums of g u and g d_y for b.
+    """Return the gradient row of a ring or arc, summed over rows of a tile: the moments of h, the sums of g and of the
+    colours, the gradients of r0 and w, and the sums of g u and g d_y, from which the gradient of b follows.
 
-    shape: index of its first number in `shapes`; arcs: whether there are arcs; add: the blend is "add", else "over"."""
+    The module head explains these letters. shape: index of the Gaussian's first number in `shapes`. left, top: corner
+    of the tile, px. first_row, end_row: rows of the tile, the last one excluded. arcs: whether there are arcs. add: the
+    blend is "add", else "over".
+    """
     lane0_u, row_dy, k = _row_start(records, record, left, top + first_row)
     r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
     zero = splat(ZERO)

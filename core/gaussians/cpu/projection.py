@@ -364,16 +364,9 @@ def _project_block(
     store(small_tiles, first, first_tile)
     store(small_rows, first, packed_rows)
 
-    red, green, blue = zero, zero, zero
-    if any_of(is_visible):
-        harmonics.load_transposed(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), transposed)
-        direction, inverse = _direction(mean, camera)
-        red, green, blue = harmonics.colours(transposed, degree, direction[0], direction[1], direction[2], basis)
-        if colour_slopes.size > 0:
-            _colour_slopes(transposed, degree, direction, inverse, colour_slopes)
-    elif colour_slopes.size > 0:
-        for i in range(SLOPES):
-            store(colour_slopes, i * LANES, zero)
+    red, green, blue = _block_colours(
+        sh, sh_width, degree, first, mean, camera, any_of(is_visible), transposed, basis, colour_slopes
+    )
     rows = transpose((
         x, y, major, k, minor, opacity, exp2m1(curvature * TWO), minimum(sqrt(RUN_LOG2_RANGE / -curvature), RUN_MAX),
         maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
@@ -386,6 +379,27 @@ def _project_block(
 def _store2(array, first, x, y):
     """Write 16 rows of an (n, 2) array."""
     store_rows(array, 2 * first, LANES, interleave((x, y)))
+
+
+@inlined
+def _block_colours(sh, sh_width, degree, first, mean, camera, is_needed, transposed, basis, colour_slopes):
+    """Return red, green and blue of the 16 Gaussians from `first` on, and write their gradients by the means to
+    colour_slopes unless it is empty; zeros unless is_needed.
+
+    mean: vectors x, y, z of the means. transposed, basis: workspaces of TRANSPOSED and SQUARE numbers. The module head
+    lists the others.
+    """
+    red, green, blue = splat(ZERO), splat(ZERO), splat(ZERO)
+    if is_needed:
+        harmonics.load_transposed(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), transposed)
+        direction, inverse = _direction(mean, camera)
+        red, green, blue = harmonics.colours(transposed, degree, direction[0], direction[1], direction[2], basis)
+        if colour_slopes.size > 0:
+            _colour_slopes(transposed, degree, direction, inverse, colour_slopes)
+    elif colour_slopes.size > 0:
+        for i in range(SLOPES):
+            store(colour_slopes, i * LANES, splat(ZERO))
+    return red, green, blue
 
 
 @inlined

@@ -141,8 +141,12 @@ def _add_colours(state, state_row, w, sums, with_depth):
 
 @inlined
 def _needle_sums(state, records, record, left, top, first_row, end_row, with_depth):
-    """Return, by lane, a needle's sums of g u, g d_y, g u², g u d_y, g d_y² and g, and a tuple of those for red, green,
-    blue and depth; with an exponential for each row."""
+    """Return, by lane, a needle's sums of g u, g d_y, g u², g u d_y, g d_y² and g over rows of a tile, and a tuple of
+    its sums for red, green, blue and depth.
+
+    The module head explains g, u and d_y. A needle is too narrow for the recurrence over rows, so each row has its own
+    exponential. left, top: corner of the tile, px. first_row, end_row: rows of the tile, the last one excluded.
+    """
     zero = splat(ZERO)
     m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
     colours = (zero, zero, zero, zero)

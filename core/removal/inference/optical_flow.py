@@ -35,6 +35,8 @@ def compute_flow(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> Pixels
 def dense_flow(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> Pixels:
     """Return the flow from a frame to another, (h, w, 2): x and y, in pixels of the frame.
 
+    source, target: grey codes (h, w) of the frames.
+
     One thread computes it: the search propagates within the part of the frame that a thread gets, so that with several
     threads the result would depend on their number.
     """

@@ -180,11 +180,8 @@ def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
             sums = {name: value + metrics[name] for name, value in sums.items()}
             iteration = trainer.iteration
             if iteration % VALIDATE_EVERY == 0 or iteration == iterations:
-                iteration_count = iteration - last_logged
-                log_entry: dict[str, Any] = {
-                    "iteration": iteration, "seconds": round(time.monotonic() - started, 1),
-                    "pace": round((time.monotonic() - started) / (iteration - first_iteration), 3),
-                    **{name: round(value / iteration_count, 5) for name, value in sums.items()}}
+                means = {name: value / (iteration - last_logged) for name, value in sums.items()}
+                log_entry = _log_entry(iteration, time.monotonic() - started, iteration - first_iteration, means)
                 last_logged, sums = iteration, dict.fromkeys(METRICS, 0.0)
                 if pairs:
                     log_entry[GAIN] = trainer.validate(pairs)
@@ -200,6 +197,16 @@ def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
         _save_checkpoint(trainer, folder, best)
         raise
     _save_checkpoint(trainer, folder, best)
+
+
+def _log_entry(iteration: int, seconds: float, count: int, means: Mapping[str, float]) -> dict[str, Any]:
+    """Return the entry of the log for an iteration.
+
+    seconds, count: duration and number of the iterations since the training was started or resumed. means: of the
+    metrics since the last entry.
+    """
+    return {"iteration": iteration, "seconds": round(seconds, 1), "pace": round(seconds / count, 3),
+            **{name: round(value, 5) for name, value in means.items()}}
 
 
 def _save_checkpoint(trainer: RemovalTrainer, folder: Path, best: float | None) -> None:

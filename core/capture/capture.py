@@ -81,7 +81,10 @@ class Capture:
 
     def __init__(self, folder: Path, views: Sequence[View], points: PointCloud, lights: Sequence[Light] = (),
                  *, frames: dict[str, Path] | None = None, cache_bytes: int = 1 << 30) -> None:
-        """frames: the file of each view by name. Also finds the pictures in removed/, truth/ and masks/ of `folder`."""
+        """Make a capture of views, and find their pictures in removed/, truth/ and masks/ of `folder`.
+
+        frames: the file of each view by name. cache_bytes: limit of the decoded pictures that are cached.
+        """
         self.folder = folder
         self.views = tuple(views)
         self.points = points

@@ -91,17 +91,25 @@ def read_model_in_steps(folder: Path) -> Steps[tuple[list[PosedFrame], PointClou
         if camera_id not in lenses:
             raise CaptureError(f"{_file_path(folder, 'images')} gives {name} the camera {camera_id}, which "
                                f"{_file_path(folder, 'cameras')} does not have; export the whole model again.")
-        where = f"{_file_path(folder, 'images')}, {name}:"
-        pose = np.eye(4)
-        norm = math.sqrt(sum(q * q for q in quaternion))
-        if not all(abs(number) < MAX_MAGNITUDE for number in (*quaternion, *translation)):
-            raise CaptureError(f"{where} the pose is not finite numbers of a sensible size; solve the cameras again.")
-        if abs(norm - 1.0) > _MAX_QUATERNION_ERROR:
-            raise CaptureError(f"{where} the quaternion's length is {norm:.4g}, so it is no rotation; "
-                               "solve the cameras again.")
-        pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(quaternion), translation
+        pose = _to_pose(quaternion, translation, f"{_file_path(folder, 'images')}, {name}")
         posed.append(PosedFrame(name, lenses[camera_id], pose, _point_indices(observed_ids, point_ids, order)))
     return posed, points
+
+
+def _to_pose(quaternion: Sequence[float], translation: Sequence[float], source: str) -> Floats:
+    """Return the pose (4, 4), world to camera, of an image. Raises CaptureError where it is not a rigid motion.
+
+    quaternion: w, x, y, z. source: beginning of the error's message.
+    """
+    norm = math.sqrt(sum(q * q for q in quaternion))
+    if not all(abs(number) < MAX_MAGNITUDE for number in (*quaternion, *translation)):
+        raise CaptureError(f"{source}: the pose is not finite numbers of a sensible size; solve the cameras again.")
+    if abs(norm - 1.0) > _MAX_QUATERNION_ERROR:
+        raise CaptureError(f"{source}: the quaternion's length is {norm:.4g}, so it is no rotation; solve the cameras "
+                           "again.")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(quaternion), translation
+    return pose
 
 
 def _point_indices(observed_ids: NDArray[np.int64], point_ids: NDArray[np.int64],

@@ -48,6 +48,8 @@ class Adam:
         self, parameters: Mapping[str, Parameter], rates: Rate | Mapping[str, Rate],
         *, epsilon: float = 1e-15, kernels: Literal["auto", "torch"] = "auto",
     ) -> None:  # fmt: skip
+        """Start with moments of zero. epsilon: added to the root of the second moment. Raises SettingsError for a rate
+        without a parameter."""
         self.parameters = dict(parameters)
         self.rates: dict[str, Rate] = (
             dict(rates) if isinstance(rates, Mapping) else dict.fromkeys(self.parameters, rates)

@@ -234,9 +234,11 @@ def _write_gradient(
 def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, parts, parts_done, sums, value, out):
     """Write the loss, lam L1 + (1 - lam) (1 - SSIM), to value (1,) and its gradient by x to `out`, unless it is empty.
 
-    counter: index of the next part; x, y: image and target, flat; mu_y, s_y: window means and variances of the target;
-    parts: number of parts of the picture, each the work of a thread; parts_done (1,): number of finished parts, 0 at
-    first; scratch, sums (h, 2): workspaces."""
+    The loop writes the maps of one band, then the gradient of the band above it; the module head explains the bands.
+    counter: index of the next part. x, y: image and target, flat. mu_y, s_y: window means and variances of the target.
+    parts: number of parts of the picture, each the work of a thread. parts_done (1,): number of finished parts, 0 at
+    first. scratch, sums (h, 2): workspaces.
+    """
     row_length = STEP * width
     maps = scratch[: 9 * BAND * row_length].reshape(3, 3, BAND, row_length)
     rows = scratch[9 * BAND * row_length :][: 3 * BAND * (row_length + 2 * PAD)].reshape(3, BAND, row_length + 2 * PAD)

@@ -179,9 +179,7 @@ def _flare_on_frame(layers: FlareLayers, appearance: random_cameras.FlareAppeara
     """
     import cv2
 
-    half_diagonal = math.hypot(width, height) / 2
-    rest, glow, light = (cv2.warpAffine(layer, matrix, (width, height),
-                                        flags=cv2.INTER_LINEAR)
+    rest, glow, light = (cv2.warpAffine(layer, matrix, (width, height), flags=cv2.INTER_LINEAR)
                          for layer in (layers.rest, layers.glow, layers.light))
     if appearance.blur:
         rest = cv2.GaussianBlur(rest, (0, 0), appearance.blur)
@@ -189,15 +187,9 @@ def _flare_on_frame(layers: FlareLayers, appearance: random_cameras.FlareAppeara
     mean = float(np.minimum(sampled * appearance.gain, 1).mean())
     gain = appearance.gain * np.float32(min(appearance.max_mean / max(mean, 1e-6), 1))
     rest, glow = rest * (appearance.colour * gain), glow * (appearance.colour * gain)
-    light_proximity = np.zeros((height, width), np.float32)
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    for light_position in layers.lights:
-        frame_position = _canvas_to_frame(matrix, layers, light_position)
-        squared_distance = (x - frame_position[0]) ** 2 + (y - frame_position[1]) ** 2
-        falloff = np.exp(-squared_distance / np.float32((LIGHT_RADIUS * half_diagonal) ** 2))
-        light_proximity = np.maximum(light_proximity, falloff)
     red, green, blue = np.moveaxis(rest + glow, -1, 0)
     min_channel = np.minimum(np.minimum(red, green), blue)
+    light_proximity = _light_proximity(layers, matrix, width, height)
     # Clipped flare joins the light, with flare and without. It is found before the light's colour is applied, so that
     # a coloured light clips as a white one would.
     clipped = np.clip((min_channel * light_proximity - CLIP_START) / CLIP_RANGE, 0, 1)[..., None]
@@ -205,6 +197,19 @@ def _flare_on_frame(layers: FlareLayers, appearance: random_cameras.FlareAppeara
     clipped_light: Pixels = np.maximum(light, (rest + glow) * clipped)
     rest, glow, light = (part * layers.colour for part in (rest * (1 - clipped), glow * (1 - clipped), clipped_light))
     return rest, glow, light
+
+
+def _light_proximity(layers: FlareLayers, matrix: NDArray[Any], width: int, height: int) -> NDArray[np.float32]:
+    """Return (height, width): 1 at the flare's lights on the frame, falling to 0 as a Gaussian of LIGHT_RADIUS half
+    diagonals. matrix: (2, 3), from canvas to frame, pixels."""
+    squared_radius = np.float32((LIGHT_RADIUS * math.hypot(width, height) / 2) ** 2)
+    proximity = np.zeros((height, width), np.float32)
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    for light_position in layers.lights:
+        frame_position = _canvas_to_frame(matrix, layers, light_position)
+        squared_distance = (x - frame_position[0]) ** 2 + (y - frame_position[1]) ** 2
+        proximity = np.maximum(proximity, np.exp(-squared_distance / squared_radius))
+    return proximity
 
 
 def _develop(development: random_cameras.Development, displayed: Sequence[Pixels]) -> list[Pixels]:

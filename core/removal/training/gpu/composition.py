@@ -243,16 +243,21 @@ def _flare_on_frame(flares: FlareBatch, placement: FlarePlacements, matrix: Tens
     mean = ((rest[..., ::4, ::4] + glow[..., ::4, ::4]) * placement.gain).clamp(max=1).mean((1, 2, 3), keepdim=True)
     factor = placement.colour * placement.gain * (placement.max_mean / mean.clamp(min=1e-6)).clamp(max=1)
     rest, glow = rest * factor, glow * factor
-    light_positions = _canvas_to_frame(matrix[:, None], flares.lights, flares.size)
-    light_radius = LIGHT_RADIUS * math.hypot(width, height) / 2
-    squared_distance = (_pixel_coordinates(height, width, matrix) - light_positions[:, :, None, None]).square().sum(-1)
-    light_proximity = (torch.exp(-squared_distance / light_radius**2)
-                       * flares.is_light[:, :, None, None]).amax(1, keepdim=True)
+    light_proximity = _light_proximity(flares, matrix, height, width)
     clipped = (((rest + glow).amin(1, keepdim=True) * light_proximity - CLIP_START) / CLIP_RANGE).clamp(0, 1)
     clipped = clipped * clipped * (3 - 2 * clipped)  # smoothstep
     tint = flares.colour[:, :, None, None]
     light = torch.maximum(light, (rest + glow) * clipped)
     return rest * (1 - clipped) * tint, glow * (1 - clipped) * tint, light * tint
+
+
+def _light_proximity(flares: FlareBatch, matrix: Tensor, height: int, width: int) -> Tensor:
+    """Return (n, 1, height, width): 1 at the flares' lights on the frames, falling to 0 as a Gaussian of LIGHT_RADIUS
+    half diagonals. matrix: (n, 2, 3), from canvas to frame, pixels."""
+    light_positions = _canvas_to_frame(matrix[:, None], flares.lights, flares.size)
+    light_radius = LIGHT_RADIUS * math.hypot(width, height) / 2
+    squared_distance = (_pixel_coordinates(height, width, matrix) - light_positions[:, :, None, None]).square().sum(-1)
+    return (torch.exp(-squared_distance / light_radius**2) * flares.is_light[:, :, None, None]).amax(1, keepdim=True)
 
 
 def _pixel_coordinates(height: int, width: int, like: Tensor) -> Tensor:

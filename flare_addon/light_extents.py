@@ -44,7 +44,10 @@ def is_point(item: Any) -> bool:
 
 
 def _extent_of_lamp(data: Any, linear: Floats) -> LightExtent | None:
-    """Return the extent of a lamp's data; linear: the 3x3 of its matrix_world."""
+    """Return the extent of a lamp in Blender's world, about its origin; None for a lamp that is a point.
+
+    data: the lamp's data. linear: the upper left (3, 3) of its matrix_world.
+    """
     if data.type == "AREA":
         wide = data.size
         high = data.size_y if data.shape in ("RECTANGLE", "ELLIPSE") else wide

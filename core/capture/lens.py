@@ -218,8 +218,8 @@ def undistort_picture(picture: Picture, maps: tuple[NDArray[np.float32], NDArray
 def _brown_conrady(x: Floats, y: Floats, p: Parameters, numerator: str, denominator: str = "") -> tuple[Floats, Floats]:
     """Distort coordinates by Brown and Conrady's terms: radial, tangential (p1, p2) and thin prism (sx, sy).
 
-    numerator, denominator: names of the coefficients of the radial quotient of polynomials; "" for no denominator. A
-    coefficient that the lens does not have is 0.
+    x, y: normalised coordinates, (n,) each, as are the results. numerator, denominator: names of the coefficients of
+    the radial quotient of polynomials; "" for no denominator. A coefficient that the lens does not have is 0.
     """
     r2 = x * x + y * y
     radial = _even_polynomial(r2, [p.get(name, 0.0) for name in numerator.split()])

@@ -94,7 +94,7 @@ def _invert_curve(curve: Table, decoded: Pixels, ramp: Pixels, light: Pixels) ->
     """Return the values 0..1 at which `curve` gives `light`: interpolated in the curve's samples, then refined by one
     secant step, since the samples are coarse where the curve is flat or steep.
 
-    decoded: the curve's samples at `ramp`, never decreasing.
+    ramp: (k,) rising values 0..1. decoded: (k,) the curve's samples there, never decreasing. light: 0..1, any shape.
     """
     value = np.interp(light, decoded, ramp)
     step = np.float32(0.5 / _SAMPLES)

@@ -106,7 +106,8 @@ def _solve_tridiagonal(weights: NDArray[np.float64], springs: NDArray[np.float64
                        target: NDArray[np.float64]) -> NDArray[np.float64]:
     """Solve (diag(weights) + L) x = target by elimination (Thomas algorithm).
 
-    L is the Laplacian of a chain: spring i pulls x[i] and x[i + 1] together.
+    L is the Laplacian of a chain: spring i pulls x[i] and x[i + 1] together. weights, target, x: (n,). springs:
+    (n - 1,) stiffnesses.
     """
     diagonal = weights.copy()
     diagonal[:-1] += springs
@@ -171,8 +172,8 @@ def _scale_colours(sh: torch.Tensor, head: nn.Linear, names: Sequence[str], widt
                    factor: float) -> None:
     """Multiply the colours of Gaussians by a factor, in place.
 
-    A colour is 0.5 + C0 (sh + change) + ..., where the network's output `change` varies with the light's place. sh: the
-    coefficients. head: last layer of the network; names, widths: parts of its output.
+    A colour is 0.5 + C0 (sh + change) + ..., where the network's output `change` varies with the light's position. sh:
+    (n, 3 k) coefficients. head: last layer of the network. names, widths: names and widths of the parts of its output.
     """
     sh *= factor
     sh[:, :3] += (factor - 1) * 0.5 / C0

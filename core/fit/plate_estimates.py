@@ -90,7 +90,7 @@ class PlateEstimator:
         self.alignment = Alignment(shot.plates)
 
     def estimate(self, name: str, cleaned: Mapping[str, Pixels] | None = None) -> Pixels:
-        """Return the plate of a frame, display values; the network's plate if no neighbour can be aligned.
+        """Return the plate of a frame, display values (height, width, 3); the network's if no neighbour can be aligned.
 
         The background is the median of the aligned plates, times a smooth gain. Where nothing hides it, it replaces the
         network's plate; if the camera moves, it only makes the plate darker, in small parts. cleaned: frames minus the

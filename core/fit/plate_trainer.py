@@ -173,6 +173,7 @@ class PlateTrainer(FlareTrainer):
         """Return the loss of a composite against its frame: squares alone at first, then with L1 and SSIM.
 
         Squares count less where the composite is brighter: estimated plates more often contain flare than lack light.
+        picture: the composite; both (height, width, 3), display values.
         """
         settings = self.settings.plates
         error = picture - frame

@@ -22,7 +22,7 @@ MAX_SMALL_SIDE = 512  # pixels of the longer side of a small preview
 def preview_row(frame: torch.Tensor, view: RenderedView) -> NDArray[np.float32]:
     """Return one view as a strip of frame, composite, scene and flare side by side, with grey gaps, display values.
 
-    The flare is shown as light on black.
+    The flare is shown as light on black. frame: (height, width, 3). Returns (height, 4 width + 3 GAP, 3).
     """
     flare = encode(view.layers.flare.clamp_min(0)).clamp(0, 1)
     pictures = [frame, view.composite, view.scene.colour.clamp(0, 1), flare]

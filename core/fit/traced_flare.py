@@ -282,7 +282,7 @@ def _initial_model(settings: TracedFlareSettings, setup: LensSetup, fit: FitSett
 
 
 def _start_at_light(flare: LightFlare, rows: Tensor, reach: float, pixel: float, generator: torch.Generator) -> None:
-    """Move these rows of the initial Gaussians to the light, as rays at log-uniform distances, and scale all Gaussians
+    """Move the Gaussians `rows` (their indices) to the light, as rays at log-uniform distances, and scale all Gaussians
     to the frame.
 
     Starburst and glow have most of a flare's light and lie about the light, where few of the Gaussians along the line

@@ -117,7 +117,7 @@ def _measure_moments(picture: Floats, x: Floats, y: Floats) -> _Moments:
 
 def start_at_ghosts(flare: LightFlare, rows: torch.Tensor, ghosts: Sequence[MeasuredGhost],
                     generator: torch.Generator) -> None:
-    """Move the Gaussians of these rows to the ghosts, in place: evenly over a disc for each ghost.
+    """Move the Gaussians `rows` (their indices) to the ghosts, in place: evenly over a disc for each ghost.
 
     Brighter ghosts get more rows, in proportion to light^ENERGY_POWER; rows that remain keep their places. A ghost's
     Gaussians share a latent code, except for its last two numbers, a Gaussian's place in the ghost, so that the network

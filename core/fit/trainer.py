@@ -299,21 +299,20 @@ class Trainer(FlareTrainer):
         return discs if self.frames.display_white == 1 else discs & (targets.frame - clean < MIN_DIFFERENCE).all(-1)
 
     def _composite_target(self, targets: Targets, picture: Tensor, light_discs: Tensor | None) -> Tensor:
-        """Return the picture that the composite is compared with: the frame, except in discs where frames go above
-        white.
+        """Return the display values that the composite (`picture`) is compared with, (height, width, 3).
 
-        In these a light only has to be white or brighter, so the target there is the composite itself (`picture`), but
-        1 at least.
+        They are those of the frame. In frames with values above white, a light's disc (height, width) is the exception:
+        it only has to be white or brighter, so its target is the composite itself, but 1 at least.
         """
         if self.frames.display_white == 1 or light_discs is None:
             return targets.frame
         return torch.where(light_discs[..., None], picture.clamp_min(1), targets.frame)
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
-        """Return the picture that the scene's is compared with, display values; None where there is none.
+        """Return the display values that the scene's rendering is compared with, (height, width, 3), or None.
 
-        The clean frame in supervised modes; in mode `in-flare` the frame minus the flare as reconstructed so far.
-        picture: the composite.
+        They are those of the clean frame in supervised modes, those of the frame minus the flare as reconstructed so
+        far in mode `in-flare`; other modes have none. picture: the composite. scene: the scene's rendering.
         """
         if self.settings.supervised:
             return targets.clean
@@ -326,8 +325,9 @@ class Trainer(FlareTrainer):
                        light_discs: Tensor | None) -> Tensor:
         """Return the loss of a scene in a fit by parallax, without exact clean frames.
 
-        Only a quantile loss while the scene is fitted alone; later also terms near the lights, against an estimated
-        clean frame, and on flare far from the lights. flare: splats of all lights, None without any.
+        While the scene is fitted alone, it is a quantile loss. Later it has terms near the lights, against an estimated
+        clean frame, and on flare far from the lights as well. scene: the scene's rendering, display values (height,
+        width, 3). flare: splats of all lights, None without any. light_discs: mask (height, width) or None.
         """
         settings = self.settings
         if self.flare is None or self._is_scene_only(targets):

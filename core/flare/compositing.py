@@ -111,7 +111,7 @@ class LinearLayers(NamedTuple):
 
 
 def linear_layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend, white: float = 1.0) -> LinearLayers:
-    """Return layers from the scene's picture, display values, and each light's splats.
+    """Return layers from the scene's picture, display values (height, width, 3), and each light's splats.
 
     flares: splats by light; the first lies in front. white: display value at which the scene is clipped; the composite
     is not. With the blend "over", lights are put over the scene from the last to the first, and a light's layer is the

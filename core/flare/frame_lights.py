@@ -25,7 +25,11 @@ class FrameLights(nn.Module):
     prior: Tensor
 
     def __init__(self, frames: Sequence[str], positions: Tensor, prior: Tensor) -> None:
-        """frames: names of the frames, in the order of the shot; positions, prior: rows in the same order."""
+        """Start with the brightness of `prior`, 1 where it is NaN.
+
+        frames: names of n frames, in the order of the shot. positions, prior: of the lights in each frame, in the same
+        order: (n, lights, 3), world units, and brightness (n, lights).
+        """
         super().__init__()
         self.rows = {name: row for row, name in enumerate(frames)}
         """Row of each frame, by its name, in the order of the shot."""

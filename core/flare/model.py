@@ -299,7 +299,8 @@ class FlareModel(nn.Module):
 
         Opacities are multiplied by the visibility of the light, 0..1, and by its brightness in `frame`. If this product
         is below MIN_TRAINING_VISIBILITY, the light's Gaussians get no gradient: there is next to nothing to learn, and
-        Adam would learn the error of the visibility at full rate. visibilities: by the light's name; None if all are 1.
+        Adam would learn the error of the visibility at full rate. world_to_camera: (4, 4). visibilities: by the light's
+        name; None if all are 1.
         """
         lights = zip(self.names, self.lights, self.views(world_to_camera, frame), strict=True)
         flares = {name: flare(view) for name, flare, view in lights if view.depth > 0}

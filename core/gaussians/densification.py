@@ -143,8 +143,8 @@ class Classic:
         self.optimiser.append_rows(halves)
 
     def _split(self, is_split: Tensor) -> dict[str, Tensor]:
-        """Return two smaller Gaussians for each one to split, by name of the parameter; their means are sampled from
-        the one that is split."""
+        """Return the parameters, by name, of two smaller Gaussians for each one to split; their means are sampled from
+        the one that is split. is_split: (n,) mask of these."""
         halves = {name: p.detach()[is_split].repeat_interleave(2, 0) for name, p in self.scene.named_parameters()}
         noise = _randn(halves["means"].shape, self.generator, halves["means"])
         offsets = rotation_matrices(halves["quaternions"]) @ (noise * halves["log_scales"].exp())[..., None]

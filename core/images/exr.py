@@ -315,8 +315,8 @@ def missing_rgb_error(path: Path, channels: Iterable[str]) -> FrameError:
 
 
 def rec709_pixels(path: Path, pixels: Pixels, header: Mapping[str, Any]) -> Pixels:
-    """Convert an EXR's pixels to linear Rec. 709 by its chromaticities; unchanged where it has none. Raises FrameError
-    where they span no space."""
+    """Convert an EXR's pixels (height, width, 3) to linear Rec. 709 by its chromaticities; unchanged where it has none.
+    Raises FrameError where they span no space."""
     chromaticities = header.get("chromaticities")
     if chromaticities is None:
         return pixels

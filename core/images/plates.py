@@ -327,7 +327,8 @@ def _read_exr(path: Path, space: ColourSpace | None) -> Plate:
 
 
 def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], alpha: NDArray[Any] | None = None) -> None:
-    """Write `codes` in the format and depth of `plate`, with its alpha, channels and tags, to `path`.
+    """Write `codes` (height, width, 3) in the format and depth of `plate`, with its alpha, channels and tags, to
+    `path`.
 
     path: has the plate's suffix, or that of `clean_name`. A plate that did not change is copied. alpha: codes as
     stored, to write in place of the plate's alpha; None for the plate's. Raises FrameError for what the format cannot

@@ -97,7 +97,8 @@ class VideoColour:
         return np.asarray(cv2.transform(planes, affine.astype(np.float32)))
 
     def to_pixels(self, signal: NDArray[Any]) -> NDArray[Any]:
-        """Return display values as codes, of 8 or 16 bits, or linear light as float32, from `to_signal`'s result."""
+        """Return display values as codes, of 8 or 16 bits, or linear light as float32, from `to_signal`'s result; all
+        (height, width, 3)."""
         import cv2
 
         if not self.is_light and not self.is_wide:

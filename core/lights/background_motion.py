@@ -78,7 +78,9 @@ class BackgroundMotion:
 
     def _static_residual(self, frames: Sequence[int], places: Floats) -> float | None:
         """Return the median distance, pixels, of a light from the place to which the background carries it from another
-        frame; None if the light moves, or if too few frames or too little motion of the background decide it."""
+        frame; None if the light moves, or if too few frames or too little motion of the background decide it.
+
+        frames, places: as for `carry`."""
         partners = [(index, int(np.searchsorted(frames, frame + TEST_OFFSET))) for index, frame in enumerate(frames)]
         pairs = [(index, other) for index, other in partners
                  if other < len(frames) and frames[other] - frames[index] <= MAX_OFFSET]

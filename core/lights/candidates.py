@@ -98,7 +98,8 @@ def _draw_pairs(observations: Observations, index: NDArray[np.int64],
                 rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Draw MAX_PAIRS pairs at random by their weights, without a list of all pairs, which would fill the memory.
 
-    Pairs within one view and repeated pairs are dropped. Returns fewer where nearly all detections are of one view.
+    Pairs within one view and repeated pairs are dropped, so there are fewer where nearly all detections are of one
+    view. index: the detections to pair. Returns as `_choose_pairs` does.
     """
     weight = observations.weight[index] / observations.weight[index].sum()
     keys = np.zeros(0, np.int64)

@@ -92,7 +92,7 @@ def _group_areas(clipped: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 
 def _main_body(mask: NDArray[np.bool_], max_area: float) -> NDArray[np.bool_] | None:
-    """Return the mask with holes filled and without thin parts, such as spikes of a starburst or a bright bracket.
+    """Return a mask (h, w) with holes filled and without thin parts, such as spikes of a starburst or a bright bracket.
 
     Thin parts are removed by morphological opening; discs, ellipses and bars are unchanged. None where a disc of more
     than `max_area` pixels fits in.
@@ -114,7 +114,7 @@ def _main_body(mask: NDArray[np.bool_], max_area: float) -> NDArray[np.bool_] | 
 
 
 def open_by_disc(mask: NDArray[np.uint8], reach: int) -> NDArray[np.uint8]:
-    """Remove the parts of a mask that are too narrow for a disc of radius `reach`.
+    """Remove the parts of a mask (h, w), 0 and 1, that are too narrow for a disc of radius `reach`, pixels.
 
     Large regions are opened by distance transforms, whose cost does not grow with the disc, slightly rounder at the
     rim.

@@ -105,7 +105,8 @@ def _to_light(centre: Floats, spread: float, views: Sequence[tuple[str, Camera]]
               detections: Sequence[Sequence[Detection]]) -> FoundLight:
     """Return the light at a cluster's centroid, with the nearest detection of each view that shows it.
 
-    spread: root mean square distance of the cluster's Gaussians from the centroid, taken as the light's uncertainty.
+    centre: the centroid (3,), world units. spread: root mean square distance of the cluster's Gaussians from it, taken
+    as the light's uncertainty. views: name and camera of each view. detections: those of each view.
     """
     residuals: list[float] = []
     matched: list[tuple[str, Detection]] = []

@@ -58,7 +58,8 @@ def _variance_of_differences(frames: Floats, places: Floats, order: int, noise: 
     """Return the variance of the true path's differences of this order, estimated from consecutive measured frames.
 
     The variance that noise adds to measured differences is subtracted. Without order + 1 consecutive frames it is the
-    variance from noise alone. noise: standard deviation of the places, pixels.
+    variance from noise alone. frames: (n,) numbers of the measured frames, ascending. places: (n, 2), pixels. noise:
+    standard deviation of the places, pixels.
     """
     coefficients = np.diff(np.eye(order + 1), order, axis=0)[0]
     noise_variance = float(np.square(coefficients).sum()) * noise ** 2

@@ -199,8 +199,8 @@ def _least_squares_step(observations: Sequence[_Observation]) -> Floats:
 def _observe(views: Sequence[FlareView], positions: Floats, window: float) -> list[list[_Observation]]:
     """Return the observations of each light, one for each view that has flare under the light's Gaussian window.
 
-    Where windows overlap, lights share a pixel in proportion to their windows. window: standard deviation in frame
-    widths.
+    Where windows overlap, lights share a pixel in proportion to their windows. positions: of the lights, (lights, 3),
+    world units. window: standard deviation in frame widths.
     """
     by_light: list[list[_Observation]] = [[] for _ in positions]
     for camera, flare, observed in views:

@@ -132,8 +132,10 @@ def _open(mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
 
 
 def _largest_part(mask: NDArray[np.uint8]) -> tuple[Mask, tuple[int, int]]:
-    """Return the largest connected part of a mask within its box, and the box's corner (x, y), without the pixel of
-    padding on each side of the mask."""
+    """Return the largest connected part of a mask, within its bounding box, and the box's corner (x, y).
+
+    mask: with a pixel of padding on each side, which the corner does not count.
+    """
     import cv2
 
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)

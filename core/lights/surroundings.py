@@ -46,8 +46,8 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
     """Return the share, 0..1, of the tests in which the far surrounding is bright where a light was detected.
 
     A test looks from another view in the direction of a detection, as if its light came from far away. cameras, maps:
-    camera and brightness map of each view, by name. None if fewer than MIN_TESTS tests decide, because the light itself
-    is far or nearly in the same direction from all views.
+    camera of each view, and mask (h, w) of its bright areas, by name. None if fewer than MIN_TESTS tests decide,
+    because the light itself is far or nearly in the same direction from all views.
     """
     if light.far:
         return None
@@ -76,7 +76,7 @@ def split_gaps(lights: Sequence[FoundLight], cameras: Mapping[str, Camera],
                maps: Mapping[str, NDArray[np.bool_]]) -> tuple[list[FoundLight], list[FoundLight]]:
     """Return the lamps among the lights, and the gaps, whose light comes from a bright far surrounding.
 
-    cameras, maps: camera and brightness map of each view, by name.
+    cameras, maps: as for `explained_share`.
     """
     threshold = max(MIN_EXPLAINED, MIN_EXCESS + float(np.mean([bright.mean() for bright in maps.values()])))
     lamps: list[FoundLight] = []

@@ -67,10 +67,11 @@ def most_similar_pairs(similarity: NDArray[Any], number: int, min_distance: int)
 
 
 def vlad_similarity(descriptors: Callable[[int], NDArray[np.uint8]], frames: int, seed: int = 0) -> NDArray[np.float32]:
-    """(frames, frames) cosine of the frames' VLAD vectors.
+    """Return (frames, frames) cosines between the VLAD vectors of the frames (Jegou et al. 2010).
 
-    The vocabulary is learned from a sample of all descriptors. A frame without descriptors is similar to none. With too
-    few descriptors for a vocabulary, each frame is similar to itself alone.
+    descriptors: returns those of a frame, (n, d), by its index. The vocabulary is learned from a sample of all
+    descriptors. A frame without descriptors is similar to none. With too few descriptors for a vocabulary, each frame
+    is similar to itself alone.
     """
     rng = np.random.default_rng(seed)
     frame_samples = [_random_rows(descriptors(i), FRAME_SAMPLE, rng) for i in range(frames)]

@@ -338,7 +338,10 @@ _target_moments = _TargetMoments()
 class _L1Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, lam: float) -> Tensor:  # type: ignore[override]
-        """Return the loss, a scalar; its gradient by the image is computed at once and kept for `backward`."""
+        """Return the loss, a scalar; its gradient by the image is computed at once and kept for `backward`.
+
+        image, target: (height, width, 3). lam: weight of L1, 0..1; SSIM has the others.
+        """
         height, width, _ = image.shape
         mu_y, s_y = _target_moments(target)
         value, gradient = np.empty(1, np.float32), EMPTY

@@ -55,9 +55,9 @@ def write_scanlines(path: Path | str, channels: Mapping[str, NDArray[Any]], head
 
 
 def _encode_header(names: list[str], pixels: list[NDArray[Any]], attributes: Mapping[str, Any]) -> bytes:
-    """Return magic number, version and attributes. names, pixels: names and pixels of the channels, in the file's
-    order. attributes: the `header` of `write_scanlines`, with both windows. Raises TypeError for a value of another
-    type."""
+    """Return magic number, version and attributes. names, pixels: names and pixels (height, width) of the channels, in
+    the file's order. attributes: the `header` of `write_scanlines`, with both windows. Raises TypeError for a value of
+    another type."""
     # Of each channel: name, type, whether it is perceptually linear, and sampling of columns and lines.
     channel_list = b"".join(name.encode() + b"\0" + struct.pack("<iB3xii", _PIXEL_TYPES[channel.dtype.name], 0, 1, 1)
                             for name, channel in zip(names, pixels, strict=True)) + b"\0"

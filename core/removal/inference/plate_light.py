@@ -111,7 +111,7 @@ def removed_light(codes: NDArray[Any], clean: NDArray[Any], flare: Pixels, encod
 
     For linear codes that is `flare`, the linear flare that was subtracted. For display codes it is the light of the
     codes minus the light of the clean codes, both by the sRGB curve; `flare` itself is by another curve
-    (`image_formation.GAMMA`).
+    (`image_formation.GAMMA`). codes, clean, flare and the result: (height, width, 3).
     """
     if encoding == "linear":
         return np.minimum(flare, MAX_HALF)

@@ -200,7 +200,7 @@ class RemovalNetwork(nn.Module):
         return NetworkOutput(out[:, :3], out[:, :3] * torch.sigmoid(out[:, 3:] * 4))
 
     def _encode_level(self, x: Tensor, level: int) -> Tensor:
-        """Apply the encoder's residual blocks of a level, and its attention layers."""
+        """Apply the encoder's residual blocks of a level, and its attention layers, to features (n, c, h, w)."""
         coarse = level - (LEVELS - 2)  # 0 and 1 on the levels with attention, below 0 on the others
         inner_layers = list(cast(nn.ModuleList, self.inner_attention[coarse])) if coarse >= 0 else []
         for index, block in enumerate(cast(nn.Sequential, self.encoder[level])):

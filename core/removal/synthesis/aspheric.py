@@ -114,8 +114,10 @@ def _draw_aberrations(random: Random) -> Aberrations:
 
 
 def _draw_pupil(random: Random, u: Array, v: Array) -> Array:
-    """Return the transmission at (u, v), in radii of the stop: a circle, in a third of the ghosts cut by the rim of
-    another lens, in a fifth with a darker middle."""
+    """Return the transmission, 0..1, of the stop at u and v, radii of the stop; all of one shape.
+
+    It is a circle, in a third of the ghosts cut by the rim of another lens, in a fifth with a darker middle.
+    """
     edge = 60.0 if random.random() < 0.7 else log_uniform(random, 4, 40)  # steepness: sharp, or soft in three of ten
 
     def within(distance: Array, limit: float) -> Array:

@@ -131,8 +131,11 @@ def _draw_light_flare(random: Random, lens_seed: int, kind: str, position: Point
 
 def _draw_ghosts(random: Random, position: Point, size: int, x: Array, y: Array,
                  lenses: Sequence[Prescription]) -> Array:
-    """Return (size, size, 3), traced or freehand ghosts of one light. Through some lenses a light makes no
-    visible ghost, so up to six draws are tried."""
+    """Return traced or freehand ghosts of one light, linear light (size, size, 3).
+
+    Through some lenses a light makes no visible ghost, so up to six draws are tried. position: of the light, canvas
+    coordinates. x, y: `canvas_grid`.
+    """
     for _ in range(6):
         if random.random() < 0.7:
             layer = ghosts.draw_traced(random, ghosts.choose_lens(random, lenses), position, size)
@@ -146,7 +149,7 @@ def _draw_ghosts(random: Random, position: Point, size: int, x: Array, y: Array,
 
 
 def _normalise_exposure(random: Random, layer: Array, low: float, high: float) -> Array:
-    """Return a layer scaled to a random brightness between low and high.
+    """Return a layer (size, size, 3) scaled to a random brightness between `low` and `high`, linear light.
 
     Brightness is the 80th percentile of the lit pixels: it follows the bright area, not a peak of few pixels.
     """

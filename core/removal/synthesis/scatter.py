@@ -107,8 +107,10 @@ def _draw_phase(random: Random) -> Array:
 
 
 def draw_shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return (size, size, 3), many fine rays round the light, of uneven strength and length, of any brightness (the
-    caller normalises it). x, y: `canvas_grid`."""
+    """Draw many fine rays around the light, of uneven strength and length: (size, size, 3).
+
+    Their brightness is arbitrary; the caller normalises it. x, y: `canvas_grid`.
+    """
     dx, dy = x - light[0], y - light[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
     direction_count = 2048  # over the whole circle
@@ -153,7 +155,7 @@ def _radial_tint(random: Random, r: Array) -> Array:
 
 
 def draw_glow(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return (size, size, 3), maximum 1, the glow round a light: one to three lobes that fall off as a power or a
+    """Draw the glow around a light, (size, size, 3), maximum 1: one to three lobes that fall off as a power or as a
     Gaussian, each of a colour that changes outwards. x, y: `canvas_grid`."""
     dx, dy = x - light[0], y - light[1]
     if random.random() < 0.25:  # stretched, as a smear is

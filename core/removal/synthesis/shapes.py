@@ -11,7 +11,7 @@ from .canvas import GREEN_WAVELENGTH, Array, Point, Random, log_uniform, random_
 
 
 def draw_streak(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return (size, size, 3), maximum 1: the long horizontal line of an anamorphic lens, or a few close to each other.
+    """Draw the long horizontal streak of an anamorphic lens, or a few close to each other: (size, size, 3), maximum 1.
 
     x, y: `canvas_grid`.
     """
@@ -35,11 +35,11 @@ def draw_streak(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def draw_smear(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return what wiped grease on the front glass shows, as on most telephones at night: beams at right angles to the
-    wiping marks. Each widens outwards, is smooth or made of fine rays, and lies on one or both sides of the light.
+    """Draw the beams that wiped grease on the front glass causes, as on most telephones at night: (size, size, 3).
 
-    The first beam has a brightness of about 1 at a distance of 0.25 from the light, so the layer (size, size, 3)
-    exceeds 1 nearer to it. x, y: `canvas_grid`.
+    They lie at right angles to the wiping marks. Each widens outwards, is smooth or made of fine rays, and lies on one
+    or both sides of the light. The first beam has a brightness of about 1 at a distance of 0.25 from the light, so the
+    layer exceeds 1 nearer to it. x, y: `canvas_grid`.
     """
     dx, dy = x - light[0], y - light[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
@@ -50,7 +50,7 @@ def draw_smear(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Array:
-    """Return (size, size, 3), one beam of a smear.
+    """Draw one beam of a smear, (size, size, 3).
 
     r, angle: each pixel's polar coordinates about the light. fainter: draw the beam's brightness from 0.1 to 1; else it
     is 1.
@@ -90,7 +90,7 @@ def _draw_ray_profile(random: Random) -> Callable[[Array], Array]:
 
 
 def draw_halo(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return (size, size, 3), maximum 1: one or two rings, white or in the colours of diffraction, whole or partial.
+    """Draw one or two rings, white or in the colours of diffraction, whole or partial: (size, size, 3), maximum 1.
 
     They are centred on the light, in three of ten flares on another point of the line through the light and the middle.
     x, y: `canvas_grid`.

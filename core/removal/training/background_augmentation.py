@@ -97,7 +97,8 @@ def defocus(scene: Pixels, aperture: Pixels) -> Pixels:
 
 
 def _add_dead_leaves(random: Random, scene: Pixels, draw_view: DrawView) -> Pixels:
-    """Cover the scene with one to eight pieces of other views, each in its own exposure, some with soft edges."""
+    """Cover the scene, linear light (height, width, 3), with one to eight pieces of other views, each in its own
+    exposure, some with soft edges."""
     height, width = scene.shape[:2]
     scene = scene.copy()
     for _ in range(int(random.integers(1, 9))):
@@ -164,7 +165,8 @@ def _draw_polygon(corners: NDArray[np.float64], width: int, height: int) -> Pixe
 
 
 def _random_grade(random: Random, scene: Pixels) -> Pixels:
-    """Change contrast, saturation and colour balance, each in half of the scenes; permute the channels of a fifth."""
+    """Change contrast, saturation and colour balance of linear light (height, width, 3), each in half of the scenes;
+    permute the channels of a fifth."""
     level = np.float32(max(float(scene.mean()), 1e-4))  # contrast changes about the mean
     if random.random() < 0.5:
         scene = level * (scene / level) ** np.float32(math.exp(random.normal(0, 0.25)))
@@ -234,7 +236,8 @@ def _optical_depth(random: Random, scene: Pixels, below_horizon: Pixels) -> Pixe
 
 
 def _add_bright_objects(random: Random, scene: Pixels) -> Pixels:
-    """Add some panels, or the reflections of some lamps on a floor or water."""
+    """Add one to four panels to linear light (height, width, 3), or the reflections of as many lamps on a floor or
+    water."""
     on_floor = random.random() < 0.4
     for _ in range(int(random.integers(1, 5))):
         colour = np.exp(random.normal(0, 0.3, 3) + random.uniform(-1.5, 1.5)).astype(np.float32)

@@ -145,9 +145,12 @@ def to_grey(pair: Pair, channel: int) -> Pair:
 
 def _place_against_bright_scene(random: Random, layers: FlareLayers, matrix: NDArray[Any],
                                 scene: Pixels) -> tuple[NDArray[Any], float]:
-    """Return (placement, brightness of the scene at the light): out of `matrix` and PLACEMENTS - 1 random placements,
-    the one that puts the flare's first light where the scene is brightest. A light outside the frame counts as at the
-    nearest edge."""
+    """Choose the placement that puts the flare's first light where the scene is brightest, out of `matrix` and
+    PLACEMENTS - 1 random ones.
+
+    Returns its matrix (2, 3), canvas to frame in pixels, and the scene's brightness at the light, linear light. A light
+    outside the frame counts as at the nearest edge.
+    """
     import cv2
 
     height, width = scene.shape[:2]
@@ -224,7 +227,8 @@ def _develop(development: random_cameras.Development, displayed: Sequence[Pixels
 
 
 def _quantise(random: Random, frame: Pixels) -> Pixels:
-    """Return the frame as it is read from a file: display values of 8 bit codes, in four of ten through JPEG."""
+    """Return the frame, display values (height, width, 3), as it is read from a file of 8 bit codes, in four of ten
+    cases from a JPEG."""
     import cv2
 
     codes: NDArray[Any] = (frame * 255 + random_cameras.draw_dither(random)).astype(np.uint8)

@@ -28,7 +28,7 @@ class SharedArrays(Sequence[NDArray[Any]]):
     """
 
     def __init__(self, path: Path, arrays: Iterable[NDArray[Any]]) -> None:
-        """Write the arrays to `path`."""
+        """Write the arrays, of any shapes and types, to the file `path`."""
         self._path, self._spans = path, []
         self._bytes: NDArray[np.uint8] | None = None
         with open(path, "wb") as file:

@@ -135,7 +135,7 @@ class RemovalTrainer:
 
     def _compute_loss(self, psnr_phase: bool, frame: Tensor, scene: Tensor, scene_with_glow: Tensor,
                       schedule: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the loss and the metrics.
+        """Return the loss, a scalar, and the METRICS, (4,).
 
         Before the PSNR phase, the loss of a picture is its mean squared error, divided by its flare's mean square to a
         power that rises from 0.5 to 1. So strong flares, which are learned sooner, count more at the start; at the end

@@ -77,7 +77,7 @@ def write_by_oiio(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[
 def _write_webp(path: Path, source: Path, codes: NDArray[Any], alpha: NDArray[Any] | None) -> None:
     """Write a lossless WebP with the profile, Exif and XMP of `source`. Raises FrameError.
 
-    codes: 8 bit R G B (height, width, 3). alpha: (height, width) or None.
+    codes: 8 bit, grey or R G B (height, width, 1 or 3). alpha: (height, width) or None.
     """
     from PIL import Image
 

@@ -334,7 +334,7 @@ def flare_section(kernel_sets: list[str], rounds: int) -> str:
 
 
 def _is_too_slow(kernel_set: str, width: int) -> bool:
-    """True if a kernel set is left out of `flare_section` at a width."""
+    """Return whether a kernel set is left out of `flare_section` at a width."""
     return kernel_set == "tiles" and width > 480
 
 

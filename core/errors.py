@@ -61,7 +61,7 @@ DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
 
 def is_out_of_memory(problem: BaseException) -> bool:
-    """True if an exception says that memory is short.
+    """Return whether an exception says that memory is short.
 
     torch has a class for that of graphics cards; for the processor's it raises RuntimeError, as OpenCV does.
     """

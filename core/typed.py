@@ -27,20 +27,20 @@ class Bounds:
     exclusive_maximum: bool = False
 
     def __str__(self) -> str:
-        """The range in words, to follow "must lie"."""
+        """Return the range in words, to follow "must lie"."""
         if not self.exclusive_minimum and not self.exclusive_maximum:
             return f"between {self.minimum} and {self.maximum}"
         return (f"{'above' if self.exclusive_minimum else 'from'} {self.minimum} "
                 f"{'and below' if self.exclusive_maximum else 'to'} {self.maximum}")
 
     def contains(self, value: float) -> bool:
-        """True if the number lies in the range; NaN never does."""
+        """Return whether the number lies in the range; NaN never does."""
         above_minimum = self.minimum < value if self.exclusive_minimum else self.minimum <= value
         return above_minimum and (value < self.maximum if self.exclusive_maximum else value <= self.maximum)
 
 
 def is_utf8(text: str) -> bool:
-    """True if the text can be written as UTF-8; file names may hold bytes that cannot."""
+    """Return whether the text can be written as UTF-8; file names may hold bytes that cannot."""
     try:
         text.encode()
     except UnicodeEncodeError:

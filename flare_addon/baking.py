@@ -36,7 +36,8 @@ class Preparation:
     """A scene that is being read for a bake."""
 
     def __init__(self, reading: ShotReading, own_folder: bool, folder: Path) -> None:
-        """own_folder: the layers of a single camera have a subfolder too. folder: where the layers are written."""
+        """Begin at the first frame. own_folder: the layers of a single camera have a subfolder too. folder: where the
+        layers are written."""
         self.reading, self.error = reading, ""
         self._own_folder, self._folder = own_folder, folder
 

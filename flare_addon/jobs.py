@@ -80,7 +80,7 @@ class Job:
 
     def __init__(self, kind: str, folder: Path, origin: Origin, args: Sequence[str] = (),
                  process: subprocess.Popen[bytes] | None = None) -> None:
-        """process: the running process, if this Blender started it."""
+        """Begin to watch a job in its folder. process: the running process, if this Blender started it."""
         self.kind, self.folder, self.origin = kind, folder, origin
         self.args = [arg for arg in args if arg != "--overwrite"]
         self.state: State = "running"

@@ -50,8 +50,8 @@ class ShotReading:
     """
 
     def __init__(self, scene: Any, camera_objects: Sequence[Any], frames: Sequence[int]) -> None:
-        """camera_objects: [] for the scene's camera. Raises SettingsError for negative frames, which layers cannot
-        have."""
+        """Prepare the reading of frames; `step` reads one. camera_objects: [] for the scene's camera. Raises
+        SettingsError for negative frames, which layers cannot have."""
         if min(frames, default=0) < 0:
             raise SettingsError(f"Frame {min(frames)} cannot be baked, since layers have no negative numbers; start at "
                                 "frame 0 or later.")

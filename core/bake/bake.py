@@ -176,7 +176,7 @@ class _FrameWriter:
     layer_by_light: dict[str, str]
 
     def is_finished(self, frame: NumberedFrame) -> bool:
-        """True if the layers of the frame and the files beside them are up to date."""
+        """Return whether the layers of the frame and the files beside them are up to date."""
         return (_is_up_to_date(self.out / frame.file, self._header_notes(frame))
                 and all(path.is_file() for path in self.renderer_for(frame).extra_files))
 
@@ -285,7 +285,7 @@ def _claim_folder(out: Path, cache_key: dict[str, Any], layer_by_light: dict[str
 
 
 def _is_up_to_date(path: Path, expected: Mapping[str, Any]) -> bool:
-    """True if the file is whole and its own header has the `expected` entries: the frame and its settings.
+    """Return whether the file is whole and its own header has the `expected` entries: the frame and its settings.
 
     bake.json does not show it, since other tasks of a farm write here too."""
     try:

@@ -126,7 +126,8 @@ class Camera:
         return plane * (self.fx, self.fy) + (self.cx, self.cy), depth
 
     def jacobian(self, xyz: ArrayLike) -> Floats:
-        """(2, 3) derivative of the pixel of a world point (3,) in front of the camera by the point."""
+        """Return the derivative (2, 3) of the pixel of a world point (3,) by the point, which is in front of the
+        camera."""
         rotation = self.world_to_camera[:3, :3]
         x, y, z = rotation @ np.asarray(xyz, np.float64) + self.world_to_camera[:3, 3]
         projection = np.array([[self.fx, 0, -self.fx * x / z], [0, self.fy, -self.fy * y / z]]) / z
@@ -140,7 +141,7 @@ class Camera:
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def contains(self, pixels: ArrayLike, depth: Any = 1.0) -> NDArray[np.bool_]:
-        """(n,) which pixels (n, 2), with their depths (n,), lie in front of the camera and inside the frame."""
+        """Return (n,), true for pixels (n, 2), with their depths (n,), in front of the camera and inside the frame."""
         points = np.asarray(pixels, np.float64).reshape(-1, 2)
         with np.errstate(invalid="ignore"):
             return np.asarray((np.asarray(depth) > 0) & (points >= 0).all(axis=1) & (points <= self.size).all(axis=1))
@@ -181,12 +182,13 @@ def check_in_view(cameras: Sequence[Camera], points: Floats, scene: str, world: 
 
 
 def is_rotation(matrix: Floats) -> bool:
-    """True if (3, 3) is a rotation, within the rounding of files."""
+    """Return whether (3, 3) is a rotation, within the rounding of files."""
     return bool(np.allclose(matrix.T @ matrix, np.eye(3), atol=2e-3) and np.linalg.det(matrix) > 0)
 
 
 def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:
-    """(3, 3) rotation of a quaternion (w, x, y, z), normalised first (Hamilton's convention, as in COLMAP)."""
+    """Return the rotation (3, 3) of a quaternion (w, x, y, z), normalised first; Hamilton's convention, as in
+    COLMAP."""
     w, x, y, z = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -196,7 +198,7 @@ def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:
 
 
 def quaternion_from_rotation(rotation: ArrayLike) -> Floats:
-    """(4,) unit quaternion (w, x, y, z), w >= 0, of a rotation (3, 3).
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation (3, 3).
 
     Bar-Itzhack's method (2000): the quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 x 4
     matrix, for every rotation alike.

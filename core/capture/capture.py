@@ -236,7 +236,7 @@ class Capture:
         return read_plate_space(self.folder)
 
     def frame(self, view: View, size: tuple[int, int] | None = None) -> Picture:
-        """The view's frame, undistorted, at its camera's size or at `size` (width, height).
+        """Return the view's frame, undistorted, at its camera's size or at `size` (width, height).
 
         Treat the pixels as read-only: they may be shared. Raises FrameError.
         """
@@ -252,7 +252,7 @@ class Capture:
         return self._pictures.undistorted(stored, view, path) if view.lens else stored
 
     def frame_path(self, view: View) -> Path:
-        """The file of the view's frame."""
+        """Return the file of the view's frame."""
         return self._frames[view.name]
 
     def clean_frame(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
@@ -261,12 +261,13 @@ class Capture:
         return self._optional_picture(self._clean_frames, view, size, None if is_developed else self.plate_space)
 
     def has_other_format(self, view: View) -> bool:
-        """True if a view's clean frame is an EXR and its filmed frame is not. The clean frame is then linear light."""
+        """Return whether a view's clean frame is an EXR and its filmed frame is not. The clean frame is then linear
+        light."""
         path = self._clean_frames.get(view.name)
         return path is not None and path.suffix.lower() == ".exr" != self.frame_path(view).suffix.lower()
 
     def holds_light_above_white(self, view: View) -> bool:
-        """True if the file of the view's frame may hold light above white. Raises FrameError."""
+        """Return whether the file of the view's frame may hold light above white. Raises FrameError."""
         return has_float_pixels(self.frame_path(view), self.plate_space)
 
     def clean_frame_path(self, view: View) -> Path:
@@ -293,7 +294,7 @@ class Capture:
 
     @property
     def has_masks(self) -> bool:
-        """True if some view has a mask."""
+        """Return whether some view has a mask."""
         return bool(self._masks)
 
     def truth_scene(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
@@ -306,12 +307,12 @@ class Capture:
 
     @property
     def has_clean_frames(self) -> bool:
-        """True if every view has a clean frame in removed/."""
+        """Return whether every view has a clean frame in removed/."""
         return len(self._clean_frames) == len(self.views)
 
     @property
     def has_truth(self) -> bool:
-        """True if every view has an exact scene layer."""
+        """Return whether every view has an exact scene layer."""
         return len(self._truth_scene) == len(self.views)
 
     @property
@@ -334,7 +335,7 @@ class Capture:
 
     @property
     def is_rotation_only(self) -> bool:
-        """True if all cameras share one place, as on a tripod, within rounding or the noise of a solve."""
+        """Return whether all cameras share one place, as on a tripod, within rounding or the noise of a solve."""
         return self._camera_radius <= max(1e-3 * self._point_distance, 1e-9 * (1 + float(np.abs(self.centre).max())))
 
     @property

@@ -345,7 +345,7 @@ def image_lines(lines: Sequence[str]) -> list[tuple[int, str, str]]:
 
 
 def _is_image(line: str) -> bool:
-    """True for a line of ten fields, the last of which is a name. A line of 2D points has numbers in threes."""
+    """Return whether a line has ten fields, the last of which is a name. A line of 2D points has numbers in threes."""
     fields = line.split(maxsplit=9)
     if len(fields) < 10:
         return False

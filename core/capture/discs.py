@@ -15,7 +15,8 @@ CLIP_LEVEL = 0.93
 
 
 def light_disc_mask(display: NDArray[np.float32], camera: Camera, lights: ArrayLike) -> NDArray[np.bool_]:
-    """(height, width): pixels of the lights' discs in a picture, display values (height, width, 3), of the camera.
+    """Return the mask (height, width) of the lights' discs in a picture of the camera, display values (height, width,
+    3).
 
     A pixel belongs to a disc if it is clipped and close to the projection of one of the lights (n, 3), world
     coordinates.
@@ -25,7 +26,7 @@ def light_disc_mask(display: NDArray[np.float32], camera: Camera, lights: ArrayL
 
 
 def squared_light_distances(camera: Camera, lights: ArrayLike) -> NDArray[np.float32]:
-    """(height, width): squared distance of each pixel to the nearest projection of the lights (n, 3), in frame widths.
+    """Return (height, width) squared distances of pixels to the nearest projection of lights (n, 3), in frame widths.
 
     Infinite where no light is in front of the camera.
     """

@@ -24,7 +24,7 @@ class PictureIndex:
     """The pictures below a folder, found by the names of frames elsewhere, which may have another suffix."""
 
     def __init__(self, folder: Path, folders: Iterable[Path] | None = None) -> None:
-        """folders: list the pictures of these folders, without subfolders, instead of all below `folder`."""
+        """List the pictures below `folder`, or those of `folders`, without their subfolders."""
         self.paths = (pictures_below(folder) if folders is None else
                       [path for each in folders if each.is_dir() for path in pictures_in(each)])
         self.names = [path.relative_to(folder).as_posix() for path in self.paths]

@@ -80,7 +80,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def is_model(folder: Path) -> bool:
-    """True if a folder has the cameras of a COLMAP model."""
+    """Return whether a folder has the cameras of a COLMAP model."""
     return any((cameras := find_entry(folder, f"cameras{suffix}")) is not None and cameras.is_file()
                for suffix in (".bin", ".txt"))
 

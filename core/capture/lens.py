@@ -192,7 +192,7 @@ class Lens:
             (x, zero), (x, ones * self.height), (zero, y), (ones * self.width, y))])
 
     def _is_covered(self, border: Floats) -> bool:
-        """True if the frame covers a view with this border (n, 2), as X/Z and Y/Z.
+        """Return whether the frame covers a view with this border (n, 2), as X/Z and Y/Z.
 
         Along 16 points from the centre to each border point, the distorted radius must grow: a polynomial that folds
         back shows the frame a second time, mirrored.

@@ -76,7 +76,7 @@ class Light:
 
     @property
     def is_on_picture(self) -> bool:
-        """True if the light's places are known on the picture alone."""
+        """Return whether the light's places are known on the picture alone."""
         return self.xy is not None or any(key.xy is not None for key in self.keys.values())
 
     @property
@@ -178,12 +178,12 @@ def _parse_place(entry: Mapping[str, Any], label: str, count: int, where: str) -
 
 
 def is_point(xyz: Any) -> bool:
-    """True for three finite numbers, as in JSON."""
+    """Return whether a value of JSON is a list of three finite numbers."""
     return isinstance(xyz, list) and len(xyz) == 3 and all(map(is_finite, xyz))
 
 
 def is_finite(value: Any) -> bool:
-    """True for a number of JSON that is finite and not absurdly large."""
+    """Return whether a value of JSON is a number below 1e30 in size."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e30
 
 
@@ -191,7 +191,7 @@ class LightPath:
     """The keys of one light over the frames of a capture, interpolated. `state` evaluates it in a view."""
 
     def __init__(self, light: Light, names: Sequence[str]) -> None:
-        """names: the names of the capture's views."""
+        """Match the keys of a light to views. names: the names of the capture's views."""
         self.light = light
         self._times = _frame_times(names)
         views_by_name = {_canonical(name): name for name in names}
@@ -205,7 +205,7 @@ class LightPath:
 
     @property
     def has_place(self) -> bool:
-        """True if the light's place is known in some view."""
+        """Return whether the light's place is known in some view."""
         return bool(self._place_keys) or not self.light.moves or self.light.xy is not None
 
     def interpolated_views(self) -> list[str]:

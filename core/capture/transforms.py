@@ -328,7 +328,8 @@ def _fit_similarity(model: Sequence[PosedFrame], frames: Sequence[PosedFrame]) -
 
 
 def _move_alike(first: Floats, second: Floats, xyz: NDArray[np.float32]) -> bool:
-    """True if two similarities (4, 4) move points (n, 3) to the same places, within 2 MAX_MISMATCH of their extent."""
+    """Return whether two similarities (4, 4) move points (n, 3) to the same places, within 2 MAX_MISMATCH of their
+    extent."""
     sampled = xyz[::max(len(xyz) // 1000, 1)].astype(np.float64)
     if not len(sampled):
         return True

@@ -37,7 +37,7 @@ _CAMERA_TRANSFORMS = {
 
 
 def has_configuration() -> bool:
-    """True if the variable OCIO names a configuration."""
+    """Return whether the variable OCIO names a configuration."""
     return bool(os.environ.get("OCIO"))
 
 

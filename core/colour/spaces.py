@@ -60,7 +60,7 @@ class ColourSpace:
 
     @property
     def is_linear(self) -> bool:
-        """True if light adds in this space."""
+        """Return whether light adds in this space."""
         return self.matrix is not None
 
     @property
@@ -179,7 +179,7 @@ def plate_names() -> list[str]:
 
 
 def is_plate_name(name: str) -> bool:
-    """True if `colour_space` knows a name without a configuration, however people write it."""
+    """Return whether `colour_space` knows a name without a configuration, however people write it."""
     return _normalise_name(name) in _ALIASES or _normalise_name(name) in _CAMERAS
 
 

@@ -42,7 +42,7 @@ class PixelGrid:
 
     @classmethod
     def from_focal_lengths(cls, focal_lengths: Iterable[float]) -> PixelGrid:
-        """The grid of frames with these focal lengths, px."""
+        """Return the grid of frames with these focal lengths, px."""
         lengths = list(focal_lengths)
         return cls(min(lengths), max(lengths))
 

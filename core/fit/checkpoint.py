@@ -94,7 +94,7 @@ def _nest(flat: Mapping[str, Any]) -> State:
 
 
 def _is_table_shape(shape: Any) -> bool:
-    """True for [rows, columns] of a table that memory may hold."""
+    """Return whether a value is [rows, columns] of a table that memory may hold."""
     return (isinstance(shape, list) and len(shape) == 2 and all(type(size) is int and size > 0 for size in shape)
             and shape[0] * shape[1] <= _MAX_TABLE)
 

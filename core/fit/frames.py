@@ -74,8 +74,11 @@ class Frames:
 
     def __init__(self, capture: Capture, width: int = 0, memory: int = MEMORY, *,
                  display_white: float = 1.0, frames_only: bool = False, truth: bool = True) -> None:
-        """width: largest width of the pictures, pixels, 0 for that of the frames; memory: bytes for decoded pictures;
-        frames_only: ignore the capture's clean frames; truth: use exact layers where there are no other clean frames.
+        """Choose the source of clean frames, and begin with an empty cache.
+
+        width: largest width of the pictures, pixels, 0 for that of the frames. memory: bytes for decoded pictures.
+        display_white: largest display value of the frames. frames_only: ignore the capture's clean frames. truth: use
+        exact layers where there are no other clean frames.
         """
         self.capture = capture
         self.display_white = display_white

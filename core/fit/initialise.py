@@ -151,7 +151,7 @@ def _views_in_front(light_index: int, views: tuple[View, ...], positions: torch.
 
 
 def has_frame_lights(capture: Capture) -> bool:
-    """True if a light moves, or has a brightness by frame."""
+    """Return whether a light moves, or has a brightness by frame."""
     return any(light.moves or light.keys for light in capture.lights)
 
 

@@ -41,7 +41,7 @@ class FlareShare(NamedTuple):
 
     @property
     def is_visible(self) -> bool:
-        """True if the light counts as one that flares."""
+        """Return whether the light counts as one that flares."""
         return self.share >= MIN_SHARE and self.peak >= MIN_PEAK
 
 

@@ -243,5 +243,5 @@ def resolve_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings,
 
 
 def _is_above_white(capture: Capture, view: View) -> bool:
-    """True if a pixel of the frame is above 1; only a frame whose format can hold that is decoded."""
+    """Return whether a pixel of the frame is above 1; only a frame whose format can hold that is decoded."""
     return capture.holds_light_above_white(view) and bool(capture.frame(view).pixels.max() > 1)

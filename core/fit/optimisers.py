@@ -27,8 +27,11 @@ class Optimisers:
 
     def __init__(self, scene: SceneGaussians | None, flare: FlareModel | None, settings: FitSettings, extent: float,
                  display_white: float) -> None:
-        """scene: None for plates, which a fit does not change. extent: of the capture, world units. display_white:
-        largest display value of the frames."""
+        """Make an optimiser for each kind of parameter.
+
+        scene: None for plates, which a fit does not change. extent: of the capture, world units. display_white: largest
+        display value of the frames.
+        """
         self._settings, self._extent = settings, extent
         rates = settings.scene.rates
         sh_rates = torch.full((COEFFICIENTS, 1), rates.features_rest)
@@ -108,7 +111,10 @@ class FlareOptimisers:
     grids that a view touched, and `brightness`, None for lights that stay on."""
 
     def __init__(self, flare: FlareModel, rates: FlareRates) -> None:
-        """rates: the settings' learning rates; those of lengths in the plane are multiplied by `LightFlare.scale`."""
+        """Group the parameters of all lights by their learning rates.
+
+        rates: of the settings; those of lengths in the plane are multiplied by `LightFlare.scale`.
+        """
         self._rates = rates
         gaussian_rates = {
             "positions": rates.position, "log_scales": rates.scale, "rotations": rates.rotation,

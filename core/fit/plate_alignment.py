@@ -78,14 +78,14 @@ class Alignment:
         return [self._matcher.match(*pair) for pair in pairs[::max(len(pairs) // PROBES, 1)]]
 
     def _camera_travels(self) -> bool:
-        """True if homographies explain too few matches of the probed pairs of frames, or no pair has enough matches;
-        False for a shot that is too short for a pair."""
+        """Return whether homographies explain too few matches of the probed pairs of frames, or no pair has enough
+        matches; False for a shot that is too short for a pair."""
         matches = self._probed_matches()
         shares = [match.inlier_share for match in matches if match.inlier_share is not None]
         return bool(matches) and (not shares or float(np.median(shares)) < TURNING_INLIER_SHARE)
 
     def _camera_stands(self) -> bool:
-        """True if all homographies of the probed pairs are the identity."""
+        """Return whether all homographies of the probed pairs are the identity."""
         matrices = [match.matrix for match in self._probed_matches() if match.matrix is not None]
         return bool(matrices) and all(np.array_equal(matrix, np.eye(3)) for matrix in matrices)
 

@@ -102,7 +102,7 @@ class PlateTrainer(FlareTrainer):
             self._progress.advance()
 
     def _is_lit(self, view: View) -> bool:
-        """True unless every light is out in a view."""
+        """Return whether at least one light is lit in a view."""
         assert self.flare is not None and self.flare.frame_lights is not None
         brightness = self.flare.frame_lights.brightness_in(view.name)
         return brightness is None or bool((brightness > MIN_BRIGHTNESS).any())

@@ -149,7 +149,7 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """True if the fit ran to its end: the flare is written last."""
+        """Return whether the fit ran to its end: the flare is written last."""
         return (self.folder / FLARE).is_file() or (self.settings.mode == "3dgs" and (self.folder / SCENE).is_file())
 
     @property

@@ -229,22 +229,22 @@ class FitSettings:
 
     @property
     def uses_plates(self) -> bool:
-        """True if the scene is one plate per frame."""
+        """Return whether the scene is one plate per frame."""
         return self.scene.kind == "plates"
 
     @property
     def supervised(self) -> bool:
-        """True if clean frames that are taken for exact supervise the scene."""
+        """Return whether clean frames that are taken for exact supervise the scene."""
         return self.mode in ("default", "2d")
 
     @property
     def uses_parallax(self) -> bool:
-        """True if scene and flare are separated by parallax."""
+        """Return whether scene and flare are separated by parallax."""
         return self.mode in PARALLAX_MODES
 
     @property
     def needs_clean_frames(self) -> bool:
-        """True if the fit needs clean frames, exact or estimated."""
+        """Return whether the fit needs clean frames, exact or estimated."""
         return self.supervised or self.mode == "estimated"
 
     @property
@@ -272,7 +272,7 @@ class FitSettings:
 
 
 def _is_valid_holdout(holdout: str | int | None) -> bool:
-    """True unless `holdout` is text of too many digits: text of digits is taken for a number."""
+    """Return whether `holdout` is no text of too many digits: text of digits is taken for a number."""
     if not isinstance(holdout, str) or not holdout.strip().lstrip("+-").isdigit():
         return True
     return re.fullmatch(rf"[+-]?\d{{1,{MAX_INT_DIGITS}}}", holdout.strip()) is not None

@@ -218,7 +218,7 @@ class Trainer(FlareTrainer):
 
     @property
     def _steps_in_backward(self) -> bool:
-        """True if all gradients of the scene come from one rendering, so that the backward pass may take the
+        """Return whether all gradients of the scene come from one rendering, so that the backward pass may take the
         optimiser's step."""
         settings = self.settings
         return (self.fits_scene and settings.scene.strategy == "classic"
@@ -263,7 +263,8 @@ class Trainer(FlareTrainer):
         return occlusion_loss(self.scene, eye, visible_lights, visibility, self.settings.kernels)
 
     def _is_scene_only(self, targets: Targets) -> bool:
-        """True while the scene is fitted alone, so that it hides lights by the time their flares are fitted."""
+        """Return whether the scene is still fitted alone, so that it hides lights by the time their flares are
+        fitted."""
         if self.settings.uses_parallax:
             return self.iteration <= self._scene_only_iterations
         flare_started = self.iteration > self.settings.flare.scene_only_until * self.settings.iterations

@@ -30,7 +30,7 @@ class DensitySettings:
     max_gaussians: int = 20000
 
     def is_due(self, iteration: int) -> bool:
-        """True if an iteration clones and prunes."""
+        """Return whether an iteration clones and prunes."""
         return self.start <= iteration <= self.stop and iteration % self.every == 0
 
 

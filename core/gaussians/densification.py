@@ -101,8 +101,8 @@ class Classic:
 
     @torch.no_grad()
     def update(self, iteration: int) -> bool:
-        """Every `every` iterations clone, split and prune Gaussians; every `reset_every` iterations lower all opacities
-        to at most `reset_to`. Return whether rows were added or removed."""
+        """Clone, split and prune Gaussians every `every` iterations, and lower all opacities to at most `reset_to`
+        every `reset_every` iterations. Return whether rows were added or removed."""
         settings = self.settings
         if iteration > settings.stop:
             return False
@@ -199,7 +199,10 @@ class Mcmc:
         self, scene: SceneGaussians, optimiser: Adam, generator: torch.Generator,
         settings: McmcSettings | None = None, extent: float = 1.0,
     ) -> None:  # fmt: skip
-        """extent: size of the scene, world units; Gaussians of the far layer are measured relative to it."""
+        """Begin with the scene and its optimiser.
+
+        extent: size of the scene, world units; Gaussians of the far layer are measured relative to it.
+        """
         self.scene, self.optimiser, self.generator = scene, optimiser, generator
         self.extent = extent
         self.settings = settings or McmcSettings()
@@ -215,8 +218,9 @@ class Mcmc:
 
     @torch.no_grad()
     def update(self, iteration: int) -> bool:
-        """Every `every` iterations relocate dead Gaussians and add new ones; in every iteration inject noise. Return
-        whether rows were moved or added."""
+        """Relocate dead Gaussians and add new ones every `every` iterations, and inject noise in each iteration.
+
+        Return whether rows were moved or added."""
         settings = self.settings
         changed = settings.start < iteration <= settings.stop and iteration % settings.every == 0
         if changed:

@@ -207,7 +207,7 @@ def _parse_header(path: Path, head: bytes) -> _Header:
 
 
 def _is_mip_comment(comment: Sequence[str]) -> bool:
-    """True for a comment that names a mip filter: "SplatRenderMode: mip", "antialiased 1", "mip_filter: true"."""
+    """Return whether a comment names a mip filter: "SplatRenderMode: mip", "antialiased 1", "mip_filter: true"."""
     tokens = " ".join(comment).replace(":", " ").replace("=", " ").lower().split()
     if len(tokens) != 2:
         return False

@@ -28,7 +28,7 @@ from .window import DataWindow
 
 
 def is_exr(path: Path) -> bool:
-    """True if a file is an EXR by its contents, whatever its name. Raises OSError."""
+    """Return whether a file is an EXR by its contents, whatever its name. Raises OSError."""
     return file_kind(path) == "exr"
 
 
@@ -69,7 +69,7 @@ def exr_pixel_aspect(path: Path | str) -> float:
 
 
 def is_exr_truncated(path: Path | str) -> bool:
-    """True if an EXR ends before its last lines, by its table of line offsets. Raises OSError where the file is
+    """Return whether an EXR ends before its last lines, by its table of line offsets. Raises OSError where the file is
     missing."""
     with open_regular(path) as stream:
         return stream.read(4) == exr_header.MAGIC and exr_header.is_truncated(stream)
@@ -123,7 +123,7 @@ def _in_ascii(name: bytes) -> bytes:
 
 
 def is_utf8(text: bytes) -> bool:
-    """True if bytes are valid UTF-8."""
+    """Return whether bytes are valid UTF-8."""
     try:
         text.decode("utf-8")
     except UnicodeDecodeError:
@@ -289,7 +289,8 @@ def rgb_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> Pixels:
 
 
 def has_chroma(channels: Container[str]) -> bool:
-    """True if a picture is stored as luminance and chroma of half resolution, as OpenEXR's RGBA interface can write."""
+    """Return whether a picture is stored as luminance and chroma of half resolution, as OpenEXR's RGBA interface can
+    write."""
     return all(name in channels for name in ("Y", "RY", "BY"))
 
 

@@ -178,7 +178,7 @@ def _without_resource_thumbnails(segments: list[tuple[int, bytes]]) -> list[tupl
 
 
 def _has_claims(segment: bytes) -> bool:
-    """True if an XMP segment claims that the file holds more than its first picture."""
+    """Return whether an XMP segment claims that the file holds more than its first picture."""
     return any(name.encode() in segment for name in _CLAIMS) or (
         _CAMERA.encode() in segment and any(name.encode() in segment for name in _CAMERA_CLAIMS))
 

@@ -26,7 +26,7 @@ OIIO_FORMATS = {".dpx": "dpx", ".webp": "webp", ".bmp": "bmp", ".tga": "targa", 
 
 
 def needs_oiio_writer(path: Path) -> bool:
-    """True for a plate that OpenCV cannot write as it is stored."""
+    """Return whether OpenCV cannot write a plate as it is stored."""
     kind = file_kind(path)
     return kind in ("dpx", "cineon", "webp", "bmp", "tga") or (kind == "tiff" and needs_openimageio(path))
 

@@ -30,8 +30,8 @@ _MAX_XMP_BYTES = 1 << 22
 
 
 def wraps_around(path: Path, header: Mapping[str, Any] | None = None) -> bool:
-    """True if a picture is a panorama of 360 degrees by what its file says. header: the header of an EXR; None for
-    others.
+    """Return whether a picture is a panorama of 360 degrees by what its file says. header: the header of an EXR; None
+    for others.
 
     False for a part of a panorama, for a cube map, and for a file that cannot be read.
     """
@@ -49,8 +49,8 @@ def wraps_around(path: Path, header: Mapping[str, Any] | None = None) -> bool:
 
 
 def do_sides_meet(columns: Pixels) -> bool:
-    """True if the right side of a picture continues at its left one. columns: display values (height, 4, 3) of the
-    first two and the last two columns."""
+    """Return whether the right side of a picture continues at its left one. columns: display values (height, 4, 3) of
+    the first two and the last two columns."""
     left, right = columns[:, 0].ravel(), columns[:, 3].ravel()
     if min(left.std(), right.std()) < MIN_VARIETY or np.corrcoef(left, right)[0, 1] < MIN_CORRELATION:
         return False
@@ -60,7 +60,7 @@ def do_sides_meet(columns: Pixels) -> bool:
 
 
 def _is_full_panorama(packet: bytes) -> bool:
-    """True if XMP names a projection of the whole circle, and no crop of it."""
+    """Return whether XMP names a projection of the whole circle, and no crop of it."""
     match = _PROJECTION.search(packet)
     if match is None or match[1].decode().lower() not in _PROJECTIONS:
         return False

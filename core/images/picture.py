@@ -52,7 +52,7 @@ class Picture:
 
 
 def same_aspect(size: tuple[int, int], other_size: tuple[int, int]) -> bool:
-    """True if one size (width, height) is the other, scaled and rounded to whole pixels.
+    """Return whether one size (width, height) is the other, scaled and rounded to whole pixels.
 
     Each side of the smaller size, scaled to the larger, may differ from it by one pixel of the smaller (`scale`).
     """

@@ -121,7 +121,7 @@ class Plate:
 
     @property
     def is_rec709(self) -> bool:
-        """True if the codes are sRGB display values, or scene-linear Rec. 709 light as floats."""
+        """Return whether the codes are sRGB display values, or scene-linear Rec. 709 light as floats."""
         return self.space.name == ("srgb" if self.encoding == "srgb" else "linear")
 
     @cached_property
@@ -215,8 +215,8 @@ def clean_name(path: Path) -> Path:
 
 
 def is_plate_error(problem: Exception) -> bool:
-    """True if the plate causes the error, so that others may work: it is damaged, unreadable, or too large for the
-    memory.
+    """Return whether the plate causes the error, so that others may work: it is damaged, unreadable, or too large for
+    the memory.
 
     Any other exception is a defect.
     """
@@ -263,15 +263,15 @@ def _read_codes(path: Path, space: ColourSpace | None) -> Plate:
 
 
 def _is_grey_with_alpha(path: Path) -> bool:
-    """True for a PNG of colour type 4 (PNG specification, 11.2.1), which OpenCV reads as colour."""
+    """Return whether a PNG has colour type 4 (PNG specification, 11.2.1), which OpenCV reads as colour."""
     with open_regular(path) as stream:
         header = stream.read(26)
     return header[:4] == b"\x89PNG" and header[25:] == b"\x04"
 
 
 def _is_animated(path: Path) -> bool:
-    """True for a PNG of several frames (PNG specification, third edition, 11.3.6.1), of which OpenCV reads the first.
-    """
+    """Return whether a PNG has several frames (PNG specification, third edition, 11.3.6.1), of which OpenCV reads the
+    first."""
     with open_regular(path) as stream:
         return any(int.from_bytes(content[:4], "big") > 1
                    for _, content in png.chunks(stream, (b"acTL",), before_pixels=True))

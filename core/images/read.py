@@ -102,8 +102,8 @@ def rgb_codes(stored: NDArray[Any]) -> NDArray[Any]:
 
 
 def has_float_pixels(path: Path, space: ColourSpace | None = None) -> bool:
-    """True if a picture is scene-linear and may hold light above white, by its pixels or its space (`space`, else what
-    it declares). Raises FrameError for a damaged file."""
+    """Return whether a picture is scene-linear and may hold light above white, by its pixels or its space (`space`,
+    else what it declares). Raises FrameError for a damaged file."""
     if (kind := file_kind(path)) in ("exr", "hdr", "raw"):
         return True
     if kind == "tiff":
@@ -122,7 +122,7 @@ def has_float_pixels(path: Path, space: ColourSpace | None = None) -> bool:
 
 
 def has_half_pixels(path: Path) -> bool:
-    """True for an EXR whose colours are 16 bit floats. Raises FrameError."""
+    """Return whether a file is an EXR whose colours are 16 bit floats. Raises FrameError."""
     if not is_exr(path):
         return False
     with open_regular(path) as stream:

@@ -68,7 +68,7 @@ def unsupported_reason(path: Path) -> str:
 
 
 def needs_openimageio(path: Path) -> bool:
-    """True for a TIFF that OpenCV decodes as something else, or not at all: BigTIFF; 16 bit floats; above 8 bits,
+    """Return whether OpenCV decodes a TIFF wrongly or not at all: BigTIFF; 16 bit floats; above 8 bits,
     separate planes or 0 for white; grey with alpha; depths other than 1, 8, 16, 32 and 64 bits; and compressions that
     OpenCV is built without."""
     with open_regular(path) as stream:

@@ -101,7 +101,7 @@ class VideoFrame:
 
     @property
     def is_damaged(self) -> bool:
-        """True if the decoder filled in parts of the frame."""
+        """Return whether the decoder filled in parts of the frame."""
         return bool(self.raw.is_corrupt)
 
     @property

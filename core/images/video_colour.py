@@ -66,7 +66,7 @@ class VideoColour:
 
     @property
     def is_light(self) -> bool:
-        """True if frames come out as scene-linear light rather than display values."""
+        """Return whether frames come out as scene-linear light rather than display values."""
         return self.transfer != "display"
 
     @property

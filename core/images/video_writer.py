@@ -230,8 +230,8 @@ def _add_video_stream(out: Any, video: Video, source: Any, encoder: Encoder, lef
 
 
 def _is_limited(planar: PlaneFormat, video: Video, encoder: Encoder) -> bool:
-    """True if codes are written in limited range: never as RGB; as Y Cb Cr if the encoder demands it, the source has
-    it, or the source is RGB. planar: the format that is encoded."""
+    """Return whether codes are written in limited range: never as RGB; as Y Cb Cr if the encoder demands it, the source
+    has it, or the source is RGB. planar: the format that is encoded."""
     if planar.is_rgb:
         return False
     return encoder.limited or video.colour.limited or video.colour.matrix == RGB

@@ -29,12 +29,12 @@ class DataWindow:
 
     @property
     def is_frame(self) -> bool:
-        """True if the stored pixels are exactly the frame."""
+        """Return whether the stored pixels are exactly the frame."""
         return self.size == self.frame and self.origin == (0, 0)
 
     @property
     def holds_frame(self) -> bool:
-        """True if all of the frame is stored."""
+        """Return whether all of the frame is stored."""
         return all(origin <= 0 and origin + size >= frame
                    for origin, size, frame in zip(self.origin, self.size, self.frame, strict=True))
 

@@ -41,7 +41,7 @@ class BackgroundMotion:
     """The motion of the background between the frames of a shot; a match is computed when it is first needed."""
 
     def __init__(self, capture: Capture) -> None:
-        """capture: its frames are read, at a small size, when a match first needs them."""
+        """Prepare the matcher. capture: its frames are read, at a small size, when a match first needs them."""
         self._views = capture.views
         width, height = self._views[0].camera.size
         self._scale = min(WORKING_WIDTH / width, 1.0)

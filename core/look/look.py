@@ -79,10 +79,12 @@ class LightLook:
     def __init__(self, name: str, xyz: NDArray[np.float64], form: FlareForm, query_range: QueryRange,
                  rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: Blend,
                  stored_elements: list[Element], clear_visibility: float = 1.0) -> None:
-        """rows: parameters of the canonical Gaussians, (n, width) each, by name. tensors: all tensors of this light in
-        the file, those of the network among them. stored_elements: the elements in the file, or []. clear_visibility:
-        visibility, 0..1, that the scene of the fit gives the light where nothing hides it. Raises ValueError and
-        KeyError for tensors that do not fit."""
+        """Make the look of one light of a .flare.
+
+        xyz: (3,), world units. rows: parameters of the canonical Gaussians, (n, width) each, by name. tensors: all
+        tensors of this light in the file, those of the network among them. stored_elements: the elements in the file,
+        or []. clear_visibility: visibility, 0..1, that the scene of the fit gives the light where nothing hides it.
+        Raises ValueError and KeyError for tensors that do not fit."""
         self.name, self.xyz, self.form, self.query_range, self.blend = name, xyz, form, query_range, blend
         self.clear_visibility = clear_visibility
         self._canonical, self._stored_elements = rows, stored_elements
@@ -172,7 +174,7 @@ class Look:
     def __init__(self, path: Path, lights: tuple[LightLook, ...], blend: Blend, camera: TrainedCamera,
                  licence: str = "", notes: str = "", pixel_grid: PixelGrid | None = None,
                  edit_texts: Sequence[str] = ()) -> None:
-        """edit_texts: the edits that the file stores, see `edits`."""
+        """Make a look; `read_look` reads one. edit_texts: the edits that the file stores, see `edits`."""
         self.path, self.lights, self.blend, self.camera = path, lights, blend, camera
         self._edit_texts = tuple(edit_texts)
         self.pixel_grid = pixel_grid

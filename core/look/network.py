@@ -78,8 +78,8 @@ class OffsetsBudget:
     """
 
     def __init__(self, seconds: float, seconds_at_rest: float = 0.0) -> None:
-        """seconds: for the network in one drawing. seconds_at_rest: the same while view and lights are those of the
-        last two drawings; the larger of both holds then."""
+        """Begin without offsets. seconds: for the network in one drawing. seconds_at_rest: the same while view and
+        lights are those of the last two drawings; the larger of both holds then."""
         self._seconds, self._seconds_at_rest = seconds, max(seconds, seconds_at_rest)
         self._seconds_per_light = 0.0
         # Cache key and offsets of each light, by number of its network and its name; the longest waiting first.
@@ -138,7 +138,9 @@ class HashGrid:
 
     def __init__(self, bits: int, growth: float, levels: int, base: int, rows: NDArray[Any],
                  values: NDArray[Any]) -> None:
-        """bits: log2 of the most rows of a level's table. growth: factor of the resolution from level to level. levels:
+        """Make a grid from its stored rows.
+
+        bits: log2 of the most rows of a level's table. growth: factor of the resolution from level to level. levels:
         their number. base: resolution of the coarsest. rows (k,): ascending indices of the stored table rows; all
         others are zero. values (k, features): the stored rows."""
         size = 1 << bits
@@ -222,7 +224,9 @@ class Network:
 
     def __init__(self, tensors: Mapping[str, NDArray[Any]], heads: Mapping[str, int], levels: int, base: int,
                  query_range: QueryRange, encoded: Floats) -> None:
-        """tensors: by their names in the file, without the light's number. heads: width of each offset by name. levels,
+        """Make the network of one light from the tensors of a .flare.
+
+        tensors: by their names in the file, without the light's number. heads: width of each offset by name. levels,
         base: number of levels of the hash grids, and resolution of the coarsest. encoded: (n, d) frequency-encoded
         canonical positions, then latent codes."""
         self._tensors = {name: np.asarray(tensor, np.float32) for name, tensor in tensors.items()

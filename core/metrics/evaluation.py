@@ -195,7 +195,8 @@ def _mean_scores(view_scores: list[Scores]) -> Scores:
 
 
 def _has_no_flare(scores: Scores) -> bool:
-    """True if the reference of one view holds no flare: its empty PSNR is infinite, or null as eval.json has it."""
+    """Return whether the reference of one view holds no flare: its empty PSNR is infinite, or null as eval.json has
+    it."""
     empty = scores.get("empty_psnr", 0.0)
     return empty is None or not math.isfinite(empty)
 
@@ -236,7 +237,7 @@ def format_table(scores: dict[str, Any]) -> str:
 
 
 def is_worse_than_empty(scores: dict[str, Any]) -> bool:
-    """True if an empty flare would score more, by eval.json."""
+    """Return whether an empty flare would score more, by eval.json."""
     flare = scores.get("flare", {})
     fitted, empty = flare.get("psnr"), flare.get("empty_psnr")
     return fitted is not None and empty is not None and fitted < empty

@@ -164,8 +164,8 @@ def _machine_hash() -> str:
 
 
 def _is_being_written(partial: Path) -> bool:
-    """True if the process in the name of a temporary file still runs or, for a process of another machine, if the file
-    is younger than an hour."""
+    """Return whether the process in the name of a temporary file still runs or, for a process of another machine, if
+    the file is younger than an hour."""
     writer = _WRITER_TAG.search(partial.name)
     if writer is None:
         return False
@@ -305,7 +305,8 @@ def avoid_device_name(name: str) -> str:
 
 
 def _is_file_name(part: str) -> bool:
-    """True if any file system accepts the name: at most 255 bytes, in Python's encoding of names that are not UTF-8."""
+    """Return whether any file system accepts the name: at most 255 bytes, in Python's encoding of names that are not
+    UTF-8."""
     try:
         return len(os.fsencode(part)) <= 255
     except UnicodeEncodeError:

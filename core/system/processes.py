@@ -42,7 +42,8 @@ def find_python(path: Path) -> Path | None:
 
 
 def _is_base_missing(python: Path) -> bool:
-    """True if a virtual environment's python.exe, which on Windows starts another program, has lost that program.
+    """Return whether a virtual environment's python.exe, which on Windows starts another program, has lost that
+    program.
 
     For instance because the Blender that made the environment has been replaced by a newer one.
     """
@@ -99,7 +100,7 @@ def available_cores() -> int:
 
 
 def is_same_process(pid: int, started: float) -> bool:
-    """True if the process that was recorded with start time `started`, seconds since the epoch, still runs.
+    """Return whether the process that was recorded with start time `started`, seconds since the epoch, still runs.
 
     A process with another start time has the id by coincidence: it began later, or the record is of another machine or
     of the time before this one was restarted.
@@ -109,7 +110,7 @@ def is_same_process(pid: int, started: float) -> bool:
 
 
 def is_running(pid: int) -> bool:
-    """True if a process of that id exists."""
+    """Return whether a process of that id exists."""
     if WINDOWS or PROC.is_dir():  # on Windows os.kill would end it; /proc also shows which have ended
         return _start_time(pid) is not None
     try:

@@ -343,7 +343,7 @@ def stop_signals() -> list[int]:
 
 
 def is_hangup(number: int) -> bool:
-    """True if a signal says that the terminal is closed."""
+    """Return whether a signal says that the terminal is closed."""
     return number == getattr(signal, "SIGHUP", None)
 
 

@@ -115,7 +115,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def is_finite_number(value: object) -> bool:
-    """True for a whole or real number of JSON that converts to a finite float; True and False are not numbers."""
+    """Return whether a value of JSON is a number that converts to a finite float; true and false are not numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     try:

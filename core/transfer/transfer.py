@@ -275,7 +275,7 @@ class Transfer:
         return any(self.plate(frame).is_full_float for frame in frame_by_suffix.values())
 
     def plate(self, frame: TargetFrame) -> ColouredPlate:
-        """The frame's plate in its own space."""
+        """Read the frame's plate, in its space."""
         assert frame.plate is not None
         return ColouredPlate.read(frame.plate, self.plate_space or frame.space, frame.orientation)
 

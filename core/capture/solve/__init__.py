@@ -175,7 +175,7 @@ def _prepare_output(source: Path, out: Path, request: dict[str, Any], progress: 
 
 
 def _can_resume(work: Path, request: dict[str, Any], progress: Progress) -> bool:
-    """True if an interrupted solve of the same request left intact files here."""
+    """Return whether an interrupted solve of the same request left intact files here."""
     from . import mapping, source_frames
 
     try:

@@ -256,7 +256,7 @@ def _extract_features(pycolmap: Any, sources: Sequence[SourceFrame], work: Path,
 
 
 def _has_little_texture(small: Path) -> bool:
-    """True if a quick count finds few corners."""
+    """Return whether a quick count finds few corners."""
     import cv2
 
     return len(cv2.FastFeatureDetector.create(12).detect(_read_grey(small))) < MIN_CORNERS

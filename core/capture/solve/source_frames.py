@@ -93,7 +93,7 @@ def sharpness(grey: Pixels) -> float:
 
 
 def is_interlaced(picture: Picture) -> bool:
-    """True if adjacent lines differ more than lines two apart, which only happens between two fields."""
+    """Return whether adjacent lines differ more than lines two apart, which only happens between two fields."""
     grey = picture.display().mean(axis=2)
     return len(grey) > 2 and float(np.abs(np.diff(grey, axis=0)).mean()) > COMB_RATIO * float(
         np.abs(grey[2:] - grey[:-2]).mean())

@@ -50,7 +50,8 @@ class _Worker:
     """A thread that waits for calls and makes them."""
 
     def __init__(self, counters: Array) -> None:
-        """counters (2, ...): the pool's two task counters, the first number of each row."""
+        """Start a thread that waits for calls. counters (2, ...): the pool's two task counters, the first number of
+        each row."""
         self._counters = counters
         self._call: _Call | None = None
         self._call_number = 0  # of the latest call

@@ -66,7 +66,8 @@ def sensible_aspect(aspect: float) -> float:
 
 
 def is_truncated(stream: BinaryIO) -> bool:
-    """True if chunks of a single-part scanline picture are missing from the file. Other kinds are not checked: False.
+    """Return whether chunks of a single-part scanline picture are missing from the file. Other kinds are not checked:
+    False.
     """
     stream.seek(len(MAGIC))
     flags = int.from_bytes(stream.read(4), "little")

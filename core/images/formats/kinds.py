@@ -55,11 +55,11 @@ def kind_of(head: bytes, suffix: str) -> Kind:
 
 
 def is_video(path: Path) -> bool:
-    """True if a file's name is a video's."""
+    """Return whether a file's name is a video's."""
     return path.suffix.lower() in VIDEOS
 
 
 def holds_video(head: bytes) -> bool:
-    """True if the first HEAD_BYTES of a file that is no picture are a video's."""
+    """Return whether the first HEAD_BYTES of a file that is no picture are a video's."""
     is_box = head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide") and head[8:12] != b"crx "  # Canon's raw files
     return is_box or head.startswith(_VIDEO_MAGIC) or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")

@@ -28,7 +28,7 @@ def chunks(stream: BinaryIO, names: Container[bytes], *, before_pixels: bool = F
 
 
 def is_truncated(data: bytes) -> bool:
-    """True if a chunk of a PNG claims more than the file holds; False for other files.
+    """Return whether a chunk of a PNG claims more than the file holds; False for other files.
 
     OpenCV allocates as much as a chunk claims, gigabytes for a damaged length in a small file.
     """

@@ -140,8 +140,8 @@ def page_count(stream: BinaryIO) -> int:
 
 
 def has_corrupt_data(stream: BinaryIO) -> bool:
-    """True if strips or tiles of ZIP compression do not match their checksums, which the library of the format does not
-    compare.
+    """Return whether strips or tiles of ZIP compression do not match their checksums, which the library of the format
+    does not compare.
 
     Checks at most as many bytes as the pixels can have (8 for each channel) and _BYTES_BEYOND more, since hostile data
     uncompress to any length.
@@ -225,7 +225,7 @@ def with_directory(data: bytes, number: int, tags: Mapping[int, Tag]) -> bytes:
 
 
 def is_premultiplied(path: Path) -> bool:
-    """True if a file says that its colours are multiplied with its alpha."""
+    """Return whether a file says that its colours are multiplied with its alpha."""
     with open_regular(path) as stream:
         tags = read_tags(stream, (EXTRA_SAMPLES,))
     return EXTRA_SAMPLES in tags and bool(tags[EXTRA_SAMPLES].values[0] == ASSOCIATED)

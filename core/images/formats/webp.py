@@ -25,5 +25,5 @@ def chunks(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
 
 
 def is_animated(stream: BinaryIO) -> bool:
-    """True for a WebP of several frames."""
+    """Return whether a WebP has several frames."""
     return any(name == b"ANIM" for name, _ in chunks(stream))

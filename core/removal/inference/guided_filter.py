@@ -36,7 +36,7 @@ class GuidedFilterMaps:
 
     @property
     def is_empty(self) -> bool:
-        """True if there is no flare at all."""
+        """Return whether there is no flare at all."""
         return not (self.gain.any() or self.offset.any())
 
 

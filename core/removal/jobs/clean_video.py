@@ -102,8 +102,8 @@ def _write_record(path: Path, digest: str, target: Path, finished: Path) -> None
 
 
 def _is_up_to_date(target: Path, record: Mapping[str, object], digest: str) -> bool:
-    """True if the existing video was made from the inputs that `digest` was computed from. Raises SettingsError where
-    the record does not name the existing file."""
+    """Return whether the existing video was made from the inputs that `digest` was computed from. Raises SettingsError
+    where the record does not name the existing file."""
     existing_hash = content_hash(target)
     if existing_hash not in (record.get("written"), record.get("replaced")):
         raise SettingsError(f"{target} exists and was not made from these frames, so it may be someone's work; "

@@ -112,7 +112,7 @@ class Attention(nn.Module):
     """
 
     def __init__(self, width: int, heads: int, octaves: int = 0) -> None:
-        """width: number of channels, a multiple of `heads`."""
+        """Make a layer for `width` channels, a multiple of `heads`."""
         super().__init__()
         self.heads, self.octaves = heads, octaves
         self.norm = ChannelNorm(width)

@@ -73,7 +73,7 @@ def read_architecture(path: Path | str, metadata: Mapping[str, str]) -> Architec
 
 
 def _is_size_list(sizes: object) -> bool:
-    """True for a list of 1 to _MAX_LEVELS whole numbers of 0 to _MAX_SIZE."""
+    """Return whether a value is a list of 1 to _MAX_LEVELS whole numbers of 0 to _MAX_SIZE."""
     return (isinstance(sizes, list) and 0 < len(sizes) <= _MAX_LEVELS
             and all(type(size) is int and 0 <= size <= _MAX_SIZE for size in sizes))
 

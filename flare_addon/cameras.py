@@ -43,10 +43,11 @@ def render_size(render: Any) -> tuple[int, int]:
     return max(render.resolution_x * percentage // 100, 1), max(render.resolution_y * percentage // 100, 1)
 
 
-def intrinsics_of(data: Any, render: Any) -> tuple[float, float, float, float]:
+def intrinsics_of(data: Any, render: Any, eye_shift: float = 0.0) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy of a perspective camera's data, in pixels of the render.
 
-    Raises CaptureError for an orthographic or panoramic camera, and for data of an object that is not a camera.
+    eye_shift: what stereo adds to shift_x, as part of the side that the sensor fits. Raises CaptureError for an
+    orthographic or panoramic camera, and for data of an object that is not a camera.
     """
     if getattr(data, "sensor_fit", None) is None:
         raise CaptureError("The scene's active camera is not a camera object; choose a camera in the scene's "
@@ -65,7 +66,7 @@ def intrinsics_of(data: Any, render: Any) -> tuple[float, float, float, float]:
     # Length of the side that the sensor fits, in widths of a pixel; Blender's shifts are parts of it.
     fitted_length = width if sensor_fit == "HORIZONTAL" else height * pixel_height
     fx = data.lens * fitted_length / sensor_size
-    cx = width / 2 - data.shift_x * fitted_length
+    cx = width / 2 - (data.shift_x + eye_shift) * fitted_length
     cy = height / 2 + data.shift_y * fitted_length / pixel_height
     return fx, fx / pixel_height, cx, cy
 
@@ -79,13 +80,13 @@ def camera_to_world(matrix: Any) -> Floats:
     return values @ FLIP_YZ
 
 
-def core_camera(data: Any, matrix: Any, render: Any) -> Camera:
+def core_camera(data: Any, matrix: Any, render: Any, eye_shift: float = 0.0) -> Camera:
     """Return the core's camera for a Blender camera (its evaluated data and matrix_world), in Blender's world.
 
-    Raises CaptureError for a camera that is not a perspective camera, is scaled to zero, or is not at a finite
-    position.
+    eye_shift: as in `intrinsics_of`. Raises CaptureError for a camera that is not a perspective camera, is scaled to
+    zero, or is not at a finite position.
     """
-    fx, fy, cx, cy = intrinsics_of(data, render)
+    fx, fy, cx, cy = intrinsics_of(data, render, eye_shift)
     width, height = render_size(render)
     pose = camera_to_world(matrix)
     if not np.isfinite(pose).all() or np.linalg.matrix_rank(pose[:3, :3]) < 3:

@@ -13,7 +13,7 @@ from ..core.errors import CaptureError, FlareFileError
 from ..core.look import Edit, LightLook, Look, LookEdits, PlacedLight, PlaneGaussians, read_look
 from ..core.look.look import Query
 from ..core.look.network import OffsetsBudget
-from . import cameras, fcurves, lamp_drive, light_extents, occlusion
+from . import cameras, fcurves, lamp_drive, light_extents, occlusion, stereo
 from .compositor import drivers
 from .lights import capture_position, free_name, light_name, light_position, scene_lights
 from .objects import depsgraph_of, world_matrix
@@ -261,13 +261,14 @@ def query_of(state: Any) -> Query:
     return "target" if state.native else "source"
 
 
-def place_lights(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64], list[PlacedLight]]:
-    """Return world_to_camera (4, 4) of a camera object, and the lights with their visibility.
+def place_lights(scene: Any, depsgraph: Any, camera: Any,
+                 eye: stereo.Eye = "") -> tuple[NDArray[np.float64], list[PlacedLight]]:
+    """Return world_to_camera (4, 4) of a camera object, moved to an eye, and the lights with their visibility.
 
     The coordinates are the capture's, or Blender's without a capture. Raises CaptureError.
     """
     state = scene.fit_flare
-    matrix = camera.evaluated_get(depsgraph).matrix_world
+    matrix = stereo.eye_matrix(camera.evaluated_get(depsgraph), eye)
     to_capture = cameras.world_to_capture(state.root, depsgraph)
     rendered = lamp_drive.rendered_collections(scene)
     lights = [place_light(scene, depsgraph, matrix, to_capture, item, hides=state.occlusion, rendered=rendered)
@@ -313,14 +314,14 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
 
 
 def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | None = None,
-                    budget: OffsetsBudget | None = None) -> dict[str, PlaneGaussians]:
+                    budget: OffsetsBudget | None = None, *, eye: stereo.Eye = "") -> dict[str, PlaneGaussians]:
     """Evaluate every flare of the scene for a camera object at the current frame; return the Gaussians by flare's name.
 
     edits: in place of the edits of the scene's sliders. budget: bounds the time for the network; None for exact flares.
-    Raises FlareFileError and CaptureError.
+    eye: the eye to which the camera is moved. Raises FlareFileError and CaptureError.
     """
     look = look_of(scene)
-    pose, lights = place_lights(scene, depsgraph, camera)
+    pose, lights = place_lights(scene, depsgraph, camera, eye)
     gaussians = look.evaluate_lights(pose, lights, edits or edits_of(scene.fit_flare), query_of(scene.fit_flare),
                                      budget)
     exposure = camera.evaluated_get(depsgraph).fit_flare.exposure

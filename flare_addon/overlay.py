@@ -21,16 +21,17 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.capture import Camera
 from ..core.errors import FitFlareError
 from ..core.look import Look, PlaneGaussians, to_pixels
 from ..core.look.drawing import OPACITY_MAX, cutoff_radii
 from ..core.look.network import OffsetsBudget
 from ..core.look.plane import arc_log_peak, arcs_to_pixels, concatenate
-from . import baking, cameras, highlight, looks
+from . import baking, highlight, looks, stereo
 from .compositor.flare_node import find_node
 from .overlay_shaders import gaussian_shader, sum_shader
 from .properties import redraw_viewports
-from .views import camera_of
+from .views import camera_of, has_display_footage
 
 LEVELS = (1, 2, 4, 8, 16)
 MIN_TEXELS = 4.0  # standard deviation of the narrow side of a Gaussian, in the level that it is drawn in
@@ -53,8 +54,8 @@ _handles: list[Any] = []
 _scene_buffer: Any = None  # the framebuffer with the scene-linear picture of the region that is being drawn
 _shaders: dict[str, Any] = {}
 _offscreens: dict[tuple[int, int, int, str], Any] = {}
-_budgets: dict[str, OffsetsBudget] = {}
-"""By the camera's name."""
+_budgets: dict[tuple[str, stereo.Eye], OffsetsBudget] = {}
+"""By the camera's name and the eye."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class DrawnRegion:
     intrinsics: NDArray[np.float64]
 
 
-def drawn_region(frame: CameraFrame, region: tuple[int, int], camera: Any) -> DrawnRegion | None:
+def drawn_region(frame: CameraFrame, region: tuple[int, int], camera: Camera) -> DrawnRegion | None:
     """Return the part of a frame that a region of (width, height) pixels shows; None where it shows nothing.
 
     camera: the core's camera of the render, whose intrinsics are scaled to the frame.
@@ -96,12 +97,17 @@ def drawn_region(frame: CameraFrame, region: tuple[int, int], camera: Any) -> Dr
     return DrawnRegion(left, bottom, right - left, top - bottom, intrinsics)
 
 
-def camera_frame(context: Any, scene: Any, camera: Any) -> CameraFrame | None:
-    """Return the camera's frame in the region of a 3D view that looks through it; None where it is behind the view."""
-    from bpy_extras.view3d_utils import location_3d_to_region_2d
+def camera_frame(context: Any, camera: Camera) -> CameraFrame | None:
+    """Return a camera's frame in the region of a 3D view that looks through it; None where it is behind the view.
 
-    corners = [location_3d_to_region_2d(context.region, context.region_data, camera.matrix_world.normalized() @ corner)
-               for corner in camera.data.view_frame(scene=scene)]
+    camera: the core's camera of the render, in Blender's world.
+    """
+    from bpy_extras.view3d_utils import location_3d_to_region_2d
+    from mathutils import Vector
+
+    rays = camera.rays([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]])
+    corners = [location_3d_to_region_2d(context.region, context.region_data, Vector((camera.position + ray).tolist()))
+               for ray in rays]
     if any(corner is None for corner in corners):
         return None
     xs, ys = [corner.x for corner in corners], [corner.y for corner in corners]
@@ -339,8 +345,10 @@ def _draw_outlines() -> None:
         _draw_in_camera_view(draw_outline)
 
 
-def _draw_in_camera_view(draw: Callable[[Any, Any, Any], None]) -> None:
-    """Call `draw` with context, scene and camera if the current 3D view shows the flare through a camera.
+def _draw_in_camera_view(draw: Callable[[Any, Any, Any, stereo.Eye], None]) -> None:
+    """Call `draw` with context, scene, camera and eye if the current 3D view shows the flare through a camera.
+
+    Blender calls the handlers once for each eye where a view shows both.
 
     Nothing is drawn while a bake reads the scene, since that moves the timeline. A FitFlareError is stored in
     `last_error`.
@@ -356,8 +364,9 @@ def _draw_in_camera_view(draw: Callable[[Any, Any, Any], None]) -> None:
                 and not is_composited(space, scene))
     if not is_shown or camera is None or camera.type != "CAMERA":
         return
+    camera, eye = stereo.view_camera(scene, camera, stereo.shown_view(context, camera))
     try:
-        draw(context, scene, camera)
+        draw(context, scene, camera, eye)
         last_error = ""
     except FitFlareError as error:
         last_error = str(error)
@@ -372,12 +381,12 @@ def is_composited(space: Any, scene: Any) -> bool:
     return node is not None and not node.mute
 
 
-def draw_region(context: Any, scene: Any, camera: Any) -> None:
+def draw_region(context: Any, scene: Any, camera: Any, eye: stereo.Eye = "") -> None:
     """Draw the flares of the scene over the camera view of the region. Raises FitFlareError."""
     import gpu
 
     depsgraph = context.view_layer.depsgraph
-    window = drawn_part(context, scene, camera)
+    window = drawn_part(context, scene, camera, eye)
     if window is None:
         return
     region = context.region.width, context.region.height
@@ -386,9 +395,10 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
     if chosen is not None:
         names = {item.name: [element.name for element in item.elements] for item in scene.fit_flare.lights}
         edits = highlight.emphasise(edits, chosen, names)
-    budget = _budgets.setdefault(camera.name, OffsetsBudget(NETWORK_S, NETWORK_AT_REST_S))
+    budget = _budgets.setdefault((camera.name, eye), OffsetsBudget(NETWORK_S, NETWORK_AT_REST_S))
     budget.begin()
-    gaussians = concatenate(list(looks.evaluate_flares(scene, depsgraph, camera, edits, budget).values()))
+    flares = looks.evaluate_flares(scene, depsgraph, camera, edits, budget, eye=eye)
+    gaussians = concatenate(list(flares.values()))
     if not budget.is_complete and not bpy.app.timers.is_registered(redraw_viewports):
         bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
     if gaussians is None:
@@ -406,24 +416,24 @@ def draw_region(context: Any, scene: Any, camera: Any) -> None:
     gpu.state.viewport_set(*viewport)
 
 
-def drawn_part(context: Any, scene: Any, camera: Any) -> DrawnRegion | None:
+def drawn_part(context: Any, scene: Any, camera: Any, eye: stereo.Eye = "") -> DrawnRegion | None:
     """Return the part of the camera's frame that the region of a context shows; None where it shows nothing."""
-    evaluated = camera.evaluated_get(context.view_layer.depsgraph)
-    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
-    frame = camera_frame(context, scene, evaluated)
+    core = stereo.eye_camera(camera.evaluated_get(context.view_layer.depsgraph), scene.render, eye)
+    frame = camera_frame(context, core)
     return None if frame is None else drawn_region(frame, (context.region.width, context.region.height), core)
 
 
-def draw_outline(context: Any, scene: Any, camera: Any) -> None:
+def draw_outline(context: Any, scene: Any, camera: Any, eye: stereo.Eye = "") -> None:
     """Draw a box around the highlighted element. Raises FitFlareError."""
     import gpu
     from gpu_extras.batch import batch_for_shader
 
-    window, chosen = drawn_part(context, scene, camera), highlight.current_highlight(scene)
+    window, chosen = drawn_part(context, scene, camera, eye), highlight.current_highlight(scene)
     if window is None or chosen is None:
         return
     edits = highlight.isolate(chosen, looks.edits_of(scene.fit_flare))
-    gaussians = concatenate(list(looks.evaluate_flares(scene, context.view_layer.depsgraph, camera, edits).values()))
+    flares = looks.evaluate_flares(scene, context.view_layer.depsgraph, camera, edits, eye=eye)
+    gaussians = concatenate(list(flares.values()))
     if gaussians is None:
         return
     box = highlight.outline_box(gaussians, *to_pixels(gaussians, window.intrinsics, looks.look_of(scene).pixel_grid))
@@ -438,23 +448,12 @@ def draw_outline(context: Any, scene: Any, camera: Any) -> None:
     batch_for_shader(shader, "LINES", {"pos": corners}, indices=((0, 1), (1, 2), (2, 3), (3, 0))).draw(shader)
 
 
-def has_display_footage(camera: Any) -> bool:
-    """Return whether a camera shows footage, behind or in front of the scene, that bypasses the view transform."""
-    if not camera.data.show_background_images:
-        return False
-    return any(background.alpha > 0 and not (background.source == "IMAGE" and background.image is not None
-                                             and background.image.use_view_as_render)
-               for background in camera.data.background_images
-               if (background.image if background.source == "IMAGE" else background.clip) is not None)
-
-
 def add_to_picture(target: Any, scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> None:
     """Add the flares of the scene to a picture of the whole frame. Needs a GPU context.
 
     target: offscreen buffer of (width, height) pixels, in Blender's working space.
     """
-    evaluated = camera.evaluated_get(depsgraph)
-    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    core = stereo.eye_camera(camera.evaluated_get(depsgraph), scene.render)
     window = drawn_region(CameraFrame(0, 0, width, height), (width, height), core)
     assert window is not None
     look = looks.look_of(scene)

@@ -7,8 +7,8 @@ from typing import Any
 
 import bpy
 
-from . import fits, lamp_drive, light_paths, lights, looks
-from .compositor.warnings import STEREO
+from . import fits, lamp_drive, light_paths, lights, looks, stereo
+from .compositor.warnings import stereo_warnings
 from .layouts import label_lines
 from .paths import is_folder
 
@@ -77,7 +77,10 @@ def draw_bake_buttons(row: Any, state: Any) -> None:
         button.selected, button.composite = selected, state.bake_composite
 
 
-def draw_stereo_warning(layout: Any, scene: Any) -> None:
-    """Draw what a stereo render shows of the flare."""
-    if scene.render.use_multiview:
-        label_lines(layout, STEREO, "ERROR")
+def draw_stereo_note(layout: Any, scene: Any) -> None:
+    """Draw which views a bake of a stereo scene has, and what its renders do not show right."""
+    if views := stereo.rendered_views(scene.render):
+        names = ", ".join(view.name for view in views)
+        label_lines(layout, f"Stereo: a bake has layers for each view ({names}).", "INFO")
+    for warning in stereo_warnings(scene):
+        label_lines(layout, warning, "ERROR")

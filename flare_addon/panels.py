@@ -394,7 +394,7 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
             column.prop(state, "bake_live")
             column.prop(state, "bake_scene")
             column.prop(state, "bake_composite")
-            panel_parts.draw_stereo_warning(layout, scene)
+            panel_parts.draw_stereo_note(layout, scene)
             if state.flare and engine.find_engine() is None:
                 label_lines(layout, "Without an engine, Blender's own Python draws the layers: some seconds per frame.",
                             "INFO")

@@ -22,7 +22,7 @@ from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
 from ..core.system.files import hash_files
 from ..core.system.reading import parse_json, read_text
-from . import cameras, fits, jobs, library, looks
+from . import fits, jobs, library, looks, stereo
 from .jobs import Job
 from .objects import view_layer_of
 from .paths import absolute, blend_relative
@@ -45,8 +45,8 @@ class ShotReading:
     """Reads the cameras, lights and sliders of a scene as a shot, one frame a step; each step moves the timeline.
 
     Without camera objects it reads the scene's camera, which markers on the timeline may change; all frames then have
-    the name of the first one. Scene and cameras are referred to by name, since an undo replaces the objects. total,
-    done: numbers of frames.
+    the name of the first one. Of a stereo scene it reads every view, under a name of its own. Scene and cameras are
+    referred to by name, since an undo replaces the objects. total, done: numbers of frames.
     """
 
     def __init__(self, scene: Any, camera_objects: Sequence[Any], frames: Sequence[int]) -> None:
@@ -58,6 +58,7 @@ class ShotReading:
         self.scene_name, self._cameras = scene.name, [camera.name for camera in camera_objects]
         self._frames, self._frame_before = list(frames), (scene.frame_current, scene.frame_subframe)
         self._shot_frames: list[ShotFrame] = []
+        self._labels: list[str] = []  # names of the views at the first frame
         self.total, self.done = len(self._frames), 0
 
     @property
@@ -81,12 +82,12 @@ class ShotReading:
                                "again.")
         scene.frame_set(frame)
         depsgraph = view_layer_of(scene).depsgraph
-        if self._cameras:
-            self._shot_frames += [shot_frame(scene, depsgraph, scene.objects[name], frame) for name in self._cameras]
-        else:
-            current = shot_frame(scene, depsgraph, scene.camera, frame)
-            name = self._shot_frames[0].name if self._shot_frames else current.name
-            self._shot_frames.append(replace(current, name=name))
+        camera_objects = [scene.objects[name] for name in self._cameras] or [scene.camera]
+        # Two cameras of one Multi-View pair have the same views.
+        views = {view.label: view for camera in camera_objects for view in stereo.camera_views(scene, camera)}
+        self._labels = self._labels or list(views)
+        self._shot_frames += [replace(shot_frame(scene, depsgraph, view.camera, frame, view.eye), name=label)
+                              for label, view in zip(self._labels, views.values(), strict=True)]
         self.done += 1
 
     def restore(self) -> None:
@@ -116,11 +117,14 @@ def read_scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[
     return reading.shot(flare, run)
 
 
-def shot_frame(scene: Any, depsgraph: Any, camera: Any, frame: int) -> ShotFrame:
-    """Return the frame of a shot for one camera at the current frame of the scene. frame: its number."""
+def shot_frame(scene: Any, depsgraph: Any, camera: Any, frame: int, eye: stereo.Eye = "") -> ShotFrame:
+    """Return the frame of a shot for a camera object, moved to an eye, at the current frame of the scene.
+
+    frame: its number.
+    """
     evaluated = camera.evaluated_get(depsgraph)
-    pose, lights = looks.place_lights(scene, depsgraph, camera)
-    core_camera = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    pose, lights = looks.place_lights(scene, depsgraph, camera, eye)
+    core_camera = stereo.eye_camera(evaluated, scene.render, eye)
     edits = looks.edits_of(scene.fit_flare)
     if scene.fit_flare.bake_live:
         edits = without_live_edits(edits)
@@ -205,6 +209,29 @@ def choose_layers_folder(scene: Any) -> Path:
             folder = parent / f"layers_{number}"
         state.layers = blend_relative(folder)
     return layers_folder(scene)
+
+
+def view_folders(scene: Any, layers: Path) -> dict[str, Path]:
+    """Return the folder of the layers of each view that the scene renders, by the view's name ("" without stereo).
+
+    Layers of one camera alone are for all views: {"": folder}. layers: the folder of a bake, or of one camera's layers
+    in it. Raises FrameError where there are layers of other cameras only.
+    """
+    suffixes = stereo.view_suffixes(scene.render)
+    try:
+        last_shot = Shot.read(layers / SHOT_FILE)
+    except SettingsError:
+        return {"": layers}
+    folders = last_shot.folders
+    # A bake of the scene's camera is for the scene's camera, whatever its name is now.
+    if suffixes and not last_shot.own_folder and len(folders) == len(suffixes) and all(
+            name.endswith(suffix) for name, suffix in zip(folders, suffixes.values(), strict=True)):
+        return {view: layers / folder for view, folder in zip(suffixes, folders.values(), strict=True)}
+    folders = {**_baked_folders(layers), **folders}
+    views = stereo.camera_views(scene, scene.camera) if suffixes and scene.camera is not None else []
+    if views and all(view.label in folders for view in views):
+        return {view.name: layers / folders[view.label] for view in views}
+    return {"": camera_folder(layers, scene.camera)}
 
 
 def camera_folder(layers: Path, camera: Any) -> Path:

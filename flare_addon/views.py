@@ -33,6 +33,16 @@ def camera_of(space: Any, scene: Any) -> Any:
     return space.camera if space.use_local_camera and space.camera else scene.camera
 
 
+def has_display_footage(camera: Any) -> bool:
+    """Return whether a camera shows footage, behind or in front of the scene, that bypasses the view transform."""
+    if not camera.data.show_background_images:
+        return False
+    return any(background.alpha > 0 and not (background.source == "IMAGE" and background.image is not None
+                                             and background.image.use_view_as_render)
+               for background in camera.data.background_images
+               if (background.image if background.source == "IMAGE" else background.clip) is not None)
+
+
 def view_region_at(area: Any, x: float, y: float) -> Any | None:
     """Return the region of a 3D view at a position in the window, px; None outside, and where a sidebar lies over it.
     """

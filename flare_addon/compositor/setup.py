@@ -6,19 +6,15 @@ to 5.3 (`trees`): up to 4.5 the tree ends in a Composite node, from 5.0 in a Gro
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import bpy
 
 from ...core.bake.folder import LayerFolder
-from ...core.colour.ocio import CONFIGURED_NAMES
 from ...core.errors import FrameError
-from ...core.images.exr import exr_colour_space
 from ...core.images.window import DataWindow
 from .. import fcurves
-from ..images import load_image
-from ..paths import absolute
 from . import drivers, trees
 from .flare_node import (
     GROUP,
@@ -29,9 +25,18 @@ from .flare_node import (
     node_group,
     scale_to_render_size,
 )
+from .layer_nodes import (
+    LAYERS,
+    check_views,
+    is_view_node,
+    remove_view_nodes,
+    set_name,
+    show_layers,
+    switch_views,
+    view_images,
+)
 from .trees import GROUPS_ARE_TREES, tree_of
 
-LAYERS = "Fit Flare Layers"
 PLATE = "Fit Flare Footage"
 VIEWER = "Fit Flare Viewer"
 RENDER = "Fit Flare Render"
@@ -42,22 +47,25 @@ _OUR_NODES = (GROUP, LAYERS, PLATE, SIZE, VIEWER, RENDER)
 _ENDS = (trees.OUTPUT_TYPE, "NodeGroupInput", "CompositorNodeViewer")
 """Nodes of a tree without a picture of its own."""
 STATE_PROPERTY = "fit_flare_compositor"  # of the scene: the state before the set-up
-_MAX_FRAMES = 1048574  # the limit of Blender; frames without a file have no flare
 _IMAGE_NODE_SETTINGS = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
 _OUTPUT_TYPE = trees.OUTPUT_TYPE
 
 
-def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: Any = None) -> Any:
+def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: Any = None,
+                 views: Mapping[str, LayerFolder] | None = None) -> Any:
     """Build the nodes that combine `layers`, or make existing ones show them; return the "Fit Flare" node.
 
     The flare goes over the baked scene by default. keep_image: it goes over the present input of the output (a render
-    or a plate). plate: it goes over footage, given as (image, frame_start, frame_offset, frame_duration). Inputs of an
+    or a plate). plate: it goes over footage, given as (image, frame_start, frame_offset, frame_duration). views: the
+    layers of each view of a stereo render, by the view's name; `layers` are those of the first one. Inputs of an
     existing node keep values, links and animation. Other nodes are not changed. Raises FrameError where the files hold
-    no flare layers, and for a scene that renders a cropped region.
+    no flare layers, where views have different layers, and for a scene that renders a cropped region.
     """
     if scene.render.use_border and scene.render.use_crop_to_border:
         raise FrameError(f"The scene {scene.name!r} renders a cropped region, which layers of whole frames do not fit; "
                          "switch Crop to Render Region off in its output properties.")
+    if views:
+        check_views(views)
     original = tree_of(scene)
     own_tree = _own_tree(scene)  # the same one, or a copy of it
     if STATE_PROPERTY in scene and (own_tree is None or not any(map(_is_ours, own_tree.nodes))):
@@ -67,8 +75,8 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
     source = tree.nodes.get(LAYERS)
     node_settings = None if source is None else {name: getattr(source, name) for name in _IMAGE_NODE_SETTINGS}
     if source is None:
-        source = _set_name(new_node(tree, "CompositorNodeImage", -4, 0), LAYERS)
-    _show_layers(source, layers)
+        source = set_name(new_node(tree, "CompositorNodeImage", -4, 0), LAYERS)
+    show_layers(source, layers)
     # The node keeps linked sockets of layers that it showed before, as unavailable ones.
     sockets = {socket.name: socket for socket in source.outputs if not socket.is_unavailable}
     names = [name for name in sockets if name.startswith("flare_")] or [name for name in sockets if name == "flare"]
@@ -82,12 +90,16 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
         scene[STATE_PROPERTY] = {**state, **_tree_state(tree)}
     node = tree.nodes.get(GROUP)
     if node is None:
-        node = _set_name(new_node(tree, "CompositorNodeGroup", -2, 0), GROUP)
+        node = set_name(new_node(tree, "CompositorNodeGroup", -2, 0), GROUP)
     drivers.disconnect_node(scene)
     _change_inputs(tree, node, names)
     _remove_crops(tree)
+    outdated = view_images(tree) + ([] if node_settings is None else [node_settings["image"]])
+    remove_view_nodes(tree)
+    shown_names = names if plate is not None or keep_image else ["scene", *names]
+    if views:
+        sockets.update(switch_views(scene, tree, views, shown_names))
     if not (window := layers.window()).is_frame:  # the layers have overscan
-        shown_names = names if plate is not None or keep_image else ["scene", *names]
         sockets.update(_crop_overscan(tree, window, {name: sockets[name] for name in shown_names}))
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
@@ -110,13 +122,14 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
     if not is_set_up or end.links[0].from_node == node:  # else the artist has nodes between ours and the output
         tree.links.new(node.outputs["Image"], end)
     _add_viewer(tree, node)
+    _remove_unused(outdated, {})
     return node
 
 
 def _add_viewer(tree: Any, node: Any) -> None:
     """Show our node in the backdrop, unless the tree has a viewer."""
     if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
-        viewer = _set_name(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)
+        viewer = set_name(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)
         tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
 
 
@@ -141,7 +154,7 @@ def _change_inputs(tree: Any, node: Any, layer_names: Sequence[str]) -> None:
 
 def _crop_overscan(tree: Any, window: DataWindow, sockets: dict[str, Any]) -> dict[str, Any]:
     """Add nodes that cut the overscan of layers off; return their output sockets. sockets: of the layers, by name."""
-    return {name: _set_name(crop_to_frame(tree, socket, window, -3.2, -0.7 * row), f"{CROP} {name}").outputs[0]
+    return {name: set_name(crop_to_frame(tree, socket, window, -3.2, -0.7 * row), f"{CROP} {name}").outputs[0]
             for row, (name, socket) in enumerate(sockets.items())}
 
 
@@ -152,8 +165,9 @@ def _connect_scene_picture(tree: Any, node: Any, socket: Any) -> None:
     """
     if (size := tree.nodes.get(SIZE)) is not None:
         tree.nodes.remove(size)
-    if socket is not None and (socket.node.name in (LAYERS, PLATE) or _is_crop(socket.node)):
-        socket = _set_name(scale_to_render_size(tree, socket, -3, 1), SIZE).outputs[0]
+    if socket is not None and (
+            socket.node.name in (LAYERS, PLATE) or _is_crop(socket.node) or is_view_node(socket.node)):
+        socket = set_name(scale_to_render_size(tree, socket, -3, 1), SIZE).outputs[0]
     tree.links.new(socket, node.inputs["Scene"])
 
 
@@ -164,7 +178,7 @@ def _is_crop(node: Any) -> bool:
 
 def _is_ours(node: Any) -> bool:
     """Return whether a node was added by `set_up_nodes`."""
-    return node.name in _OUR_NODES or _is_crop(node)
+    return node.name in _OUR_NODES or _is_crop(node) or is_view_node(node)
 
 
 def _remove_crops(tree: Any) -> None:
@@ -220,7 +234,7 @@ def show_plate(scene: Any) -> bool:
         scene[STATE_PROPERTY] = {**state, **_tree_state(tree)}
     footage = _footage_node(tree, plate)
     if find_node(scene) is None:
-        size = tree.nodes.get(SIZE) or _set_name(scale_to_render_size(tree, footage.outputs["Image"], -3, 1), SIZE)
+        size = tree.nodes.get(SIZE) or set_name(scale_to_render_size(tree, footage.outputs["Image"], -3, 1), SIZE)
         tree.links.new(size.outputs[0], _final_input(tree))
     return True
 
@@ -293,12 +307,12 @@ def _render_picture(tree: Any) -> Any:
     render = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
     if render is None and (incoming := trees.incoming_picture(tree, RENDER)) is not None:
         return incoming
-    return (render or _set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)).outputs["Image"]
+    return (render or set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)).outputs["Image"]
 
 
 def _footage_node(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
     """Return the node that shows footage. plate: image, frame_start, frame_offset, frame_duration."""
-    node = tree.nodes.get(PLATE) or _set_name(new_node(tree, "CompositorNodeImage", -4, 2.5), PLATE)
+    node = tree.nodes.get(PLATE) or set_name(new_node(tree, "CompositorNodeImage", -4, 2.5), PLATE)
     image, start, offset, duration = plate
     node.image = image
     if image.source == "SEQUENCE":
@@ -354,6 +368,7 @@ def remove_nodes(scene: Any) -> None:
     state = dict(scene[STATE_PROPERTY]) if STATE_PROPERTY in scene else {**_scene_state(scene), **_tree_state(tree),
                                                                          "nodes": None}
     group, images = node.node_tree, [tree.nodes[name].image for name in (LAYERS, PLATE) if tree.nodes.get(name)]
+    images += view_images(tree)
     # The output socket that takes the place of our node's.
     picture_below = _image_under_flare(tree, node, state)
     if picture_below is None and not state["tree"]:
@@ -366,6 +381,7 @@ def remove_nodes(scene: Any) -> None:
     if not state.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
         tree.animation_data_clear()
     _remove_crops(tree)
+    remove_view_nodes(tree)
     for name in _OUR_NODES:
         our_node = tree.nodes.get(name)
         if our_node is not None and not (name == RENDER and any(socket.is_linked for socket in our_node.outputs)):
@@ -399,7 +415,10 @@ def _restore_tree(scene: Any, tree: Any, state: dict[str, Any]) -> None:
 
 
 def _remove_unused(images: Sequence[Any], state: dict[str, Any]) -> None:
-    """Remove images without users, and the viewer's image where there was none before the set-up."""
+    """Remove images without users, and the viewer's image where there was none before the set-up.
+
+    state: the compositor's before the set-up, from `_scene_state`; {} keeps the viewer's image.
+    """
     viewers = [image for image in bpy.data.images if image.type == "COMPOSITING" and not state.get("viewer", True)]
     for image in (*images, *viewers):
         if image is not None and (not image.users or image.type == "COMPOSITING"):  # the viewer's image is its own user
@@ -410,12 +429,6 @@ def _input_value(node: Any, name: str) -> Any:
     """Return the value of an input, a number or a tuple."""
     value = node.inputs[name].default_value
     return value if isinstance(value, float) else tuple(value)
-
-
-def _set_name(node: Any, name: str) -> Any:
-    """Set name and label of a node; return it."""
-    node.name = node.label = name
-    return node
 
 
 def _new_tree(scene: Any, keep_image: bool) -> Any:
@@ -457,37 +470,9 @@ def _is_active_output(tree: Any, end: Any) -> bool:
     return GROUP in tree.nodes and _depends_on(end, tree.nodes[GROUP])
 
 
-def _show_layers(node: Any, layers: LayerFolder) -> None:
-    """Make an Image node show the file with the number of each frame; gaps and a frame 0 are possible."""
-    image = load_image(layers.files[layers.first], "SEQUENCE")
-    node.image = image
-    if space := _configured_space(image):  # a configuration may assign another space to EXRs
-        image.colorspace_settings.name = space
-    node.frame_start, node.frame_offset = layers.first, layers.first - 1
-    node.frame_duration = _MAX_FRAMES  # with the range of the layers the last one would be repeated after it
-    node.use_auto_refresh = True
-
-
 def is_over_render(scene: Any) -> bool:
     """Return whether the flare goes over the render of the scene."""
     node = find_node(scene)
     sources = ("CompositorNodeRLayers", "NodeGroupInput")
     return node is not None and any(_depends_on(node, candidate) for candidate in tree_of(scene).nodes
                                     if candidate.bl_idname in sources)
-
-
-def colour_space_warning(scene: Any) -> str:
-    """Return a warning where the colour configuration has no space for the layers, "" where it has."""
-    image = tree_of(scene).nodes[LAYERS].image
-    if _configured_space(image):
-        return ""
-    space = exr_colour_space(absolute(image.filepath)).replace("linear", "linear Rec. 709")
-    return (f"The colour configuration has no space for {space or 'these chromaticities'}, which the layers are in; "
-            f"they are read as {image.colorspace_settings.name}, and their colours are wrong.")
-
-
-def _configured_space(image: Any) -> str:
-    """Return the name of an EXR's colour space in the colour configuration; "" where it has none of the known names."""
-    known = {item.identifier for item in image.colorspace_settings.bl_rna.properties["name"].enum_items}
-    names = CONFIGURED_NAMES.get(exr_colour_space(absolute(image.filepath)), ())
-    return next((name for name in names if name in known), "")

@@ -2,22 +2,24 @@
 """Warnings about scene settings that keep a render from showing the composite."""
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from ...core.bake.folder import LayerFolder
 from ...core.conventions.frame_numbers import NumberedFrame, missing_numbers
 from ...core.images.picture import same_aspect
-from . import drivers, flare_node, setup, trees
+from .. import stereo
+from . import drivers, flare_node, layer_nodes, setup, trees
 
-STEREO = ("This scene renders stereo, and both eyes get the flare of one camera; for each eye, make a scene with "
-          "its own camera, and bake and composite there.")
+SPHERICAL = ("The camera has Spherical Stereo, with which the flares do not lie on the lights; switch it off in the "
+             "camera's Stereoscopy settings.")
 
 
-def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
-    """Yield a warning for each problem of a scene whose compositor shows `layers`.
+def warnings(scene: Any, views: Sequence[LayerFolder], live: bool) -> Iterator[str]:
+    """Yield a warning for each problem of a scene whose compositor shows layers.
 
-    live: the sliders of the panel drive the compositor.
+    views: the layers of each view of a stereo scene, else one folder. live: the sliders of the panel drive the
+    compositor.
     """
     render = scene.render
     if not render.use_compositing:
@@ -26,19 +28,19 @@ def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
     if trees.is_off_in_renders(scene):
         yield ("The compositor effect with the flare is switched off for renders, so they have no flare; switch it on "
                "in the list of effects.")
-    if render.use_multiview:
-        yield STEREO
+    yield from stereo_warnings(scene)
     if strips := _active_strips(scene):
         yield (f"Renders show the video sequencer, which has {strips[0].name!r}, in place of the compositor, without "
                "the flare; switch Sequencer off in the output properties, under Post Processing.")
     if render.film_transparent and setup.is_over_render(scene) and _loses_light(render.image_settings):
         yield (f"The film is transparent, and {render.image_settings.file_format} files lose the flare where alpha is "
                "0; render to OpenEXR, or without alpha (RGB).")
-    width, height = layers.size()
+    width, height = views[0].size()
     if not same_aspect((width, height), (render.resolution_x, render.resolution_y)):
         yield (f"The layers have {width} x {height} pixels and the scene renders {render.resolution_x} x "
                f"{render.resolution_y}, another aspect ratio, to which they are stretched; bake them again.")
-    baked = [NumberedFrame(view="", number=number, file="") for number in layers.files]
+    baked = [NumberedFrame(view="", number=number, file="") for number in views[0].files
+             if all(number in layers.files for layers in views)]
     if missing := missing_numbers(baked, f"{max(scene.frame_start, 0)}-{max(scene.frame_end, scene.frame_start, 0)}"):
         effect = "this version of Blender shows in magenta" if flare_node.MISSING_IS_MAGENTA else "are without flare"
         yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}, and there are no layers of {missing}, "
@@ -46,8 +48,24 @@ def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
     if live and drivers.is_animated(scene):
         yield ("Sliders that act on it are animated: without this extension, as on a farm, they do not move; bake "
                "without Keep Colours Live for that.")
-    if warning := setup.colour_space_warning(scene):
+    if warning := layer_nodes.colour_space_warning(scene):
         yield warning
+
+
+def stereo_warnings(scene: Any) -> Iterator[str]:
+    """Yield a warning for each reason why views of a scene do not get their own flares."""
+    views, shown = [view.name for view in stereo.rendered_views(scene.render)], layer_nodes.shown_views(scene)
+    if not views and shown:
+        yield ("This scene does not render stereo, and its compositor has the flare of one view; bake and composite "
+               "again.")
+    missing = [view for view in views if view not in shown]
+    if missing and len(views) > 1 and flare_node.find_node(scene) is not None:
+        yield (f"This scene renders stereo, and the compositor has no flare of its own for {' and '.join(missing)}; "
+               "bake and composite again.")
+    camera = scene.camera
+    if views and camera is not None and camera.type == "CAMERA" and scene.render.views_format == "STEREO_3D" and \
+            camera.data.stereo.use_spherical_stereo:
+        yield SPHERICAL
 
 
 def _active_strips(scene: Any) -> Any:

@@ -96,13 +96,14 @@ def set_up_compositor(operator: Any, scene: Any, folder: str, *, keep_image: boo
     scene, the compositor's present output (`keep_image`), or the footage behind the camera (`plate`). match: set the
     frames and the size of the scene to the layers'. Raises FrameError.
     """
-    layers = LayerFolder.open(shots.camera_folder(absolute(folder), scene.camera))
+    views = {view: LayerFolder.open(path) for view, path in shots.view_folders(scene, absolute(folder)).items()}
+    layers = next(iter(views.values()))
     footage = setup.footage_behind_camera(scene) if plate else None
-    setup.set_up_nodes(scene, layers, keep_image=keep_image, plate=footage)
+    setup.set_up_nodes(scene, layers, keep_image=keep_image, plate=footage, views=views if len(views) > 1 else None)
     if match:
         render_settings.match_scene(scene, layers, layers.size())
     live = "; Intensity and Tint of the panel act on it" if connect_sliders(scene, layers) else ""
-    for warning in warnings.warnings(scene, layers, bool(live)):
+    for warning in warnings.warnings(scene, list(views.values()), bool(live)):
         operator.report({"WARNING"}, warning)
     operator.report({"INFO"}, f"{len(layers.files)} frames of layers set up{live}")
 

@@ -8,10 +8,11 @@ from typing import Any
 import bpy
 from mathutils import Vector
 
+from ...core.capture import Camera
 from ...core.errors import FlareFileError
-from .. import asset_browser, cameras, lamp_drive, library, lights, looks, overlay, render_settings
+from .. import asset_browser, lamp_drive, library, lights, looks, overlay, render_settings, stereo
 from ..compositor import setup
-from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator
+from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator, report_errors
 from ..views import look_through_camera, view_region_at
 
 SENSOR = 36.0  # mm, width of the sensor of a picture's camera
@@ -126,6 +127,9 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
     distance: bpy.props.FloatProperty(  # type: ignore[valid-type]
         name="Distance", description="Distance from the camera where no object is hit; 0 uses ten units", default=0.0,
         min=0.0, subtype="DISTANCE")
+    view: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="View", description="View of a stereo render that X and Y are positions in; empty for the camera itself",
+        options={"SKIP_SAVE"})
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
@@ -156,15 +160,21 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         if event.type in {"ESC", "RIGHTMOUSE"} or area is None or self.why_not(context):
             self.cancel(context)
             return {"CANCELLED"}
-        if event.type != "LEFTMOUSE" or event.value != "PRESS" or not self._store_position(context, area, event):
+        if event.type != "LEFTMOUSE" or event.value != "PRESS":
             return {"PASS_THROUGH"}
+        with report_errors(self) as outcome:
+            if not self._store_position(context, area, event):
+                return {"PASS_THROUGH"}
+        if outcome.status == {"CANCELLED"}:
+            self.cancel(context)
+            return outcome.status
         self.cancel(context)
         return self.execute(context)
 
     def _store_position(self, context: bpy.types.Context, area: Any, event: Any) -> bool:
         """Store the position of the mouse in the picture; return whether it is over the picture.
 
-        area: the 3D view, as `invoke` turned it to the camera.
+        area: the 3D view, as `invoke` turned it to the camera. Raises CaptureError.
         """
         space = area.spaces.active
         region = view_region_at(area, event.mouse_x, event.mouse_y) if space.type == "VIEW_3D" else None
@@ -172,7 +182,9 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
             return False
         x, y = event.mouse_x - region.x, event.mouse_y - region.y
         with context.temp_override(area=area, region=region, space_data=space, region_data=space.region_3d):
-            frame = overlay.camera_frame(bpy.context, context.scene, context.scene.camera)
+            self.view = stereo.shown_view(bpy.context, context.scene.camera)
+            core_camera = _core_camera(context.scene, bpy.context.view_layer.depsgraph, self.view)
+            frame = overlay.camera_frame(bpy.context, core_camera)
         if frame is None:
             return False
         self.x, self.y = (x - frame.left) / frame.width, 1 - (y - frame.bottom) / frame.height
@@ -192,13 +204,12 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         """
         scene = context.scene
         depsgraph = context.evaluated_depsgraph_get()
-        camera = scene.camera.evaluated_get(depsgraph)
-        core_camera = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
+        core_camera = _core_camera(scene, depsgraph, self.view)
         ray = Vector(core_camera.rays([[self.x * core_camera.width, self.y * core_camera.height]])[0].tolist())
-        eye = camera.matrix_world.translation
+        eye = Vector(core_camera.position.tolist())
         hit, position, *_ = scene.ray_cast(depsgraph, eye, ray)
         if not hit:
-            position = eye + ray * (self.distance or 10.0 * max(camera.matrix_world.to_scale()))
+            position = eye + ray * (self.distance or 10.0 * max(scene.camera.matrix_world.to_scale()))
         look, state = looks.look_of(scene), scene.fit_flare
         placeholder = next((flare.target for flare in state.lights if looks.is_placed(flare, scene)
                             and flare.target.fit_flare.is_placeholder), None)
@@ -214,6 +225,12 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
             item = looks.add_flare(scene, light, state.lights[state.light].source if state.lights
                                    else look.names[0])
         item.target = light
+
+
+def _core_camera(scene: Any, depsgraph: Any, view: str) -> Camera:
+    """Return the core's camera of a view of the scene by its name, "" for the scene's camera. Raises CaptureError."""
+    camera, eye = stereo.view_camera(scene, scene.camera, view)
+    return stereo.eye_camera(camera.evaluated_get(depsgraph), scene.render, eye)
 
 
 class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):

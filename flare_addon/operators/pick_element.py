@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ...core.look.picking import brightest_element
-from .. import looks, overlay
+from .. import looks, overlay, stereo
 from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator, report_errors
 from ..views import camera_of, view_region_at
 
@@ -90,18 +90,20 @@ def choose_element_at(context: Any, position: tuple[float, float]) -> bool:
     there is one. Raises FitFlareError."""
     scene = context.scene
     camera = camera_of(context.space_data, scene)
-    window = overlay.drawn_part(context, scene, camera)
+    camera, eye = stereo.view_camera(scene, camera, stereo.shown_view(context, camera))
+    window = overlay.drawn_part(context, scene, camera, eye)
     if window is None:
         return False
     point = position[0] + 0.5 - window.x, window.height - (position[1] + 0.5 - window.y)
-    return choose_element(scene, context.view_layer.depsgraph, camera, window.intrinsics, point)
+    return choose_element(scene, context.view_layer.depsgraph, camera, window.intrinsics, point, eye)
 
 
-def choose_element(scene: Any, depsgraph: Any, camera: Any, intrinsics: Any, point: tuple[float, float]) -> bool:
+def choose_element(scene: Any, depsgraph: Any, camera: Any, intrinsics: Any, point: tuple[float, float],
+                   eye: stereo.Eye = "") -> bool:
     """Choose the element that is brightest at a point, px of the intrinsics (3, 3), in the lists of the panel Look,
     which highlights it; return whether there is one. Raises FitFlareError."""
     state, look, edits = scene.fit_flare, looks.look_of(scene), looks.edits_of(scene.fit_flare)
-    flares = looks.evaluate_flares(scene, depsgraph, camera)
+    flares = looks.evaluate_flares(scene, depsgraph, camera, eye=eye)
     source_names = {item.name: item.source for item in state.lights}
     names = brightest_element(look, source_names, flares, edits, intrinsics, point)
     if names is None:

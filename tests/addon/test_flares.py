@@ -103,7 +103,7 @@ def test_frames_without_layers_are_reported_and_show_no_flare(facts: Any) -> Non
     ("switched off", "Compositing is switched off for this scene"),
     ("sequenced", "the video sequencer, which has 'title', in place of the compositor"),
     ("square", "The layers have 16 x 8 pixels and the scene renders 8 x 8, another aspect ratio"),
-    ("stereo", "This scene renders stereo, and both eyes get the flare of one camera"),
+    ("stereo", "This scene renders stereo, and the compositor has no flare of its own for left and right"),
     ("transparent", "The film is transparent, and PNG files lose the flare"),
 ])
 def test_renders_that_would_not_show_the_composite_give_a_warning(facts: Any, case: str, sentence: str) -> None:

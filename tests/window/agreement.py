@@ -169,7 +169,8 @@ def compare(scene, engine: str, over: str, results) -> None:
                 break
             before = pixels(path)
         with ui.override():
-            frame = module("overlay").camera_frame(bpy.context, scene, scene.camera)
+            frame = module("overlay").camera_frame(bpy.context, module("stereo").eye_camera(
+                scene.camera, scene.render))
         region = ui.region("WINDOW")
         left, bottom = round(region.x + frame.left), round(region.y + frame.bottom)
         assert (round(frame.width), round(frame.height)) == (WIDTH, HEIGHT), frame
@@ -212,7 +213,8 @@ def align(scene) -> None:
 
     def corner():
         with ui.override():
-            frame = module("overlay").camera_frame(bpy.context, scene, scene.camera)
+            frame = module("overlay").camera_frame(bpy.context, module("stereo").eye_camera(
+                scene.camera, scene.render))
         return np.array([frame.left, frame.bottom])
 
     for _ in range(3):

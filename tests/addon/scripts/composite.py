@@ -21,7 +21,7 @@ from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
 from fit_flare.core.errors import FrameError  # noqa: E402
 from fit_flare.core.system.progress import Progress  # noqa: E402
 from fit_flare.flare_addon import render_settings  # noqa: E402
-from fit_flare.flare_addon.compositor import flare_node, setup  # noqa: E402
+from fit_flare.flare_addon.compositor import flare_node, layer_nodes, setup  # noqa: E402
 from fit_flare.headless.commands import compose  # noqa: E402
 
 INTENSITY, TINT = 1.7, (1.0, 0.5, 0.25, 1.0)
@@ -138,7 +138,7 @@ except FrameError as problem:
 # ---- the command, of layers of wide pixels in ACEScg ----------------------------------------------
 compose.compose_frames(LayerFolder.open(aces), out / "aces", Progress())
 scene = bpy.context.scene
-facts["aces"] = [setup.colour_space_warning(scene), scene.render.pixel_aspect_x, scene.render.pixel_aspect_y]
+facts["aces"] = [layer_nodes.colour_space_warning(scene), scene.render.pixel_aspect_x, scene.render.pixel_aspect_y]
 
 # ---- overscan, in the command and beside an artist's nodes ------------------------------------------
 compose.compose_frames(LayerFolder.open(overscan), out / "overscan", Progress())

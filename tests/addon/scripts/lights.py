@@ -180,7 +180,7 @@ facts["clicks"] = {}
 for how, x, y in (("beside the picture", 50, 100), ("below the view", 150, -5), ("on the panel", 300, 100),
                   ("on the light", 160, 75), ("the camera is gone", 160, 75), ("the view is gone", 160, 75)):
     kind = library.FITFLARE_OT_pick_light
-    operator = SimpleNamespace(_area=7, execute=lambda _context: {"FINISHED"},
+    operator = SimpleNamespace(_area=7, view="", execute=lambda _context: {"FINISHED"},
                                why_not=lambda _context, how=how: "No" if how == "the camera is gone" else "")
     operator._store_position, operator.cancel = partial(kind._store_position, operator), partial(kind.cancel, operator)
     if how == "the view is gone":

@@ -15,8 +15,8 @@ package, capture, flare, layers, out, *space = sys.argv[1:]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-compositor, rendering, overlay = (
-    part(f"flare_addon.{name}") for name in ("compositor.setup", "render_settings", "overlay"))
+layer_nodes, rendering, overlay = (
+    part(f"flare_addon.{name}") for name in ("compositor.layer_nodes", "render_settings", "overlay"))
 facts: dict[str, object] = {}
 
 scene = empty()
@@ -27,7 +27,7 @@ facts["working space"] = bpy.data.colorspace.working_space if hasattr(bpy.data, 
 ops.open_flare(filepath=flare)
 scene.fit_flare.layers, scene.fit_flare.over = layers, "scene"
 ops.set_up_baked()
-facts["misread"] = compositor.colour_space_warning(scene)
+facts["misread"] = layer_nodes.colour_space_warning(scene)
 facts["red in the camera view"] = overlay.working_space()[:, 0].tolist()
 rendering.render_frames(scene, [1], lambda _number, suffix: Path(out) / f"shown{suffix}")
 leave(facts)

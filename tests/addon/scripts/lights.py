@@ -165,6 +165,7 @@ for how in ("linked", "overridden"):
     facts["linked"][how] = [possible, [lights.light_name(item) for item in lights.scene_lights(bpy.context.scene)]]
 
 # ---- a click in the picture -------------------------------------------------------------------------
+bpy.context.scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
 library = part("flare_addon.operators.library")
 frame_in, library.overlay.camera_frame = overlay.camera_frame, lambda *_words: overlay.CameraFrame(100, 50, 200, 100)
 view, panel = (SimpleNamespace(type=kind, x=left, y=0, width=width, height=300)

@@ -348,10 +348,8 @@ def _draw_outlines() -> None:
 def _draw_in_camera_view(draw: Callable[[Any, Any, Any, stereo.Eye], None]) -> None:
     """Call `draw` with context, scene, camera and eye if the current 3D view shows the flare through a camera.
 
-    Blender calls the handlers once for each eye where a view shows both.
-
-    Nothing is drawn while a bake reads the scene, since that moves the timeline. A FitFlareError is stored in
-    `last_error`.
+    Blender calls the handlers once for each eye where a view shows both. Nothing is drawn while a bake reads the scene,
+    since that moves the timeline. A FitFlareError is stored in `last_error`.
     """
     global last_error
     context = bpy.context
@@ -397,8 +395,7 @@ def draw_region(context: Any, scene: Any, camera: Any, eye: stereo.Eye = "") -> 
         edits = highlight.emphasise(edits, chosen, names)
     budget = _budgets.setdefault((camera.name, eye), OffsetsBudget(NETWORK_S, NETWORK_AT_REST_S))
     budget.begin()
-    flares = looks.evaluate_flares(scene, depsgraph, camera, edits, budget, eye=eye)
-    gaussians = concatenate(list(flares.values()))
+    gaussians = concatenate([*looks.evaluate_flares(scene, depsgraph, camera, edits, budget, eye=eye).values()])
     if not budget.is_complete and not bpy.app.timers.is_registered(redraw_viewports):
         bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
     if gaussians is None:

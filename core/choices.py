@@ -12,6 +12,7 @@ Mode = Literal["default", "estimated", "split", "unsup", "in-flare", "2d", "3dgs
 Model = Literal["paper", "ours"]
 Blend = Literal["over", "add"]
 Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
+Device = Literal["auto", "cpu", "cuda"]
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 Follows = Literal["source", "target", "blend"]
 """Camera and lights that the appearance of a transferred flare follows, see `core.transfer.query`."""

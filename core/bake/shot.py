@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
+from ..choices import Device
 from ..fit.rendering import render_scene, splat_look
 from ..fit.run import Run, ViewLayers
 from ..flare.compositing import linear_layers as linear_layers
 from ..flare.visibility import visibility_behind
+from ..gaussians.device import select_device
 from ..look import LookEdits, PlacedLight
 from ..look.shot import Shot, ShotFrame
 from ..system.progress import Progress
@@ -27,9 +29,11 @@ from .shot_frames import ShotSource, bake_shot_frames
 class ShotRenderer(ShotSource):
     """Renders the frames of a shot in the engine, with the scene of its run."""
 
-    def __init__(self, shot: Shot) -> None:
+    def __init__(self, shot: Shot, device: Device = "cpu") -> None:
+        """device: of the rasterizer."""
         super().__init__(shot)
-        self.run = Run.open(shot.run) if shot.run else None
+        self._device = select_device(device)
+        self.run = Run.open(shot.run, device=device) if shot.run else None
         model = self.run.flare.model if self.run is not None and self.run.flare is not None else None
         # Visibility of each unoccluded light through the scene of the fit, by name.
         self._clear_visibilities = ({} if model is None else
@@ -47,19 +51,22 @@ class ShotRenderer(ShotSource):
         placed = [self._occlude(light, camera) for light in shot_frame.lights]
         with torch.no_grad():
             gaussians_by_light = self.look.evaluate_lights(camera.world_to_camera, placed, edits, self.shot.query)
-            flares = {name: splat_look(self.look, gaussians, camera) for name, gaussians in gaussians_by_light.items()}
-            black = torch.zeros(camera.height, camera.width, 3)
+            flares = {name: splat_look(self.look, gaussians, camera, self._device)
+                      for name, gaussians in gaussians_by_light.items()}
+            black = torch.zeros(camera.height, camera.width, 3, device=self._device)
             scene, white = (None, 1.0) if self.run is None else (render_scene(self.run.gaussians, camera),
                                                                  self.run.gaussians.display_white)
-            linear = linear_layers(black if scene is None else scene.colour, flares, self.look.blend, white)
+            linear = linear_layers(black if scene is None else scene.colour, flares, self.look.blend, white).to(
+                torch.device("cpu"))
         # Without a scene an added layer is light alone, as `draw_layers` draws it. With the blend "over" a layer is
         # negative where its light covers a brighter flare, since the layers sum to the picture.
         is_light_alone = scene is None and self.look.blend == "add"
         layers = {name: np.maximum(layer.numpy(), 0) if is_light_alone else layer.numpy()
                   for name, layer in linear.flares.items()}
         depth = black[..., 0] if scene is None else scene.depth
-        return ViewLayers(linear.scene.numpy(), {name: layers.get(name, black.numpy()) for name in self.lights},
-                          depth.detach().numpy())
+        dark = black.cpu().numpy()
+        return ViewLayers(linear.scene.numpy(), {name: layers.get(name, dark) for name in self.lights},
+                          depth.detach().cpu().numpy())
 
     def _occlude(self, light: PlacedLight, camera: Camera) -> PlacedLight:
         """Return the light with its visibility behind the fitted scene, computed as in the fit.

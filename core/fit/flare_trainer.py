@@ -20,6 +20,7 @@ from ..conventions.run_files import FRAME_LIGHTS
 from ..errors import RunError
 from ..flare.density import clone_and_prune
 from ..flare.model import FlareModel
+from ..gaussians.device import select_device
 from ..system.progress import Progress
 from .checkpoint import State
 from .frames import Frames
@@ -52,6 +53,8 @@ class FlareTrainer(abc.ABC):
     def __init__(self, settings: FitSettings) -> None:
         torch.manual_seed(settings.seed)
         self.settings = settings
+        self.device = select_device(settings.device)
+        """The device that parameters and frames of an iteration are on; inputs are read and prepared on the CPU."""
         self.iteration = 0
         self.losses: dict[str, float] = {}
         """Last loss of each view, by name."""
@@ -135,7 +138,7 @@ class FlareTrainer(abc.ABC):
         """Return the penalties on delta_l, the learned correction of each light's place, at a pose (4, 4), and on the
         brightness of the lights in its frame."""
         assert self.flare is not None
-        settings, penalty = self.settings, torch.zeros(())
+        settings, penalty = self.settings, torch.zeros((), device=self.device)
         if settings.flare.correction_weight:
             corrections = self.flare.light_corrections(pose, frame)
             penalty = penalty + settings.flare.correction_weight * corrections.square().sum()
@@ -175,4 +178,4 @@ class FlareTrainer(abc.ABC):
 def load_parameters(parameters: dict[str, Parameter], state: State) -> None:
     """Load values of any number of rows: Gaussians are added and removed during a fit."""
     for name, parameter in parameters.items():
-        parameter.data = state[name].clone().to(parameter.dtype)
+        parameter.data = state[name].clone().to(parameter)

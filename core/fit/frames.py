@@ -21,6 +21,8 @@ from .cache import MEMORY, PictureCache
 
 SAMPLED_FRAMES = 12
 """Approximate number of frames in which black borders are measured."""
+DEVICE_MEMORY = 4 << 30
+"""Bytes of a GPU's memory for frames: 1380 frames of 480x270 with their clean frames, 86 of 1920x1080."""
 BORDER_MARGIN = 1
 """Lines beside a border that resizing mixes with it."""
 
@@ -60,6 +62,11 @@ class Targets(NamedTuple):
     camera: Camera
     frame: Tensor
     clean: Tensor | None
+
+
+    def to(self, device: torch.device) -> Targets:
+        """Return the targets with their pictures on a device."""
+        return Targets(self.camera, self.frame.to(device), None if self.clean is None else self.clean.to(device))
 
 
 class Frames:
@@ -198,3 +205,27 @@ class Frames:
             codes = (picture.display(self.display_white) * self._codes_per_value + 0.5).astype(np.uint16)
             self.cache.put(name, codes)
         return codes
+
+
+class DeviceFrames:
+    """The frames of a fit on its device. On a GPU they stay there, up to `memory` bytes; others are copied each time.
+    """
+
+    def __init__(self, frames: Frames, device: torch.device, memory: int = DEVICE_MEMORY) -> None:
+        self.device = device
+        self._frames, self._free_bytes = frames, memory
+        self._stored: dict[str, tuple[Targets, Tensor | None]] = {}
+
+    def read(self, view: View) -> tuple[Targets, Tensor | None]:
+        """Return `Frames.targets` and `Frames.mask` of a view, on the device."""
+        if view.name in self._stored:
+            return self._stored[view.name]
+        targets, mask = self._frames.targets(view), self._frames.mask(view)
+        if self.device.type == "cpu":
+            return targets, mask
+        copied = targets.to(self.device), None if mask is None else mask.to(self.device)
+        num_bytes = sum(part.numel() * part.element_size() for part in (*copied[0][1:], copied[1]) if part is not None)
+        if num_bytes <= self._free_bytes:
+            self._free_bytes -= num_bytes
+            self._stored[view.name] = copied
+        return copied

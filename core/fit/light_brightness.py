@@ -60,7 +60,7 @@ def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, r
     rows = [lights.rows[view.name] for view in views]
     solved, certainty = np.zeros((2, len(views), len(flare.names)))
     for number, (view, row) in enumerate(zip(views, rows, strict=True)):
-        start = brightness[row].clamp(0, MAX_BRIGHTNESS).numpy().astype(np.float64)
+        start = brightness[row].clamp(0, MAX_BRIGHTNESS).cpu().numpy().astype(np.float64)
         brightness[row] = 1.0  # so that the layers have their usual strength
         rendered = render_view(view)
         columns = [rendered.layers.flares[name].numpy() if name in rendered.layers.flares else None
@@ -75,7 +75,7 @@ def solve_brightness(flare: FlareModel, views: Sequence[View], frames: Frames, r
     solved = (certainty * solved + prior_certainty * np.nan_to_num(prior)) / np.maximum(total_certainty, 1e-9)
     for light in range(len(flare.names)):
         smooth = smooth_with_steps(solved[:, light], total_certainty[:, light])
-        brightness[rows, light] = torch.from_numpy(smooth.clip(0, MAX_BRIGHTNESS)).float()
+        brightness[rows, light] = torch.from_numpy(smooth.clip(0, MAX_BRIGHTNESS)).to(brightness)
 
 
 def _lights_in_frame(lights: FrameLights, view: View, edge: float = 0.0) -> NDArray[np.bool_]:

@@ -98,6 +98,8 @@ def select_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:
     model = FlareModel([flare.names[row] for row in rows], flare.positions[rows],
                        [flare.lights[row] for row in rows], lights)
     model.clear.copy_(flare.clear[rows])
+    if rows:
+        model.move_to(model.lights[0].device)
     return model
 
 
@@ -109,7 +111,7 @@ def write_frame_lights(path: Path, capture: Capture, flare: FlareModel) -> None:
     lights = flare.frame_lights
     if lights is None:
         return
-    brightness = lights.brightness.weight.detach().clamp(0, 1).numpy()
+    brightness = lights.brightness.weight.detach().clamp(0, 1).cpu().numpy()
     entries: list[dict[str, Any]] = []
     for light in capture.lights:
         entry: dict[str, Any] = {"name": light.name}

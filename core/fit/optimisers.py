@@ -39,7 +39,8 @@ class Optimisers:
         sh_rates[0] = rates.features * (COLOUR_RATE_FACTOR if display_white > 1 else 1)
         rate_by_name: dict[str, float | Tensor] = {
             "means": self._means_rate(0.0), "log_scales": rates.scale, "quaternions": rates.rotation,
-            "opacity_logits": rates.opacity, "sh": sh_rates.expand(COEFFICIENTS, 3).contiguous(),
+            "opacity_logits": rates.opacity,
+            "sh": sh_rates.expand(COEFFICIENTS, 3).contiguous().to("cpu" if scene is None else scene.means.device),
         }
         self.scene = Adam({} if scene is None else dict(scene.named_parameters()),
                           {} if scene is None else rate_by_name)

@@ -43,7 +43,7 @@ def scene_loss(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor
     """
     ramp = _ramp(progress)
     loss = settings.scene_weight * quantile_loss(scene, targets.frame, settings.excess_weight * (1 - ramp))
-    proximity = torch.from_numpy(light_proximity(targets.camera, lights, settings.light_radius))
+    proximity = torch.from_numpy(light_proximity(targets.camera, lights, settings.light_radius)).to(scene.device)
     loss = loss + settings.near_scene_penalty * ramp * (scene * proximity[..., None]).mean()
     # In the discs, the scene is fitted to the frame.
     if discs is not None:
@@ -73,7 +73,7 @@ def far_flare_penalty(added: Tensor, estimated_flare: Tensor | None, ratio: floa
     if estimated_flare is not None:
         confidence = (ratio - settings.diverged_ratio) / max(settings.converged_ratio - settings.diverged_ratio, 1e-9)
         added = (added - min(max(confidence, 0), 1) * estimated_flare.clamp(min=0)).clamp(min=0)
-    far = torch.from_numpy(1 - light_proximity(camera, lights, settings.light_radius))
+    far = torch.from_numpy(1 - light_proximity(camera, lights, settings.light_radius)).to(added.device)
     return settings.far_flare_penalty * (added * far[..., None]).mean()
 
 

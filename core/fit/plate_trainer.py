@@ -32,7 +32,7 @@ from ..removal.jobs.fitted import remove_fitted_flare
 from ..system.progress import Progress
 from .checkpoint import FitInputs, State
 from .flare_trainer import FlareTrainer
-from .frames import Frames, Targets, masked
+from .frames import DeviceFrames, Frames, Targets, masked
 from .initialise import initial_flare
 from .light_brightness import solve_brightness
 from .optimisers import Optimisers
@@ -66,6 +66,8 @@ class PlateTrainer(FlareTrainer):
         self.flare = initial_flare(capture, self.views, self.frames, settings)
         self.warnings = (*self.frames.warnings, *footage_warnings(capture, settings, self.views, self.frames))
         self._inputs = FitInputs(capture, clean_frames=self.frames.clean_source == "removed", lights=True)
+        self._device_frames = DeviceFrames(self.frames, self.device)
+        self.flare.move_to(self.device)
         self.optimisers = Optimisers(scene=None, flare=self.flare, settings=settings, extent=capture.extent,
                                      display_white=self.frames.display_white)
         self._progress = progress or Progress()
@@ -141,7 +143,7 @@ class PlateTrainer(FlareTrainer):
         self.iteration += 1
         assert self.flare is not None
         settings, view = self.settings, self._pick_view()
-        targets, mask = self.frames.targets(view), self.frames.mask(view)
+        targets, mask = self._device_frames.read(view)
         self.optimisers.set_rates(self.iteration)
         flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels)
         if flare is None:  # no light is in front of the camera
@@ -188,10 +190,10 @@ class PlateTrainer(FlareTrainer):
         assert self.flare is not None
         plate = self._plate(view)
         if self.settings.blend != "add":
-            return plate
+            return plate.to(self.device)
         lights = self.flare.positions_in(targets.camera.frame).numpy()
         discs = torch.from_numpy(light_disc_mask(plate.numpy(), targets.camera, lights))
-        return plate.masked_fill(discs[..., None], 0)
+        return plate.masked_fill(discs[..., None], 0).to(self.device)
 
     def finish(self, folder: Path, pixel_grid: PixelGrid, progress: Progress) -> None:
         """Write the plates: the frames without the fitted flare, and where they are clipped the plates of the fit."""

@@ -5,8 +5,8 @@
 """
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import fields, replace
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -28,6 +28,8 @@ from .plate_scene import PlateScene
 Scene = SceneGaussians | PlateScene
 """The scene of a fit: Gaussians, or one plate per frame."""
 
+T = TypeVar("T", Rendering, Splats)
+
 MIN_ALPHA = 1e-6
 """Smallest alpha by which a depth is divided: where nothing is, it stays 0."""
 
@@ -35,7 +37,7 @@ MIN_ALPHA = 1e-6
 class RenderedView(NamedTuple):
     """A rendered view. scene: rasterized in display space; flares: splats of each light, in the lights' order.
 
-    composite: (height, width, 3), display values 0..1; layers: the same in linear light, separated.
+    composite: (height, width, 3), display values 0..1; layers: the same in linear light, separated. All are on the CPU.
     """
 
     scene: Rendering
@@ -86,7 +88,11 @@ def render(scene: Scene, flare: FlareModel | None, blend: Blend, camera: Camera,
     visibility: how the scene hides lights; None if it does not. look, edits: with both, `look` evaluates the flare
     under these edits, in place of `flare`. pixel_grid: the grid at which the flare was fitted; None in the fit itself.
     """
-    rendering = scene.render_frame(camera) if isinstance(scene, PlateScene) else render_scene(scene, camera, kernels)
+    device = _device_of(scene, flare)
+    if isinstance(scene, PlateScene):
+        rendering = _move(scene.render_frame(camera), device)
+    else:
+        rendering = render_scene(scene, camera, kernels)
     flares: dict[str, Splats] = {}
     if flare is not None:
         pose, intrinsics = pose_and_intrinsics(camera)
@@ -94,12 +100,28 @@ def render(scene: Scene, flare: FlareModel | None, blend: Blend, camera: Camera,
         if look is None or edits is None:
             gaussians = flare(pose, visibilities, camera.frame)
         else:
-            gaussians = _evaluate_look_with_edits(look, flare, edits, camera, visibilities)
+            gaussians = {name: as_tensors(plane, device) for name, plane in
+                         _evaluate_look_with_edits(look, flare, edits, camera, visibilities).items()}
         flares = {name: splat_flare(light_gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels,
                                     pixel_grid=pixel_grid, exposure=camera.exposure)
                   for name, light_gaussians in gaussians.items()}
     layers = linear_layers(rendering.colour, flares, blend, scene.display_white)
-    return RenderedView(rendering, flares, encode(layers.composite.clamp_min(0)).clamp(0, 1), layers)
+    composite = encode(layers.composite.clamp_min(0)).clamp(0, 1)
+    cpu = torch.device("cpu")
+    return RenderedView(_move(rendering, cpu), {name: _move(splats, cpu) for name, splats in flares.items()},
+                        composite.to(cpu), layers.to(cpu))
+
+
+def _device_of(scene: Scene, flare: FlareModel | None) -> torch.device:
+    """Return the device of a fitted model: that of its scene, or of its flare over plates."""
+    if isinstance(scene, SceneGaussians):
+        return scene.means.device
+    return flare.lights[0].device if flare is not None and flare.lights else torch.device("cpu")
+
+
+def _move(pictures: T, device: torch.device) -> T:
+    """Return a `Rendering` or `Splats` with its tensors on a device."""
+    return type(pictures)(**{entry.name: getattr(pictures, entry.name).to(device) for entry in fields(pictures)})
 
 
 def render_scene(scene: SceneGaussians, camera: Camera, kernels: Kernels = "auto", *, sh_degree: int | None = None,
@@ -138,7 +160,7 @@ def _render_supersampled(scene: SceneGaussians, camera: Camera, kernels: Kernels
 
 
 def _evaluate_look_with_edits(look: Look, flare: FlareModel, edits: LookEdits, camera: Camera,
-                              visibilities: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
+                              visibilities: dict[str, Tensor] | None) -> dict[str, LookGaussians]:
     """Return the look's Gaussians of each light under an artist's edits, by the light's name.
 
     `flare` gives the lights' positions and brightness for the camera's frame. visibilities: 0..1 by light, None where
@@ -146,23 +168,25 @@ def _evaluate_look_with_edits(look: Look, flare: FlareModel, edits: LookEdits, c
     """
     visible_brightness = flare.shares(visibilities, camera.frame) or {}
     positions = dict(zip(flare.names, flare.positions_in(camera.frame).numpy(), strict=True))
-    gaussians_by_light = look.evaluate(camera.world_to_camera, lights=positions, edits=edits,
-                                       visibilities={name: float(value) for name, value in visible_brightness.items()})
-    return {name: as_tensors(gaussians) for name, gaussians in gaussians_by_light.items()}
+    return look.evaluate(camera.world_to_camera, lights=positions, edits=edits,
+                         visibilities={name: float(value) for name, value in visible_brightness.items()})
 
 
-def splat_look(look: Look, gaussians: LookGaussians, camera: Camera) -> Splats:
-    """Splat Gaussians of a look on the camera's picture, at the pixel grid that they were fitted at."""
+def splat_look(look: Look, gaussians: LookGaussians, camera: Camera, device: torch.device | None = None) -> Splats:
+    """Splat Gaussians of a look on the camera's picture, at the pixel grid that they were fitted at.
+
+    device: of the rasterizer and of the result; None for the CPU.
+    """
     _, intrinsics = pose_and_intrinsics(camera)
-    return splat_flare(as_tensors(gaussians), intrinsics, *camera.size, look.blend, pixel_grid=look.pixel_grid,
+    return splat_flare(as_tensors(gaussians, device), intrinsics, *camera.size, look.blend, pixel_grid=look.pixel_grid,
                        exposure=camera.exposure)
 
 
-def as_tensors(gaussians: LookGaussians) -> PlaneGaussians:
-    """Convert a look's Gaussians to those of the rasterizer."""
+def as_tensors(gaussians: LookGaussians, device: torch.device | None = None) -> PlaneGaussians:
+    """Convert a look's Gaussians to those of the rasterizer, on a device, None for the CPU."""
     means, covariances, opacities, colours = (
-        torch.from_numpy(part).float()
+        torch.from_numpy(part).float().to(device)
         for part in (gaussians.means, gaussians.covariances, gaussians.opacities, gaussians.colours))
-    rings, arcs = (None if part is None else torch.from_numpy(part).float()
+    rings, arcs = (None if part is None else torch.from_numpy(part).float().to(device)
                    for part in (gaussians.rings, gaussians.arcs))
     return PlaneGaussians(means, covariances, opacities, colours, rings, arcs)

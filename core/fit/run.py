@@ -20,12 +20,14 @@ from pathlib import Path
 import numpy as np
 
 from ..capture import Camera, Capture, read_lights
+from ..choices import Device
 from ..colour.srgb import Pixels
 from ..conventions import exposures
 from ..conventions.run_files import CAPTURE, CONFIG, FLARE, FRAME_LIGHTS, PLATES, SCENE
 from ..errors import RunError
 from ..flare import file as flare_file
 from ..flare.file import FlareFile
+from ..gaussians.device import select_device
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits, read_look
@@ -55,9 +57,11 @@ class ViewLayers:
 class Run:
     """The folder of a finished or unfinished fit; made by `Run.create` or `Run.open`."""
 
-    def __init__(self, folder: Path, settings: FitSettings, capture_folder: Path) -> None:
+    def __init__(self, folder: Path, settings: FitSettings, capture_folder: Path, device: Device = "cpu") -> None:
+        """device: where scene and flare are rendered; a fit computes where its settings say."""
         self.folder = folder
         self.settings = settings
+        self.device = select_device(device)
         self.capture_folder = capture_folder
         self._last_opened: Capture | None = None
 
@@ -91,9 +95,12 @@ class Run:
         return run
 
     @classmethod
-    def open(cls, folder: Path | str, progress: Progress | None = None) -> Run:
-        """Open the run in a folder; with `progress`, old names of settings are reported to the user. Raises RunError if
-        the folder is no run."""
+    def open(cls, folder: Path | str, progress: Progress | None = None, *, device: Device = "cpu") -> Run:
+        """Open the run in a folder; with `progress`, old names of settings are reported to the user.
+
+        device: where scene and flare are rendered. Raises RunError if the folder is no run, EngineError for a device
+        that cannot be used.
+        """
         folder = Path(folder)
         if not (folder / CONFIG).is_file():
             raise RunError(f"{folder} is not the folder of a run (it has no {CONFIG}); name one that fit has written.")
@@ -106,7 +113,7 @@ class Run:
             raise RunError(f"{folder / CAPTURE} is not UTF-8 text; start the fit anew.") from problem
         if not capture_folder.name:  # an empty file would give the working folder
             raise RunError(f"{folder / CAPTURE} names no capture; start the fit anew.")
-        return cls(folder, settings, capture_folder)
+        return cls(folder, settings, capture_folder, device)
 
     @cached_property
     def exposures(self) -> dict[str, float]:
@@ -167,13 +174,14 @@ class Run:
         flare = flare_file.load(self._require(FLARE))
         if (self.folder / FRAME_LIGHTS).is_file():
             flare.model.frame_lights = make_frame_lights(self._opened_capture(), flare.model.names)
+        flare.model.move_to(self.device)
         return flare
 
     @cached_property
     def scene(self) -> Scene:
         """The fitted scene: Gaussians, or one plate per frame. Raises RunError."""
         if not self.settings.uses_plates:
-            return read_ply(self._require(SCENE))
+            return read_ply(self._require(SCENE)).to(self.device)
         if not (self.folder / PLATES).is_dir():
             raise RunError(f"{self.folder} has no {PLATES}/ yet; finish the fit with --resume first.")
         capture = self._opened_capture()

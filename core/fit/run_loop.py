@@ -6,11 +6,13 @@ import contextlib
 import json
 import time
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from ..capture import Capture
+from ..choices import Device
 from ..conventions.pixel_grid import PixelGrid
 from ..conventions.run_files import CHECKPOINT, CONFIG, FLARE, LOG, METRICS, PREVIEW, SMALL_PREVIEW
 from ..errors import Cancelled, RunError
@@ -37,11 +39,12 @@ PREVIEW_ROWS = 4
 
 
 def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: Progress | None = None, *,
-        resume: bool = False) -> Run:
+        resume: bool = False, device: Device | None = None) -> Run:
     """Fit scene and flare of a capture; results, checkpoints, metrics and previews are written to the run's folder.
 
     With `resume`, an unfinished run in `folder` continues from its checkpoint with its own settings, and gives the same
-    fit as an uninterrupted one; without a run there, one is started.
+    fit as an uninterrupted one; without a run there, one is started. device: that of a resumed fit, which may differ
+    from that of its start, and then rounds otherwise; None for the run's own.
 
     Raises CaptureError, RunError, SettingsError, and Cancelled after a requested stop (with a checkpoint, if the fit
     had started).
@@ -50,6 +53,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     if resume and (folder / CONFIG).exists():
         with folder_lock(folder):
             run = Run.open(folder, progress)
+            run.settings = replace(run.settings, device=device or run.settings.device)
             _check_capture(run, capture)
             if run.finished:
                 progress.say(f"The fit in {folder} is finished already.")

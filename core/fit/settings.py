@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..choices import ITERATIONS, PARALLAX_LENGTH_FACTOR, PARALLAX_MODES, Blend, Kernels, Mode, Model, Preset
+from ..choices import ITERATIONS, PARALLAX_LENGTH_FACTOR, PARALLAX_MODES, Blend, Device, Kernels, Mode, Model, Preset
 from ..colour.srgb import srgb_from_linear
 from ..errors import SettingsError
 from ..flare.density import DensitySettings
@@ -202,7 +202,8 @@ class FitSettings:
     ssim_share is 1 - lambda of the paper's loss. separate_until: share of the iterations, from the start, in which the
     flare is composited over the clean frames instead of the scene; 0 in the paper. holdout: a number N (every N-th view
     is held out; 0: none), a split file's name, or None (the capture's split.json, else every 8th). exposure: "measured"
-    finds frames whose exposure differs from most, "fixed" takes all for equal.
+    finds frames whose exposure differs from most, "fixed" takes all for equal. device: of scene, flare and frames in
+    the iterations, see `core.gaussians.device`.
 
     white: scene-linear light at which frames are clipped; None where the frames have not been checked for more than 1,
     which only float frames can hold, and in runs of versions that clipped all at 1.
@@ -219,6 +220,7 @@ class FitSettings:
     white: float | None = None
     exposure: Literal["measured", "fixed"] = "measured"
     kernels: Kernels = "auto"
+    device: Device = "auto"
     checkpoint_every_s: float = 60.0
     preview_every: int = 1000
     flare: FlareSettings = field(default_factory=FlareSettings)
@@ -286,8 +288,7 @@ _FROM_0, _FROM_1 = Bounds(0, _MAX_INT), Bounds(1, _MAX_INT)
 _UNIT = Bounds(0, 1)
 _OPEN_UNIT = Bounds(0, 1, exclusive_minimum=True, exclusive_maximum=True)  # has a logit
 _NON_NEGATIVE = Bounds(0, _MAX_FLOAT)  # a weight or a rate; 0 switches its term or its parameter's steps off
-# A rate that decays by a ratio, or that the optimiser refuses at 0.
-_POSITIVE = Bounds(0, _MAX_FLOAT, exclusive_minimum=True)
+_POSITIVE = Bounds(0, _MAX_FLOAT, exclusive_minimum=True)  # a rate that decays by a ratio, or that Adam refuses at 0
 
 BOUNDS: dict[str, Bounds] = {
     "iterations": Bounds(1, 10**9), "width": _FROM_0, "seed": Bounds(0, MAX_SEED), "ssim_share": _UNIT,
@@ -295,8 +296,7 @@ BOUNDS: dict[str, Bounds] = {
     "preview_every": _FROM_1,
 
     "flare.count": Bounds(1, MAX_GAUSSIANS), "flare.opacity": _OPEN_UNIT,
-    "flare.scene_only_until": Bounds(0, 1, exclusive_maximum=True),
-    "flare.correction_weight": _NON_NEGATIVE,
+    "flare.scene_only_until": Bounds(0, 1, exclusive_maximum=True), "flare.correction_weight": _NON_NEGATIVE,
     **{f"flare.form.{name}": bounds for name, bounds in FORM_BOUNDS.items()},
     "flare.density.start": _FROM_0, "flare.density.stop": _FROM_0, "flare.density.every": _FROM_1,
     "flare.density.clone_above": _UNIT, "flare.density.clone_ratio": _UNIT, "flare.density.noise": _NON_NEGATIVE,

@@ -37,7 +37,7 @@ from . import metering
 from .checkpoint import FitInputs, State
 from .far_layer import far_layer_messages
 from .flare_trainer import FlareTrainer, load_parameters
-from .frames import Frames, Targets, masked, subsample
+from .frames import DeviceFrames, Frames, Targets, masked, subsample
 from .initialise import has_frame_lights, initial_flare, initial_scene
 from .optimisers import Optimisers
 from .parallax_losses import (
@@ -105,6 +105,14 @@ class Trainer(FlareTrainer):
                                  lights=self.flare is not None)
         self._scene_only_iterations = scene_only_iterations(settings.split, len(self.views), settings.iterations)
 
+        # Moved before the optimisers take the parameters.
+        self._device_frames = DeviceFrames(self.frames, self.device)
+        self._scene.to(self.device)
+        if self.flare is not None:
+            self.flare.move_to(self.device)
+        self._light_discs: dict[str, Tensor | None] = {}
+        """On a GPU, the light discs of views that were used, by name."""
+
         # Optimisers and strategy hold the parameters of the models.
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
         self.strategy = self._make_strategy()
@@ -136,7 +144,7 @@ class Trainer(FlareTrainer):
         self.iteration += 1
         settings = self.settings
         view = self._pick_view()
-        targets, mask = self.frames.targets(view), self.frames.mask(view)
+        targets, mask = self._device_frames.read(view)
         self.optimisers.set_rates(self.iteration)
         rendering = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)
         scene_picture = self._clip_as_filmed(rendering.colour)
@@ -145,7 +153,7 @@ class Trainer(FlareTrainer):
         scene_only = self._is_scene_only(targets)
         flare = None if scene_only else render_flare(self.flare, settings.blend, targets.camera, settings.kernels,
                                                      scene=self.scene, visibility=settings.flare.active_visibility)
-        light_discs = self._light_disc_mask(targets)
+        light_discs = self._light_discs_of(view, targets)
         background = self._flare_background(targets, scene_picture, light_discs)
         composite_picture = composite(background, flare, settings.blend, self.frames.display_white)
         # The losses of composite and scene, and the penalties.
@@ -244,10 +252,10 @@ class Trainer(FlareTrainer):
 
         def residual(view: View) -> Tensor:
             """Return frame minus scene of a view, (height, width, 3) display values, 0 where the mask is black."""
-            targets = self.frames.targets(view)
+            targets, mask = self._device_frames.read(view)
             scene = render_scene(self.scene, targets.camera, self.settings.kernels, sh_degree=self._sh_degree(),
                                  depth=False)
-            return targets.frame - masked(self._clip_as_filmed(scene.colour), targets.frame, self.frames.mask(view))
+            return targets.frame - masked(self._clip_as_filmed(scene.colour), targets.frame, mask)
 
         self._excess_ratio = excess_ratio(residual(view) for view in subsample(self.views, SAMPLED_VIEWS))
 
@@ -257,8 +265,9 @@ class Trainer(FlareTrainer):
         visibility = self.settings.flare.active_visibility
         if self.flare is None or visibility is None or not self.fits_scene or bool((self.flare.clear > 0).all()):
             return None
+        frame = targets.frame.cpu().numpy()
         visible_lights = [light for light in self.flare.positions_in(targets.camera.frame)[self.flare.clear <= 0]
-                          if light_disc_mask(targets.frame.numpy(), targets.camera, light[None].numpy()).any()]
+                          if light_disc_mask(frame, targets.camera, light[None].numpy()).any()]
         eye = torch.from_numpy(targets.camera.position)
         return occlusion_loss(self.scene, eye, visible_lights, visibility, self.settings.kernels)
 
@@ -284,6 +293,15 @@ class Trainer(FlareTrainer):
             behind = targets.clean if is_separate else torch.where(targets.clean > 1, targets.clean, scene)
         return behind if light_discs is None else behind.masked_fill(light_discs[..., None], 0)
 
+    def _light_discs_of(self, view: View, targets: Targets) -> Tensor | None:
+        """Return `_light_disc_mask` of a view; on a GPU it is computed once, on the CPU, since nothing in it changes.
+        """
+        if self.device.type == "cpu":
+            return self._light_disc_mask(targets)
+        if view.name not in self._light_discs:
+            self._light_discs[view.name] = self._light_disc_mask(targets)
+        return self._light_discs[view.name]
+
     def _light_disc_mask(self, targets: Targets) -> Tensor | None:
         """Return (height, width), True in the clipped disc of each light; None if the blend or the mode uses no discs.
 
@@ -295,8 +313,8 @@ class Trainer(FlareTrainer):
         clean = targets.frame if settings.uses_parallax else targets.clean if settings.supervised else None
         if settings.blend != "add" or self.flare is None or clean is None:
             return None
-        discs = torch.from_numpy(light_disc_mask(clean.numpy(), targets.camera,
-                                                 self.flare.positions_in(targets.camera.frame).numpy()))
+        discs = torch.from_numpy(light_disc_mask(clean.cpu().numpy(), targets.camera,
+                                                 self.flare.positions_in(targets.camera.frame).numpy())).to(clean.device)
         return discs if self.frames.display_white == 1 else discs & (targets.frame - clean < MIN_DIFFERENCE).all(-1)
 
     def _composite_target(self, targets: Targets, picture: Tensor, light_discs: Tensor | None) -> Tensor:

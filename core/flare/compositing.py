@@ -109,6 +109,11 @@ class LinearLayers(NamedTuple):
     flare: Tensor
     flares: dict[str, Tensor]
 
+    def to(self, device: torch.device) -> LinearLayers:
+        """Return the layers on a device."""
+        return LinearLayers(self.composite.to(device), self.scene.to(device), self.flare.to(device),
+                            {name: layer.to(device) for name, layer in self.flares.items()})
+
 
 def linear_layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend, white: float = 1.0) -> LinearLayers:
     """Return layers from the scene's picture, display values (height, width, 3), and each light's splats.

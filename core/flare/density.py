@@ -44,11 +44,11 @@ def clone_and_prune(flare: LightFlare, optimiser: Adam, names: Mapping[str, str]
     """
     opacity = flare.gaussians["opacity_logits"].detach().sigmoid()[:, 0]
     keep = (opacity >= settings.prune_below).nonzero()[:, 0]
-    chosen = torch.rand(len(opacity), generator=generator) < settings.clone_ratio
+    chosen = torch.rand(len(opacity), generator=generator).to(opacity.device) < settings.clone_ratio
     cloned = (chosen & (opacity > settings.clone_above)).nonzero()[:, 0]
     cloned = cloned[: max(settings.max_gaussians - len(keep), 0)]
     clones = {names[name]: rows.detach()[cloned] for name, rows in flare.gaussians.items()}
     positions = clones[names["positions"]]
-    positions += settings.noise * torch.randn(positions.shape, generator=generator)
+    positions += settings.noise * torch.randn(positions.shape, generator=generator).to(positions.device)
     optimiser.keep_rows(keep, names.values())
     optimiser.append_rows(clones)

@@ -39,10 +39,14 @@ class FrameLights(nn.Module):
         with torch.no_grad():
             self.brightness.weight.copy_(prior.nan_to_num(1.0))
 
+    def _index(self, rows: int | list[int]) -> Tensor:
+        """Return row numbers as an index of the brightness, on its device."""
+        return torch.tensor(rows, device=self.brightness.weight.device)
+
     def brightness_in(self, frame: str) -> Tensor | None:
         """Return the brightness (lights,) of a frame, 0 or more; None for a frame that is not listed."""
         row = self.rows.get(frame)
-        values: Tensor | None = None if row is None else self.brightness(torch.tensor(row)).clamp_min(0)
+        values: Tensor | None = None if row is None else self.brightness(self._index(row)).clamp_min(0)
         return values
 
     def positions_in(self, frame: str) -> Tensor | None:
@@ -57,13 +61,13 @@ class FrameLights(nn.Module):
         Absolute values allow steps, such as of a switch, and smooth the brightness where frames do not determine it.
         """
         row, last = self.rows[frame], len(self.rows) - 1
-        near = torch.tensor([max(row - 1, 0), row, min(row + 1, last)])
-        values = self.brightness(near)
+        values = self.brightness(self._index([max(row - 1, 0), row, min(row + 1, last)]))
         total: Tensor = values.diff(dim=0).abs().sum()
         return total
 
     def deviation(self, frame: str) -> Tensor:
         """Return the sum of squared differences of a frame's brightness from that in the lights' file."""
-        prior = self.prior[self.rows[frame]]
-        difference: Tensor = self.brightness(torch.tensor(self.rows[frame])) - prior.nan_to_num(0)
+        row = self.rows[frame]
+        prior = self.prior[row].to(self.brightness.weight.device)
+        difference: Tensor = self.brightness(self._index(row)) - prior.nan_to_num(0)
         return difference.square()[prior.isfinite()].sum()

@@ -61,6 +61,10 @@ class ViewOfLight(NamedTuple):
     light: Tensor
     depth: float
 
+    def to(self, device: torch.device) -> ViewOfLight:
+        """Return the view with its tensors on a device."""
+        return ViewOfLight(self.camera.to(device), self.rotation.to(device), self.light.to(device), self.depth)
+
     @classmethod
     def of(cls, world_to_camera: Tensor, xyz: Tensor) -> ViewOfLight:
         """Make the view, in float32, from a pose world_to_camera (4, 4) and the light's position xyz (3,) in the world.
@@ -110,6 +114,11 @@ class LightFlare(nn.Module):
     def count(self) -> int:
         """Number of Gaussians."""
         return len(self.gaussians["positions"])
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the parameters."""
+        return self.gaussians["positions"].device
 
     def forward(self, view: ViewOfLight) -> PlaneGaussians:
         """Return the flare's Gaussians in this view (paper, eq. 1 to 3), on the normalised plane.
@@ -234,6 +243,9 @@ class FlareModel(nn.Module):
     clear: (lights,) the visibility of each light behind the fitted scene where nothing hides it, 0..1. It is less than
     1, since Gaussians that show the lamp itself, or a sky nearer than the sun, stand before it. 0: unknown, and
     visibilities are 1. frame_lights: places and brightness by frame, where lights move or change; a .flare has none.
+
+    `move_to` puts the parameters on a device. The lights' places and `clear` stay on the CPU, where cameras are
+    computed with them.
     """
 
     positions: Tensor
@@ -247,6 +259,12 @@ class FlareModel(nn.Module):
         self.register_buffer("clear", torch.ones(len(positions)))
         self.flares = nn.ModuleList(flares)
         self.frame_lights = frame_lights
+
+    def move_to(self, device: torch.device) -> None:
+        """Move the parameters to a device."""
+        self.flares.to(device)
+        if self.frame_lights is not None:
+            self.frame_lights.brightness.to(device)
 
     @property
     def lights(self) -> list[LightFlare]:
@@ -264,8 +282,9 @@ class FlareModel(nn.Module):
         return self.positions if places is None else places
 
     def views(self, world_to_camera: Tensor, frame: str = "") -> list[ViewOfLight]:
-        """Return every light seen from one pose (4, 4), at its place in `frame`."""
-        return [ViewOfLight.of(world_to_camera, xyz) for xyz in self.positions_in(frame)]
+        """Return every light seen from one pose (4, 4), at its place in `frame`, on the device of its flare."""
+        return [ViewOfLight.of(world_to_camera, xyz).to(flare.device)
+                for flare, xyz in zip(self.lights, self.positions_in(frame), strict=True)]
 
     def training_views(self, poses: Sequence[Tensor], frames: Sequence[str] = ()) -> dict[str, list[list[float]]]:
         """Return, by the light's name, a list [camera x, y, z, light x, y] for each pose (4, 4) that has it in front.

@@ -113,6 +113,7 @@ def to_pixels(gaussians: PlaneGaussians, intrinsics: Tensor,
     stretch = torch.stack([fx * fx, fx * fy, fy * fy])
     variance = dilation(pixel_grid, math.sqrt(float(fx * fy)))
     low_pass = torch.tensor([variance, 0.0, variance], dtype=stretch.dtype, device=stretch.device)
+    focal, centre, stretch, low_pass = (part.to(gaussians.means.device) for part in (focal, centre, stretch, low_pass))
     return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass
 
 
@@ -123,7 +124,7 @@ def arcs_to_pixels(arcs: Tensor, covariances: Tensor, intrinsics: Tensor) -> Ten
     2x2 system, in double precision, since covariances of long thin Gaussians are nearly singular. covariances: (n, 3),
     px^2, from `to_pixels`: with the low-pass filter, so that the filter does not change the shift.
     """
-    x, y = (arcs * intrinsics.diagonal()[:2]).double().unbind(-1)
+    x, y = (arcs * intrinsics.diagonal()[:2].to(arcs.device)).double().unbind(-1)
     xx, xy, yy = covariances.double().unbind(-1)
     determinant = (xx * yy - xy * xy).clamp(min=1e-12)
     return (torch.stack([yy * x - xy * y, xx * y - xy * x], -1) / determinant[:, None]).to(arcs.dtype)

@@ -63,7 +63,7 @@ def relative_to_clear(visibility: Tensor, clear: Tensor | float) -> Tensor:
 
     clear: visibility of the light behind the scene where nothing hides it.
     """
-    return (visibility / clear).clamp(max=1) if clear > 0 else torch.ones(())
+    return (visibility / clear).clamp(max=1) if clear > 0 else visibility.new_ones(())
 
 
 @torch.no_grad()
@@ -146,7 +146,7 @@ def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings
     direction = (light - eye).float()
     distance = float(direction.norm())
     if distance <= 0:
-        return torch.ones(())
+        return scene.means.new_ones(())
     pose = _look_along(eye.float(), direction / distance)
     rows = _occluders(scene, pose, distance, settings)
     size, half = settings.pixels, settings.pixels / 2
@@ -156,9 +156,9 @@ def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings
     near = _near_plane(scene, distance)
     colourless = scene.sh.new_zeros(len(rows), 1, 3)  # colours are not needed, and their gradient would cost most
     alpha = rasterization(scene.means[rows], scene.quaternions[rows], scene.log_scales[rows].exp(),
-                          scene.opacity_logits[rows].sigmoid(), colourless, pose, intrinsics, size, size,
-                          near=near, depth=False, kernels=kernels).alpha
-    offset = torch.arange(size) + 0.5 - half
+                          scene.opacity_logits[rows].sigmoid(), colourless, pose.to(colourless),
+                          intrinsics.to(colourless), size, size, near=near, depth=False, kernels=kernels).alpha
+    offset = torch.arange(size, device=alpha.device) + 0.5 - half
     window = torch.exp(-0.5 * (offset / (half / 2)) ** 2)
     weights = window[:, None] * window
     return ((1 - alpha) * weights).sum() / weights.sum()
@@ -173,19 +173,31 @@ def _near_plane(scene: SceneGaussians, distance: float) -> float:
 def _occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
     """Return the rows of Gaussians between camera and light that may touch the small picture, without the far layer.
 
-    pose: world_to_camera (4, 4) of the small camera. distance: from camera to light. Uses numpy, which takes a third of
-    torch's time here.
+    pose: world_to_camera (4, 4) of the small camera. distance: from camera to light. On the CPU it uses numpy, which
+    takes a third of torch's time here.
     """
-    means, scales, rigid = (part.detach().cpu().numpy() for part in (scene.means, scene.log_scales, pose))
+    if not scene.means.is_cpu:
+        return _occluders_on_device(scene, pose.to(scene.means), distance, settings)
+    means, scales, rigid = (part.detach().numpy() for part in (scene.means, scene.log_scales, pose))
     x, y, depth = (means @ rigid[:3, :3].T + rigid[:3, 3]).T
     reach = 3 * np.exp(np.maximum(np.maximum(scales[:, 0], scales[:, 1]), scales[:, 2]))
     between = (depth > _near_plane(scene, distance)) & (depth < (1 - settings.margin) * distance)
     if scene.far is not None:
-        between &= ~scene.far.contains(scene.means).cpu().numpy()
+        between &= ~scene.far.contains(scene.means).numpy()
     off_axis = np.sqrt(x * x + y * y)
     # The picture's corners are at 2 sqrt(2) radii from its middle.
-    rows = np.flatnonzero(between & (off_axis < depth * settings.radius * 4 + reach))
-    return torch.from_numpy(rows).to(scene.means.device)
+    return torch.from_numpy(np.flatnonzero(between & (off_axis < depth * settings.radius * 4 + reach)))
+
+
+@torch.no_grad()
+def _occluders_on_device(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
+    """Return the rows of `_occluders` for a scene on a GPU, computed there. pose: (4, 4), on the scene's device."""
+    x, y, depth = (scene.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+    reach = 3 * scene.log_scales.amax(-1).exp()
+    between = (depth > _near_plane(scene, distance)) & (depth < (1 - settings.margin) * distance)
+    if scene.far is not None:
+        between &= ~scene.far.contains(scene.means)
+    return torch.nonzero(between & (torch.hypot(x, y) < depth * settings.radius * 4 + reach))[:, 0]
 
 
 def _look_along(position: Tensor, forward: Tensor) -> Tensor:

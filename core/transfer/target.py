@@ -103,7 +103,7 @@ class Target:
         """Return a hash of the scene; "" without one."""
         digest = hashlib.sha256()
         for parameter in self.scene.parameters() if self.scene is not None else ():
-            digest.update(parameter.detach().numpy().tobytes())
+            digest.update(parameter.detach().cpu().numpy().tobytes())
         return digest.hexdigest()[:16] if self.scene is not None else ""
 
 

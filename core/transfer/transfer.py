@@ -81,8 +81,13 @@ class Transfer:
     """
 
     def __init__(self, flare: Path, target: Target, settings: TransferSettings | None = None,
-                 training: Sequence[ArrayLike] | None = None, config: str | None = None) -> None:
-        """Read the look of `flare`, and index the target's frames. Raises FlareFileError."""
+                 training: Sequence[ArrayLike] | None = None, config: str | None = None,
+                 device: torch.device | None = None) -> None:
+        """Read the look of `flare`, and index the target's frames. device: of the rasterizer, to which the target's
+        scene is moved; None for the CPU. Raises FlareFileError."""
+        self.device = device or torch.device("cpu")
+        if target.scene is not None:
+            target.scene.to(self.device)
         self.flare, self.target, self.settings, self.config = flare, target, settings or TransferSettings(), config
         self.look = read_look(flare)
         self.sources = {light.name: light for light in self.look.lights}
@@ -155,7 +160,7 @@ class Transfer:
             gaussians = evaluate_placed(placed, camera.world_to_camera, self.look.blend, evaluate,
                                         self.look.pixel_grid)
             if gaussians is not None:
-                splats[light.name] = splat_look(self.look, gaussians, camera)
+                splats[light.name] = splat_look(self.look, gaussians, camera, self.device)
         return splats
 
     def visibility(self, index: int, light: str) -> float:
@@ -324,10 +329,10 @@ class _FrameRenderer:
             scene, depth = self._background(camera)
             flares = self._transfer.flares(self._index, camera, edits, scene)
             # The blend "over" works in display space, over the clipped scene; the scene layer stays unclipped.
-            display = encode(torch.from_numpy(np.clip(scene, 0, 1)))
+            display = encode(torch.from_numpy(np.clip(scene, 0, 1)).to(self._transfer.device))
             parts = linear_layers(display, flares, self._transfer.look.blend)
         black = np.zeros_like(scene)
-        return ViewLayers(scene, {name: parts.flares[name].numpy() if name in parts.flares else black
+        return ViewLayers(scene, {name: parts.flares[name].cpu().numpy() if name in parts.flares else black
                                   for name in self._transfer.lights}, depth)
 
     def _background(self, camera: Camera) -> tuple[Pixels, Pixels]:
@@ -349,7 +354,8 @@ class _FrameRenderer:
             return np.asarray(picture.resized(*camera.size).pixels, np.float32), no_depth
         if target.scene is not None and target.scene_is_background:
             rendering = render_scene(target.scene, camera)
-            return decode(rendering.colour.clamp(0, target.scene.display_white)).numpy(), rendering.depth.numpy()
+            light = decode(rendering.colour.clamp(0, target.scene.display_white))
+            return light.cpu().numpy(), rendering.depth.cpu().numpy()
         return np.zeros((camera.height, camera.width, 3), np.float32), no_depth
 
     def finish(self, layers: FrameLayers, camera: Camera) -> FrameLayers:

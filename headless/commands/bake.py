@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...core.errors import RunError, SettingsError
 from ...core.system.progress import Progress
-from .. import frames, jobs, layers, targets
+from .. import device, frames, jobs, layers, targets
 from ..command import Command, Step
 from . import transfer
 
@@ -43,6 +44,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--without-engine", action="store_true",
                         help="for a shot: draw it with numpy in this Python, slower, and without the scene of a fit")
     parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)  # that the Blender step of --blend has written
+    device.add_option(parser)
     jobs.add_option(parser)
 
 
@@ -52,6 +54,8 @@ def draw_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     if args.run.suffix.lower() != ".json":
         raise SettingsError("--without-engine is for a shot; leave it out.")
+    if args.device == "cuda":
+        raise SettingsError("--without-engine draws on the processor; leave out --device cuda.")
     return _bake_shot(args, progress, "draw", LookRenderer)
 
 
@@ -67,7 +71,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         return run_flare(args, progress)
     if args.scene or args.lights:
         raise SettingsError(f"--{'scene' if args.scene else 'lights'} is for a .flare; name the run's flare.flare.")
-    run_ = Run.open(args.run)
+    run_ = Run.open(args.run, device=args.device)
     if not run_.finished:
         raise RunError(f"{args.run} is not finished; resume it with `fit --resume` first.")
     capture = run_.open_capture(args.capture, need_frames=False)
@@ -121,7 +125,7 @@ def run_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Bake a shot, whose file holds its edits, in the engine."""
     from ...core.bake.shot import ShotRenderer
 
-    return _bake_shot(args, progress, "bake", ShotRenderer)
+    return _bake_shot(args, progress, "bake", partial(ShotRenderer, device=args.device))
 
 
 def _bake_shot(args: argparse.Namespace, progress: Progress, step: str,

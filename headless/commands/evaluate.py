@@ -6,9 +6,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from ...core.choices import Device
 from ...core.errors import RunError
 from ...core.system.progress import Progress
-from .. import plate_space, tallies
+from .. import device, plate_space, tallies
 from ..command import Command, Step
 
 VIEWS = ("held-out", "train", "all")
@@ -20,6 +21,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", choices=VIEWS, default="held-out", help="which views to score (default held-out)")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="the capture, if it was moved")
     plate_space.add_option(parser)
+    device.add_option(parser)
     parser.add_argument("--lpips", type=Path, metavar="DIR", help="folder with the weights of LPIPS (AlexNet, v0.1)")
 
 
@@ -30,14 +32,16 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
         plate_space.record(args, Run.open(args.run).find_capture(args.capture))
     return score_run(args.run, progress, view_set=args.views, capture_folder=args.capture,
-                     lpips_folder=args.lpips)
+                     lpips_folder=args.lpips, device_name=args.device)
 
 
 def score_run(folder: Path, progress: Progress, *, view_set: str = "held-out",
-              capture_folder: Path | None = None, lpips_folder: Path | None = None) -> dict[str, Any]:
+              capture_folder: Path | None = None, lpips_folder: Path | None = None,
+              device_name: Device = "auto") -> dict[str, Any]:
     """Score the views of a run, write its eval.json and report the table; return the file and the scores.
 
-    view_set: one of VIEWS. capture_folder: None for the run's. lpips_folder: None to leave LPIPS out. Raises RunError.
+    view_set: one of VIEWS. capture_folder: None for the run's. lpips_folder: None to leave LPIPS out. device_name: what
+    renders the views. Raises RunError and EngineError.
     """
     from ...core.conventions.run_files import EVALUATION
     from ...core.fit.frames import Frames
@@ -50,7 +54,7 @@ def score_run(folder: Path, progress: Progress, *, view_set: str = "held-out",
         from ...core.metrics.lpips import Lpips
 
         perceptual = Lpips(lpips_folder)
-    run_ = Run.open(folder)
+    run_ = Run.open(folder, device=device_name)
     capture = run_.open_capture(capture_folder)
     tallies.report_capture(capture, progress)
     train, held_out = capture.split(run_.settings.holdout)

@@ -11,7 +11,7 @@ from ...core.errors import CaptureError, SettingsError
 from ...core.system.progress import Progress
 from ...core.system.reading import UTF8_SIG, read_text
 from ...core.typed import MAX_INT_DIGITS
-from .. import jobs, plate_space, tallies
+from .. import device, jobs, plate_space, tallies
 from ..command import Command, Step, check_at_least_one, parse_seed, reject_unused_options
 from .lights import with_lights
 from .remove import with_clean_frames
@@ -67,6 +67,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--freeze-scene", action="store_true",
                         help="keep the scene of --scene unchanged and fit the flare alone; needs no clean frames")
     plate_space.add_option(parser)
+    device.add_option(parser, default=None)
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes",
                         help="any other setting by its name in config.toml, such as flare.count=400; repeatable")
 
@@ -103,7 +104,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
     capture = with_supervision(capture, settings, progress)
-    result = fit(capture, settings, out, progress, resume=args.resume)
+    result = fit(capture, settings, out, progress, resume=args.resume, device=args.device)
     progress.say(f"The run is in {result.folder}: look at preview.png there, then run `eval` and `bake`.")
     used = {view.name for part in capture.split(settings.holdout) for view in part}
     tally = tallies.tally_capture(capture, used=len(used))
@@ -121,7 +122,8 @@ def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress)
     settings = preset(args.preset, mode=mode, blend=args.blend, iterations=args.iterations, **overrides)
     if kind == "plates":
         settings = adapt_to_plates(settings)
-    changes = {"width": args.size, "seed": args.seed, "holdout": parse_holdout(args.holdout)}
+    changes = {"width": args.size, "seed": args.seed, "holdout": parse_holdout(args.holdout),
+               "device": args.device}
     if args.scene and str(args.scene) not in SCENE_KINDS:
         if not args.scene.is_file():
             raise SettingsError(f"--scene {args.scene} is missing.")

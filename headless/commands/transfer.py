@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from ...core.choices import Follows
 from ...core.errors import SettingsError
 from ...core.system.progress import Progress
-from .. import frames, jobs, layers, targets
+from .. import device, frames, jobs, layers, targets
 from ..command import Command, Step, check_at_least_one
 from ..targets import TargetOptions
 
@@ -82,6 +82,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     layers.add_options(plates, half="unless a plate has more", producer="transfer",
                        edits="an edit, as for `bake`, by the lights of the target; repeatable")
     parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)  # that the Blender step of --blend has written
+    device.add_option(parser)
     jobs.add_option(parser)
 
 
@@ -158,10 +159,11 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
                 training_poses: list[Floats] | None, progress: Progress) -> dict[str, Any]:
     """Render the layers of a flare for a target, as a step of `transfer` or `bake`.
 
-    args: the command's, with the options of layers, --frames, --size and --jobs. step: name of the command's step,
-    which --jobs starts. flare: the .flare. training_poses: of training views, for a .flare that does not store its own.
-    Returns the command's result.
+    args: the command's, with the options of layers, --frames, --size, --device and --jobs. step: name of the command's
+    step, which --jobs starts. flare: the .flare. training_poses: of training views, for a .flare that does not store
+    its own. Returns the command's result.
     """
+    from ...core.gaussians.device import select_device
     from ...core.transfer.target import resized
     from ...core.transfer.transfer import Transfer, TransferSettings
 
@@ -175,7 +177,7 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     settings = TransferSettings(options.query, options.scale, options.smooth, options.plate_space,
                                 fall_off=options.fall_off, highlights=options.highlights,
                                 highlight_gain=1.0 if options.highlight_gain is None else options.highlight_gain)
-    transfer = Transfer(flare, target, settings, training_poses, args.ocio)
+    transfer = Transfer(flare, target, settings, training_poses, args.ocio, select_device(args.device))
     selected = frames.select_task([target_frame.frame for target_frame in target.frames], args, progress)
     if not selected:
         return layers.empty_result(args.out)

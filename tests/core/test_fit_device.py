@@ -58,8 +58,9 @@ def quick(iterations: int, model: str = "ours", mode: str = "default", **changes
     """A short fit with every event of a long one; the lights are hidden by the scene."""
     return override_settings(preset("draft", iterations=iterations, model=model, mode=mode), {
         "flare.count": 60, "holdout": 4, "preview_every": 1000, "checkpoint_every_s": 1e6,
-        "flare.density.start": 10, "flare.density.every": 10, "flare.density.stop": 30, "scene.classic.start": 5, "scene.classic.every": 10,
-        "scene.classic.cap": 400, "scene.reorder_every": 12, "scene.sh_every": 8, **changes})
+        "flare.density.start": 10, "flare.density.every": 10, "flare.density.stop": 30,
+        "scene.classic.start": 5, "scene.classic.every": 10, "scene.classic.cap": 400,
+        "scene.reorder_every": 12, "scene.sh_every": 8, **changes})
 
 
 def scores(run: Run) -> dict[str, float]:

@@ -113,7 +113,7 @@ def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, pr
     read_look(flare)
     scene = open_blend(options.to[0])
     if scene.render.use_multiview:
-        progress.say(f"The scene {scene.name!r} renders stereo, and this flare is that of its camera, not of its views; "
+        progress.say(f"The scene {scene.name!r} renders stereo; this flare is that of its camera, not of its views: "
                      "Bake Layers in Blender makes layers of each view.")
     all_numbers = range(scene.frame_start, scene.frame_end + 1)
     all_frames = [NumberedFrame(view="", number=number, file="") for number in all_numbers]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Layout elements of panels and preferences: wrapped sentences and progress bars."""
+"""Layout elements of panels and preferences: wrapped sentences, progress bars, columns of settings."""
 from __future__ import annotations
 
 from typing import Any
@@ -59,3 +59,11 @@ def _wrap(text: str, width: int) -> list[str]:
         lines += [line] if line else []
         line = word
     return lines
+
+
+def settings_column(layout: Any) -> Any:
+    """Return a column for properties that are not animated."""
+    column = layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    return column

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Parts of the panels in the sidebar: the switches of a flare, and notes about lights that move and stereo renders."""
+"""Parts of the panels in the sidebar: settings of a fit and a bake, the switches of a flare, and notes about lights
+that move and stereo renders."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -7,9 +8,9 @@ from typing import Any
 
 import bpy
 
-from . import fits, lamp_drive, light_paths, lights, looks, stereo
+from . import baking, fits, jobs, lamp_drive, light_paths, lights, looks, stereo
 from .compositor.warnings import stereo_warnings
-from .layouts import label_lines
+from .layouts import label_lines, settings_column
 from .paths import is_folder
 
 
@@ -84,3 +85,40 @@ def draw_stereo_note(layout: Any, scene: Any) -> None:
         label_lines(layout, f"Stereo: a bake has layers for each view ({names}).", "INFO")
     for warning in stereo_warnings(scene):
         label_lines(layout, warning, "ERROR")
+
+
+def draw_fit_settings(layout: Any, state: Any) -> None:
+    """Draw preset, mode and the limit of the width."""
+    settings = settings_column(layout)
+    settings.prop(state, "preset")
+    settings.prop(state, "mode")
+    row = settings.row(heading="Limit Width")
+    row.prop(state, "limits_width", text="")
+    if state.limits_width:
+        row.prop(state, "width", text="")
+
+
+def draw_bake_settings(layout: Any, state: Any) -> None:
+    """Draw range, folder and layers of the next bake."""
+    column = settings_column(layout)
+    column.prop(state, "bake_range")
+    if state.bake_range == "custom":
+        column.prop(state, "bake_first")
+        column.prop(state, "bake_last")
+    column.prop(state, "layers")
+    column.prop(state, "bake_live")
+    column.prop(state, "bake_scene")
+    column.prop(state, "bake_composite")
+
+
+def draw_last_bake(layout: Any, scene: Any, job: jobs.Job | None) -> None:
+    """Draw the error or the result of the last bake, which does not run; nothing without one."""
+    if error := baking.last_error(scene):
+        label_lines(layout, error, "ERROR")
+    elif job is not None and job.error:
+        label_lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
+    elif job is not None and job.state == "done":
+        count = job.result.get("frames", 0)
+        label_lines(layout, f"Layers of {count} frame{'' if count == 1 else 's'} are baked.", "CHECKMARK")
+        for warning in job.warnings:
+            label_lines(layout, warning, "ERROR")

@@ -16,7 +16,7 @@ from ..core.errors import FitFlareError
 from ..core.look import Look
 from . import baking, engine, fits, handbook, jobs, library, light_extents, lights, looks, overlay, panel_parts, shots
 from .compositor import drivers, flare_node, setup
-from .layouts import draw_progress, label_lines
+from .layouts import draw_progress, label_lines, settings_column
 from .operators import make_flare
 from .paths import is_folder
 from .user_settings import PACKAGE
@@ -33,14 +33,6 @@ class _SidebarPanel:
 
     def draw_header_preset(self, _context: bpy.types.Context) -> None:
         handbook.draw_button(self.layout, self.page)  # type: ignore[attr-defined]
-
-
-def _settings_column(layout: Any) -> Any:
-    """Return a column for properties that are not animated."""
-    column = layout.column()
-    column.use_property_split = True
-    column.use_property_decorate = False
-    return column
 
 
 class _FitPanel(_SidebarPanel):
@@ -70,7 +62,7 @@ class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
         row.operator("fit_flare.import_capture", icon="IMPORT")
         if folder is not None:
             layout.prop(state, "capture", text="")
-            _settings_column(layout).prop(state, "plate_space")
+            settings_column(layout).prop(state, "plate_space")
             if fits.has_clean_frames(context.scene):
                 layout.row().prop(state, "footage", expand=True)
         column = layout.column()
@@ -132,28 +124,11 @@ class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
         if fit_state == "running" and job is not None:
             _draw_running_fit(layout, job)
             return
-        settings = _settings_column(layout)
-        settings.prop(state, "preset")
-        settings.prop(state, "mode")
-        row = settings.row(heading="Limit Width")
-        row.prop(state, "limits_width", text="")
-        if state.limits_width:
-            row.prop(state, "width", text="")
+        panel_parts.draw_fit_settings(layout, state)
         capture = fits.capture_folder(scene)
         if capture is not None and (state.mode != "default" or fits.cleaning_job(capture) is not None):
             _draw_clean_frames(layout, state, capture, fit_state)
-        if fit_state == "lost":
-            label_lines(layout, f"The folder of the run {folder} does not exist any more: start a new fit.", "ERROR")
-        elif fit_state == "resumable":
-            if job is not None and job.state == "failed":
-                label_lines(layout, job.error, "ERROR")
-            else:
-                label_lines(layout, "The fit was stopped and can be resumed.", "INFO")
-            layout.operator("fit_flare.resume", icon="PLAY")
-        elif fit_state == "finished":
-            _draw_finished_fit(layout, scene, job)
-        elif job is not None and job.state in ("failed", "stopped"):
-            label_lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
+        _draw_last_fit(layout, scene, fit_state, job)
         reason = fits.why_not_fit(scene)
         if reason and engine.find_engine() is not None:
             label_lines(layout, f"{reason}.", "INFO")
@@ -163,6 +138,26 @@ class FITFLARE_PT_fit(_FitPanel, bpy.types.Panel):
         row.operator("fit_flare.fit", text=label, icon="RENDER_ANIMATION")
         if folder is not None and is_folder(folder):
             _draw_log_buttons(layout, folder)
+
+
+def _draw_last_fit(layout: Any, scene: Any, fit_state: str, job: jobs.Job | None) -> None:
+    """Draw the state of the last fit, which does not run, with the button that resumes it or the result.
+
+    fit_state: of `fits.fit_state`. job: of the fit, None if it ran before Blender was started.
+    """
+    if fit_state == "lost":
+        label_lines(layout, f"The folder of the run {fits.run_folder(scene)} does not exist any more: start a new fit.",
+                    "ERROR")
+    elif fit_state == "resumable":
+        if job is not None and job.state == "failed":
+            label_lines(layout, job.error, "ERROR")
+        else:
+            label_lines(layout, "The fit was stopped and can be resumed.", "INFO")
+        layout.operator("fit_flare.resume", icon="PLAY")
+    elif fit_state == "finished":
+        _draw_finished_fit(layout, scene, job)
+    elif job is not None and job.state in ("failed", "stopped"):
+        label_lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
 
 
 def _draw_clean_frames(layout: Any, state: Any, capture: Any, fit_state: str) -> None:
@@ -184,7 +179,7 @@ def _draw_clean_frames(layout: Any, state: Any, capture: Any, fit_state: str) ->
                     "No clean frames: the fit separates scene and flare by parallax." if state.mode == "split" else
                     "No clean frames yet: the fit starts by making them.", "INFO")
     if offers_network:
-        options = _settings_column(layout)
+        options = settings_column(layout)
         options.prop(state, "matte")
         options.prop(state, "keep_glow")
         if not exists and state.mode != "split" and (state.matte or state.keep_glow):
@@ -385,28 +380,12 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
             draw_progress(layout, job, "Bake")
             _draw_bake_log(layout, job)
         else:
-            column = _settings_column(layout)
-            column.prop(state, "bake_range")
-            if state.bake_range == "custom":
-                column.prop(state, "bake_first")
-                column.prop(state, "bake_last")
-            column.prop(state, "layers")
-            column.prop(state, "bake_live")
-            column.prop(state, "bake_scene")
-            column.prop(state, "bake_composite")
+            panel_parts.draw_bake_settings(layout, state)
             panel_parts.draw_stereo_note(layout, scene)
             if state.flare and engine.find_engine() is None:
                 label_lines(layout, "Without an engine, Blender's own Python draws the layers: some seconds per frame.",
                             "INFO")
-            if error := baking.last_error(scene):
-                label_lines(layout, error, "ERROR")
-            elif job is not None and job.error:
-                label_lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
-            elif job is not None and job.state == "done":
-                count = job.result.get("frames", 0)
-                label_lines(layout, f"Layers of {count} frame{'' if count == 1 else 's'} are baked.", "CHECKMARK")
-                for warning in job.warnings:
-                    label_lines(layout, warning, "ERROR")
+            panel_parts.draw_last_bake(layout, scene, job)
             row = layout.row(align=True)
             row.scale_y = 1.3
             panel_parts.draw_bake_buttons(row, state)
@@ -418,7 +397,7 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
         """Draw the set-up of the compositor, and its sliders where the panel Look does not drive them."""
         state, node = scene.fit_flare, flare_node.find_node(scene)
         box = layout.box().column()
-        column = _settings_column(box)
+        column = settings_column(box)
         column.prop(state, "over")
         box.operator("fit_flare.set_up_baked", icon="NODE_COMPOSITING")
         if node is not None and node.node_tree is not None:

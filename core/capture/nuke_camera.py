@@ -174,8 +174,21 @@ class _CameraNode:
         return any("curve" in value for value in self.knobs.values())
 
     def to_camera(self) -> NukeCamera:
-        """Return the camera at the frames that have keys. Raises CaptureError for values of knobs
-        that are not supported."""
+        """Return the camera at the frames that have keys. Raises CaptureError for values of knobs that are not
+        supported."""
+        self._check_knobs()
+        focal, aperture = self._single_curve("focal", DEFAULT_FOCAL), self._single_curve("haperture", DEFAULT_APERTURE)
+        read_poses = self._matrix_poses if self.knobs.get("useMatrix") == "true" else self._transform_poses
+        poses, is_still = read_poses(focal, aperture)
+        if not poses:
+            raise self._unsupported("its curves have no frame in common")
+        # An aperture of 0 gives NaN, which `read_nuke_camera` refuses.
+        relative_focal = {number: _value_at(focal, number) / (_value_at(aperture, number) or math.nan)
+                          for number in poses}
+        return NukeCamera(poses, relative_focal, is_still=is_still)
+
+    def _check_knobs(self) -> None:
+        """Raise CaptureError for a projection or a transform that this program does not read."""
         for name, neutral in _NEUTRAL.items():
             curves = self._read_curves(name) if name in self.knobs else []
             if any(value != neutral for curve in curves for value in curve.values()):
@@ -184,28 +197,29 @@ class _CameraNode:
             raise self._unsupported(f"its projection is {self.knobs['projection_mode']}")
         if self.knobs.get("xform_order", "SRT") != "SRT":
             raise self._unsupported(f"its transform order is {self.knobs['xform_order']}")
-        focal, aperture = self._single_curve("focal", DEFAULT_FOCAL), self._single_curve("haperture", DEFAULT_APERTURE)
-        if self.knobs.get("useMatrix") == "true":
-            curves = self._read_curves("matrix", 16)
-            numbers, is_still = _common_frames(*curves, focal, aperture)
-            poses = {number: np.reshape([_value_at(curve, number) for curve in curves], (4, 4)) for number in numbers}
-            if any(not is_rotation(pose[:3, :3]) or (pose[3] != (0, 0, 0, 1)).any() for pose in poses.values()):
-                raise self._unsupported("its matrix is no rotation with a translation")
-        else:
-            order = self.knobs.get("rot_order", DEFAULT_ORDER)
-            if order not in ROTATION_ORDERS:
-                raise self._unsupported(f"its rotation order is {order}")
-            translation, rotation = (self._read_curves(name, 3) for name in ("translate", "rotate"))
-            numbers, is_still = _common_frames(*translation, *rotation, focal, aperture)
-            poses = {number: _compose_pose([_value_at(curve, number) for curve in translation],
-                                           [_value_at(curve, number) for curve in rotation], order)
-                     for number in numbers}
-        if not poses:
-            raise self._unsupported("its curves have no frame in common")
-        # An aperture of 0 gives NaN, which `read_nuke_camera` refuses.
-        relative_focal = {number: _value_at(focal, number) / (_value_at(aperture, number) or math.nan)
-                          for number in poses}
-        return NukeCamera(poses, relative_focal, is_still=is_still)
+
+    def _matrix_poses(self, *lens_curves: Curve) -> tuple[dict[int, Floats], bool]:
+        """Return the poses (4, 4), camera to world, by frame, from the knob `matrix`, and whether nothing is animated.
+
+        lens_curves: curves whose frames count too. Raises CaptureError.
+        """
+        curves = self._read_curves("matrix", 16)
+        numbers, is_still = _common_frames(*curves, *lens_curves)
+        poses = {number: np.reshape([_value_at(curve, number) for curve in curves], (4, 4)) for number in numbers}
+        if any(not is_rotation(pose[:3, :3]) or (pose[3] != (0, 0, 0, 1)).any() for pose in poses.values()):
+            raise self._unsupported("its matrix is no rotation with a translation")
+        return poses, is_still
+
+    def _transform_poses(self, *lens_curves: Curve) -> tuple[dict[int, Floats], bool]:
+        """Return what `_matrix_poses` does, from the knobs `translate` and `rotate`."""
+        order = self.knobs.get("rot_order", DEFAULT_ORDER)
+        if order not in ROTATION_ORDERS:
+            raise self._unsupported(f"its rotation order is {order}")
+        translation, rotation = (self._read_curves(name, 3) for name in ("translate", "rotate"))
+        numbers, is_still = _common_frames(*translation, *rotation, *lens_curves)
+        return {number: _compose_pose([_value_at(curve, number) for curve in translation],
+                                      [_value_at(curve, number) for curve in rotation], order)
+                for number in numbers}, is_still
 
     def _single_curve(self, name: str, default: float) -> Curve:
         return self._read_curves(name, 1)[0] if name in self.knobs else {0: default}

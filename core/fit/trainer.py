@@ -162,14 +162,7 @@ class Trainer(FlareTrainer):
         loss = (scene_picture.new_zeros(()) if scene_only else
                 l1_ssim(masked(composite_picture, composite_target, mask), composite_target, l1_weight))
         metrics = {} if scene_only else {"loss": float(loss.detach())}
-        scene_term = None
-        if self.fits_scene:
-            scene_target = self._scene_target(targets, composite_picture, scene_picture)
-            if scene_target is not None:
-                scene_term = l1_ssim(masked(scene_picture, scene_target, mask), scene_target, l1_weight)
-            elif settings.uses_parallax:
-                scene_term = self._parallax_loss(targets, masked(scene_picture, targets.frame, mask), flare,
-                                                 light_discs)
+        scene_term = self._scene_loss(targets, mask, composite_picture, scene_picture, flare, light_discs)
         if scene_term is not None:
             metrics["scene_loss"] = float(scene_term.detach())
             loss = loss + scene_term
@@ -326,6 +319,23 @@ class Trainer(FlareTrainer):
         if self.frames.display_white == 1 or light_discs is None:
             return targets.frame
         return torch.where(light_discs[..., None], picture.clamp_min(1), targets.frame)
+
+    def _scene_loss(self, targets: Targets, mask: Tensor | None, composite_picture: Tensor, scene_picture: Tensor,
+                    flare: Splats | None, light_discs: Tensor | None) -> Tensor | None:
+        """Return the loss of the scene's rendering, a scalar; None if the scene is frozen or only the composite
+        supervises it.
+
+        composite_picture, scene_picture: display values (height, width, 3). mask: (height, width), true for pixels that
+        count; None for all. flare, light_discs: as for `_parallax_loss`.
+        """
+        if not self.fits_scene:
+            return None
+        target = self._scene_target(targets, composite_picture, scene_picture)
+        if target is not None:
+            return l1_ssim(masked(scene_picture, target, mask), target, 1 - self.settings.ssim_share)
+        if self.settings.uses_parallax:
+            return self._parallax_loss(targets, masked(scene_picture, targets.frame, mask), flare, light_discs)
+        return None
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
         """Return the display values that the scene's rendering is compared with, (height, width, 3), or None.

@@ -441,20 +441,29 @@ def _read_colour(path: Path, raw: Any, stream: Any) -> VideoColour:
     elif planar.is_grey:
         matrix, limited = BT_709, colour_range == LIMITED_RANGE  # any matrix: only the luma is decoded
     else:
+        matrix = _matrix_of_components(path, raw, matrix, primaries)
         limited = colour_range != FULL_RANGE and not planar.is_full_range and not raw.format.name.startswith("yuvj")
-        if matrix == BY_PRIMARIES:
-            matrix = primaries if primaries in (BT_709, BT_2020) else UNSPECIFIED
-        if matrix in UNSUPPORTED_MATRICES:
-            raise FrameError(f"{path} has the colour matrix {UNSUPPORTED_MATRICES[matrix]}, which this program does "
-                             "not read; convert the video to BT.709, BT.2020 or RGB.")
-        if matrix not in LUMA_WEIGHTS and matrix != YCGCO:
-            matrix = BT_2020 if primaries == BT_2020 else usual_matrix(raw.width, raw.height)
     if transfer in UNSUPPORTED_TRANSFERS:
         raise FrameError(f"{path} has a {UNSUPPORTED_TRANSFERS[transfer]} transfer curve, which this program does not "
                          "read; convert the video to BT.709.")
     if primaries in (UNSPECIFIED, 0) and (matrix == BT_2020 or transfer in (PQ, HLG)):
         primaries = BT_2020
     return VideoColour(matrix, limited, planar.bits, TRANSFERS.get(transfer, "display"), WIDE_PRIMARIES.get(primaries))
+
+
+def _matrix_of_components(path: Path, raw: Any, matrix: int, primaries: int) -> int:
+    """Return the code point of the matrix by which a frame of luma and chroma is decoded.
+
+    raw: the frame. matrix, primaries: code points of its tags. Raises FrameError for a matrix that is not supported.
+    """
+    if matrix == BY_PRIMARIES:
+        matrix = primaries if primaries in (BT_709, BT_2020) else UNSPECIFIED
+    if matrix in UNSUPPORTED_MATRICES:
+        raise FrameError(f"{path} has the colour matrix {UNSUPPORTED_MATRICES[matrix]}, which this program does not "
+                         "read; convert the video to BT.709, BT.2020 or RGB.")
+    if matrix not in LUMA_WEIGHTS and matrix != YCGCO:
+        matrix = BT_2020 if primaries == BT_2020 else usual_matrix(raw.width, raw.height)
+    return matrix
 
 
 def _has_alpha(raw: Any) -> bool:

@@ -215,11 +215,7 @@ def _add_video_stream(out: Any, video: Video, source: Any, encoder: Encoder, lef
     ratio = original.sample_aspect_ratio
     if ratio:
         context.sample_aspect_ratio = ratio
-    tags = {"colorspace": raw.colorspace, "color_trc": raw.color_trc, "color_primaries": raw.color_primaries}
-    for name, value in tags.items():  # a tag that the frame lacks is taken from the container
-        setattr(context, name, value if value not in (0, UNSPECIFIED) else getattr(original.codec_context, name))
-    if not planar.is_rgb and video.colour.matrix == RGB:
-        context.colorspace = usual_matrix(*video.stored_size)  # converted from RGB
+    _set_colour_tags(context, video, raw, planar)
     context.color_range = LIMITED_RANGE if _is_limited(planar, video, encoder) else FULL_RANGE
     if video.matrix is not None:
         stream.set_display_matrix(video.matrix)
@@ -227,6 +223,18 @@ def _add_video_stream(out: Any, video: Video, source: Any, encoder: Encoder, lef
     if timecode := _timecode(source, original):
         stream.metadata["timecode"] = timecode
     return stream
+
+
+def _set_colour_tags(context: Any, video: Video, raw: Any, planar: PlaneFormat) -> None:
+    """Set matrix, transfer curve and primaries of a codec context to those of the video's first frame, `raw`.
+
+    planar: the format that is encoded.
+    """
+    tags = {"colorspace": raw.colorspace, "color_trc": raw.color_trc, "color_primaries": raw.color_primaries}
+    for name, value in tags.items():  # a tag that the frame lacks is taken from the container
+        setattr(context, name, value if value not in (0, UNSPECIFIED) else getattr(video.stream.codec_context, name))
+    if not planar.is_rgb and video.colour.matrix == RGB:
+        context.colorspace = usual_matrix(*video.stored_size)  # converted from RGB
 
 
 def _is_limited(planar: PlaneFormat, video: Video, encoder: Encoder) -> bool:

@@ -140,19 +140,16 @@ def _sum_over_cells(light: PlacedLight, extent: LightExtent, pose: NDArray[np.fl
         gaussians = _evaluate_point(pose, centres.mean(0), light.visibility * float(strengths.sum()), evaluate)
         return None if gaussians is None else multiply_light(gaussians, factors.mean(0), blend)
     # Hidden cells are evaluated too, unless they are lights of their own: they show how the Gaussians follow the light.
-    parts, positions, cells = [], [], []
-    for cell in np.flatnonzero(is_in_front & (strengths > 0 if sampled.factors is not None else True)):
-        part = _evaluate_point(pose, centres[cell], light.visibility, evaluate)
-        if part is not None:
-            parts.append(part)
-            positions.append(plane[sampled.cells == cell].mean(0))
-            cells.append(int(cell))
-    if not parts:
+    evaluated = {int(cell): part for cell in np.flatnonzero(is_in_front & (sampled.factors is None or strengths > 0))
+                 if (part := _evaluate_point(pose, centres[cell], light.visibility, evaluate)) is not None}
+    if not evaluated:
         return None
-    are_points = sampled.count == len(sampled.points)  # a cell of one sample has no size to blur by
-    motions = None if are_points else _fit_motions(parts, np.array(positions))
+    motions = None
+    if sampled.count < len(sampled.points):  # else a cell is one sample, and has no size to blur by
+        positions = np.array([plane[sampled.cells == cell].mean(0) for cell in evaluated])
+        motions = _fit_motions(list(evaluated.values()), positions)
     visible = []
-    for part, cell in zip(parts, cells, strict=True):
+    for cell, part in evaluated.items():
         if strengths[cell] > 0:
             if motions is not None:
                 spread = CELL_BLUR * np.cov(plane[sampled.cells == cell].T, bias=True)

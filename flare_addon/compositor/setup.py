@@ -103,27 +103,34 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
         sockets.update(_crop_overscan(tree, window, {name: sockets[name] for name in shown_names}))
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
-    end = _final_input(tree)
-    final_picture = _feeding_socket(end)
-    # Whether our node was set up earlier; the artist may have added nodes after it.
-    is_set_up = final_picture is not None and _depends_on(final_picture.node, node)
-    artists_picture = final_picture
-    if is_set_up or final_picture is None or _is_ours(final_picture.node):
-        artists_picture = _image_under_flare(tree, node, scene[STATE_PROPERTY])
-    if artists_picture is not None:  # the socket to which `remove_nodes` connects the output again
-        scene[STATE_PROPERTY].update({"from": artists_picture.node.name, "socket": artists_picture.identifier})
     if plate is not None:
         scene_picture = _footage_node(tree, plate).outputs["Image"]
-    elif keep_image:
-        scene_picture = artists_picture or _render_picture(tree)
     else:
-        scene_picture = sockets["scene"]
-    _connect_scene_picture(tree, node, scene_picture)
-    if not is_set_up or end.links[0].from_node == node:  # else the artist has nodes between ours and the output
-        tree.links.new(node.outputs["Image"], end)
+        scene_picture = None if keep_image else sockets["scene"]
+    _insert_node(scene, tree, node, scene_picture)
     _add_viewer(tree, node)
     _remove_unused(outdated, {})
     return node
+
+
+def _insert_node(scene: Any, tree: Any, node: Any, scene_picture: Any) -> None:
+    """Connect our node between the picture under the flare and the output of the compositor.
+
+    scene_picture: output socket of the picture; None for the artist's, which feeds the output now, or the render. The
+    artist's picture is stored in the scene: `remove_nodes` connects the output to it again.
+    """
+    end = _final_input(tree)
+    final_picture = trees.feeding_socket(end)
+    # Whether our node was set up earlier; the artist may have added nodes after it.
+    is_set_up = final_picture is not None and trees.depends_on(final_picture.node, node)
+    artists_picture = final_picture
+    if is_set_up or final_picture is None or _is_ours(final_picture.node):
+        artists_picture = _image_under_flare(tree, node, scene[STATE_PROPERTY])
+    if artists_picture is not None:
+        scene[STATE_PROPERTY].update({"from": artists_picture.node.name, "socket": artists_picture.identifier})
+    _connect_scene_picture(tree, node, scene_picture or artists_picture or _render_picture(tree))
+    if not is_set_up or end.links[0].from_node == node:  # else the artist has nodes between ours and the output
+        tree.links.new(node.outputs["Image"], end)
 
 
 def _add_viewer(tree: Any, node: Any) -> None:
@@ -136,7 +143,7 @@ def _add_viewer(tree: Any, node: Any) -> None:
 def _change_inputs(tree: Any, node: Any, layer_names: Sequence[str]) -> None:
     """Give our node the inputs of these layers. Inputs that stay keep values and animation, and sliders their links."""
     old_names = [socket.name for socket in node.inputs]
-    sliders = {name: (_input_value(node, name), _feeding_socket(node.inputs[name])) for name in old_names
+    sliders = {name: (_input_value(node, name), trees.feeding_socket(node.inputs[name])) for name in old_names
                if name in ("Intensity", "Tint") or layer_of_gain(name)}
     node.node_tree = node_group(layer_names)
     new_indices = {socket.name: index for index, socket in enumerate(node.inputs)}
@@ -245,25 +252,6 @@ def shows_plate_alone(scene: Any) -> bool:
     return tree is not None and find_node(scene) is None and PLATE in tree.nodes and STATE_PROPERTY in scene
 
 
-def _feeding_socket(socket: Any) -> Any:
-    """Return the output socket that feeds an input; None where nothing does."""
-    return socket.links[0].from_socket if socket is not None and socket.is_linked else None
-
-
-def _depends_on(candidate: Any, node: Any) -> bool:
-    """Return whether a node is `node`, or uses its output directly or through others."""
-    visited: set[str] = set()
-    remaining = [candidate]
-    while remaining:
-        current = remaining.pop()
-        if current == node:
-            return True
-        if current.name not in visited:
-            visited.add(current.name)
-            remaining += [link.from_node for socket in current.inputs for link in socket.links]
-    return False
-
-
 def _image_under_flare(tree: Any, node: Any, state: Any) -> Any:
     """Return the output socket of the artist's image under the flare; None where there is none.
 
@@ -273,8 +261,8 @@ def _image_under_flare(tree: Any, node: Any, state: Any) -> Any:
     feeder = tree.nodes.get(state["from"])
     outputs = feeder.outputs if feeder else ()
     stored = next((output for output in outputs if output.identifier == state["socket"]), None)
-    for socket in (_feeding_socket(node.inputs.get("Scene")), stored):
-        if socket is not None and not _is_ours(socket.node) and not _depends_on(socket.node, node):
+    for socket in (trees.feeding_socket(node.inputs.get("Scene")), stored):
+        if socket is not None and not _is_ours(socket.node) and not trees.depends_on(socket.node, node):
             return socket
     return None
 
@@ -342,7 +330,7 @@ def _tree_state(tree: Any) -> dict[str, Any]:
     socket: node and socket that feed its output; "" for none.
     """
     end = _final_input(tree, add=False)
-    feeder = _feeding_socket(end)
+    feeder = trees.feeding_socket(end)
     return {"nodes": "\n".join(node.name for node in tree.nodes if node.name not in (GROUP, LAYERS)),
             "drivers": tree.animation_data is not None, "inputs": len(trees.input_sockets(tree)),
             "from": feeder.node.name if feeder else "", "socket": feeder.identifier if feeder else ""}
@@ -354,12 +342,7 @@ def remove_nodes(scene: Any) -> None:
     Raises FrameError where the compositor has none.
     """
     if shows_plate_alone(scene):
-        tree = tree_of(scene)
-        image = tree.nodes[PLATE].image
-        trees.discard_tree(scene, tree, bool(scene[STATE_PROPERTY]["use_nodes"]))
-        state = dict(scene[STATE_PROPERTY])
-        del scene[STATE_PROPERTY]
-        _remove_unused([image], state)
+        _remove_plate_alone(scene)
         return
     if find_node(scene) is None:
         raise FrameError(f"The compositor of the scene {scene.name!r} has no nodes of Fit Flare to remove.")
@@ -369,14 +352,7 @@ def remove_nodes(scene: Any) -> None:
                                                                          "nodes": None}
     group, images = node.node_tree, [tree.nodes[name].image for name in (LAYERS, PLATE) if tree.nodes.get(name)]
     images += view_images(tree)
-    # The output socket that takes the place of our node's.
-    picture_below = _image_under_flare(tree, node, state)
-    if picture_below is None and not state["tree"]:
-        picture_below = _render_picture(tree)
-    for fed_input in [link.to_socket for link in tree.links if link.from_node == node
-                      and (link.from_socket.name == "Image" or link.to_node.bl_idname == _OUTPUT_TYPE)]:
-        if picture_below is not None:
-            tree.links.new(picture_below, fed_input)
+    _bypass_node(tree, node, state)
     drivers.disconnect_node(scene)
     if not state.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
         tree.animation_data_clear()
@@ -392,6 +368,31 @@ def remove_nodes(scene: Any) -> None:
     if group is not None and not group.users:
         bpy.data.node_groups.remove(group)
     _remove_unused(images, state)
+
+
+def _remove_plate_alone(scene: Any) -> None:
+    """Remove the compositor that `show_plate` made, and restore the state before."""
+    tree = tree_of(scene)
+    image = tree.nodes[PLATE].image
+    trees.discard_tree(scene, tree, bool(scene[STATE_PROPERTY]["use_nodes"]))
+    state = dict(scene[STATE_PROPERTY])
+    del scene[STATE_PROPERTY]
+    _remove_unused([image], state)
+
+
+def _bypass_node(tree: Any, node: Any, state: dict[str, Any]) -> None:
+    """Connect the picture under the flare to the inputs that our node feeds.
+
+    It is the artist's picture, or the render in a compositor that `set_up_nodes` made. state: as `set_up_nodes` stored
+    it.
+    """
+    picture_below = _image_under_flare(tree, node, state)
+    if picture_below is None and not state["tree"]:
+        picture_below = _render_picture(tree)
+    for fed_input in [link.to_socket for link in tree.links if link.from_node == node
+                      and (link.from_socket.name == "Image" or link.to_node.bl_idname == _OUTPUT_TYPE)]:
+        if picture_below is not None:
+            tree.links.new(picture_below, fed_input)
 
 
 def _restore_tree(scene: Any, tree: Any, state: dict[str, Any]) -> None:
@@ -448,7 +449,7 @@ def _final_input(tree: Any, add: bool = True) -> Any:
     add: add it where there is none, instead of returning None.
     """
     outputs = sorted((node for node in tree.nodes if node.bl_idname == _OUTPUT_TYPE),
-                     key=lambda node: not _is_active_output(tree, node))
+                     key=lambda node: not trees.is_active_output(tree, node))
     if not add:
         return outputs[0].inputs[0] if outputs and len(outputs[0].inputs) else None
     if GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
@@ -457,22 +458,9 @@ def _final_input(tree: Any, add: bool = True) -> Any:
     return node.inputs[0]
 
 
-def _is_active_output(tree: Any, end: Any) -> bool:
-    """Return whether an output node is the one that Blender uses, where there are several.
-
-    Blender 4.x stores no active output: it uses the output that was selected last. Where another node is selected now,
-    that is the output that shows our node, since our node was linked to the active one.
-    """
-    if hasattr(end, "is_active_output"):
-        return bool(end.is_active_output)
-    if tree.nodes.active is not None and tree.nodes.active.bl_idname == _OUTPUT_TYPE:
-        return bool(end == tree.nodes.active)
-    return GROUP in tree.nodes and _depends_on(end, tree.nodes[GROUP])
-
-
 def is_over_render(scene: Any) -> bool:
     """Return whether the flare goes over the render of the scene."""
     node = find_node(scene)
     sources = ("CompositorNodeRLayers", "NodeGroupInput")
-    return node is not None and any(_depends_on(node, candidate) for candidate in tree_of(scene).nodes
+    return node is not None and any(trees.depends_on(node, candidate) for candidate in tree_of(scene).nodes
                                     if candidate.bl_idname in sources)

@@ -3,6 +3,7 @@
 
 The effects of a stack follow each other. The Group Input of an effect's tree is the picture of the effects before it,
 that of the first is the render. The flare belongs into the last effect, so that it lies over the whole picture.
+The last functions follow the links between the nodes of any tree.
 """
 from __future__ import annotations
 
@@ -141,3 +142,35 @@ def remove_incoming(tree: Any, count: int) -> None:
     if HAS_EFFECTS and not any(node.bl_idname == "NodeGroupInput" for node in tree.nodes):
         for item in input_sockets(tree)[count:]:
             tree.interface.remove(item)
+
+
+def feeding_socket(socket: Any) -> Any:
+    """Return the output socket that feeds an input; None where nothing does."""
+    return socket.links[0].from_socket if socket is not None and socket.is_linked else None
+
+
+def depends_on(candidate: Any, node: Any) -> bool:
+    """Return whether a node is `node`, or uses its output directly or through others."""
+    visited: set[str] = set()
+    remaining = [candidate]
+    while remaining:
+        current = remaining.pop()
+        if current == node:
+            return True
+        if current.name not in visited:
+            visited.add(current.name)
+            remaining += [link.from_node for socket in current.inputs for link in socket.links]
+    return False
+
+
+def is_active_output(tree: Any, end: Any) -> bool:
+    """Return whether an output node is the one that Blender uses, where there are several.
+
+    Blender 4.x stores no active output: it uses the output that was selected last. Where another node is selected now,
+    that is the output that shows our node, since our node was linked to the active one.
+    """
+    if hasattr(end, "is_active_output"):
+        return bool(end.is_active_output)
+    if tree.nodes.active is not None and tree.nodes.active.bl_idname == OUTPUT_TYPE:
+        return bool(end == tree.nodes.active)
+    return NODE in tree.nodes and depends_on(end, tree.nodes[NODE])

@@ -43,8 +43,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.conventions.frame_numbers import number_views
     from ...core.conventions.run_files import FLARE
     from ...core.fit.run import Run
-    from ...core.look import LookEdits, ViewOfLight, read_look
-    from ...core.transfer.export import write_preset
+    from ...core.look import LookEdits, read_look
 
     folder = args.capture
     if args.flare.is_dir():
@@ -69,17 +68,28 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.frames is not None and len(selected) > 1:
         raise SettingsError(f"A preset holds one frame, and --frames {args.frames} selects {len(selected)}; select "
                             "one.")
-    number, camera = selected[0].number, cameras[selected[0].view]
+    _write_preset(args.out, look, edits, folder, selected[0].number, cameras[selected[0].view], progress)
+    return {"preset": str(args.out)}
+
+
+def _write_preset(path: Path, look: Look, edits: LookEdits, capture: Path, number: int, camera: Camera,
+                  progress: Progress) -> None:
+    """Write the preset of a frame, and report lights that are left out. Raises RunError if all are.
+
+    capture, number: folder of the capture and number of the frame, for messages.
+    """
+    from ...core.look import ViewOfLight
+    from ...core.transfer.export import write_preset
+
     views = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
     behind = [name for name, view in views.items() if view.depth <= 0]
     if len(behind) == len(views):
-        raise RunError(f"No light is in front of the camera in frame {number} of {folder}; name another with "
+        raise RunError(f"No light is in front of the camera in frame {number} of {capture}; name another with "
                        "--frames.")
-    write_preset(args.out, look, views, edits, camera)
-    progress.say(f"The preset is {args.out}.")
+    write_preset(path, look, views, edits, camera)
+    progress.say(f"The preset is {path}.")
     if behind:
         progress.say(f"Lights behind the camera in frame {number} are left out: {', '.join(behind)}.")
-    return {"preset": str(args.out)}
 
 
 def _write_plys(out: Path, look: Look, edits: LookEdits, selected: Sequence[NumberedFrame],

@@ -87,11 +87,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         reject_unused_options(args, {"entry": None, "jobs": 1}, "--list")
     check_at_least_one("--jobs", args.jobs)
     if args.list_file is not None and args.entry is None:
-        count = len(read_capture_list(args.list_file))
-        part_options = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]
-        jobs.run_parts(args, "fit", part_options, args.jobs, count, progress, continue_on_failure=True)
-        progress.say(f"{count} runs are in {args.out}.")
-        return {"runs": str(args.out), "count": count}
+        return _fit_list(args, progress)
     folder, out = resolve_folders(args)
     is_resumed = args.resume and (out / CONFIG).is_file()
     if not is_resumed:
@@ -110,6 +106,15 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     tally = tallies.tally_capture(capture, used=len(used))
     tally.skip("in no list of the capture", *(view.name for view in capture.views if view.name not in used))
     return {"run": str(result.folder), **tallies.report_tally(tally, progress)}
+
+
+def _fit_list(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Fit every capture of the list in a process of its own, --jobs at a time; return the command's result."""
+    count = len(read_capture_list(args.list_file))
+    part_options = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]
+    jobs.run_parts(args, "fit", part_options, args.jobs, count, progress, continue_on_failure=True)
+    progress.say(f"{count} runs are in {args.out}.")
+    return {"runs": str(args.out), "count": count}
 
 
 def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress) -> FitSettings:

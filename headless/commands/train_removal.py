@@ -57,6 +57,19 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "processor core, at most four without a GPU)")
 
 
+def _check_options(args: argparse.Namespace) -> None:
+    """Raise SettingsError for options without an effect and for numbers below 1."""
+    if args.model == "network":
+        reject_unused_options(args, {"base": None, "keep_glow": False, "lpips": None}, "--model diffusion")
+    else:
+        reject_unused_options(args, {"start": None, "processes": None}, "--model network")
+    if args.lenses is None:
+        reject_unused_options(args, {"max_lenses": MAX_LENSES}, "--lenses")
+    check_at_least_one("--max-lenses", args.max_lenses)
+    if args.threads is not None:
+        check_at_least_one("--threads", args.threads)
+
+
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Train the network, or the LoRA of the diffusion model. Raises SettingsError."""
     import torch
@@ -68,31 +81,17 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         describe_unusable,
         is_held_out,
         open_shared_backgrounds,
-        read_backgrounds,
     )
     from ...core.removal.training.run import train
 
-    if args.model == "network":
-        reject_unused_options(args, {"base": None, "keep_glow": False, "lpips": None}, "--model diffusion")
-    else:
-        reject_unused_options(args, {"start": None, "processes": None}, "--model network")
-    if args.lenses is None:
-        reject_unused_options(args, {"max_lenses": MAX_LENSES}, "--lenses")
-    check_at_least_one("--max-lenses", args.max_lenses)
+    _check_options(args)
     if args.threads is not None:
-        check_at_least_one("--threads", args.threads)
         torch.set_num_threads(args.threads)
     recipe = _make_recipe(args, progress)
     lenses = read_lenses(args.lenses, args.max_lenses) if args.lenses else []
     train_lenses = [lens for lens in lenses if not is_held_out(lens.name)] + built_in_lenses()
-    test_lenses = held_out_lenses(lenses)
     with open_shared_backgrounds(args.backgrounds, "train", augmented=True) as backgrounds:
-        try:
-            validation = read_backgrounds(args.backgrounds, "test"), test_lenses
-        except SettingsError:
-            validation = None
-            progress.say("There are too few clean pictures for a validation set; the log will have no validation "
-                         "scores.")
+        validation = _read_validation(args.backgrounds, held_out_lenses(lenses), progress)
         unusable = [*backgrounds.unusable, *(validation[0].unusable if validation else ())]
         if warning := describe_unusable(unusable):
             progress.say(warning)
@@ -106,6 +105,18 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                      resume=args.resume, start=start, processes=args.processes, progress=progress)
         progress.say(f"The weights are in {path}; use them with `remove --weights`.")
         return {"weights": str(path)}
+
+
+def _read_validation(folders: Sequence[Path], lenses: Sequence[Prescription],
+                     progress: Progress) -> tuple[Backgrounds, Sequence[Prescription]] | None:
+    """Return backgrounds and lenses that are held out for validation; None, with a message, for too few pictures."""
+    from ...core.removal.training.backgrounds import read_backgrounds
+
+    try:
+        return read_backgrounds(folders, "test"), lenses
+    except SettingsError:
+        progress.say("There are too few clean pictures for a validation set; the log will have no validation scores.")
+        return None
 
 
 def _make_recipe(args: argparse.Namespace, progress: Progress) -> Recipe:

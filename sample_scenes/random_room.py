@@ -134,7 +134,7 @@ class Room:
         """Add a lamp: a bulb, a screen or a tube that is seen, or a spot, which only lights.
 
         A visible lamp emits its power divided by roughly its surface; the constant added to the surface bounds the
-    radiance of the smallest lamps.
+        radiance of the smallest lamps.
         """
         random = self.random
         position = self._random_position(random.uniform(0.6, self.height * 0.95), min_distance=2)

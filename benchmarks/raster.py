@@ -139,12 +139,13 @@ class Iteration:
     """A training iteration with one kernel set, at learning rates of zero, so that the work does not change: trained on
     noise for some hundred steps, the Gaussians would cover a third fewer tiles."""
 
-    def __init__(self, case: Case, kernel_set: str) -> None:
+    def __init__(self, case: Case, kernel_set: str, device: str = "cpu") -> None:
         self.case, self.kernel_set = case, kernel_set
-        self.scene = SceneGaussians(*workload.make_scene(case.gaussians))
-        self.flares = [torch.nn.Parameter(v) for v in workload.make_flares(case.flares, case.width, case.height)]
-        self.camera = (torch.eye(4), workload.intrinsics(case.width, case.height))
-        self.target = torch.rand(case.height, case.width, 3, generator=torch.Generator().manual_seed(0))
+        self.scene = SceneGaussians(*workload.make_scene(case.gaussians)).to(device)
+        flares = workload.make_flares(case.flares, case.width, case.height)
+        self.flares = [torch.nn.Parameter(value.to(device)) for value in flares]
+        self.camera = (torch.eye(4).to(device), workload.intrinsics(case.width, case.height).to(device))
+        self.target = torch.rand(case.height, case.width, 3, generator=torch.Generator().manual_seed(0)).to(device)
         parameters = dict(self.scene.named_parameters())
         rates = Optimisers(self.scene, flare=None, settings=FitSettings(), extent=1.0, display_white=1.0).scene.rates
         if case.flares:
@@ -473,16 +474,15 @@ def main() -> None:
         "peer": lambda: peer_section(args.opensplat, rounds),
         "gpu": lambda: gpu_section(rounds),
     }
-    unavailable = {"peer"} if args.opensplat is None else set()
-    unavailable |= {"gpu"} if args.device == "cpu" else set()
+    unavailable = {} if args.opensplat else {"peer": "it needs --opensplat"}
+    unavailable |= {} if args.device == "cuda" else {"gpu": "torch finds no NVIDIA GPU"}
     for section in args.only:
         if section in unavailable:
+            print(f"The section {section} is left out: {unavailable[section]}.", file=sys.stderr)
             continue
-        conditions = report.conditions()
-        text = f"## {SECTIONS[section]}\n\n{sections[section]()}\n\n{conditions}"
+        text = f"## {SECTIONS[section]}\n\n{sections[section]()}\n\n{report.conditions()}"
         report.write_section(args.out, section, text)
-        sys.stdout.write(text + "\n\n")
-        sys.stdout.flush()
+        print(text, end="\n\n", flush=True)
 
 
 SECTIONS = {

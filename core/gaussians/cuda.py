@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The kernel set for NVIDIA GPUs: projection, colours and tile lists in torch, tiles by Warp (`pip install warp-lang`),
-which needs neither a CUDA toolkit nor a compiler.
-
-Small pictures spend their time in torch's calls, so the CPU kernels are faster there (docs/results/rasterizer.md).
-"""
+"""The kernel set for NVIDIA GPUs, by Warp (`pip install warp-lang`), which needs neither a CUDA toolkit nor a compiler:
+`warp_scene` for scenes, `tiled` with `warp_kernels` for 2D Gaussians."""
 from __future__ import annotations
 
 from functools import partial
@@ -13,7 +10,7 @@ import torch
 if not torch.cuda.is_available():
     raise ImportError("torch finds no NVIDIA GPU")
 
-from . import tiled, warp_kernels
+from . import tiled, warp_kernels, warp_scene
 
-rasterize_scene = partial(tiled.rasterize_scene, warp_kernels.draw, warp_kernels.TILE)
+rasterize_scene = warp_scene.rasterize_scene
 splat = partial(tiled.splat, warp_kernels.draw, warp_kernels.TILE)

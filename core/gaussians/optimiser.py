@@ -11,7 +11,7 @@ densification; and the fused CPU kernel where it is available.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal, NamedTuple
 
@@ -33,6 +33,17 @@ class Moments(NamedTuple):
 
     first: Tensor
     second: Tensor
+
+
+class TorchStep(NamedTuple):
+    """A step of one parameter: the arguments of `adam_step`."""
+
+    parameter: Tensor
+    gradient: Tensor
+    first: Tensor
+    second: Tensor
+    step: int
+    rate: Rate
 
 
 class Adam:
@@ -101,21 +112,26 @@ class Adam:
         options = self._options
         fused: FusedKernels | None = None
         fused_steps: list[Any] = []
+        gpu_steps: list[TorchStep] = []
         for name, rate in self.rates.items():
             parameter = self.parameters[name]
             if parameter.grad is None or parameter.numel() == 0:
                 continue
             self.steps[name] += 1
             data = parameter.data
-            values = (data, parameter.grad.contiguous(), *self.moments[name], self.steps[name], rate)
+            values = TorchStep(data, parameter.grad.contiguous(), *self.moments[name], self.steps[name], rate)
             kernels = self._kernels_for(data)
-            if kernels is None:
+            if kernels is None and data.is_cpu:
                 adam_step(*values, **options)
+            elif kernels is None:
+                gpu_steps.append(values)
             else:
                 fused = kernels
                 fused_steps.append(kernels.AdamStep(*values))
         if fused is not None:
             fused.adam_steps(fused_steps, **options)
+        if gpu_steps:
+            adam_steps(gpu_steps, **options)
 
     @torch.no_grad()
     def last_step(self, name: str, rows: Tensor) -> Tensor:
@@ -203,6 +219,25 @@ def adam_step(
         parameter.sub_(first / root * (rate / (1 - beta1**step)))
     else:
         parameter.addcdiv_(first, root, value=-rate / (1 - beta1**step))
+
+
+def adam_steps(steps: Sequence[TorchStep], *, beta1: float, beta2: float, epsilon: float) -> None:
+    """Make the steps of `adam_step` on many parameters, each operation on all of them at once: on a GPU a fit's
+    parameters take ten launches in place of seven each."""
+    parameters, gradients, firsts, seconds, counts, rates = (list(column) for column in zip(*steps, strict=True))
+    torch._foreach_lerp_(firsts, gradients, 1 - beta1)
+    torch._foreach_mul_(seconds, beta2)
+    torch._foreach_addcmul_(seconds, gradients, gradients, 1 - beta2)
+    roots = torch._foreach_sqrt(seconds)
+    torch._foreach_div_(roots, [math.sqrt(1 - beta2**count) for count in counts])
+    torch._foreach_add_(roots, epsilon)
+    changes = list(torch._foreach_div(firsts, roots))
+    torch._foreach_div_(changes, [1 - beta1**count for count in counts])
+    for change, rate in zip(changes, rates, strict=True):
+        if isinstance(rate, Tensor):
+            change.mul_(rate)
+    torch._foreach_mul_(changes, [1.0 if isinstance(rate, Tensor) else rate for rate in rates])
+    torch._foreach_sub_(parameters, changes)
 
 
 def _zeros(parameter: Tensor) -> Moments:

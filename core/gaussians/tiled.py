@@ -169,11 +169,11 @@ def draw_tiles(
         ]
         return torch.cat([picture for picture, _ in halves]), torch.cat([median_rows for _, median_rows in halves])
     lists = bin_tiles(centres, gaussians.places.detach()[:, 2:], half_size, radii, width, height, tile_size)
-    picture, median_rows = (_assemble(part, lists)[:height, :width] for part in draw(lists, blend, median, gaussians))
+    picture, median_rows = (assemble(part, lists)[:height, :width] for part in draw(lists, blend, median, gaussians))
     return picture, median_rows
 
 
-def _assemble(parts: Tensor, lists: TileLists) -> Tensor:
+def assemble(parts: Tensor, lists: TileLists) -> Tensor:
     """Assemble tiles (tiles, size², ...) to a picture (rows * size, columns * size, ...)."""
     parts = parts.reshape(lists.rows, lists.columns, lists.size, lists.size, *parts.shape[2:]).transpose(1, 2)
     return parts.reshape(lists.rows * lists.size, lists.columns * lists.size, *parts.shape[4:])

@@ -47,11 +47,10 @@ def _one_thread() -> Iterator[None]:
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> SimulatedGpu:
-    warp_kernels = pytest.importorskip("core.gaussians.warp_kernels")
-    kernel_set = SimpleNamespace(
-        rasterize_scene=partial(tiled.rasterize_scene, warp_kernels.draw, warp_kernels.TILE),
-        splat=partial(tiled.splat, warp_kernels.draw, warp_kernels.TILE))
-    return simulate(monkeypatch, kernel_set)
+    warp_scene = pytest.importorskip("core.gaussians.warp_scene")
+    warp_kernels = warp_scene.warp_kernels
+    splat = partial(tiled.splat, warp_kernels.draw, warp_kernels.TILE)
+    return simulate(monkeypatch, SimpleNamespace(rasterize_scene=warp_scene.rasterize_scene, splat=splat))
 
 
 def quick(iterations: int, model: str = "ours", mode: str = "default", **changes: Any) -> FitSettings:

@@ -19,6 +19,7 @@ from core.fit.optimisers import Optimisers
 from core.fit.settings import FitSettings
 from core.gaussians import Adam, Rendering, SceneGaussians, kernels, l1_ssim, ssim
 from core.gaussians.densification import Classic, ClassicSettings, Mcmc, McmcSettings, relocated_opacity_and_scale
+from core.gaussians.optimiser import TorchStep, adam_step, adam_steps
 from core.gaussians.ordering import morton_order, nearest_distances
 
 
@@ -478,3 +479,24 @@ def test_initial_sizes_scale_with_the_unit_of_the_world(unit: float) -> None:
     sizes = SceneGaussians.from_points(cloud).log_scales.detach().exp()[:, 0].numpy() / unit
     assert sizes[0] < 0.2 * np.median(sizes)
     assert 0.05 < np.median(sizes) < 0.5
+
+
+def test_steps_on_all_parameters_at_once_equal_single_steps() -> None:
+    """Also with a rate for each column, as spherical harmonics have."""
+    generator = torch.Generator().manual_seed(0)
+    shapes, rates = ((5, 3), (7,), (4, 6)), (0.01, 0.3, torch.rand(6, generator=generator).double())
+    single, joint = ([TorchStep(torch.ones(shape).double(), torch.zeros(shape).double(), torch.zeros(shape).double(),
+                                torch.zeros(shape).double(), 1, rate)
+                      for shape, rate in zip(shapes, rates, strict=True)] for _ in range(2))
+    options = {"beta1": 0.9, "beta2": 0.999, "epsilon": 1e-15}
+    for count in range(1, 5):
+        gradients = [torch.randn(shape, generator=generator).double() for shape in shapes]
+        single, joint = ([step._replace(gradient=gradient, step=count + number)  # parameters that began earlier
+                          for number, (step, gradient) in enumerate(zip(steps, gradients, strict=True))]
+                         for steps in (single, joint))
+        for step in single:
+            adam_step(*step, **options)
+        adam_steps(joint, **options)
+    for expected, made in zip(single, joint, strict=True):
+        for name in ("parameter", "first", "second"):
+            torch.testing.assert_close(getattr(made, name), getattr(expected, name), rtol=1e-12, atol=1e-12)

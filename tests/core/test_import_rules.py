@@ -26,7 +26,7 @@ LAYERS = ("core.system", "core.conventions", "core.optics", "core.colour", "core
           "core.bake", "core.transfer", "flare_addon", "headless")
 
 # Kernel sets that refuse to be imported on a machine without their device.
-OPTIONAL = ("core.gaussians.cuda", "core.gaussians.warp_kernels")
+OPTIONAL = ("core.gaussians.cuda", "core.gaussians.warp_kernels", "core.gaussians.warp_scene")
 
 
 def run_isolated(code: str) -> None:

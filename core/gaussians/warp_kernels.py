@@ -85,7 +85,10 @@ def _kernels(channels: int) -> tuple[Any, Any]:
         for j in range(starts[tile], starts[tile + 1]):
             row = entries[j]
             place = places[row]
-            g = _profile(x - place[0], y - place[1], place, shapes[row], rings, arcs)
+            shape = _Shape()
+            if rings or arcs:
+                shape = shapes[row]
+            g = _profile(x - place[0], y - place[1], place, shape, rings, arcs)
             if add:
                 if g >= _PROFILE_MIN:
                     total += g * values[row]
@@ -125,7 +128,10 @@ def _kernels(channels: int) -> tuple[Any, Any]:
                 if wp.tile_extract(wp.tile_sum(wp.tile(alive)), 0) == 0.0:
                     break
             row = entries[j]
-            place, shape = places[row], shapes[row]
+            place = places[row]
+            shape = _Shape()
+            if rings or arcs:
+                shape = shapes[row]
             dx, dy = x - place[0], y - place[1]
             g = _profile(dx, dy, place, shape, rings, arcs)
             dot = wp.dot(upstream_here, values[row])
@@ -210,7 +216,7 @@ class _DrawTiles(torch.autograd.Function):
 
 
 def _as_warp_array(tensor: Tensor) -> Any:
-    """Return a Warp array of a tensor's rows, without a copy."""
+    """Return a Warp array of a tensor's rows, without a copy; rows may be apart, their numbers are not."""
     if tensor.ndim == 1:
         return wp.from_torch(tensor.detach(), requires_grad=False)
     kind = wp.types.vector(length=tensor.shape[1], dtype=wp.float32)
@@ -221,7 +227,7 @@ def _launch(kernel: Any, lists: TileLists, blend: Blend, parts: Any, other_array
     """Launch a kernel with one thread for each pixel of each tile. parts: the fields of `WhitenedGaussians`; absent
     rings and arcs are passed as zeros. other_arrays: the kernel's last arguments, which include its outputs."""
     places, values, rings, arcs = parts
-    shapes = values.new_zeros(len(values), SHAPES)
+    shapes = values.new_zeros(len(values) if rings is not None or arcs is not None else 1, SHAPES)
     if rings is not None:
         shapes[:, :2] = rings
     if arcs is not None:
@@ -229,8 +235,8 @@ def _launch(kernel: Any, lists: TileLists, blend: Blend, parts: Any, other_array
     device = wp.device_from_torch(values.device)
     inputs = [
         _as_warp_array(lists.entries.int()), _as_warp_array(lists.starts.int()), lists.columns,
-        _as_warp_array(places.float().contiguous()), _as_warp_array(values[:, 0].contiguous()),
-        _as_warp_array(values[:, 1:].contiguous()), _as_warp_array(shapes), rings is not None, arcs is not None,
+        _as_warp_array(places.float().contiguous()), _as_warp_array(values[:, 0]), _as_warp_array(values[:, 1:]),
+        _as_warp_array(shapes), rings is not None, arcs is not None,
         blend == "add", *other_arrays,
     ]  # fmt: skip
     stream = wp.stream_from_torch(values.device) if device.is_cuda else None

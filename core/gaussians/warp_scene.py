@@ -254,8 +254,13 @@ def _launch(kernel: Any, dim: int, device: torch.device, inputs: list[Any], outp
     wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=warp_device, stream=stream, **adjoint)
 
 
+def _with_whole_rows(matrix: Tensor) -> Tensor:
+    """Return a matrix whose rows are contiguous, themselves apart or not; a copy only if they are not."""
+    return matrix if matrix.stride(-1) == 1 else matrix.contiguous()
+
+
 def _array(tensor: Tensor | None, dtype: Any) -> Any:
-    """Return a Warp array of a contiguous tensor, without a copy; None without a tensor."""
+    """Return a Warp array of a tensor with contiguous rows, without a copy; None without a tensor."""
     return None if tensor is None else wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
@@ -290,7 +295,8 @@ class _Project(torch.autograd.Function):
             project, len(places), places.device, [*arrays, arrays[-1], *ctx.options],
             [_array(places, _Place), _array(values, _Values)],
             adj_inputs=[*adjoints, None, *[None] * len(ctx.options)],
-            adj_outputs=[_array(d_places.contiguous(), _Place), _array(d_values.contiguous(), _Values)], adjoint=True,
+            adj_outputs=[_array(_with_whole_rows(d_places), _Place), _array(_with_whole_rows(d_values), _Values)],
+            adjoint=True,
         )  # fmt: skip
         return None, *gradients
 

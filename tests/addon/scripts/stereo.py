@@ -61,7 +61,7 @@ def projections(scene, point):
 
 # ---- the cameras of the views, against renders of a small ball ---------------------------------------------
 scene, _ = scene_with()
-use_stereo(scene, 200, 120, 32)
+use_stereo(scene, 200, 120, 64)
 scene.cycles.max_bounces = 0
 camera = scene.camera
 camera.location, camera.rotation_euler, camera.scale = (1, -2, 0.5), (1.35, 0.1, 0.3), (2, 1.5, 1)

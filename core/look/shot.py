@@ -10,8 +10,9 @@
 
 A light of the shot shows the flare of the .flare's light `source`. Edits and layers use its own `name`, so that several
 lights can share a source. `share` is its visibility, 0..1. `extent` and the three after it are optional
-(`PlacedLight`). `apart` is true if the layers of a single camera have a folder of their own too. Coordinates are the
-capture's if the flare is shown in the scene of its fit, else any.
+(`PlacedLight`). `apart` is true if the layers of a single camera have a folder of their own too. Each view of a stereo
+scene is a camera of its own, by `name`. Coordinates are the capture's if the flare is shown in the scene of its fit,
+else any.
 """
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -54,8 +55,9 @@ def light_visibilities(scene: SceneGaussians, model: FlareModel, world_to_camera
     """
     pose = world_to_camera.double()
     camera = -pose[:3, :3].T @ pose[:3, 3]
-    return {name: relative_to_clear(light_visibility(scene, camera, light, settings, kernels), clear)
-            for name, light, clear in zip(model.names, model.positions_in(frame), model.clear, strict=True)}
+    visibilities = _visibilities(scene, camera, list(model.positions_in(frame)), settings, kernels)
+    return {name: relative_to_clear(visibility, clear)
+            for name, visibility, clear in zip(model.names, visibilities, model.clear, strict=True)}
 
 
 def relative_to_clear(visibility: Tensor, clear: Tensor | float) -> Tensor:
@@ -142,21 +144,80 @@ def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings
     A small camera that looks from the eye at the light rasterizes the Gaussians in between; the visibility is the mean
     transmittance over a Gaussian window, the light's soft disk.
     """
-    settings = settings or VisibilitySettings()
+    return _visibilities(scene, eye, [light], settings or VisibilitySettings(), kernels)[0]
+
+
+class _Occluders(NamedTuple):
+    """Gaussians that may hide a light, with the parameters of `SceneGaussians`."""
+
+    means: Tensor
+    quaternions: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+
+    def select(self, rows: Tensor) -> _Occluders:
+        """Return the Gaussians at these rows."""
+        return _Occluders(*(part[rows] for part in self))
+
+
+class _ViewOfLight(NamedTuple):
+    """A small camera's pose (4, 4), world to camera, the distance of the light that it looks at, and the rows of the
+    scene's Gaussians that may hide the light from it."""
+
+    pose: Tensor
+    distance: float
+    rows: Tensor
+
+
+def _visibilities(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor], settings: VisibilitySettings,
+                  kernels: Kernels) -> list[Tensor]:
+    """Return the `light_visibility` of each light (3,) from a camera at `eye` (3,).
+
+    The Gaussians that may hide any of the lights are selected together: the gradient of each selection has the size of
+    the whole scene.
+    """
+    views = [_view_of_light(scene, eye, light, settings) for light in lights]
+    all_rows = [view.rows for view in views if view is not None]
+    if not all_rows:
+        return [scene.means.new_ones(()) for _ in lights]
+    rows = torch.unique(torch.cat(all_rows)) if len(all_rows) > 1 else all_rows[0]
+    occluders = _Occluders(scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits).select(rows)
+    visibilities = []
+    for view in views:
+        if view is None:
+            visibilities.append(scene.means.new_ones(()))
+            continue
+        hidden_by = occluders if len(view.rows) == len(rows) else occluders.select(torch.searchsorted(rows, view.rows))
+        visibilities.append(_mean_transmittance(hidden_by, view.pose, _near_plane(scene, view.distance), settings,
+                                                kernels))
+    return visibilities
+
+
+def _view_of_light(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings
+                   ) -> _ViewOfLight | None:
+    """Return the view of a light from a small camera at `eye`; None for a light at the eye, which nothing hides."""
     direction = (light - eye).float()
     distance = float(direction.norm())
     if distance <= 0:
-        return scene.means.new_ones(())
+        return None
     pose = _look_along(eye.float(), direction / distance)
-    rows = _occluders(scene, pose, distance, settings)
+    return _ViewOfLight(pose, distance, _occluders(scene, pose, distance, settings))
+
+
+def _mean_transmittance(occluders: _Occluders, pose: Tensor, near: float, settings: VisibilitySettings,
+                        kernels: Kernels) -> Tensor:
+    """Return the mean transmittance (scalar, 0..1) of Gaussians over a light's soft disk.
+
+    pose: (4, 4), world to camera, of the small camera that looks at the light. near: its near plane, world units.
+    """
     size, half = settings.pixels, settings.pixels / 2
     # The picture's edge is at twice the disk's radius, which is the window's standard deviation.
     focal = half / (2 * settings.radius)
     intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
-    near = _near_plane(scene, distance)
-    colourless = scene.sh.new_zeros(len(rows), 1, 3)  # colours are not needed, and their gradient would cost most
-    alpha = rasterization(scene.means[rows], scene.quaternions[rows], scene.log_scales[rows].exp(),
-                          scene.opacity_logits[rows].sigmoid(), colourless, pose.to(colourless),
+    # Colours are not needed, and their gradient would cost most.
+    colourless = occluders.means.new_zeros(len(occluders.means), 1, 3)
+    alpha = rasterization(occluders.means, occluders.quaternions, occluders.log_scales.exp(),
+                          occluders.opacity_logits.sigmoid(), colourless, pose.to(colourless),
                           intrinsics.to(colourless), size, size, near=near, depth=False, kernels=kernels).alpha
     offset = torch.arange(size, device=alpha.device) + 0.5 - half
     window = torch.exp(-0.5 * (offset / (half / 2)) ** 2)
@@ -179,7 +240,8 @@ def _occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: V
     if not scene.means.is_cpu:
         return _occluders_on_device(scene, pose.to(scene.means), distance, settings)
     means, scales, rigid = (part.detach().numpy() for part in (scene.means, scene.log_scales, pose))
-    x, y, depth = (means @ rigid[:3, :3].T + rigid[:3, 3]).T
+    # Sums of columns, since a product of matrices this narrow waits for the threads of the BLAS.
+    x, y, depth = (sum(means[:, axis] * row[axis] for axis in range(3)) + row[3] for row in rigid[:3])
     reach = 3 * np.exp(np.maximum(np.maximum(scales[:, 0], scales[:, 1]), scales[:, 2]))
     between = (depth > _near_plane(scene, distance)) & (depth < (1 - settings.margin) * distance)
     if scene.far is not None:

@@ -63,7 +63,7 @@ class _Rasterize(torch.autograd.Function):
             projection.project, *inputs, flat(sh), sh.shape[1] * 3,
             options.sh_degree, options.raw, camera, w, h, records, centres_flat, radii_flat, gaussian_depths,
             max_tiles, small_tiles, small_rows, first_slots, chunk_max_tiles, flat(centre_gradients), colour_slopes,
-            scratch=projection.SCRATCH,
+            scratch=projection.SCRATCH, limit=len(chunk_max_tiles),
         )  # fmt: skip
         keys = gaussian_depths.view(np.uint32)  # the bits of a positive number sort as the number
         bins = bin_gaussians(
@@ -79,6 +79,7 @@ class _Rasterize(torch.autograd.Function):
         parallel(
             raster_forward.raster, bins.entries, bins.starts, records, background_flat, w, h, options.tiles_x,
             image_flat, alpha_flat, depth_flat, median_flat, ends, scratch=raster_forward.STATE,
+            limit=options.num_tiles,
         )  # fmt: skip
         ctx.save_for_backward(means, quats, scales, opacities, sh, image, alpha, depth)
         ctx.options, ctx.bins, ctx.centre_gradients, ctx.is_first_backward = options, bins, centre_gradients, True
@@ -104,6 +105,7 @@ class _Rasterize(torch.autograd.Function):
         parallel(
             raster_backward.raster_backward, bins.entries, bins.starts, ends, records, background_flat, w, h,
             options.tiles_x, *pictures, v_image, v_alpha, v_depth, rows, scratch=raster_backward.SCRATCH,
+            limit=options.num_tiles,
         )  # fmt: skip
         parameters = (means, quats, scales, opacities, sh)
         steps = stepping.claim_steps(parameters)
@@ -120,7 +122,7 @@ class _Rasterize(torch.autograd.Function):
             projection.project_backward, (*inputs, flat(sh) if steps else EMPTY), sh.shape[1] * 3, options.sh_degree,
             options.raw, camera, records, colour_slopes, rows, bins.first_slots, bins.slot_counts, gradients_flat,
             d_centres, sums, with_camera, *(steps or stepping.NO_STEPS),
-            scratch=projection.STEP_SCRATCH if steps else projection.SCRATCH,
+            scratch=projection.STEP_SCRATCH if steps else projection.SCRATCH, limit=-(-n // layout.CHUNK),
         )  # fmt: skip
         if not is_first:
             flat(ctx.centre_gradients)[:] += d_centres

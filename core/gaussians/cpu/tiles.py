@@ -68,7 +68,8 @@ def bin_gaussians(
     max_tiles                (n,) upper bound on each Gaussian's number of tiles; becomes slot_counts
     first_slots              (n,) exclusive sums of max_tiles within chunks of CHUNK Gaussians; become first slots
     chunk_max_tiles          (chunks,) sums of max_tiles by chunk"""
-    n, parts = len(keys), min(torch.get_num_threads(), MAX_PARTS)  # each part scans all keys
+    n = len(keys)
+    parts = min(torch.get_num_threads(), MAX_PARTS, len(chunk_max_tiles))  # each part scans all keys
     chunk_starts, cuts = np.empty(len(chunk_max_tiles), np.int64), np.empty(parts + 1, np.int64)
     num_slots = binning.plan_parts(
         keys, max_tiles, chunk_max_tiles, max(1, -(-n // SAMPLE_SIZE)), np.empty(binning.HISTOGRAM_BINS, np.int64),
@@ -81,10 +82,10 @@ def bin_gaussians(
         binning.list_sorted, records, keys, small_tiles, small_rows, max_tiles, first_slots, chunk_starts, cuts,
         grid.width, grid.height, grid.tiles_x, np.zeros(2, np.int64),
         np.empty((parts, binning.DIGITS, 1 << 11), np.int32), buffers.empty(2 * (n + parts), np.int64).reshape(2, -1),
-        tile_list, spans, tile_counts,
+        tile_list, spans, tile_counts, limit=parts,
     )  # fmt: skip
     starts = np.empty(grid.num_tiles + 1, np.int64)
     binning.scan_tile_counts(tile_counts, starts)
     entries = buffers.empty(int(starts[-1]) * layout.ENTRY, np.int32)
-    parallel(binning.scatter_entries, tile_list, spans, tile_counts, entries)
+    parallel(binning.scatter_entries, tile_list, spans, tile_counts, entries, limit=parts)
     return Bins(entries, starts, first_slots, max_tiles, num_slots)

@@ -48,9 +48,10 @@ from core.capture import Camera, Capture, Light
 from core.choices import ITERATIONS, OUR_PRESETS, Preset
 from core.fit import fit
 from core.fit.frames import Frames
+from core.fit.overrides import override_settings
 from core.fit.rendering import render
 from core.fit.run import Run, ViewLayers
-from core.fit.settings import FitSettings, override_settings, preset
+from core.fit.settings import FitSettings, preset
 from core.gaussians.scene import SceneGaussians
 from core.metrics.evaluation import evaluate
 from core.removal.inference.remover import Remover

@@ -30,7 +30,8 @@ from core.capture.lights import read_lights
 from core.colour.srgb import linear_from_srgb
 from core.conventions.run_files import FRAME_LIGHTS
 from core.fit import Run, fit, preset
-from core.fit.settings import adapt_to_plates, override_settings
+from core.fit.overrides import override_settings
+from core.fit.settings import adapt_to_plates
 from core.images.read import read_picture
 from core.metrics.evaluation import displayed_flare, unscored_mask
 from core.metrics.pictures import psnr, relative_l2

@@ -29,7 +29,7 @@ from benchmarks.resident import resident_memory
 from core.bake.shot import bake_shot
 from core.capture import Capture
 from core.fit import fit, preset
-from core.fit.settings import override_settings
+from core.fit.overrides import override_settings
 from core.flare.file import FlareFile
 from core.flare.file import save as save_flare
 from core.images.write import write_png

@@ -19,7 +19,7 @@ Follows = Literal["source", "target", "blend"]
 
 OUR_PRESETS: tuple[Preset, ...] = ("draft", "standard", "high")
 """Presets of the model "ours", the shortest first."""
-ITERATIONS: dict[Preset, int] = {"draft": 1500, "standard": 3000, "high": 10000, "paper": 30000}
+ITERATIONS: dict[Preset, int] = {"draft": 1500, "standard": 2400, "high": 10000, "paper": 30000}
 """Number of iterations of a fit by its preset."""
 PARALLAX_MODES: tuple[Mode, ...] = ("estimated", "split")
 """Modes that separate scene and flare by parallax."""

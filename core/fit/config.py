@@ -13,7 +13,8 @@ from ..system.files import write_text
 from ..system.progress import Progress
 from ..system.reading import MAX_TOML_BYTES, UTF8_SIG, parse_toml, read_text
 from ..typed import parse_table
-from .settings import FitSettings, current_names
+from .overrides import current_names
+from .settings import FitSettings
 
 
 def write_config(path: Path, settings: FitSettings) -> None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -89,7 +90,7 @@ class Frames:
         """
         self.capture = capture
         self.display_white = display_white
-        self._width = width
+        self._width, self._reduction = width, 1
         # Codes per display value: 16 bit keep the smoothness of linear footage at half the size of float.
         self._codes_per_value = 65535 / display_white
         self.cache = PictureCache(memory)
@@ -110,9 +111,21 @@ class Frames:
     def camera(self, view: View) -> Camera:
         """Return the view's camera at the working size, borders included, never larger than the frame."""
         camera = view.camera
-        if not self._width or camera.width <= self._width:
-            return camera
-        return camera.scaled(self._width)
+        if self._width and camera.width > self._width:
+            camera = camera.scaled(self._width)
+        return camera if self._reduction == 1 else camera.scaled(max(round(camera.width / self._reduction), 1))
+
+    def reduced(self, factor: int) -> Frames:
+        """Return the same frames at a working size smaller by a factor. Both share one cache."""
+        frames = copy(self)
+        frames._reduction = factor
+        if self.picture_area is not None:
+            top, bottom, left, right = self.picture_area
+            starts = (-(-line // factor) + BORDER_MARGIN for line in (top, left))
+            ends = (line // factor - BORDER_MARGIN for line in (bottom, right))
+            (top, left), (bottom, right) = starts, ends
+            frames.picture_area = PictureArea(top, bottom, left, right)
+        return frames
 
     def _find_picture_area(self) -> PictureArea | None:
         """Return the area inside the black borders that all frames share, at the working size; None without borders, or
@@ -166,7 +179,7 @@ class Frames:
         do."""
         if self.capture.mask_path(view) is None:
             return None
-        name = f"mask/{view.name}"
+        name = self._cache_name("mask", view)
         codes = self.cache.get(name)
         if codes is None:
             mask = self.capture.mask(view, self.camera(view).size)
@@ -174,6 +187,10 @@ class Frames:
             codes = mask.astype(np.uint16)
             self.cache.put(name, codes)
         return torch.from_numpy((codes if self.picture_area is None else codes[self.picture_area.slices]) > 0)
+
+    def _cache_name(self, kind: str, view: View) -> str:
+        """Return the name in the cache of a view's picture at the working size; kind: its first part."""
+        return f"{kind}/{self._reduction}/{view.name}"
 
     def _load_display(self, view: View, kind: str,
                       decode: Callable[[View, tuple[int, int]], Picture | None]) -> Tensor | None:
@@ -196,7 +213,7 @@ class Frames:
         kind: first part of the picture's name in the cache. decode: reads the picture of a view at a size (width,
         height).
         """
-        name = f"{kind}/{view.name}"
+        name = self._cache_name(kind, view)
         codes = self.cache.get(name)
         if codes is None:
             picture = decode(view, self.camera(view).size)
@@ -214,18 +231,23 @@ class DeviceFrames:
     def __init__(self, frames: Frames, device: torch.device, memory: int = DEVICE_MEMORY) -> None:
         self.device = device
         self._frames, self._free_bytes = frames, memory
-        self._stored: dict[str, tuple[Targets, Tensor | None]] = {}
+        self._reduced = {1: frames}
+        self._stored: dict[tuple[str, int], tuple[Targets, Tensor | None]] = {}
 
-    def read(self, view: View) -> tuple[Targets, Tensor | None]:
-        """Return `Frames.targets` and `Frames.mask` of a view, on the device."""
-        if view.name in self._stored:
-            return self._stored[view.name]
-        targets, mask = self._frames.targets(view), self._frames.mask(view)
+    def read(self, view: View, reduction: int = 1) -> tuple[Targets, Tensor | None]:
+        """Return `Frames.targets` and `Frames.mask` of a view, on the device; at the working size divided by
+        `reduction`."""
+        if (view.name, reduction) in self._stored:
+            return self._stored[view.name, reduction]
+        if reduction not in self._reduced:
+            self._reduced[reduction] = self._frames.reduced(reduction)
+        frames = self._reduced[reduction]
+        targets, mask = frames.targets(view), frames.mask(view)
         if self.device.type == "cpu":
             return targets, mask
         copied = targets.to(self.device), None if mask is None else mask.to(self.device)
         num_bytes = sum(part.numel() * part.element_size() for part in (*copied[0][1:], copied[1]) if part is not None)
         if num_bytes <= self._free_bytes:
             self._free_bytes -= num_bytes
-            self._stored[view.name] = copied
+            self._stored[view.name, reduction] = copied
         return copied

@@ -8,10 +8,9 @@ keeps them in a run.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -24,8 +23,8 @@ from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
 from ..look.form import FORM_BOUNDS, FlareForm
 from ..look.look import MAX_GAUSSIANS
-from ..system.progress import Progress
-from ..typed import MAX_INT_DIGITS, MAX_SEED, Bounds, parse_field
+from ..typed import MAX_INT_DIGITS, MAX_SEED, Bounds
+from .coarse_to_fine import CoarseToFineSettings
 
 
 @dataclass(frozen=True)
@@ -203,7 +202,8 @@ class FitSettings:
     flare is composited over the clean frames instead of the scene; 0 in the paper. holdout: a number N (every N-th view
     is held out; 0: none), a split file's name, or None (the capture's split.json, else every 8th). exposure: "measured"
     finds frames whose exposure differs from most, "fixed" takes all for equal. device: of scene, flare and frames in
-    the iterations, see `core.gaussians.device`.
+    the iterations, see `core.gaussians.device`. coarse_to_fine: sizes of the pictures in modes with exact clean frames;
+    the others use full size throughout.
 
     white: scene-linear light at which frames are clipped; None where the frames have not been checked for more than 1,
     which only float frames can hold, and in runs of versions that clipped all at 1.
@@ -223,6 +223,7 @@ class FitSettings:
     device: Device = "auto"
     checkpoint_every_s: float = 60.0
     preview_every: int = 1000
+    coarse_to_fine: CoarseToFineSettings = field(default_factory=CoarseToFineSettings)
     flare: FlareSettings = field(default_factory=FlareSettings)
     scene: SceneSettings = field(default_factory=SceneSettings)
     split: SplitSettings = field(default_factory=SplitSettings)
@@ -295,6 +296,9 @@ BOUNDS: dict[str, Bounds] = {
     "separate_until": _UNIT, "holdout": _FROM_0, "white": Bounds(1, 65504), "checkpoint_every_s": _NON_NEGATIVE,
     "preview_every": _FROM_1,
 
+    "coarse_to_fine.scene_width": _FROM_0, "coarse_to_fine.scene_until": _UNIT,
+    "coarse_to_fine.flare_width": _FROM_0, "coarse_to_fine.flare_until": _UNIT,
+
     "flare.count": Bounds(1, MAX_GAUSSIANS), "flare.opacity": _OPEN_UNIT,
     "flare.scene_only_until": Bounds(0, 1, exclusive_maximum=True), "flare.correction_weight": _NON_NEGATIVE,
     **{f"flare.form.{name}": bounds for name, bounds in FORM_BOUNDS.items()},
@@ -338,6 +342,10 @@ BOUNDS: dict[str, Bounds] = {
 
 SEPARATE_UNTIL = 0.7
 """`separate_until` of our form."""
+COARSE_TO_FINE = CoarseToFineSettings(scene_width=240, flare_width=120)
+"""`coarse_to_fine` of `standard`."""
+STANDARD_SCENE_RATES = {"features": 5e-3, "features_rest": 5e-3 / 20, "scale": 0.02}
+"""Learning rates of the scene in `standard`: above the paper's, for a fit a fifteenth as long."""
 SCENE_ONLY_UNTIL = 0.08
 """`flare.scene_only_until` of our form."""
 CORRECTION_WEIGHT = 0.1
@@ -379,6 +387,9 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
     else:
         count, max_gaussians = {"draft": (300, 40_000), "standard": (500, 60_000), "high": (700, 200_000)}[name]
         settings = _shorten_schedule(settings, count, max_gaussians)
+    if name == "standard":
+        rates = replace(settings.scene.rates, **STANDARD_SCENE_RATES)
+        settings = replace(settings, coarse_to_fine=COARSE_TO_FINE, scene=replace(settings.scene, rates=rates))
     if blend == "add":
         # Light that adds is fainter than what covers: a ghost is a hundredth of white, not a tenth of opaque.
         density = replace(settings.flare.density, clone_above=5e-4, prune_below=2e-4)
@@ -436,65 +447,3 @@ def _shorten_schedule(settings: FitSettings, count: int, max_gaussians: int) -> 
                     rates=replace(settings.scene.rates, position=3.2e-4, position_final=3.2e-6))
     flare = replace(settings.flare, count=count, density=density, rates=rates)
     return replace(settings, preview_every=max(length // 8, 1), scene=scene, flare=flare)
-
-
-# ---- changes by name -----------------------------------------------------------------------------
-
-RENAMED = {
-    "apart": "separate_until", "flare.begin": "flare.scene_only_until", "flare.snap": "flare.snap_lights",
-    "flare.steady": "flare.correction_weight", "flare.density.most": "flare.density.max_gaussians",
-    "flare.rates.settled": "flare.rates.final_ratio", "split.rounds": "split.scene_only_rounds",
-    "split.excess": "split.excess_weight", "split.weight": "split.scene_weight",
-    "split.glow": "split.near_scene_penalty", "split.reach": "split.light_radius", "split.plain": "split.low_sh_until",
-    "split.found": "split.converged_ratio", "split.lost": "split.diverged_ratio",
-    "split.haze": "split.far_flare_penalty"}
-"""The present name of each setting that was renamed, by its name in runs of format 0; both are read."""
-RENAMED_VALUES = {("exposure", "found"): "measured"}
-"""The present value of settings whose values were renamed, by (present name, value in runs of format 0)."""
-
-
-def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return settings under their present dotted names and values, and the present name by each old name that was used.
-
-    If a setting occurs under both its old and its present name, the later in `values` counts.
-    """
-    current, renamed = {}, {}
-    for name, value in values.items():
-        current_name = RENAMED.get(name, name)
-        if current_name != name:
-            renamed[name] = current_name
-        has_old_value = isinstance(value, str) and (current_name, value) in RENAMED_VALUES
-        current[current_name] = RENAMED_VALUES[current_name, value] if has_old_value else value
-    return current, renamed
-
-
-def override_settings(settings: FitSettings, values: Mapping[str, Any],
-                      progress: Progress | None = None) -> FitSettings:
-    """Return settings with some replaced by dotted name, such as {"flare.rates.network": 1e-3}.
-
-    Old names work too; with `progress`, the user is told the present ones. Raises SettingsError for an unknown name or
-    a value of the wrong kind.
-    """
-    values, renamed = current_names(values)
-    for old, new in renamed.items():
-        if progress is not None:
-            progress.say(f"The setting {old} is now {new}; the old name still works in this version.")
-    for name, value in values.items():
-        settings = override_field(settings, name.split("."), value, name)
-    return settings.validated()
-
-
-def override_field(table: Any, keys: list[str], value: Any, name: str) -> Any:
-    """Return a dataclass with the field at the path `keys` replaced. name: its dotted name, for error messages."""
-    field_names = {entry.name for entry in fields(table)}
-    if keys[0] not in field_names:
-        raise SettingsError(f"There is no setting {name!r}; here there are {', '.join(sorted(field_names))}.")
-    current = getattr(table, keys[0])
-    if len(keys) > 1:
-        if not is_dataclass(current):
-            raise SettingsError(f"There is no setting {name!r}; {keys[0]} has no parts.")
-        return replace(table, **{keys[0]: override_field(current, keys[1:], value, name)})
-    try:
-        return replace(table, **{keys[0]: parse_field(type(table), keys[0], value)})
-    except (ValueError, TypeError) as problem:
-        raise SettingsError(f"The setting {name!r} cannot be used so ({problem}).") from problem

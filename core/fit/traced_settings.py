@@ -17,7 +17,7 @@ from ..optics.ghosts import GhostSettings
 from ..optics.lenses import find_lens
 from ..optics.starburst import Glow, Ring, Starburst, Streak
 from ..typed import MAX_SEED, Bounds
-from .settings import override_field
+from .overrides import override_field
 
 REFERENCE_REACH = 2 / 3
 """Half the frame's width over the focal length of the frame in which the tangents of starburst, glow, rings and streaks

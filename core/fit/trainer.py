@@ -110,7 +110,7 @@ class Trainer(FlareTrainer):
         self._scene.to(self.device)
         if self.flare is not None:
             self.flare.move_to(self.device)
-        self._light_discs: dict[str, Tensor | None] = {}
+        self._light_discs: dict[tuple[str, int], Tensor | None] = {}
         """On a GPU, the light discs of views that were used, by name."""
 
         # Optimisers and strategy hold the parameters of the models.
@@ -144,23 +144,24 @@ class Trainer(FlareTrainer):
         self.iteration += 1
         settings = self.settings
         view = self._pick_view()
-        targets, mask = self._device_frames.read(view)
+        (targets, mask), (flare_targets, flare_mask) = self._load_targets_of_step(view)
         self.optimisers.set_rates(self.iteration)
         rendering = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)
         scene_picture = self._clip_as_filmed(rendering.colour)
         self._update_clear_visibility()
         self._measure_excess_ratio()
         scene_only = self._is_scene_only(targets)
-        flare = None if scene_only else render_flare(self.flare, settings.blend, targets.camera, settings.kernels,
-                                                     scene=self.scene, visibility=settings.flare.active_visibility)
-        light_discs = self._light_discs_of(view, targets)
-        background = self._flare_background(targets, scene_picture, light_discs)
+        flare = None if scene_only else render_flare(self.flare, settings.blend, flare_targets.camera,
+                                                     settings.kernels, scene=self.scene,
+                                                     visibility=settings.flare.active_visibility)
+        light_discs = self._light_discs_of(view, flare_targets)
+        background = self._flare_background(flare_targets, scene_picture, light_discs)
         composite_picture = composite(background, flare, settings.blend, self.frames.display_white)
         # The losses of composite and scene, and the penalties.
         l1_weight = 1 - settings.ssim_share
-        composite_target = self._composite_target(targets, composite_picture.detach(), light_discs)
+        composite_target = self._composite_target(flare_targets, composite_picture.detach(), light_discs)
         loss = (scene_picture.new_zeros(()) if scene_only else
-                l1_ssim(masked(composite_picture, composite_target, mask), composite_target, l1_weight))
+                l1_ssim(masked(composite_picture, composite_target, flare_mask), composite_target, l1_weight))
         metrics = {} if scene_only else {"loss": float(loss.detach())}
         scene_term = self._scene_loss(targets, mask, composite_picture, scene_picture, flare, light_discs)
         if scene_term is not None:
@@ -181,6 +182,24 @@ class Trainer(FlareTrainer):
         if not scene_only:  # flare Gaussians are untrained until then, and their opacities say nothing
             self._change_flare_density()
         return metrics
+
+    def _load_targets_of_step(self, view: View) -> tuple[tuple[Targets, Tensor | None], tuple[Targets, Tensor | None]]:
+        """Return targets and mask of this iteration, for the loss of the scene and for that of the composite.
+
+        They differ in size only while the flare is composited over the clean frame of the view.
+        """
+        settings, width = self.settings.coarse_to_fine, self.frames.camera(view).width
+        progress = self.iteration / self.settings.iterations
+        is_coarse = self.settings.supervised and self.fits_scene
+        of_scene = self._device_frames.read(view, settings.scene_reduction(width, progress) if is_coarse else 1)
+        if not self._is_separate or of_scene[0].clean is None:
+            return of_scene, of_scene
+        return of_scene, self._device_frames.read(view, settings.flare_reduction(width, progress))
+
+    @property
+    def _is_separate(self) -> bool:
+        """True while flares are composited over exact clean frames instead of the scene: until `separate_until`."""
+        return self.settings.supervised and self.iteration <= self.settings.separate_until * self.settings.iterations
 
     def _optimise(self, loss: Tensor, rendering: Rendering) -> None:
         """Backpropagate a loss, make the optimisers' steps, and densify and reorder the scene at intervals.
@@ -282,18 +301,18 @@ class Trainer(FlareTrainer):
         """
         behind = scene
         if self.settings.supervised and targets.clean is not None and self.settings.separate_until:
-            is_separate = self.iteration <= self.settings.separate_until * self.settings.iterations
-            behind = targets.clean if is_separate else torch.where(targets.clean > 1, targets.clean, scene)
+            behind = targets.clean if self._is_separate else torch.where(targets.clean > 1, targets.clean, scene)
         return behind if light_discs is None else behind.masked_fill(light_discs[..., None], 0)
 
     def _light_discs_of(self, view: View, targets: Targets) -> Tensor | None:
-        """Return `_light_disc_mask` of a view; on a GPU it is computed once, on the CPU, since nothing in it changes.
-        """
+        """Return `_light_disc_mask` of a view. On a GPU it is computed once for each size, on the CPU, since nothing in
+        it changes."""
         if self.device.type == "cpu":
             return self._light_disc_mask(targets)
-        if view.name not in self._light_discs:
-            self._light_discs[view.name] = self._light_disc_mask(targets)
-        return self._light_discs[view.name]
+        key = view.name, targets.camera.width
+        if key not in self._light_discs:
+            self._light_discs[key] = self._light_disc_mask(targets)
+        return self._light_discs[key]
 
     def _light_disc_mask(self, targets: Targets) -> Tensor | None:
         """Return (height, width), True in the clipped disc of each light; None if the blend or the mode uses no discs.

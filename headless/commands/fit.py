@@ -119,7 +119,8 @@ def _fit_list(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress) -> FitSettings:
     """Return the settings from the arguments. Raises SettingsError."""
-    from ...core.fit.settings import adapt_to_plates, override_settings, preset
+    from ...core.fit.overrides import override_settings
+    from ...core.fit.settings import adapt_to_plates, preset
 
     kind = scene_kind(args.scene, capture, progress)
     overrides = {"model": args.model} if args.model else {}

@@ -155,7 +155,8 @@ def _fit_settings(args: argparse.Namespace, kind: str, capture: Capture, progres
     scene of plates."""
     from ...core.conventions.run_files import CONFIG
     from ...core.fit import Run, preset
-    from ...core.fit.settings import adapt_to_plates, override_settings
+    from ...core.fit.overrides import override_settings
+    from ...core.fit.settings import adapt_to_plates
 
     if (args.out / RUN / CONFIG).is_file():
         return Run.open(args.out / RUN).settings

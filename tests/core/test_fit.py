@@ -27,6 +27,7 @@ from core.errors import Cancelled, CaptureError, FlareFileError, RunError, Setti
 from core.fit import FitSettings, Run, checkpoint, fit, preset
 from core.fit.frames import Frames
 from core.fit.initialise import NEAR_PLANE_FACTOR, nearest_depth
+from core.fit.overrides import override_settings
 from core.fit.parallax_losses import (
     MAX_EXCESS_RATIO,
     excess_ratio,
@@ -36,7 +37,7 @@ from core.fit.parallax_losses import (
     scene_loss,
 )
 from core.fit.rendering import render_flare
-from core.fit.settings import SplitSettings, override_settings
+from core.fit.settings import SplitSettings
 from core.fit.sky import SKY_POINTS, add_sky_points
 from core.fit.trainer import Trainer
 from core.flare.compositing import composite

@@ -17,7 +17,8 @@ from core.fit import checkpoint
 from core.fit.far_layer import SweepView, classify_patches, find_far_layer
 from core.fit.frames import Frames
 from core.fit.initialise import initial_scene
-from core.fit.settings import override_settings, preset
+from core.fit.overrides import override_settings
+from core.fit.settings import preset
 from core.fit.trainer import Trainer
 from core.flare.visibility import light_visibility
 from core.gaussians.densification import Classic, ClassicSettings, Mcmc

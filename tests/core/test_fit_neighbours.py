@@ -16,7 +16,8 @@ from core.fit import preset
 from core.fit.frames import Frames, masked
 from core.fit.initial_points import RANDOM_POINTS, ensure_points, triangulate_pair
 from core.fit.metering import PointObservations
-from core.fit.settings import FitSettings, override_settings
+from core.fit.overrides import override_settings
+from core.fit.settings import FitSettings
 from core.fit.trainer import Trainer
 from core.gaussians.loss import l1_ssim
 from core.gaussians.ply import read_ply, write_ply

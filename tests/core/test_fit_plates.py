@@ -18,7 +18,8 @@ from core.conventions.run_files import CHECKPOINT, FRAME_LIGHTS, PLATES
 from core.errors import Cancelled, CaptureError, RunError
 from core.fit import FitSettings, Run, fit, preset
 from core.fit.light_results import FlareShare, make_frame_lights, select_flaring, share_messages
-from core.fit.settings import adapt_to_plates, override_settings
+from core.fit.overrides import override_settings
+from core.fit.settings import adapt_to_plates
 from core.images.write import write_png
 from core.metrics.pictures import relative_l2
 from core.removal.jobs.fitted import remove_fitted_flare

@@ -13,7 +13,7 @@ import torch
 from core.capture import Capture
 from core.errors import FlareFileError, SettingsError
 from core.fit import FitSettings, fit, preset
-from core.fit.settings import override_settings
+from core.fit.overrides import override_settings
 from core.fit.trainer import Trainer
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import read_ply, write_ply

@@ -14,7 +14,8 @@ import pytest
 from core.choices import Mode
 from core.errors import RunError, SettingsError
 from core.fit.config import read_config, write_config
-from core.fit.settings import BOUNDS, RENAMED, FitSettings, override_settings, preset
+from core.fit.overrides import RENAMED, override_settings
+from core.fit.settings import BOUNDS, FitSettings, preset
 from tests.core.recording_progress import RecordingProgress
 
 

@@ -9,7 +9,7 @@ from benchmarks.bilateral import BilateralTrainer
 from benchmarks.exact_scene import ExactSceneTrainer
 from core.capture import Capture
 from core.fit import preset
-from core.fit.settings import override_settings
+from core.fit.overrides import override_settings
 from tests.core.flared import flared_capture
 
 

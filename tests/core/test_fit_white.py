@@ -20,7 +20,7 @@ from core.errors import SettingsError
 from core.fit import FitSettings, Run, fit, preset
 from core.fit.frames import Frames, Targets
 from core.fit.metering import MAX_WHITE, resolve_white
-from core.fit.settings import override_settings
+from core.fit.overrides import override_settings
 from core.fit.sky import add_sky_points
 from core.fit.trainer import Trainer
 from core.flare.compositing import composite, linear_layers

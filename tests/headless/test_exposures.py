@@ -15,7 +15,7 @@ from core.bake.exr import read_layers
 from core.capture import Capture
 from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.fit import Run, fit, preset
-from core.fit.settings import override_settings
+from core.fit.overrides import override_settings
 from core.gaussians.ply import read_ply
 from core.images.read import read_picture
 from core.images.write import write_png

@@ -22,7 +22,7 @@ from fit_flare.headless import cli
 from core.bake.bake import read_manifest
 from core.capture import Capture
 from core.fit import fit, preset
-from core.fit.settings import override_settings
+from core.fit.overrides import override_settings
 from core.look import PlacedLight, read_look
 from core.look.shot import Shot, ShotFrame
 from core.removal.jobs.manifest import MANIFEST

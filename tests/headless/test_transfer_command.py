@@ -18,7 +18,7 @@ import torch
 from core.bake.exr import read_description, read_layers
 from core.capture import Capture
 from core.fit import fit, preset
-from core.fit.settings import override_settings
+from core.fit.overrides import override_settings
 from core.flare.file import FlareFile
 from core.flare.file import save as save_flare
 from core.gaussians.ply import read_ply

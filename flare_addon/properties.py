@@ -44,7 +44,7 @@ MODES: tuple[tuple[Mode, str, str, int], ...] = (  # a .blend stores the numbers
     ("estimated", "Estimated Clean Frames", "Use the clean frames of Make Clean Frames, or those that the "
      "removal network makes when the fit starts. Parallax separates their remaining flare. The fit takes a fifth "
      "longer", 2),
-    ("split", "No Clean Frames", "Separate scene and flare by parallax alone. The fit takes a fifth longer", 1),
+    ("split", "No Clean Frames", "Separate scene and flare by parallax alone. The fit takes longer", 1),
 )
 
 

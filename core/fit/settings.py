@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..choices import ITERATIONS, PARALLAX_LENGTH_FACTOR, PARALLAX_MODES, Blend, Device, Kernels, Mode, Model, Preset
+from ..choices import ITERATIONS, PARALLAX_ITERATIONS, PARALLAX_MODES, Blend, Device, Kernels, Mode, Model, Preset
 from ..colour.srgb import srgb_from_linear
 from ..errors import SettingsError
 from ..flare.density import DensitySettings
@@ -362,7 +362,7 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
     """Return the settings of a preset, with every schedule scaled to the number of iterations.
 
     `paper` has the paper's form and figures, 30,000 iterations. `draft`, `standard` and `high` have our form, shorter
-    schedules and higher rates. All are a fifth longer in the modes `estimated` and `split`, unless `iterations` is
+    schedules and higher rates. All are longer in the modes `estimated` and `split`, unless `iterations` is
     given. model, blend: another form and blend than the preset's: "paper" blends "over" in display space, "ours" adds
     in linear light and is hidden by the scene. Raises SettingsError for an unknown name or a number out of bounds.
     """
@@ -370,7 +370,7 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
         raise SettingsError(f"There is no preset {name!r}; choose {', '.join(ITERATIONS)}.")
     length = iterations
     if length is None:
-        length = round(ITERATIONS[name] * (PARALLAX_LENGTH_FACTOR if mode in PARALLAX_MODES else 1))
+        length = (PARALLAX_ITERATIONS if mode in PARALLAX_MODES else ITERATIONS)[name]
     model = model or ("paper" if name == "paper" else "ours")
     form = replace(PAPER if model == "paper" else OURS, line=mode != "2d")
     if blend is None:
@@ -387,7 +387,7 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
     else:
         count, max_gaussians = {"draft": (300, 40_000), "standard": (500, 60_000), "high": (700, 200_000)}[name]
         settings = _shorten_schedule(settings, count, max_gaussians)
-    if name == "standard":
+    if name == "standard" and mode not in PARALLAX_MODES:
         rates = replace(settings.scene.rates, **STANDARD_SCENE_RATES)
         settings = replace(settings, coarse_to_fine=COARSE_TO_FINE, scene=replace(settings.scene, rates=rates))
     if blend == "add":

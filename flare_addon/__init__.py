@@ -42,11 +42,12 @@ from . import (
     points,
     preferences,
     properties,
+    scene_changes,
 )
 from .compositor import drivers
 
-_MODULES = (properties, preferences, handbook, operators, panels, editor_panels, points, overlay, highlight, paths,
-            asset_browser)
+_MODULES = (properties, preferences, handbook, operators, panels, editor_panels, points, scene_changes, overlay,
+            highlight, paths, asset_browser)
 
 
 @bpy.app.handlers.persistent

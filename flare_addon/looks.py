@@ -20,6 +20,9 @@ from .objects import depsgraph_of, world_matrix
 from .paths import absolute, blend_relative
 from .properties import EDIT_NAMES, edit_of, set_slider
 
+MIN_LIGHTS_FOR_BOXES = 8
+"""Lights from which on the boxes of all objects cost less than the rays that they save."""
+
 _look_cache: dict[str, tuple[tuple[float, int], Look | str]] = {}
 
 
@@ -271,19 +274,22 @@ def place_lights(scene: Any, depsgraph: Any, camera: Any,
     matrix = stereo.eye_matrix(camera.evaluated_get(depsgraph), eye)
     to_capture = cameras.world_to_capture(state.root, depsgraph)
     rendered = lamp_drive.rendered_collections(scene)
-    lights = [place_light(scene, depsgraph, matrix, to_capture, item, hides=state.occlusion, rendered=rendered)
-              for item in state.lights if is_placed(item, scene)]
+    items = [item for item in state.lights if is_placed(item, scene)]
+    occluders = occlusion.Occluders(depsgraph) if state.occlusion and len(items) >= MIN_LIGHTS_FOR_BOXES else None
+    lights = [place_light(scene, depsgraph, matrix, to_capture, item, hides=state.occlusion, rendered=rendered,
+                          occluders=occluders) for item in items]
     return cameras.pose_in_capture(matrix, state.root, depsgraph), lights
 
 
 def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.float64], item: Any, *,
-                hides: bool, rendered: set[Any]) -> PlacedLight:
+                hides: bool, rendered: set[Any], occluders: occlusion.Occluders | None = None) -> PlacedLight:
     """Return the light of a flare as a camera sees it. Of a light with an extent, `shares` has the visible share of
     each cell, and the visibility is 1.
 
     Raises CaptureError where the light's object is disabled, so that its place is unknown, unless its flare is dark.
     camera: matrix_world of the camera. to_capture: matrix (4, 4) from Blender's world to the coordinates of the result.
     item: the flare. hides: whether objects hide the light. rendered: the collections that renders show.
+    occluders: boxes of the objects that may hide lights, None to cast all rays.
     """
     eye, target = camera.translation, item.target
     is_dark = item.follow_visibility and not lamp_drive.is_visible(target, depsgraph, rendered)
@@ -303,7 +309,7 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
     reference *= float(np.cbrt(abs(np.linalg.det(to_capture[:3, :3]))))  # scene units to units of the capture
     extent = light_extents.extent_of(item, depsgraph, matrix)
     if extent is None:
-        visibility = occlusion.visibility(scene, depsgraph, eye, item) if hides else 1.0
+        visibility = occlusion.visibility(scene, depsgraph, eye, item, occluders) if hides else 1.0
         return PlacedLight(item.name, item.source, xyz, visibility, factor=gain, reference_distance=reference)
     extent, shares = extent.transformed(to_capture[:3, :3]), None
     if hides:
@@ -322,7 +328,8 @@ def evaluate_flares(scene: Any, depsgraph: Any, camera: Any, edits: LookEdits | 
     """
     look = look_of(scene)
     pose, lights = place_lights(scene, depsgraph, camera, eye)
-    gaussians = look.evaluate_lights(pose, lights, edits or edits_of(scene.fit_flare), query_of(scene.fit_flare),
+    edits = edits or edits_of(scene.fit_flare)
+    gaussians = look.evaluate_lights(pose, lights, None if edits.is_neutral else edits, query_of(scene.fit_flare),
                                      budget)
     exposure = camera.evaluated_get(depsgraph).fit_flare.exposure
     return {name: light_gaussians.with_exposure(exposure, look.blend) for name, light_gaussians in gaussians.items()}

@@ -34,13 +34,58 @@ def _disc_samples() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 _POINTS, _WEIGHTS = _disc_samples()
 
 
-def visibility(scene: Any, depsgraph: Any, eye: Any, item: Any) -> float:
+_CLEAR = min(sum(_WEIGHTS.tolist()), 1.0)
+"""Visibility of a disc that nothing hides."""
+MAX_BOXES, MAX_INSTANCES = 100, 1000
+"""Most boxes that `Occluders` computes, and most objects and instances that it looks at."""
+_WITHOUT_SURFACE = frozenset(("ARMATURE", "CAMERA", "EMPTY", "LATTICE", "LIGHT", "LIGHT_PROBE", "SPEAKER"))
+
+
+class Occluders:
+    """The boxes of all objects and instances that may hide a light, for a quick answer that none does.
+
+    In a scene with too many of them, or with an object that is being edited, any light may be hidden.
+    """
+
+    def __init__(self, depsgraph: Any) -> None:
+        lows: list[NDArray[np.float64]] = []
+        highs: list[NDArray[np.float64]] = []
+        self._is_complete = True
+        for number, instance in enumerate(depsgraph.object_instances):
+            obj = instance.object
+            if obj.type in _WITHOUT_SURFACE and number < MAX_INSTANCES:
+                continue
+            if number >= MAX_INSTANCES or len(lows) >= MAX_BOXES or obj.original.mode != "OBJECT":
+                self._is_complete = False
+                break
+            matrix = np.array(instance.matrix_world, np.float64)
+            corners = np.array([tuple(corner) for corner in obj.bound_box], np.float64) @ matrix[:3, :3].T
+            lows.append((corners + matrix[:3, 3]).min(0))
+            highs.append((corners + matrix[:3, 3]).max(0))
+        self._lows, self._highs = (np.array(ends, np.float64).reshape(-1, 3) for ends in (lows, highs))
+
+    def may_hide(self, eye: Any, light: Any, radius: float) -> bool:
+        """Return whether a box comes as near as `radius` to the line from `eye` to a light; lengths in world units."""
+        if not self._is_complete:
+            return True
+        start, step = np.array(eye, np.float64), np.array(light, np.float64) - np.array(eye, np.float64)
+        step = np.where(np.abs(step) < 1e-12, 1e-12, step)
+        margin = radius + 1e-3 * float(np.linalg.norm(step))
+        first, last = (self._lows - margin - start) / step, (self._highs + margin - start) / step
+        enters, leaves = np.minimum(first, last).max(-1), np.maximum(first, last).min(-1)
+        return bool(((enters <= leaves) & (leaves >= 0) & (enters <= 1)).any())
+
+
+def visibility(scene: Any, depsgraph: Any, eye: Any, item: Any, occluders: Occluders | None = None) -> float:
     """Return the visibility of a flare's light from `eye`, 0..1: the part of its disc that no object hides.
 
     The lamp itself hides nothing: objects within `LIGHT_MARGIN` of the distance, the light object, its children, and
-    the instances of these.
+    the instances of these. occluders: boxes of what may hide it; None to cast all rays.
     """
     position = light_position(item.target, world_matrix(item.target, depsgraph), eye)
+    radius = item.radius or DISC_RADIUS_FRACTION * (position - eye).length
+    if occluders is not None and not occluders.may_hide(eye, position, radius):
+        return _CLEAR
     ignored, instances = _lamp_parts(item, depsgraph)
     return disc_visibility(scene, depsgraph, eye, position, ignored, item.radius, instances)
 

@@ -24,23 +24,22 @@ from numpy.typing import NDArray
 from ..core.capture import Camera
 from ..core.errors import FitFlareError
 from ..core.look import Look, PlaneGaussians, to_pixels
-from ..core.look.drawing import OPACITY_MAX, cutoff_radii
 from ..core.look.network import OffsetsBudget
-from ..core.look.plane import arc_log_peak, arcs_to_pixels, concatenate
+from ..core.look.plane import concatenate
 from . import baking, highlight, looks, stereo
 from .compositor.flare_node import find_node
+from .overlay_quads import LEVELS, DrawnRegion, QuadMemory, Quads, quads_by_level
 from .overlay_shaders import gaussian_shader, sum_shader
 from .properties import redraw_viewports
+from .scene_changes import change_count
 from .views import camera_of, has_display_footage
-
-LEVELS = (1, 2, 4, 8, 16)
-MIN_TEXELS = 4.0  # standard deviation of the narrow side of a Gaussian, in the level that it is drawn in
+from .working_space import working_space
 
 MAX_IN_HALF_FLOAT = 6_000
 """Gaussians up to which the buffers are half float. A sum of more, as for an area light, loses the light of faint ones
 to rounding."""
 
-NETWORK_S, NETWORK_AT_REST_S = 0.03, 0.25
+NETWORK_S, NETWORK_AT_REST_S = 0.02, 0.25
 """Time for the look's network in one drawing while the camera moves, and at rest; more lights than fit take turns."""
 REFINE_S = 0.02
 """Time after which a drawing in which lights wait for their turn is followed by another."""
@@ -56,6 +55,9 @@ _shaders: dict[str, Any] = {}
 _offscreens: dict[tuple[int, int, int, str], Any] = {}
 _budgets: dict[tuple[str, stereo.Eye], OffsetsBudget] = {}
 """By the camera's name and the eye."""
+_memory = QuadMemory()
+_rendered: tuple[Any, list[Any]] | None = None
+"""What the offscreen buffers hold: the key of `_drawing_key`, and the buffers of `render_levels`. None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -66,18 +68,6 @@ class CameraFrame:
     bottom: float
     width: float
     height: float
-
-
-@dataclass(frozen=True)
-class DrawnRegion:
-    """The part of a frame that is drawn: lower left corner and size in region pixels, and the intrinsics (3, 3) of its
-    pixels, with row 0 on top."""
-
-    x: int
-    y: int
-    width: int
-    height: int
-    intrinsics: NDArray[np.float64]
 
 
 def drawn_region(frame: CameraFrame, region: tuple[int, int], camera: Camera) -> DrawnRegion | None:
@@ -112,114 +102,6 @@ def camera_frame(context: Any, camera: Camera) -> CameraFrame | None:
         return None
     xs, ys = [corner.x for corner in corners], [corner.y for corner in corners]
     return CameraFrame(min(xs), min(ys), max(xs) - min(xs), max(ys) - min(ys))
-
-
-# ---- quads ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Quads:
-    """Vertices of n quads.
-
-    place (4n, 2): pixels of the level that they are drawn in. local (4n, 2): Mahalanobis coordinates, along the long
-    axis and across it. light (4n, 3): colour times opacity. ring (4n, 3): radius r0 and width w in the unit of local,
-    and opacity. arc (4n, 3): vector to the brighter side in the unit of local, and the logarithm of the peak that it
-    gives, which the shader subtracts. triangles (2n, 3): indices of vertices.
-    """
-
-    place: Floats
-    local: Floats
-    light: Floats
-    ring: Floats
-    arc: Floats
-    triangles: NDArray[np.uint32]
-
-
-_CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
-
-
-def make_quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ring: Floats, arcs: Floats) -> Quads:
-    """Return a quad about each ellipse, in their order.
-
-    centres (n, 2) px, covariances (n, 3) xx, xy, yy in px², radii (n,) Mahalanobis, arcs (n, 2) px. light (n, 3):
-    colour times opacity. ring (n, 3): r0, w and opacity.
-    """
-    centres, covariances, radii, arcs = (np.asarray(item, np.float32) for item in (centres, covariances, radii, arcs))
-    xx, xy, yy = covariances.T
-    half, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)  # the eigenvalues are half + root and half - root
-    long, short = np.sqrt(np.maximum(half + root, 0)), np.sqrt(np.maximum(half - root, 0))
-    cosine = (xx - yy) / np.maximum(2 * root, np.finfo(np.float32).tiny)  # of twice the angle of the long axis
-    # Unit vector (x, y) of the long axis, by the half-angle formulas; (-y, x) is the short one.
-    x, y = np.sqrt(np.clip((1 + cosine) / 2, 0, 1)), np.copysign(np.sqrt(np.clip((1 - cosine) / 2, 0, 1)), xy)
-    count = len(centres)
-    place, local = np.empty((2, count, 4, 2), np.float32)
-    for corner, (sign_u, sign_v) in enumerate(_CORNERS.tolist()):
-        local[:, corner, 0], local[:, corner, 1] = sign_u * radii, sign_v * radii
-        u, v = sign_u * radii * long, sign_v * radii * short
-        place[:, corner, 0] = centres[:, 0] + u * x - v * y
-        place[:, corner, 1] = centres[:, 1] + u * y + v * x
-    long, short = np.maximum(long, 1e-6), np.maximum(short, 1e-6)
-    arc = np.empty((count, 3), np.float32)
-    arc[:, 0] = (x * arcs[:, 0] + y * arcs[:, 1]) / long
-    arc[:, 1] = (x * arcs[:, 1] - y * arcs[:, 0]) / short
-    arc[:, 2] = arc_log_peak(np.hypot(arc[:, 0], arc[:, 1]), ring[:, :2])
-    index = 4 * np.arange(count, dtype=np.uint32)[:, None, None]
-    triangles = (index + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
-
-    def for_corners(values: Floats) -> Floats:
-        return np.repeat(np.asarray(values, np.float32), 4, 0)
-
-    return Quads(place.reshape(-1, 2), local.reshape(-1, 2), for_corners(light), for_corners(ring), for_corners(arc),
-                 np.ascontiguousarray(triangles, np.uint32))
-
-
-def level_indices(covariances: Floats, rings: Floats | None) -> NDArray[np.int64]:
-    """Return the index in LEVELS (n,) that each Gaussian is drawn in, by its narrow side in pixels.
-
-    covariances: (n, 3) px². rings: (n, 2) r0 and w, or None.
-    """
-    xx, xy, yy = covariances.T
-    half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-    deviation = np.sqrt(np.maximum(half - root, 0))
-    if rings is not None:
-        deviation = deviation * np.minimum(rings[:, 1], 1)  # the line of a ring is thinner than its ellipse
-    return np.clip(np.searchsorted(np.array(LEVELS), deviation / MIN_TEXELS, side="right") - 1, 0, len(LEVELS) - 1)
-
-
-def touches_region(centres: Floats, covariances: Floats, radii: Floats, width: int, height: int) -> NDArray[np.bool_]:
-    """Return which ellipses (n,) touch a picture of this size; degenerate ones do not. Arguments as in `make_quads`."""
-    xx, xy, yy = covariances.T
-    reach_x, reach_y = radii * np.sqrt(np.maximum(xx, 0)), radii * np.sqrt(np.maximum(yy, 0))
-    x, y = centres.T
-    with np.errstate(invalid="ignore"):
-        return np.asarray((x + reach_x > 0) & (y + reach_y > 0) & (x - reach_x < width) & (y - reach_y < height)
-                          & (xx * yy - xy * xy > 0) & (radii > 0) & np.isfinite(x + y))
-
-
-def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -> dict[int, Quads]:
-    """Return the quads of the Gaussians that touch the region, by level: the divisor of the size of the buffer that
-    they are drawn in. Lengths are pixels of that buffer; quads are in drawing order, with "over" back to front."""
-    blend = look.blend
-    centres, covariances = to_pixels(gaussians, window.intrinsics, look.pixel_grid)
-    radii, arcs = cutoff_radii(gaussians, blend), arcs_to_pixels(gaussians, window.intrinsics)
-    rows = np.flatnonzero(touches_region(centres, covariances, radii, window.width, window.height))
-    opacities = gaussians.opacities if blend == "add" else np.minimum(gaussians.opacities, OPACITY_MAX)
-    rings = gaussians.rings
-    if rings is None:
-        rings = np.tile(np.array([0, 1], np.float32), (len(gaussians), 1))  # radius 0, width 1: a plain Gaussian
-    light, ring = gaussians.colours * opacities[:, None], np.concatenate([rings, opacities[:, None]], -1)
-    if blend == "over":  # the first is in front, so it is drawn last
-        rows = rows[::-1]
-        levels = np.zeros(len(gaussians), np.int64)  # all at full size
-    else:
-        levels = level_indices(covariances, gaussians.rings)
-    by_level: dict[int, Quads] = {}
-    for number, divisor in enumerate(LEVELS):
-        members = rows[levels[rows] == number]
-        if len(members):
-            by_level[divisor] = make_quads(centres[members] / divisor, covariances[members] / divisor**2,
-                                           radii[members], light[members], ring[members], arcs[members] / divisor)
-    return by_level
 
 
 # ---- the GPU --------------------------------------------------------------------------------------
@@ -267,9 +149,11 @@ def render_levels(gaussians: PlaneGaussians | None, window: DrawnRegion, look: L
 
     Needs a GPU context.
     """
+    global _rendered
     import gpu
 
-    by_level = {} if gaussians is None else quads_by_level(gaussians, window, look)
+    _rendered = None  # the buffers get another content
+    by_level = {} if gaussians is None else quads_by_level(gaussians, window, look, _memory)
     texture_format = "RGBA16F" if gaussians is None or len(gaussians) <= MAX_IN_HALF_FLOAT else "RGBA32F"
     buffers = []
     for divisor in LEVELS:
@@ -287,16 +171,6 @@ def render_levels(gaussians: PlaneGaussians | None, window: DrawnRegion, look: L
                 _upload_quads(by_level[divisor]).draw(shader)
         buffers.append(offscreen)
     return buffers
-
-
-def working_space() -> NDArray[np.float64]:
-    """Return the matrix (3, 3) from linear Rec. 709, the space of a look, to Blender's scene-linear working space.
-
-    Under a studio's OpenColorIO configuration that is often ACEScg; from Blender 5.0 on a .blend may choose it.
-    """
-    from mathutils import Color
-
-    return np.array([Color(axis).from_rec709_linear_to_scene_linear()[:] for axis in np.eye(3).tolist()]).T
 
 
 def composite_levels(buffers: list[Any], box: tuple[float, float, float, float], blend: str, region: DrawnRegion,
@@ -383,24 +257,14 @@ def draw_region(context: Any, scene: Any, camera: Any, eye: stereo.Eye = "") -> 
     """Draw the flares of the scene over the camera view of the region. Raises FitFlareError."""
     import gpu
 
-    depsgraph = context.view_layer.depsgraph
     window = drawn_part(context, scene, camera, eye)
     if window is None:
         return
     region = context.region.width, context.region.height
     look = looks.look_of(scene)
-    chosen, edits = highlight.current_highlight(scene), looks.edits_of(scene.fit_flare)
-    if chosen is not None:
-        names = {item.name: [element.name for element in item.elements] for item in scene.fit_flare.lights}
-        edits = highlight.emphasise(edits, chosen, names)
-    budget = _budgets.setdefault((camera.name, eye), OffsetsBudget(NETWORK_S, NETWORK_AT_REST_S))
-    budget.begin()
-    gaussians = concatenate([*looks.evaluate_flares(scene, depsgraph, camera, edits, budget, eye=eye).values()])
-    if not budget.is_complete and not bpy.app.timers.is_registered(redraw_viewports):
-        bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
-    if gaussians is None:
+    buffers = _render_region(context, scene, camera, window, look, eye)
+    if buffers is None:
         return
-    buffers = render_levels(gaussians, window, look)
     viewport = gpu.state.viewport_get()
     box = (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
            (window.y + window.height) / region[1])
@@ -411,6 +275,43 @@ def draw_region(context: Any, scene: Any, camera: Any, eye: stereo.Eye = "") -> 
             gpu.state.viewport_set(*viewport)
             composite_levels(buffers, box, look.blend, window, working_space())
     gpu.state.viewport_set(*viewport)
+
+
+def _render_region(context: Any, scene: Any, camera: Any, window: DrawnRegion, look: Look, eye: stereo.Eye = ""
+                   ) -> list[Any] | None:
+    """Return the offscreen buffers with the flares of a scene, full size first; None without a flare.
+
+    They are rendered only if anything has changed since they were. Raises FitFlareError.
+    """
+    global _rendered
+    chosen = highlight.current_highlight(scene)
+    key = (camera.name, eye, chosen, look, *_drawing_key(context, scene, window))
+    if _rendered is not None and _rendered[0] == key:
+        return _rendered[1]
+    edits = looks.edits_of(scene.fit_flare)
+    if chosen is not None:
+        names = {item.name: [element.name for element in item.elements] for item in scene.fit_flare.lights}
+        edits = highlight.emphasise(edits, chosen, names)
+    budget = _budgets.setdefault((camera.name, eye), OffsetsBudget(NETWORK_S, NETWORK_AT_REST_S))
+    budget.begin()
+    flares = looks.evaluate_flares(scene, context.view_layer.depsgraph, camera, edits, budget, eye=eye)
+    if not budget.is_complete and not bpy.app.timers.is_registered(redraw_viewports):
+        bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
+    gaussians = concatenate(list(flares.values()))
+    if gaussians is None:
+        return None
+    buffers = render_levels(gaussians, window, look)
+    if budget.is_complete:
+        _rendered = key, buffers
+    return buffers
+
+
+def _drawing_key(context: Any, scene: Any, window: DrawnRegion) -> tuple[Any, ...]:
+    """Return what the flares of a scene in a region depend on besides camera and look, for a comparison.
+
+    `change_count` stands for Blender's data."""
+    return (change_count(), scene.name, context.view_layer.name, window.x, window.y, window.width, window.height,
+            window.intrinsics.tobytes())
 
 
 def drawn_part(context: Any, scene: Any, camera: Any, eye: stereo.Eye = "") -> DrawnRegion | None:
@@ -484,11 +385,11 @@ def register() -> None:
 
 
 def unregister() -> None:
-    global _scene_buffer, last_error
+    global _scene_buffer, _rendered, last_error
     for handle in _handles:
         bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
     _handles.clear()
-    _scene_buffer = None
+    _scene_buffer = _rendered = None
     for offscreen in _offscreens.values():
         offscreen.free()
     _offscreens.clear()

@@ -26,6 +26,7 @@ from ..core.choices import ITERATIONS, Mode, Preset
 from ..core.conventions.exposures import MIN_EXPOSURE
 from ..core.look import Edit
 from .plate_space import clear_recorded_space, search_names
+from .working_space import picked_from_tint, tint_from_picked
 
 # From 4.5 on this option permits paths relative to the .blend; earlier versions do not know it.
 PATH_OPTIONS = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
@@ -129,15 +130,17 @@ EDIT_NAMES = tuple(entry.name for entry in dataclasses.fields(Edit))
 
 
 def edit_of(sliders: Any) -> Edit:
-    """Return the edit that a group of sliders makes."""
+    """Return the edit that a group of sliders makes; the tint is converted from Blender's working space."""
     red, green, blue = sliders.tint
-    return Edit(intensity=sliders.intensity, tint=(red, green, blue), saturation=sliders.saturation,
+    return Edit(intensity=sliders.intensity, tint=tint_from_picked((red, green, blue)), saturation=sliders.saturation,
                 scale=sliders.scale, spread=sliders.spread, rotation=math.degrees(sliders.rotation),
                 streak=sliders.streak, mute=sliders.mute, solo=sliders.solo)
 
 
 def set_slider(sliders: Any, name: str, value: Any) -> None:
-    """Set a slider to the value that an edit has for it; a rotation is in degrees."""
+    """Set a slider to the value that an edit has for it: a rotation in degrees, a tint in linear Rec. 709."""
+    if name == "tint":
+        value = picked_from_tint(value)
     setattr(sliders, name, math.radians(value) if name == "rotation" else value)
 
 

@@ -73,6 +73,27 @@ class TrainedCamera:
         return max(width, height) / max(self.width, self.height) if is_turned else width / self.width
 
 
+@dataclass(frozen=True, eq=False)
+class _Deformed:
+    """What the Gaussians of a light have from canonical parameters and offsets alone, wherever the light is.
+
+    positions (n, 1) on the line, or (n, 2) on the plane. shift (n, 2): on the plane, or None. scales, rotations: of the
+    ellipses or ellipsoids. covariances (n, 3): xx, xy, yy, None where they depend on the place. opacities (n,). sh (n,
+    k, 3). colours (n, 3): None where they depend on the view. rings, arcs (n, 2): or None, as in `PlaneGaussians`.
+    """
+
+    positions: Floats
+    shift: Floats | None
+    scales: Floats
+    rotations: Floats
+    covariances: Floats | None
+    opacities: Floats
+    sh: Floats
+    colours: Floats | None
+    rings: Floats | None
+    arcs: Floats | None
+
+
 class LightLook:
     """The flare of one light; created by `read_look`."""
 
@@ -137,26 +158,39 @@ class LightLook:
 
         query: camera and light for the network; None for the view's. budget: bounds the time for the network. name: of
         the placed light, for the budget."""
-        form, rows, queried = self.form, self._canonical, query or view  # the rows are canonical, before deformation
+        form, queried = self.form, query or view
         features = self._network.view_features(queried.camera, queried.light)
         offsets = self._network.offsets(features, budget, name)
+        if offsets.deformed is None:
+            offsets.deformed = self._deform(offsets.by_name)
+        deformed: _Deformed = offsets.deformed
         light = view.light
         if form.light_correction:
             light = light + self._network.light_correction(features)
-        positions = rows["positions"] + offsets["positions"]
-        means = positions * light if form.line else positions
-        if "plane_offset" in offsets:
-            means = means + offsets["plane_offset"]
+        means = deformed.positions * light if form.line else deformed.positions
+        if deformed.shift is not None:
+            means = means + deformed.shift
+        covariances = deformed.covariances
+        if covariances is None:
+            covariances = project_covariances(means, deformed.scales, deformed.rotations)
+        sh_colours = deformed.colours
+        if sh_colours is None:
+            # From camera to world: a row times the rotation is its transpose times the vector.
+            rays = np.concatenate([means, np.ones_like(means[:, :1])], -1) @ view.rotation
+            sh_colours = colours(rays, deformed.sh, form.sh_degree)
+        return PlaneGaussians(means, covariances, deformed.opacities, sh_colours, deformed.rings, deformed.arcs), light
+
+    def _deform(self, offsets: Mapping[str, Floats]) -> _Deformed:
+        """Return the canonical Gaussians with the offsets (n, width) of a view."""
+        form, rows = self.form, self._canonical
+        shift = offsets.get("plane_offset")
         if form.static_offset:
-            means = means + rows["offsets"]
+            shift = rows["offsets"] if shift is None else shift + rows["offsets"]
         scales, rotations = rows["log_scales"] + offsets["log_scales"], rows["rotations"] + offsets["rotations"]
-        covariances = (project_covariances(means, scales, rotations) if form.solid
-                       else covariance_of_ellipse(scales, rotations))
         with np.errstate(over="ignore"):  # an exponential that overflows gives opacity 0
             opacities = 1 / (1 + np.exp(-(rows["opacity_logits"] + offsets["opacity_logits"])[:, 0]))
-        # From camera to world: a row times the rotation is its transpose times the vector.
-        rays = np.concatenate([means, np.ones_like(means[:, :1])], -1) @ view.rotation
-        sh = (rows["sh"] + offsets["sh"]).reshape(len(means), (self.form.sh_degree + 1) ** 2, 3)
+        positions = rows["positions"] + offsets["positions"]
+        sh = (rows["sh"] + offsets["sh"]).reshape(len(positions), (form.sh_degree + 1) ** 2, 3)
         rings = arcs = None
         if form.rings:
             ring_values = rows["rings"] + offsets["rings"]  # r0, and the logarithm of w, clamped as in core.flare
@@ -165,7 +199,9 @@ class LightLook:
             ellipse_arcs = rows["arcs"] + offsets["arcs"]
             opacities = opacities * opacity_gain(ellipse_arcs, rings)
             arcs = arcs_of_ellipse(ellipse_arcs, scales, rotations)
-        return PlaneGaussians(means, covariances, opacities, colours(rays, sh, form.sh_degree), rings, arcs), light
+        return _Deformed(positions, shift, scales, rotations,
+                         None if form.solid else covariance_of_ellipse(scales, rotations), opacities, sh,
+                         None if form.sh_degree else colours(np.zeros((len(sh), 3), np.float32), sh, 0), rings, arcs)
 
 
 class Look:

@@ -39,6 +39,27 @@ _numbers = itertools.count()
 """Numbers of the networks, for their entries in the cache."""
 
 
+class Offsets:
+    """The offsets of a light's Gaussians for one view; they are shared and must not be changed.
+
+    values: (n, sum of the heads' widths). by_name: (n, width) of each head. deformed: what `LightLook` computes from
+    them alone, None until it has.
+    """
+
+    def __init__(self, values: Floats, heads: Mapping[str, int]) -> None:
+        """heads: widths by name, in the order of the columns."""
+        self.values = values
+        edges = np.cumsum([0, *heads.values()])
+        self.by_name = {name: values[:, start:end] for name, start, end in zip(heads, edges[:-1], edges[1:],
+                                                                               strict=True)}
+        self.deformed: Any = None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the offsets and, about as many, of what is computed from them."""
+        return 2 * self.values.nbytes
+
+
 class _OffsetsCache:
     """The offsets that were computed last, by network and features.
 
@@ -47,9 +68,9 @@ class _OffsetsCache:
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes, self._bytes, self._lock = max_bytes, 0, threading.Lock()
-        self._entries: OrderedDict[tuple[int, bytes], Floats] = OrderedDict()
+        self._entries: OrderedDict[tuple[int, bytes], Offsets] = OrderedDict()
 
-    def get(self, key: tuple[int, bytes], compute: Callable[[], Floats]) -> Floats:
+    def get(self, key: tuple[int, bytes], compute: Callable[[], Offsets]) -> Offsets:
         """Return the entry of a key, computed where it is missing."""
         with self._lock:
             entry = self._entries.get(key)
@@ -83,7 +104,7 @@ class OffsetsBudget:
         self._seconds, self._seconds_at_rest = seconds, max(seconds, seconds_at_rest)
         self._seconds_per_light = 0.0
         # Cache key and offsets of each light, by number of its network and its name; the longest waiting first.
-        self._offsets: OrderedDict[tuple[int, str], tuple[tuple[int, bytes], Floats]] = OrderedDict()
+        self._offsets: OrderedDict[tuple[int, str], tuple[tuple[int, bytes], Offsets]] = OrderedDict()
         # Cache key of each light in the drawing since `begin`, and in the one before.
         self._drawn: dict[tuple[int, str], tuple[int, bytes]] = {}
         self._drawn_before: dict[tuple[int, str], tuple[int, bytes]] = {}
@@ -99,7 +120,7 @@ class OffsetsBudget:
         self._rested, self.is_complete = self._drawn == self._drawn_before, True
         self._drawn, self._drawn_before = {}, self._drawn
 
-    def get(self, light: tuple[int, str], key: tuple[int, bytes], compute: Callable[[], Floats]) -> Floats:
+    def get(self, light: tuple[int, str], key: tuple[int, bytes], compute: Callable[[], Offsets]) -> Offsets:
         """Return the offsets of a light: newly computed for `key` (features of the current view) if it is the light's
         turn or its first drawing, else its last ones.
 
@@ -124,7 +145,7 @@ class OffsetsBudget:
         count = max(int(seconds / self._seconds_per_light), 1) if self._seconds_per_light else len(self._offsets)
         self._due = set(itertools.islice(self._offsets, count))
 
-    def _measure(self, compute: Callable[[], Floats]) -> Floats:
+    def _measure(self, compute: Callable[[], Offsets]) -> Offsets:
         """Compute offsets, and update the mean time of it."""
         began = time.perf_counter()
         offsets = compute()
@@ -278,18 +299,15 @@ class Network:
         if has_correction and self.light_correction(features).shape != (2,):
             raise ValueError("the correction of the light is no place")
 
-    def offsets(self, features: Floats, budget: OffsetsBudget | None = None, light: str = "") -> dict[str, Floats]:
-        """Return the offsets by name, (n, width) each; they are shared and must not be changed.
+    def offsets(self, features: Floats, budget: OffsetsBudget | None = None, light: str = "") -> Offsets:
+        """Return the offsets for the features of a view.
 
         budget: may return earlier offsets of the placed light of the name `light`."""
-        def compute() -> Floats:
-            return self._concatenated_offsets(self._gaussian_features, features)
+        def compute() -> Offsets:
+            return Offsets(self._concatenated_offsets(self._gaussian_features, features), self._heads)
 
         key = self._number, features.tobytes()
-        all_offsets = _cache.get(key, compute) if budget is None else budget.get((self._number, light), key, compute)
-        edges = np.cumsum([0, *self._heads.values()])
-        return {name: all_offsets[:, start:end]
-                for name, start, end in zip(self._heads, edges[:-1], edges[1:], strict=True)}
+        return _cache.get(key, compute) if budget is None else budget.get((self._number, light), key, compute)
 
     def _encode_gaussians(self, encoded: Floats) -> Floats:
         """Return the contribution of encoded Gaussians (n, d) to the first layer, (n, width)."""

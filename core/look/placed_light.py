@@ -164,6 +164,8 @@ def multiply_light(gaussians: PlaneGaussians, factor: ArrayLike, blend: Blend) -
     factors = np.asarray(factor, np.float64)
     if (factors == 1).all():
         return gaussians
+    if blend == "add":
+        return replace(gaussians, colours=gaussians.colours * factors.astype(np.float32))
     intensity = float(factors.max())  # not in the tint, so that with the blend "over" a factor below 1 dims opacities
     red, green, blue = (factors / intensity if intensity > 0 else factors).tolist()
     return apply_colour(gaussians, Edit(intensity=intensity, tint=(red, green, blue)), blend)

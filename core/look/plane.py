@@ -51,6 +51,8 @@ class PlaneGaussians:
 
     def with_exposure(self, exposure: float, blend: Blend) -> PlaneGaussians:
         """Return the Gaussians in a frame whose exposure is a multiple of the usual one."""
+        if exposure == 1:
+            return self
         return replace(self, colours=np.float32(colour_scale(exposure, blend)) * self.colours)
 
     def select(self, rows: Any) -> PlaneGaussians:

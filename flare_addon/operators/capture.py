@@ -13,7 +13,7 @@ from ..capture import exporter
 from ..capture.importer import ImportSettings, import_in_steps
 from ..reports import NO_CAMERA, GuardedOperator, report_errors
 
-STEP_S = 0.01
+STEP_S = 0.02
 """Time for which an import holds the window in one go; a step that takes longer is not interrupted."""
 INTERVAL_S = 0.005
 """Pause of the import between two such times."""

@@ -77,3 +77,20 @@ def test_a_flare_dims_with_the_square_of_the_distance(facts: Any) -> None:
     assert facts["in a scaled capture"] == pytest.approx(1, abs=1e-3), "at the reference distance"
     assert facts["distance, in a transfer"] == [pytest.approx(8.016, abs=1e-3)] * 2
     assert facts["a sun has no distance"] == [0, 0]
+
+
+def test_a_camera_view_is_rendered_anew_only_where_something_changed(facts: Any) -> None:
+    """Block of lamps.py: "a camera view that is drawn again". How often two drawings render, and whether they agree."""
+    drawn = facts["drawn again"]
+    assert drawn.pop("unchanged") == [0, True]
+    assert drawn.pop("mute") == [0, True], "without a flare"
+    assert len(drawn) == 13 and set(map(tuple, drawn.values())) == {(1, True)}, drawn
+
+
+def test_boxes_of_objects_save_rays_but_change_no_visibility(facts: Any) -> None:
+    """Block of lamps.py: "many lamps among walls". Visibility by rays, whether a box is near, and visibility with
+    boxes."""
+    by_rays, is_near, with_boxes = map(list, zip(*facts["among walls"], strict=True))
+    assert with_boxes == by_rays
+    assert min(by_rays) == 0 and by_rays.count(max(by_rays)) > 10
+    assert 5 < sum(is_near) < 36

@@ -23,6 +23,8 @@ REC_709 = """
       0.089776443959, 0.813439428749, 0.096784127293, 0, 0.017541170383, 0.111546553302, 0.870912276314, 0,
       0, 0, 0, 1]}
 """
+PICKED = 0.8, 0.5, 0.4
+"""As in studio.py."""
 CONFIGURATION = """ocio_profile_version: 2
 strictparsing: true
 roles: {default: raw, scene_linear: ACEScg, data: raw, color_picking: sRGB, aces_interchange: ACES2065-1}
@@ -76,6 +78,7 @@ def test_layers_and_the_camera_view_keep_their_colours(blender: Blender, package
     assert (facts["import"], facts["misread"]) == ([["FINISHED"], "Un-tone-mapped"], "")
     np.testing.assert_allclose(shown, np.broadcast_to(RED_IN_ACESCG, shown.shape), atol=1e-3)
     np.testing.assert_allclose(facts["red in the camera view"], shown[0, 0], atol=1e-3)
+    check_tints(facts)
 
 
 def test_the_working_space_of_a_blend_is_followed(blender: Blender, package: Path, tmp_path: Path) -> None:
@@ -85,6 +88,17 @@ def test_the_working_space_of_a_blend_is_followed(blender: Blender, package: Pat
         pytest.skip("this Blender has one working space; from 5.0 on a .blend may have another")
     np.testing.assert_allclose(facts["red in the camera view"], RED_IN_ACESCG, atol=1e-3)
     np.testing.assert_allclose(facts["red in the camera view"], shown[0, 0], atol=1e-3)
+    check_tints(facts)
+
+
+def check_tints(facts: dict[str, Any]) -> None:
+    """Check that a white flare gets the tint that is picked in the working space: in the camera view, a bake and a
+    transfer. Block of studio.py: "the tint that an artist picks"."""
+    assert facts["tints"].keys() == {"camera view", "bake", "transfer"}
+    for name, tint in facts["tints"].items():
+        np.testing.assert_allclose(tint, PICKED, atol=1e-5, err_msg=name)
+    np.testing.assert_allclose(facts["tint of a file"], PICKED, atol=1e-5)
+    assert facts["white"]
 
 
 def test_a_colour_space_missing_from_the_configuration_is_reported(blender: Blender, package: Path,

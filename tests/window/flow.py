@@ -132,7 +132,7 @@ def import_capture():
     yield from ui.press_button("fit_flare.import_capture", panel())
     shot("02_file_browser")
     yield from ui.choose_file(CAPTURE + os.sep)
-    import_s = yield from wait(lambda: bpy.context.scene.fit_flare.capture, 30)
+    import_s = yield from wait(lambda: bpy.context.scene.fit_flare.capture, 120)
     done("import", import_s=round(import_s, 3))
     yield 0.5
     shot("03_imported")

@@ -237,4 +237,63 @@ facts["in a scaled capture"] = round(followed / brightness(scene), 4)
 scene, sun, item = lit_scene((0, 0, 9), "SUN")
 facts["a sun has no distance"] = [item.reference_distance, placed_light(scene).reference_distance]
 
+
+# ---- many lamps among walls -----------------------------------------------------------------------------
+occlusion = part("flare_addon.occlusion")
+scene, lamp, item = lit_scene()
+wall = bpy.data.meshes.new("Wall")
+wall.from_pydata([(-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1)], [], [(0, 1, 2, 3)])
+collection = bpy.data.collections.new("Walls")
+collection.objects.link(bpy.data.objects.new("Part", wall))
+walls = object_in(scene, "Instance", None, (-2, 5, 0.3))
+walls.instance_type, walls.instance_collection = "COLLECTION", collection
+turned = object_in(scene, "Turned", wall, (1.2, 3, 0))
+turned.rotation_euler, turned.scale = (0.3, 0.2, 0.8), (0.5, 1, 0.7)
+compared = []
+for x in np.linspace(-5, 5, 41):
+    lamp.location = x, 8, 0.2
+    bpy.context.view_layer.update()
+    depsgraph, eye = bpy.context.evaluated_depsgraph_get(), scene.camera.matrix_world.translation
+    boxes = occlusion.Occluders(depsgraph)
+    compared.append([occlusion.visibility(scene, depsgraph, eye, item), boxes.may_hide(eye, lamp.location, 0.2),
+                     occlusion.visibility(scene, depsgraph, eye, item, boxes)])
+facts["among walls"] = compared
+
+# ---- a camera view that is drawn again ------------------------------------------------------------------
+overlay, cameras = part("flare_addon.overlay"), part("flare_addon.cameras")
+scene, lamp, item = lit_scene()
+wall = object_in(scene, "Wall", bpy.data.meshes.new("Wall"), (50, 0, 0))
+state, rendered, budgets = scene.fit_flare, [], overlay._budgets
+
+
+def render_levels(gaussians, _window, _look):
+    overlay._rendered = None
+    rendered.append(float((gaussians.opacities @ gaussians.colours).sum()))
+    return rendered[-1:]
+
+
+def render_twice():
+    """Draw the camera view twice; return how often it was rendered, and whether both drawings are the same."""
+    bpy.context.view_layer.update()
+    before, camera = len(rendered), scene.camera
+    core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
+    window = overlay.drawn_region(overlay.CameraFrame(0, 0, 96, 54), (96, 54), core)
+    first, second = (overlay._render_region(bpy.context, scene, camera, window, looks.look_of(scene)) for _ in range(2))
+    return [len(rendered) - before, first == second]
+
+
+overlay.render_levels = render_levels
+facts["drawn again"] = {"at first": render_twice(), "unchanged": render_twice()}
+for name, owner, attribute, value in (
+        ("camera", scene.camera, "location", (0.1, 0, 0)), ("lamp", lamp, "location", (0.4, 8, 0.5)),
+        ("power", lamp.data, "energy", 33.0), ("wall", wall, "location", (0, 4, 0)),
+        ("lens", scene.camera.data, "lens", 40),
+        ("master", state.master, "intensity", 2.0), ("tint", item, "tint", (1, 0.5, 0.2)), ("mute", item, "mute", True),
+        ("mute again", item, "mute", False), ("size", scene.render, "resolution_x", 1000),
+        ("occlusion", state, "occlusion", False), ("exposure", scene.camera.fit_flare, "exposure", 2.0)):
+    setattr(owner, attribute, value)
+    facts["drawn again"][name] = render_twice()
+scene.frame_set(5)
+facts["drawn again"]["frame"] = render_twice()
+
 leave(facts)

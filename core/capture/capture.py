@@ -47,7 +47,7 @@ from .frame_sizes import checked_size, size_or_model_size
 from .layout import check_is_folder
 from .lens import PINHOLES, Lens
 from .lights import Light, LightState, check_places, light_paths, read_lights
-from .orientation import TurnedFrame, exif_orientation, find_upright, turned_frame
+from .orientation import TurnedFrame, exif_orientation, upright_frames_of
 from .pictures import PictureCache, read_mask
 from .plate_space import read_plate_space
 from .unsolved import cameras_without_solve
@@ -139,7 +139,8 @@ class Capture:
         yield
         matched = yield from match_frames_in_steps(solve)
         yield
-        upright_frames, orientation_warnings = _upright_frames(solve, matched.files, has_cameras)
+        upright_frames, orientation_warnings = upright_frames_of(solve.frames, matched.files,
+                                                                 solve.points if has_cameras else None)
         yield
         opened = yield from _open_views_in_steps(folder, solve, matched.files, upright_frames, need_frames)
         names = opened.names
@@ -261,8 +262,7 @@ class Capture:
         return self._optional_picture(self._clean_frames, view, size, None if is_developed else self.plate_space)
 
     def has_other_format(self, view: View) -> bool:
-        """Return whether a view's clean frame is an EXR and its filmed frame is not. The clean frame is then linear
-        light."""
+        """Return whether a view's clean frame is an EXR, so linear light, and its filmed frame is not."""
         path = self._clean_frames.get(view.name)
         return path is not None and path.suffix.lower() == ".exr" != self.frame_path(view).suffix.lower()
 
@@ -463,24 +463,11 @@ class _OpenedViews:
     names: dict[str, str] = field(default_factory=dict)
 
 
-def _upright_frames(solve: CameraSolve, files: Mapping[str, Path],
-                    has_cameras: bool) -> tuple[dict[str, TurnedFrame], list[str]]:
-    """Return the frames that were solved from the picture as its Exif orientation turns it, by the name of the pose,
-    and sentences for the user.
-
-    files: pictures by pose name. has_cameras: if False, there was no solve, and all turned frames count.
-    """
-    turned = [frame for pose in solve.frames if (frame := turned_frame(pose, files.get(pose.name))) is not None]
-    upright, warnings = (find_upright(turned, solve.points) if has_cameras
-                         else ({frame.posed.name for frame in turned}, []))
-    return {frame.posed.name: frame for frame in turned if frame.posed.name in upright}, warnings
-
-
 def _open_views_in_steps(folder: Path, solve: CameraSolve, files: Mapping[str, Path],
                          upright_frames: Mapping[str, TurnedFrame], need_frames: bool) -> Steps[_OpenedViews]:
     """Check the pictures of the poses, and make views of them. Raises CaptureError and FrameError.
 
-    files: pictures by pose name. upright_frames: those of `_upright_frames`. need_frames: if False, a view without a
+    files: pictures by pose name. upright_frames: those of `upright_frames_of`. need_frames: if False, a view without a
     picture gets the size of its model.
     """
     opened = _OpenedViews()

@@ -7,7 +7,7 @@ picture that was solved. `Capture.open` calls it; most captures have no such pho
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,6 +63,18 @@ def turned_frame(posed: PosedFrame, path: Path | None) -> TurnedFrame | None:
         return TurnedFrame(posed, path, orientation, picture_size(path))
     except FrameError:  # the check of its size reports it
         return None
+
+
+def upright_frames_of(frames: Iterable[PosedFrame], files: Mapping[str, Path],
+                      points: PointCloud | None) -> tuple[dict[str, TurnedFrame], list[str]]:
+    """Return the frames that were solved from the picture as its Exif orientation turns it, by the name of the pose,
+    and sentences for the user.
+
+    files: pictures by pose name. points: of the solve; None without one, where all turned frames count.
+    """
+    turned = [frame for pose in frames if (frame := turned_frame(pose, files.get(pose.name))) is not None]
+    upright, warnings = ({frame.posed.name for frame in turned}, []) if points is None else find_upright(turned, points)
+    return {frame.posed.name: frame for frame in turned if frame.posed.name in upright}, warnings
 
 
 def find_upright(frames: Sequence[TurnedFrame], points: PointCloud) -> tuple[set[str], list[str]]:

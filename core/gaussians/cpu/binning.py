@@ -240,13 +240,9 @@ def _list_column(column, top_row, bottom_row, tiles_x, i, slot_offset, tile_list
 def _list_tiles(records, i, width, height, tiles_x, slot_offset, tile_list, place, tile_counts):
     """Append the tiles of Gaussian i, of any size, to tile_list from `place` on; return the next free place.
 
-    In each column of tiles these are the tiles between the ellipse's smallest and largest y there; the module head has
-    the equations. The loop goes from column to column and reuses the rows at the edge that two columns share.
-
-    records: a record of RECORD numbers for each Gaussian (`layout`). width, height: size of the picture, px. tiles_x:
-    tiles in a row of it. slot_offset: slot of an entry minus its place. tile_counts: entries by tile, which are
-    increased.
-    """
+    In each column these are the tiles between the ellipse's smallest and largest y there (equations: module head).
+    records: RECORD numbers for each Gaussian (`layout`). width, height: of the picture, px. tiles_x: tiles in a row of
+    it. slot_offset: slot of an entry minus its place. tile_counts: entries by tile, which are increased."""
     record = i * RECORD
     x, half_x = load_scalar(records, record + X), load_scalar(records, record + HALF_X)
     padded_half_x = half_x + ROW_MARGIN

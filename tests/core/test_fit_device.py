@@ -161,4 +161,6 @@ def test_the_simulated_gpu_refuses_what_a_gpu_refuses(gpu: SimulatedGpu) -> None
             there.numpy()
         with pytest.raises(RuntimeError, match="generator"):
             torch.rand(3, generator=torch.Generator(), device="cuda")
+        with pytest.raises(RuntimeError, match="on the CPU"):
+            _ = there * torch.from_numpy(np.ones(3, np.float32))[...]
         assert (there + here[0]).device == GPU and here[there.cpu() > 0].device.type == "cpu"

@@ -83,8 +83,7 @@ class Capture:
                  *, frames: dict[str, Path] | None = None, cache_bytes: int = 1 << 30) -> None:
         """Make a capture of views, and find their pictures in removed/, truth/ and masks/ of `folder`.
 
-        frames: the file of each view by name. cache_bytes: limit of the decoded pictures that are cached.
-        """
+        frames: the file of each view by name. cache_bytes: limit of the decoded pictures that are cached."""
         self.folder = folder
         self.views = tuple(views)
         self.points = points

@@ -21,8 +21,9 @@ def light_disc_mask(display: NDArray[np.float32], camera: Camera, lights: ArrayL
     A pixel belongs to a disc if it is clipped and close to the projection of one of the lights (n, 3), world
     coordinates.
     """
-    near = squared_light_distances(camera, lights) < DISC_RADIUS**2
-    return np.asarray(near & (display >= CLIP_LEVEL).all(-1))
+    mask = squared_light_distances(camera, lights) < DISC_RADIUS**2
+    mask[mask] = (display[mask] >= CLIP_LEVEL).all(-1)
+    return mask
 
 
 def squared_light_distances(camera: Camera, lights: ArrayLike) -> NDArray[np.float32]:

@@ -10,6 +10,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+MIN_SIDE = 12
+"""Shortest side of a reduced picture, pixels: one window of SSIM."""
+
 
 @dataclass(frozen=True)
 class CoarseToFineSettings:
@@ -25,29 +28,35 @@ class CoarseToFineSettings:
     flare_width: int = 0
     flare_until: float = 0.4
 
-    def scene_reduction(self, width: int, progress: float) -> int:
-        """Return the factor by which pictures of the scene are reduced; width: that of the whole picture, pixels;
-        progress: share of the iterations, 0..1.
+    def scene_reduction(self, size: tuple[int, int], progress: float) -> int:
+        """Return the factor by which pictures of the scene are reduced; size: (width, height) of the whole picture,
+        pixels; progress: share of the iterations, 0..1.
 
         The larger the whole picture is, the later it is used: each doubling halves its share of the iterations.
         """
-        levels = _halvings(width, self.scene_width)
+        levels = _halvings(size, self.scene_width)
         for level in range(levels, 0, -1):
             if progress <= 1 - (1 - self.scene_until) * 0.5 ** (levels - level):
                 return 1 << level
         return 1
 
-    def flare_reduction(self, width: int, progress: float) -> int:
-        """Return the factor by which pictures of the composite are reduced while the flare is fitted by itself.
+    def flare_reduction(self, size: tuple[int, int], progress: float) -> int:
+        """Return the factor by which pictures of the composite are reduced while the flare is fitted by itself, if
+        `flare_width` is not 0.
 
-        width, progress: as for `scene_reduction`.
+        size, progress: as for `scene_reduction`.
         """
-        if not self.flare_width:
-            return self.scene_reduction(width, progress)
-        levels = _halvings(width, self.flare_width)
+        levels = _halvings(size, self.flare_width)
         return 1 << (levels if progress <= self.flare_until else max(levels - 1, 0))
 
 
-def _halvings(width: int, smallest_width: int) -> int:
-    """Return how many times `width` is halved to come near `smallest_width`; 0 if that is 0 or wider."""
-    return max(round(math.log2(width / smallest_width)), 0) if smallest_width else 0
+def _halvings(size: tuple[int, int], smallest_width: int) -> int:
+    """Return how many times pictures of a size (width, height) are halved to come near `smallest_width`; 0 if that is 0
+    or wider.
+
+    Neither side gets shorter than MIN_SIDE.
+    """
+    if not smallest_width:
+        return 0
+    limit = max(math.floor(math.log2(min(size) / MIN_SIDE)), 0) if min(size) else 0
+    return min(max(round(math.log2(size[0] / smallest_width)), 0), limit)

@@ -5,6 +5,7 @@
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any, NamedTuple, TypeVar
@@ -23,7 +24,8 @@ from .cache import MEMORY, PictureCache
 SAMPLED_FRAMES = 12
 """Approximate number of frames in which black borders are measured."""
 DEVICE_MEMORY = 4 << 30
-"""Bytes of a GPU's memory for frames: 1380 frames of 480x270 with their clean frames, 86 of 1920x1080."""
+"""Bytes of a GPU's memory for frames: 1380 frames of 480x270 with their clean frames, 86 of 1920x1080. On small GPUs it
+is a quarter of what is free."""
 BORDER_MARGIN = 1
 """Lines beside a border that resizing mixes with it."""
 
@@ -63,7 +65,6 @@ class Targets(NamedTuple):
     camera: Camera
     frame: Tensor
     clean: Tensor | None
-
 
     def to(self, device: torch.device) -> Targets:
         """Return the targets with their pictures on a device."""
@@ -120,11 +121,14 @@ class Frames:
         frames = copy(self)
         frames._reduction = factor
         if self.picture_area is not None:
+            view = self.capture.views[0]  # all views have one size where there are borders
+            (width, height), (small_width, small_height) = self.camera(view).size, frames.camera(view).size
             top, bottom, left, right = self.picture_area
-            starts = (-(-line // factor) + BORDER_MARGIN for line in (top, left))
-            ends = (line // factor - BORDER_MARGIN for line in (bottom, right))
-            (top, left), (bottom, right) = starts, ends
-            frames.picture_area = PictureArea(top, bottom, left, right)
+            frames.picture_area = PictureArea(
+                math.ceil(top * small_height / height) + BORDER_MARGIN,
+                math.floor(bottom * small_height / height) - BORDER_MARGIN,
+                math.ceil(left * small_width / width) + BORDER_MARGIN,
+                math.floor(right * small_width / width) - BORDER_MARGIN)
         return frames
 
     def _find_picture_area(self) -> PictureArea | None:
@@ -228,8 +232,14 @@ class DeviceFrames:
     """The frames of a fit on its device. On a GPU they stay there, up to `memory` bytes; others are copied each time.
     """
 
-    def __init__(self, frames: Frames, device: torch.device, memory: int = DEVICE_MEMORY) -> None:
+    def __init__(self, frames: Frames, device: torch.device, memory: int | None = None) -> None:
+        """Take the frames, none of which is read yet. memory: bytes for them on a GPU, None for DEVICE_MEMORY or a
+        quarter of what is free there."""
         self.device = device
+        if memory is None:
+            memory = DEVICE_MEMORY
+            if device.type == "cuda" and torch.cuda.is_available():
+                memory = min(memory, torch.cuda.mem_get_info(device)[0] // 4)
         self._frames, self._free_bytes = frames, memory
         self._reduced = {1: frames}
         self._stored: dict[tuple[str, int], tuple[Targets, Tensor | None]] = {}

@@ -58,7 +58,10 @@ class Run:
     """The folder of a finished or unfinished fit; made by `Run.create` or `Run.open`."""
 
     def __init__(self, folder: Path, settings: FitSettings, capture_folder: Path, device: Device = "cpu") -> None:
-        """device: where scene and flare are rendered; a fit computes where its settings say."""
+        """Name the folder of a run, its settings and its capture.
+
+        device: where scene and flare are rendered; a fit computes where its settings say.
+        """
         self.folder = folder
         self.settings = settings
         self.device = select_device(device)

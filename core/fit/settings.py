@@ -203,7 +203,7 @@ class FitSettings:
     is held out; 0: none), a split file's name, or None (the capture's split.json, else every 8th). exposure: "measured"
     finds frames whose exposure differs from most, "fixed" takes all for equal. device: of scene, flare and frames in
     the iterations, see `core.gaussians.device`. coarse_to_fine: sizes of the pictures in modes with exact clean frames;
-    the others use full size throughout.
+    the others, and a scene that starts from a PLY, use full size throughout.
 
     white: scene-linear light at which frames are clipped; None where the frames have not been checked for more than 1,
     which only float frames can hold, and in runs of versions that clipped all at 1.
@@ -362,9 +362,9 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
     """Return the settings of a preset, with every schedule scaled to the number of iterations.
 
     `paper` has the paper's form and figures, 30,000 iterations. `draft`, `standard` and `high` have our form, shorter
-    schedules and higher rates. All are longer in the modes `estimated` and `split`, unless `iterations` is
-    given. model, blend: another form and blend than the preset's: "paper" blends "over" in display space, "ours" adds
-    in linear light and is hidden by the scene. Raises SettingsError for an unknown name or a number out of bounds.
+    schedules and higher rates. All are longer in the modes `estimated` and `split`, unless `iterations` is given.
+    model, blend: another form and blend than the preset's: "paper" blends "over" in display space, "ours" adds in
+    linear light and is hidden by the scene. Raises SettingsError for an unknown name or a number out of bounds.
     """
     if name not in ITERATIONS:
         raise SettingsError(f"There is no preset {name!r}; choose {', '.join(ITERATIONS)}.")

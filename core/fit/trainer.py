@@ -175,7 +175,7 @@ class Trainer(FlareTrainer):
         if flare is not None and self.flare is not None:
             pose = torch.from_numpy(targets.camera.world_to_camera)
             loss = loss + self._flare_penalty(pose, targets.camera.frame)
-        occlusion_loss = self._occlusion_loss(targets)
+        occlusion_loss = self._occlusion_loss(view)
         if occlusion_loss is not None:
             loss = loss + occlusion_loss
         self._optimise(loss, rendering)
@@ -188,13 +188,16 @@ class Trainer(FlareTrainer):
 
         They differ in size only while the flare is composited over the clean frame of the view.
         """
-        settings, width = self.settings.coarse_to_fine, self.frames.camera(view).width
+        settings, size = self.settings.coarse_to_fine, self.frames.camera(view).size
         progress = self.iteration / self.settings.iterations
-        is_coarse = self.settings.supervised and self.fits_scene
-        of_scene = self._device_frames.read(view, settings.scene_reduction(width, progress) if is_coarse else 1)
+        # A scene that starts from a PLY has fine detail, which small pictures would destroy.
+        is_coarse = self.settings.supervised and self.fits_scene and not self.settings.scene.start
+        scene_reduction = settings.scene_reduction(size, progress) if is_coarse else 1
+        of_scene = self._device_frames.read(view, scene_reduction)
         if not self._is_separate or of_scene[0].clean is None:
             return of_scene, of_scene
-        return of_scene, self._device_frames.read(view, settings.flare_reduction(width, progress))
+        flare_reduction = settings.flare_reduction(size, progress) if settings.flare_width else scene_reduction
+        return of_scene, self._device_frames.read(view, flare_reduction)
 
     @property
     def _is_separate(self) -> bool:
@@ -271,13 +274,17 @@ class Trainer(FlareTrainer):
 
         self._excess_ratio = excess_ratio(residual(view) for view in subsample(self.views, SAMPLED_VIEWS))
 
-    def _occlusion_loss(self, targets: Targets) -> Tensor | None:
-        """Return the loss that makes the scene transparent in front of lights that this frame shows although the scene
-        hides them from every view; None if there is no such light."""
+    def _occlusion_loss(self, view: View) -> Tensor | None:
+        """Return the loss that makes the scene transparent in front of lights that the frame of a view shows although
+        the scene hides them from every view; None if there is no such light.
+
+        It looks for them at full size, where the disc of a small lamp is clipped.
+        """
         visibility = self.settings.flare.active_visibility
         if self.flare is None or visibility is None or not self.fits_scene or bool((self.flare.clear > 0).all()):
             return None
-        frame = targets.frame.cpu().numpy()
+        targets = self.frames.targets(view)
+        frame = targets.frame.numpy()
         visible_lights = [light for light in self.flare.positions_in(targets.camera.frame)[self.flare.clear <= 0]
                           if light_disc_mask(frame, targets.camera, light[None].numpy()).any()]
         eye = torch.from_numpy(targets.camera.position)
@@ -311,8 +318,10 @@ class Trainer(FlareTrainer):
             return self._light_disc_mask(targets)
         key = view.name, targets.camera.width
         if key not in self._light_discs:
-            self._light_discs[key] = self._light_disc_mask(targets)
-        return self._light_discs[key]
+            discs = self._light_disc_mask(targets)
+            self._light_discs[key] = None if discs is None else discs.cpu()
+        discs = self._light_discs[key]
+        return None if discs is None else discs.to(self.device)
 
     def _light_disc_mask(self, targets: Targets) -> Tensor | None:
         """Return (height, width), True in the clipped disc of each light; None if the blend or the mode uses no discs.

@@ -9,13 +9,14 @@ import torch
 
 from core.capture import Capture
 from core.fit import trainer as trainer_module
-from core.fit.coarse_to_fine import CoarseToFineSettings
+from core.fit.coarse_to_fine import MIN_SIDE, CoarseToFineSettings
 from core.fit.frames import Frames
 from core.fit.overrides import override_settings
 from core.fit.run import Run
 from core.fit.run_loop import fit
 from core.fit.settings import FitSettings, preset
 from core.fit.trainer import Trainer
+from core.gaussians.ply import write_ply
 from core.images.borders import PictureArea
 from tests.core.flared import flared_capture
 
@@ -43,18 +44,18 @@ def short_fit(capture: Capture, iterations: int = 20, **changes: object) -> FitS
     (240, {0.0: 1}), (300, {0.0: 1}), (60, {0.0: 1}),
 ])
 def test_the_larger_a_picture_the_later_the_scene_has_its_full_size(width: int, sizes: dict[float, int]) -> None:
-    assert {progress: SETTINGS.scene_reduction(width, progress) for progress in sizes} == sizes
+    assert {progress: SETTINGS.scene_reduction((width, width), progress) for progress in sizes} == sizes
 
 
 @pytest.mark.parametrize(("width", "first", "second"), [(480, 4, 2), (1920, 16, 8), (240, 2, 1), (120, 1, 1)])
 def test_a_flare_by_itself_begins_small_and_doubles(width: int, first: int, second: int) -> None:
-    assert [SETTINGS.flare_reduction(width, progress) for progress in (0.1, 0.4, 0.41, 0.8)] == [
+    assert [SETTINGS.flare_reduction((width, width), progress) for progress in (0.1, 0.4, 0.41, 0.8)] == [
         first, first, second, second]
 
 
 def test_without_widths_pictures_keep_their_size() -> None:
     plain = CoarseToFineSettings()
-    assert plain.scene_reduction(4096, 0.0) == plain.flare_reduction(4096, 0.0) == 1
+    assert plain.scene_reduction((4096, 4096), 0.0) == plain.flare_reduction((4096, 4096), 0.0) == 1
 
 
 def test_reduced_frames_show_the_same_camera_and_light_at_a_smaller_size(capture: Capture) -> None:
@@ -108,6 +109,21 @@ def test_a_fit_without_clean_frames_keeps_the_full_size(capture: Capture) -> Non
     trainer.step()
     (targets, _), (flare_targets, _) = trainer._load_targets_of_step(trainer.views[0])
     assert targets.camera.width == flare_targets.camera.width == capture.views[0].camera.width
+
+
+def test_a_scene_that_starts_from_a_file_keeps_the_full_size(tmp_path: Path, capture: Capture) -> None:
+    write_ply(tmp_path / "scene.ply", Trainer(capture, short_fit(capture)).scene)
+    trainer = Trainer(capture, short_fit(capture, **{"scene.start": str(tmp_path / "scene.ply"),
+                                                     "coarse_to_fine.flare_width": 0}))
+    trainer.iteration = 1
+    (targets, _), (flare_targets, _) = trainer._load_targets_of_step(trainer.views[0])
+    assert targets.camera.width == flare_targets.camera.width == capture.views[0].camera.width
+
+
+@pytest.mark.parametrize("size", [(4096, 256), (256, 4096), (1920, 40), (40, 1920), (1, 1)])
+def test_no_side_of_a_reduced_picture_is_shorter_than_its_limit(size: tuple[int, int]) -> None:
+    reduction = CoarseToFineSettings(scene_width=1, flare_width=1).flare_reduction(size, 0.0)
+    assert reduction == 1 or min(size) // reduction >= MIN_SIDE
 
 
 def test_a_resumed_coarse_fit_equals_the_uninterrupted_one(capture: Capture) -> None:

@@ -17,7 +17,7 @@ from core.bake.shot import ShotRenderer
 from core.capture import Capture
 from core.errors import Cancelled, EngineError, SettingsError
 from core.fit import FitSettings, Run, fit, preset
-from core.fit.settings import override_settings
+from core.fit.overrides import override_settings
 from core.gaussians import tiled
 from core.gaussians.device import select_device
 from core.look import PlacedLight, read_look

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-MIN_SIDE = 12
-"""Shortest side of a reduced picture, pixels: one window of SSIM."""
+MIN_SIDE = 8
+"""Shortest side of a reduced picture, pixels."""
 
 
 @dataclass(frozen=True)

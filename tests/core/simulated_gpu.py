@@ -142,7 +142,7 @@ def simulate(monkeypatch: pytest.MonkeyPatch, kernel_set: Any) -> SimulatedGpu:
     load = kernels._load_kernel_set
     monkeypatch.setattr(kernels, "_load_kernel_set", lambda name: stand_in if name == "cuda" else load(name))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device=None: (4 << 30, 4 << 30))  # bytes free, and all
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _device: (4 << 30, 4 << 30))  # bytes free, and all
     from_numpy = torch.from_numpy  # a function that modes do not see
     monkeypatch.setattr(torch, "from_numpy", lambda array: tag(from_numpy(array), "cpu"))
     return SimulatedGpu()

@@ -346,6 +346,8 @@ COARSE_TO_FINE = CoarseToFineSettings(scene_width=240, flare_width=120)
 """`coarse_to_fine` of `standard`."""
 STANDARD_SCENE_RATES = {"features": 5e-3, "features_rest": 5e-3 / 20, "scale": 0.02}
 """Learning rates of the scene in `standard`: above the paper's, for a fit a fifteenth as long."""
+TRAINED_SCENE_RATES = {f"scene.rates.{name}": getattr(SceneRates(), name) for name in STANDARD_SCENE_RATES}
+"""The rates, by dotted name, of a scene that was trained before and has to keep its detail."""
 SCENE_ONLY_UNTIL = 0.08
 """`flare.scene_only_until` of our form."""
 CORRECTION_WEIGHT = 0.1

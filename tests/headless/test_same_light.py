@@ -23,6 +23,8 @@ from core.capture.colmap import ObservedFrame, PointCloud, write_model
 from core.capture.lens import Lens
 from core.colour import ColourSpace, colour_space
 from core.colour.srgb import linear_from_srgb
+from core.fit import Run
+from core.fit.settings import SceneRates
 from core.gaussians import rasterization, spherical_harmonics
 from core.gaussians.ply import write_ply
 from core.gaussians.scene import COEFFICIENTS, SceneGaussians
@@ -170,6 +172,7 @@ def test_every_command_sees_the_same_light(name: str, scene: Scene, weights: Pat
     run("lights", shot.folder, *shot.words)
     run("fit", shot.folder, "--out", tmp_path / "run", "--mode", "3dgs", "--iterations", ITERATIONS, "--scene",
         scene.start, "--set", "scene.rates.features=0.01", "--set", "scene.classic.stop=1", "--holdout", "0")
+    assert Run.open(tmp_path / "run").settings.scene.rates.scale == SceneRates().scale  # it was trained before
     for number, path in enumerate(shot.frames):
         compare("lights", searched[number], scene, number)
         compare("fit", fitted[path.name], scene, number)

@@ -42,4 +42,6 @@ def renumber(block: Any, path: str, new_index: Callable[[int], int | None]) -> N
 def remove_item(collection: Any, path: str, index: int) -> None:
     """Remove an item of the collection property at `path` of its data block, with the animation of that item."""
     collection.remove(index)
+    # Blender counts no change for an item that Python removes, and the overlay would keep drawing the removed item.
+    collection.id_data.update_tag()
     renumber(collection.id_data, path, lambda old: None if old == index else old - (old > index))

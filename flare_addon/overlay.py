@@ -54,10 +54,10 @@ _scene_buffer: Any = None  # the framebuffer with the scene-linear picture of th
 _shaders: dict[str, Any] = {}
 _offscreens: dict[tuple[int, int, int, str], Any] = {}
 _budgets: dict[tuple[str, stereo.Eye], OffsetsBudget] = {}
-"""By the camera's name and the eye."""
+"""By the camera's full name and the eye."""
 _memory = QuadMemory()
 _rendered: tuple[Any, list[Any]] | None = None
-"""What the offscreen buffers hold: the key of `_drawing_key`, and the buffers of `render_levels`. None if unknown."""
+"""What the offscreen buffers hold: the key of `_render_region`, and the buffers of `render_levels`. None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -285,14 +285,14 @@ def _render_region(context: Any, scene: Any, camera: Any, window: DrawnRegion, l
     """
     global _rendered
     chosen = highlight.current_highlight(scene)
-    key = (camera.name, eye, chosen, look, *_drawing_key(context, scene, window))
+    key = (camera.name_full, eye, chosen, look, *_drawing_key(context, scene, window))
     if _rendered is not None and _rendered[0] == key:
         return _rendered[1]
     edits = looks.edits_of(scene.fit_flare)
     if chosen is not None:
         names = {item.name: [element.name for element in item.elements] for item in scene.fit_flare.lights}
         edits = highlight.emphasise(edits, chosen, names)
-    budget = _budgets.setdefault((camera.name, eye), OffsetsBudget(NETWORK_S, NETWORK_AT_REST_S))
+    budget = _budgets.setdefault((camera.name_full, eye), OffsetsBudget(NETWORK_S, NETWORK_AT_REST_S))
     budget.begin()
     flares = looks.evaluate_flares(scene, context.view_layer.depsgraph, camera, edits, budget, eye=eye)
     if not budget.is_complete and not bpy.app.timers.is_registered(redraw_viewports):
@@ -309,9 +309,10 @@ def _render_region(context: Any, scene: Any, camera: Any, window: DrawnRegion, l
 def _drawing_key(context: Any, scene: Any, window: DrawnRegion) -> tuple[Any, ...]:
     """Return what the flares of a scene in a region depend on besides camera and look, for a comparison.
 
-    `change_count` stands for Blender's data."""
-    return (change_count(), scene.name, context.view_layer.name, window.x, window.y, window.width, window.height,
-            window.intrinsics.tobytes())
+    `change_count` stands for Blender's data. Names are full, with the library of linked data. The working space is that
+    of the tints."""
+    return (change_count(), scene.name_full, context.view_layer.name, window.x, window.y, window.width, window.height,
+            window.intrinsics.tobytes(), working_space().tobytes())
 
 
 def drawn_part(context: Any, scene: Any, camera: Any, eye: stereo.Eye = "") -> DrawnRegion | None:

@@ -28,7 +28,9 @@ class _Cloud:
     """
 
     def __init__(self) -> None:
-        self._vertices: tuple[Floats, Floats] | None = None  # positions (n, 3) and linear colours (n, 4)
+        # Positions (n, 3) and linear colours (n, 4); None before they are read and once all are on the GPU.
+        self._vertices: tuple[Floats, Floats] | None = None
+        self._count: int | None = None  # vertices to draw; None before they are read
         self._batches: list[Any] = []
         self._sent = 0  # vertices in the batches
         self._is_new = True
@@ -36,7 +38,7 @@ class _Cloud:
     @property
     def is_complete(self) -> bool:
         """Whether all vertices are on the GPU."""
-        return self._vertices is not None and self._sent == len(self._vertices[0])
+        return self._sent == self._count
 
     def prepare(self, mesh: Any) -> None:
         """Do the next part of the work on the cloud of a mesh."""
@@ -44,13 +46,16 @@ class _Cloud:
 
         if self._is_new:
             self._is_new = False
-        elif self._vertices is None:
+        elif self._count is None:
             self._vertices = _read_vertices(mesh)
-        elif not self.is_complete:
+            self._count = len(self._vertices[0])
+        elif self._vertices is not None:
             rows = slice(self._sent, self._sent + VERTICES_PER_DRAWING)
             positions, colours = (np.ascontiguousarray(values[rows]) for values in self._vertices)
             self._batches.append(batch_for_shader(_shader(), "POINTS", {"pos": positions, "color": colours}))
             self._sent += len(positions)
+            if self.is_complete:
+                self._vertices = None
 
     def draw(self) -> None:
         """Draw the batches."""

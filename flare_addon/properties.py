@@ -161,7 +161,7 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
     """
 
     source: StringProperty(  # type: ignore[valid-type]
-        name="Look", description="The light of the .flare that this flare looks like")
+        name="Look", description="The light of the .flare that this flare looks like", update=redraw_viewports)
     target: PointerProperty(  # type: ignore[valid-type]
         name="Light", description="The light object of this flare; the flare follows it",
         type=bpy.types.Object, update=_update_target)

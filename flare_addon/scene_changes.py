@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Counts the changes of Blender's data, so that the overlay can draw again what it drew if nothing has changed since.
 
-Blender updates its dependency graph after each change of an object, a slider or a setting, and calls the handlers here
-before it draws. `overlay` compares the counts.
+Blender updates its dependency graph after each change that is tagged: of an object, a setting, or a property with
+`update`; items that Python removes need `update_tag`. It calls the handlers here before it draws. `overlay` compares
+the counts.
 """
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ _HANDLERS = ("depsgraph_update_post", "frame_change_post", "undo_post", "redo_po
 
 
 def change_count() -> int:
-    """Return a number that grows with every change of Blender's data."""
+    """Return a number that grows with every tagged change of Blender's data."""
     return _count
 
 

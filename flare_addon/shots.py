@@ -58,7 +58,8 @@ class ShotReading:
         self.scene_name, self._cameras = scene.name, [camera.name for camera in camera_objects]
         self._frames, self._frame_before = list(frames), (scene.frame_current, scene.frame_subframe)
         self._shot_frames: list[ShotFrame] = []
-        self._labels: list[str] = []  # names of the views at the first frame
+        self._labels: list[str] = []  # names of the sequences of layers at the first frame
+        self._views: list[tuple[str, stereo.Eye]] = []  # names and eyes of the views at the first frame
         self.total, self.done = len(self._frames), 0
 
     @property
@@ -72,8 +73,8 @@ class ShotReading:
     def step(self) -> None:
         """Read the next frame.
 
-        Raises CaptureError for a camera that is not a perspective camera or was deleted and for a disabled light that
-        is animated, FlareFileError for a bad .flare.
+        Raises CaptureError for a camera that is not a perspective camera or was deleted, for a disabled light that is
+        animated, and where the stereo settings differ from those at the first frame; FlareFileError for a bad .flare.
         """
         scene, frame = self.scene, self._frames[self.done]
         missing = next((name for name in self._cameras if name not in scene.objects), None)
@@ -85,7 +86,10 @@ class ShotReading:
         camera_objects = [scene.objects[name] for name in self._cameras] or [scene.camera]
         # Two cameras of one Multi-View pair have the same views.
         views = {view.label: view for camera in camera_objects for view in stereo.camera_views(scene, camera)}
-        self._labels = self._labels or list(views)
+        names_and_eyes = [(view.name, view.eye) for view in views.values()]
+        self._labels, self._views = self._labels or list(views), self._views or names_and_eyes
+        if names_and_eyes != self._views:
+            raise CaptureError("The stereo settings changed while the scene was read; bake again.")
         self._shot_frames += [replace(shot_frame(scene, depsgraph, view.camera, frame, view.eye), name=label)
                               for label, view in zip(self._labels, views.values(), strict=True)]
         self.done += 1
@@ -231,13 +235,14 @@ def view_folders(scene: Any, layers: Path) -> dict[str, Path]:
     views = stereo.camera_views(scene, scene.camera) if suffixes and scene.camera is not None else []
     if views and all(view.label in folders for view in views):
         return {view.name: layers / folders[view.label] for view in views}
-    return {"": camera_folder(layers, scene.camera)}
+    return {"": camera_folder(layers, scene.camera, scene.render)}
 
 
-def camera_folder(layers: Path, camera: Any) -> Path:
+def camera_folder(layers: Path, camera: Any, render: Any) -> Path:
     """Return the folder of a camera's layers, inside the folder of a bake or that folder itself.
 
-    camera: a camera object, or None. Raises FrameError where there are layers of other cameras only.
+    camera: a camera object, or None. render: the scene's render settings. Raises FrameError where there are layers of
+    other cameras only.
     """
     try:
         last_folders = Shot.read(layers / SHOT_FILE).folders
@@ -247,8 +252,12 @@ def camera_folder(layers: Path, camera: Any) -> Path:
     name = camera.name if camera is not None else ""
     # Where the last bake wrote into the folder itself (""), or EXRs are there, they serve any camera.
     if name not in folders and "" not in last_folders.values() and not any(layers.glob("*.exr")):
+        stereo_names = {f"{name}{suffix}" for view in render.views for suffix in (view.file_suffix, f"_{view.name}")}
+        hint = "" if render.use_multiview or stereo_names.isdisjoint(folders) else (
+            " Layers of a stereo render need Stereoscopy switched on.")
         raise FrameError(f"{layers} has no layers of the camera {name!r}, only of {', '.join(map(repr, folders))}; "
-                         "bake it too, or make one of those the scene's camera. A renamed camera needs its old name.")
+                         "bake it too, or make one of those the scene's camera. A renamed camera needs its old name."
+                         f"{hint}")
     return layers / folders.get(name, "")
 
 

@@ -6,6 +6,7 @@ capture's coordinates, and the root places the capture in the scene.
 """
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -86,12 +87,25 @@ class _SceneState:
         self._images, self._actions = set(bpy.data.images), set(bpy.data.actions)
 
     def restore(self, *collections: Any) -> None:
-        """Restore size and frames of the scene, and remove collections with their objects and what only these used."""
+        """Restore size and frames of the scene, and remove collections with their objects and what only these used.
+
+        A scene that was deleted meanwhile is left out; after an undo, which replaces all data, nothing is removed.
+        """
+        with contextlib.suppress(ReferenceError):
+            self._restore_scene()
+        with contextlib.suppress(ReferenceError):
+            self._remove(collections)
+
+    def _restore_scene(self) -> None:
+        """Restore size and frames of the scene. Raises ReferenceError for one that is gone."""
         scene = self._scene
         scene.frame_start, scene.frame_end = self._range
         for name, value in self._render.items():
             setattr(scene.render, name, value)
         scene.frame_set(self._current_frame, subframe=self._subframe)
+
+    def _remove(self, collections: Sequence[Any]) -> None:
+        """Remove collections with their objects and what only these used. Raises ReferenceError where they are gone."""
         objects = [item for collection in collections for item in collection.objects]
         data = {item.data for item in objects if item.data is not None}
         bpy.data.batch_remove([*objects, *collections])
@@ -144,7 +158,7 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
 
     After each step in which the scene gets objects, Blender builds its dependency graph and draws anew, which takes
     longer the more objects there are. All objects are therefore made in the collection `unlinked`, which no scene has,
-    and moved over OBJECTS_PER_LINK at a time; the last ones in one step with the scene's new camera.
+    and moved over OBJECTS_PER_LINK at a time; the last ones in most cases in the turn that sets the scene's camera.
     """
     notes: list[str] = []
     extent = capture.extent

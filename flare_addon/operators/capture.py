@@ -2,8 +2,10 @@
 """Operators that import a capture, and that make one from a solved or animated camera of Blender."""
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -12,6 +14,7 @@ from .. import fits
 from ..capture import exporter
 from ..capture.importer import ImportSettings, import_in_steps
 from ..reports import NO_CAMERA, GuardedOperator, report_errors
+from ..views import look_through_camera
 
 STEP_S = 0.02
 """Time for which an import holds the window in one go; a step that takes longer is not interrupted."""
@@ -56,6 +59,8 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
     """Whether all is imported, after which ESC cancels nothing."""
     _rests = False
     """Whether the present turn is the window's own."""
+    _timer: Any = None
+    """The timer of an import in steps; None before it and after its end."""
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         self._in_steps = True
@@ -93,8 +98,10 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         """Go on with the import; other events wait, so that nothing else changes the scene meanwhile.
 
         Every other turn is left to the window, so that what Blender computes and draws after a step does not add to the
-        next step.
+        next step. Raises ReferenceError or RuntimeError where another window deleted the scene or undid the import.
         """
+        if self._timer is None:  # Blender calls an operator again whose turn raised an exception
+            return {"CANCELLED", "PASS_THROUGH"}
         if event.type == "ESC" and not self._is_complete:
             self.cancel(context)
             self.report({"INFO"}, "The import was cancelled")
@@ -112,14 +119,23 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
                 return {"RUNNING_MODAL"}
             except StopIteration:
                 pass
+            except (ReferenceError, RuntimeError):
+                self.cancel(context)
+                raise
         self.cancel(context)
         return outcome.status
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """End the import and the timer; an import that is not finished leaves nothing."""
-        self._steps.close()
+        """End the import and the timer; an import that is not finished leaves nothing.
+
+        An import that has ended is left as it is.
+        """
+        if self._timer is None:
+            return
         context.window_manager.event_timer_remove(self._timer)
+        self._timer = None
         context.workspace.status_text_set(None)
+        self._steps.close()
 
     def _import_and_show(self, context: bpy.types.Context, path: Path, settings: ImportSettings) -> Steps[None]:
         """Import the capture at `path`, report it, and turn the view to its camera, in steps. Raises FitFlareError.
@@ -138,24 +154,18 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         if self._in_steps:
             _load_footage(context.scene)
             yield PAUSE
-        _look_through_camera(context)
+        look_through_camera(context)
         yield PAUSE
 
 
 def _load_footage(scene: bpy.types.Scene) -> None:
     """Load the picture behind the scene's camera at the current frame to the GPU; one that is missing is left out."""
+    if scene.camera is None or scene.camera.type != "CAMERA":  # changed since the import's step before
+        return
     for background in scene.camera.data.background_images:
         if background.image is not None:
-            background.image.gl_load(frame=scene.frame_current)
-
-
-def _look_through_camera(context: bpy.types.Context) -> None:
-    """Switch the largest 3D view to the camera, so that the footage is visible."""
-    screen = context.screen
-    views = [area for area in screen.areas if area.type == "VIEW_3D"] if screen is not None else []
-    if views:
-        space = max(views, key=lambda area: area.width * area.height).spaces.active
-        space.region_3d.view_perspective = "CAMERA"
+            with contextlib.suppress(RuntimeError):
+                background.image.gl_load(frame=scene.frame_current)
 
 
 class FITFLARE_OT_capture_from_camera(GuardedOperator, bpy.types.Operator):

@@ -104,12 +104,14 @@ def choose_element(scene: Any, depsgraph: Any, camera: Any, intrinsics: Any, poi
     which highlights it; return whether there is one. Raises FitFlareError."""
     state, look, edits = scene.fit_flare, looks.look_of(scene), looks.edits_of(scene.fit_flare)
     flares = looks.evaluate_flares(scene, depsgraph, camera, eye=eye)
-    source_names = {item.name: item.source for item in state.lights}
+    placed = {item.name: (index, item.source) for index, item in enumerate(state.lights)
+              if looks.is_placed(item, scene) and item.source in look.names}
+    source_names = {name: source for name, (_, source) in placed.items()}
     names = brightest_element(look, source_names, flares, edits, intrinsics, point)
     if names is None:
         return False
     flare_name, element_name = names
-    index = next(index for index, item in enumerate(state.lights) if item.name == flare_name)
+    index, _ = placed[flare_name]
     item = state.lights[index]
     state.light, item.show_elements = index, True
     item.element = next(row for row, element in enumerate(item.elements) if element.name == element_name)

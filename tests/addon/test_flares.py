@@ -140,6 +140,7 @@ def test_a_click_chooses_the_brightest_element(facts: Any) -> None:
     """Block of flares.py: "an element is picked"."""
     assert len(facts["picked"]) > 1 and all(facts["picked"])
     assert facts["picked in the dark"] == [False, True]
+    assert facts["picked beside an unplaced namesake"] == [True, True]
 
 
 def test_elements_are_picked_in_a_camera_view_alone_until_escape(facts: Any) -> None:

@@ -84,7 +84,9 @@ def test_a_camera_view_is_rendered_anew_only_where_something_changed(facts: Any)
     drawn = facts["drawn again"]
     assert drawn.pop("unchanged") == [0, True]
     assert drawn.pop("mute") == [0, True], "without a flare"
-    assert len(drawn) == 13 and set(map(tuple, drawn.values())) == {(1, True)}, drawn
+    assert len(drawn) == 17 and set(map(tuple, drawn.values())) == {(1, True)}, drawn
+    one, *sums = facts["sums of a flare more and less"]
+    assert sums[0] == sums[2] > 1.2 * one and sums[1] == sums[3] == one == 1
 
 
 def test_boxes_of_objects_save_rays_but_change_no_visibility(facts: Any) -> None:

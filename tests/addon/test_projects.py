@@ -94,6 +94,14 @@ def test_an_import_leaves_every_other_turn_to_the_window(facts: Any) -> None:
     assert facts["turns"] == [0, 1, 1, 2, 2, 3, 3]
 
 
+def test_an_import_ends_where_its_scene_is_deleted(facts: Any) -> None:
+    """Block of projects.py: "an import that is cancelled". Whether nothing of it remains, and what ended."""
+    *ended, calls = facts["scene deleted meanwhile"]
+    assert ended == [True] * 3
+    assert calls == ["window_manager.event_timer_remove", "workspace.status_text_set"]
+    assert facts["missing pictures"] == 2, "each is left out"
+
+
 def test_a_cloud_is_sent_to_the_gpu_over_several_drawings(facts: Any) -> None:
     """Block of projects.py: "a large cloud"."""
     drawings, most = facts["cloud"]

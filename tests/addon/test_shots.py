@@ -58,6 +58,7 @@ def test_every_selected_camera_bakes_to_its_own_folder(facts: Any) -> None:
     assert facts["one chosen"] == [facts["one chosen, read again"]] == ["Camera"]
     assert facts["the scene's own"] == [""]
     assert "has no layers of the camera 'Other', only of 'Camera'" in facts["renamed since"]
+    assert "Stereoscopy" not in facts["renamed since"]
     assert facts["of an earlier bake"] == "Other_2", "which is kept beside those of the last"
     assert facts["none chosen"] == "No camera is selected; select those to bake from."
 

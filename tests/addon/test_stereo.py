@@ -102,6 +102,7 @@ def test_layers_of_another_number_of_views_are_reported(facts: Any) -> None:
     (warning,), note, refused = facts["no stereo now"]
     assert "This scene does not render stereo" in warning and warning in note
     assert "no layers of the camera 'Camera', only of 'Camera_L', 'Camera_R'" in refused
+    assert "Stereoscopy switched on" in refused
     assert facts["mono"] == [[], [], []]
     refused, (warning,) = facts["mono layers"]
     assert refused == ""
@@ -116,6 +117,11 @@ def test_views_have_sequences_of_their_own(facts: Any) -> None:
     assert facts["equal suffixes"] == ["Camera_left", "Camera_right"]
     assert facts["selected"] == ["Camera_L", "Camera_R", "Second_L", "Second_R"]
     assert facts["selected pair"] == ["Cam_L", "Cam_R"]
+
+
+def test_a_reading_ends_where_the_stereo_settings_change(facts: Any) -> None:
+    """Block of stereo.py: "stereo settings that change while a bake reads the scene"."""
+    assert facts["changed meanwhile"] == ["The stereo settings changed while the scene was read; bake again."] * 2
 
 
 def test_the_overlay_is_of_the_view_that_is_shown(facts: Any) -> None:

@@ -297,6 +297,13 @@ facts["picked"] = picked
 before = state.light, state.lights[state.light].element
 facts["picked in the dark"] = [picking.choose_element(scene, depsgraph, scene.camera, intrinsics, (1e7, 0)),
                                before == (state.light, state.lights[state.light].element)]
+unplaced = state.lights.add()
+unplaced.name, unplaced.source = state.lights[0].name, "of another look"
+at_first = next(name for name in pictures if name[0] == unplaced.name)
+y, x = np.unravel_index(np.argmax(pictures[at_first]), pictures[at_first].shape)
+facts["picked beside an unplaced namesake"] = [
+    picking.choose_element(scene, depsgraph, scene.camera, intrinsics, (x + 0.5, y + 0.5)), state.light < 2]
+looks.remove_flare(scene, 2)
 
 
 def place_on_screen(kind, x, y, width, height):

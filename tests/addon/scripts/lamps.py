@@ -293,6 +293,18 @@ for name, owner, attribute, value in (
         ("occlusion", state, "occlusion", False), ("exposure", scene.camera.fit_flare, "exposure", 2.0)):
     setattr(owner, attribute, value)
     facts["drawn again"][name] = render_twice()
+overlay.working_space = lambda: 2 * np.eye(3)
+facts["drawn again"]["working space"] = render_twice()
+state.lights.add().name = "Second"
+state.lights[1].source, state.lights[1].target = item.source, lamp
+facts["drawn again"]["added"] = render_twice()
+before, state.lights[1].source = len(rendered), "none"
+facts["drawn again"]["source"] = render_twice()
+state.lights[1].source = item.source
+render_twice()
+looks.remove_flare(scene, 1)
+facts["drawn again"]["removed"] = render_twice()
+facts["sums of a flare more and less"] = [round(value / rendered[before - 2], 3) for value in rendered[before - 2:]]
 scene.frame_set(5)
 facts["drawn again"]["frame"] = render_twice()
 

@@ -8,6 +8,7 @@ import sys
 from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 
@@ -199,12 +200,34 @@ def three_steps():
 
 
 operator = SimpleNamespace(_steps=three_steps(), _rests=False, _is_complete=False, cancel=lambda _context: None,
-                           report=lambda *_words: None)
+                           report=lambda *_words: None, _timer=object())
 turns, turn = [], partial(operators.FITFLARE_OT_import_capture.modal, operator, bpy.context,
                          SimpleNamespace(type="TIMER"))
 while "FINISHED" not in turn():
     turns.append(len(done))
 facts["turns"] = turns
+scene = empty()
+doomed, kind, calls = bpy.data.scenes.new("Doomed"), operators.FITFLARE_OT_import_capture, MagicMock()
+before, steps = all_of_it()[-6:], importer.import_in_steps(doomed, capture, importer.ImportSettings("each"))
+while not bpy.data.cameras:
+    next(steps)
+bpy.data.scenes.remove(doomed)
+operator = SimpleNamespace(_steps=steps, _rests=True, _is_complete=False, report=print, _timer=object())
+operator.cancel = partial(kind.cancel, operator)
+turn, raised = partial(kind.modal, operator, calls, SimpleNamespace(type="TIMER")), ""
+while not raised:
+    try:
+        turn()
+    except ReferenceError:
+        raised = "ReferenceError"
+facts["scene deleted meanwhile"] = [before == all_of_it()[-6:], operator._timer is None, "CANCELLED" in turn(),
+                                    [call[0] for call in calls.mock_calls]]
+operators._load_footage(scene)
+missing = MagicMock()
+missing.gl_load.side_effect = RuntimeError("Failed to load image")
+filming = SimpleNamespace(type="CAMERA", data=SimpleNamespace(background_images=[SimpleNamespace(image=missing)] * 2))
+operators._load_footage(SimpleNamespace(camera=filming, frame_current=3))
+facts["missing pictures"] = missing.gl_load.call_count
 
 # ---- a large cloud -------------------------------------------------------------------------------------
 points, batch = part("flare_addon.points"), sys.modules.setdefault("gpu_extras.batch", ModuleType("batch"))

@@ -127,16 +127,16 @@ state.lights.remove(len(state.lights) - 1)
 one = shots._panel_shot(scene, [scene.camera], [0])
 facts["one chosen"] = list(one.folders.values())
 one.write(folder / "shot.json")
-facts["one chosen, read again"] = shots.camera_folder(folder, scene.camera).name
+facts["one chosen, read again"] = shots.camera_folder(folder, scene.camera, scene.render).name
 scene.camera.name = "Other"
 try:
-    shots.camera_folder(folder, scene.camera)
+    shots.camera_folder(folder, scene.camera, scene.render)
 except part("core.errors").FrameError as problem:
     facts["renamed since"] = str(problem)
 write_json(folder / "bake.json", {"version": 1, "made_from": {}, "layers": {}, "frames": [
     {"file": f"Other_2/layers.{number:04d}.exr", "frame": number, "view": f"Other/{number}", "width": 8, "height": 8}
     for number in range(2)]})
-facts["of an earlier bake"] = shots.camera_folder(folder, scene.camera).name
+facts["of an earlier bake"] = shots.camera_folder(folder, scene.camera, scene.render).name
 (folder / "bake.json").unlink()
 facts["the scene's own"] = list(shots._panel_shot(scene, [], [0]).folders.values())
 for item in scene.objects:

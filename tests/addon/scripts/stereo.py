@@ -182,6 +182,19 @@ scene.render.views_format, scene.camera.name, second.name = "MULTIVIEW", "Cam_L"
 facts["selected pair"] = names([scene.camera, second])
 scene.render.views_format = "STEREO_3D"
 
+# ---- stereo settings that change while a bake reads the scene -----------------------------------------------
+facts["changed meanwhile"] = []
+for name, changed, before in (("use_multiview", False, True), ("views_format", "MULTIVIEW", "STEREO_3D")):
+    reading = shots.ShotReading(scene, [], [1, 3])
+    reading.step()
+    setattr(scene.render, name, changed)
+    try:
+        reading.step()
+    except part("core.errors").CaptureError as problem:
+        facts["changed meanwhile"].append(str(problem))
+    reading.restore()
+    setattr(scene.render, name, before)
+
 # ---- the view that a 3D view shows ----------------------------------------------------------------------------------
 depsgraph = bpy.context.evaluated_depsgraph_get()
 facts["shown"] = []

@@ -99,8 +99,9 @@ def measure_frames(_: Clock, __: Path) -> str:
     return table(["a frame, ms", "cuda"], [[str(FRAME_CASE), milliseconds(seconds)]])
 
 
-def measure_threads(_: Clock, __: Path) -> str:
-    """Return a table of a training iteration on the processor by number of threads, with the ratio to the fewest."""
+def measure_thread_scaling(_: Clock, __: Path) -> str:
+    """Return a table of the time of one training iteration on the CPU by number of threads, with the speed-up over the
+    smallest number."""
     counts = [count for count in THREADS if count <= torch.get_num_threads()]
     if not counts:
         return f"The processor has fewer than {THREADS[0]} threads; none is measured."
@@ -108,7 +109,7 @@ def measure_threads(_: Clock, __: Path) -> str:
     times = median_times({str(count): on_threads(count, step) for count in counts}, ROUNDS)
     rows = [[f"{count} threads", milliseconds(times[str(count)]), f"{times[str(counts[0])] / times[str(count)]:.2f}"]
             for count in counts]
-    return table([f"iteration, {THREADS_CASE}", "ms", f"{counts[0]} threads / this"], rows)
+    return table([f"iteration, {THREADS_CASE}", "ms", f"speed-up over {counts[0]} threads"], rows)
 
 
 def measure_fits(clock: Clock, capture: Path) -> str:
@@ -151,7 +152,7 @@ def _time_fit(capture: Path, width: int, run: Path, clock: Clock) -> tuple[str, 
 
 
 PARTS: dict[str, Callable[[Clock, Path], str]] = {
-    "iterations": measure_iterations, "frames": measure_frames, "threads": measure_threads, "fits": measure_fits}
+    "iterations": measure_iterations, "frames": measure_frames, "threads": measure_thread_scaling, "fits": measure_fits}
 
 
 def main() -> int:

@@ -132,7 +132,8 @@ def _rank(light: FoundLight, ratio: float) -> tuple[int, float]:
 
 def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float, ratio: float,
                     seed: int) -> FoundLight | None:
-    """Return the light out of frame that the blobs of most views claim if they are ghosts at this ratio, or None.
+    """Return the best supported light out of frame that the blobs claim if they are ghosts at this ratio; None where
+    fewer than MIN_VIEWS views, or less than MIN_SHARE of all, agree.
 
     Each blob claims a light at centre + (blob - centre) / ratio in its view; the claims are triangulated. extent: size
     of the cameras' path, world units. seed: of the triangulation's random choices.
@@ -143,20 +144,28 @@ def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequenc
         # Triangulation tolerates half a detection's radius: 1 % of the diagonal at the ghost, 1 / |ratio| times as much
         # at the light.
         diagonal = float(np.hypot(*camera.size))
-        claims.append([Detection(centre + (blob.xy - centre) / ratio, 0.02 * diagonal / abs(ratio), 1.0,
-                                 np.ones(3), np.ones((1, 1), bool), (0, 0), False) for blob in in_view
-                       if not camera.contains([centre + (blob.xy - centre) / ratio])[0]])
+        places = [centre + (blob.xy - centre) / ratio for blob in in_view]
+        claims.append([_claim(place, 0.02 * diagonal / abs(ratio)) for place in places
+                       if not camera.contains([place])[0]])
     settings = TriangulationSettings(tolerance=0.0, min_views=MIN_VIEWS, max_nfa=MAX_NFA / len(GHOST_RATIOS),
                                      min_share=MIN_SHARE, allow_out_of_frame=True, max_lights=2, max_candidates=1000,
                                      seed=seed)
-    diagonal = float(np.hypot(*views[0][1].size))
+    first_diagonal = float(np.hypot(*views[0][1].size))
     for light in triangulate_lights(views, claims, extent, settings):
+        # A blob that stays in place is dirt on the lens.
+        ghost_motion = np.ptp([detection.xy * ratio for _, detection in light.detections], axis=0).max()
         # A light that many views have well inside the frame is not out of frame.
-        moved = np.ptp([detection.xy * ratio for _, detection in light.detections], axis=0).max()
         visible = sum(_is_well_inside(camera, light.xyz) for _, camera in views)
-        if visible < MAX_VISIBLE_SHARE * len(views) and moved > MIN_MOTION * diagonal:
+        if visible < MAX_VISIBLE_SHARE * len(views) and ghost_motion > MIN_MOTION * first_diagonal:
             return light
     return None
+
+
+def _claim(place: NDArray[np.float64], radius: float) -> Detection:
+    """Return a claimed place (2,) of a light as a detection, of which triangulation uses place and radius (pixels)
+    alone."""
+    return Detection(place, radius, score=1.0, colour=np.ones(3), mask=np.ones((1, 1), bool), corner=(0, 0),
+                     is_cut=False)
 
 
 def _is_well_inside(camera: Camera, xyz: NDArray[np.float64]) -> bool:

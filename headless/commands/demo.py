@@ -82,10 +82,11 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 def _copy_sample(out: Path, without_clean_frames: bool) -> Path:
-    """Copy the sample to DIR/capture, where results can be written; return the copy.
+    """Copy the sample to `out`/capture, or without its clean frames to `out`/capture-removal; return that folder. An
+    existing copy is used again.
 
-    Its lights are left out, since the demo finds them; `without_clean_frames` also its clean frames, which the demo
-    makes with --remove.
+    The demo finds the lights, so lights.json is left out. without_clean_frames: leave out removed/ too, which the demo
+    estimates.
     """
     copy = out / ("capture-removal" if without_clean_frames else "capture")
     left_out = [LIGHTS, REMOVED] if without_clean_frames else [LIGHTS]

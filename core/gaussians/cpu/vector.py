@@ -578,7 +578,7 @@ def transpose(typing_context, vectors):  # noqa: ARG001
     return types.UniTuple(FLOATS, LANES)(vectors), emit
 
 
-def _permute(context: Any, builder: ir.IRBuilder, vectors: ir.Value, count: int, *, invert: bool) -> ir.Value:
+def _interleave_lanes(context: Any, builder: ir.IRBuilder, vectors: ir.Value, count: int, *, invert: bool) -> ir.Value:
     """Interleave the lanes of `count` vectors a, b, ... to a0 b0 ... a1 b1 ..., or with `invert` do the opposite."""
     inputs = [builder.extract_value(vectors, i) for i in range(count)]
     results = []
@@ -590,8 +590,9 @@ def _permute(context: Any, builder: ir.IRBuilder, vectors: ir.Value, count: int,
         # Step k puts the lanes that come from vector k into their places; step 1 those of vector 0 too.
         result = inputs[0]
         for vector_number in range(1, count):
-            source_lanes = [LANES + lane if vector == vector_number else (lane if vector_number == 1 else i)
-                      for i, (vector, lane) in enumerate(positions)]  # fmt: skip
+            kept_lanes = [lane for _, lane in positions] if vector_number == 1 else range(LANES)
+            source_lanes = [LANES + lane if vector == vector_number else kept
+                            for (vector, lane), kept in zip(positions, kept_lanes, strict=True)]
             result = _shuffle(builder, result, inputs[vector_number], source_lanes)
         results.append(result)
     return _make_tuple(context, builder, results)
@@ -603,7 +604,7 @@ def interleave(typing_context, vectors):  # noqa: ARG001
     count = len(vectors)
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
-        return _permute(context, builder, args[0], count, invert=False)
+        return _interleave_lanes(context, builder, args[0], count, invert=False)
 
     return types.UniTuple(FLOATS, count)(vectors), emit
 
@@ -614,7 +615,7 @@ def deinterleave(typing_context, vectors):  # noqa: ARG001
     count = len(vectors)
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
-        return _permute(context, builder, args[0], count, invert=True)
+        return _interleave_lanes(context, builder, args[0], count, invert=True)
 
     return types.UniTuple(FLOATS, count)(vectors), emit
 

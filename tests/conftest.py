@@ -15,8 +15,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start what ru
 
 @pytest.fixture(autouse=True)
 def _ordinary_priority() -> Iterator[None]:
-    """Restore the ordinary scheduling after each test. For root, FFmpeg's AV1 encoder makes the process a real-time one,
-    and programs that later tests start would then take the processor from all others."""
+    """Restore the ordinary scheduling after each test. For root, FFmpeg's AV1 encoder makes the process a real-time
+    one, and programs that later tests start would then take the processor from all others."""
     yield
     if hasattr(os, "sched_setscheduler") and os.sched_getscheduler(0) != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

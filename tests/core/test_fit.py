@@ -358,20 +358,25 @@ def test_ambiguous_light_goes_to_the_flare_but_a_light_disc_to_the_scene(capture
     assert (brighter[~discs] > darker[~discs] * 1.5).all(), "no frame is darker than the scene"
 
 
-def test_a_visible_light_hidden_by_the_scene_from_everywhere_is_uncovered(capture: Capture) -> None:
+def test_a_visible_light_hidden_by_the_scene_from_everywhere_is_uncovered(
+        capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = Trainer(capture, quick(**{"flare.occlusion": True}))
     assert trainer.flare is not None
-    targets = trainer.frames.targets(trainer.views[0])
-    white = targets._replace(frame=torch.ones_like(targets.frame))
+    view = trainer.views[0]
+    targets = trainer.frames.targets(view)
+    white, black = (targets._replace(frame=torch.full_like(targets.frame, value)) for value in (1.0, 0.0))
     with torch.no_grad():  # as if everything stood before the light, in layers that each hide it
         camera, light = torch.from_numpy(targets.camera.position).float(), trainer.flare.positions[0].float()
         along = torch.linspace(0.3, 0.7, len(trainer.scene.means))[:, None]
         trainer.scene.means.copy_(camera + along * (light - camera))
         trainer.scene.opacity_logits.fill_(3.0)
-    assert trainer._occlusion_loss(white) is None, "as long as some views see the light"
+    monkeypatch.setattr(trainer.frames, "targets", lambda _view: white)
+    assert trainer._occlusion_loss(view) is None, "as long as some views see the light"
     trainer.flare.clear.zero_()
-    assert trainer._occlusion_loss(targets._replace(frame=torch.zeros_like(targets.frame))) is None, "it is not visible"
-    loss = trainer._occlusion_loss(white)
+    monkeypatch.setattr(trainer.frames, "targets", lambda _view: black)
+    assert trainer._occlusion_loss(view) is None, "it is not visible"
+    monkeypatch.setattr(trainer.frames, "targets", lambda _view: white)
+    loss = trainer._occlusion_loss(view)
     assert loss is not None
     loss.backward()
     slopes = trainer.scene.opacity_logits.grad

@@ -648,7 +648,7 @@ def test_a_shot_bake_uses_its_query_and_its_run(tmp_path: Path, monkeypatch: pyt
               shot_bakes.ShotRenderer(replace(one, query="trained")).fingerprint}
     for mark in "ab":
         run = SimpleNamespace(fingerprint=mark, flare=None)
-        monkeypatch.setattr(shot_bakes.Run, "open", lambda _folder, run=run: run)
+        monkeypatch.setattr(shot_bakes.Run, "open", lambda _folder, run=run, **_options: run)
         prints.add(shot_bakes.ShotRenderer(replace(one, run=tmp_path)).fingerprint)
     assert len(prints) == 4
 

@@ -222,16 +222,27 @@ def rasterize_scene(
     reach = reach[order]
     half_size = half_sizes(covariances.detach(), reach)
     picture, rows = draw_tiles(draw, tile_size, gaussians, reach, half_size, width, height, blend="over", median=depth)
-    alpha = picture[..., 4]
-    colour = picture[..., :3]
+    colour, alpha, mean_depth, median_depth = split_layers(picture, background, rows if depth else None, depths)
+    return Rendering(colour, alpha, mean_depth, median_depth, all_centres, radii, gradients)
+
+
+def split_layers(picture: Tensor, background: Tensor | None, median_rows: Tensor | None, depths: Tensor
+                 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return colour over the background, alpha, mean depth and median depth from a rasterized picture (height, width,
+    5) of colour, alpha-weighted depth and alpha.
+
+    background: (3,), None for black. median_rows: (height, width), the row in depths (n,) of each pixel's median depth,
+    -1 for none; None leaves both depths empty, (0, 0).
+    """
+    colour, alpha = picture[..., :3], picture[..., 4]
     if background is not None:
         colour = colour + (1 - alpha)[..., None] * background
-    if depth:
-        mean_depth = picture[..., 3] / alpha.clamp(min=ALPHA_MIN / 2)
-        median_depth = torch.cat([depths, depths.new_zeros(1)]).detach()[rows]  # row -1 is the appended 0
+    if median_rows is None:
+        mean_depth = median_depth = picture.new_empty(0, 0)
     else:
-        mean_depth = median_depth = means.new_empty(0, 0)
-    return Rendering(colour, alpha, mean_depth, median_depth, all_centres, radii, gradients)
+        mean_depth = picture[..., 3] / alpha.clamp(min=ALPHA_MIN / 2)
+        median_depth = torch.cat([depths, depths.new_zeros(1)]).detach()[median_rows]  # row -1 is the appended 0
+    return colour, alpha, mean_depth, median_depth
 
 
 def splat(

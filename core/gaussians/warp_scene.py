@@ -365,15 +365,8 @@ def rasterize_scene(
     gradients = _record_gradient(places)
     parts, median_rows = warp_kernels.draw(lists, "over", depth, WhitenedGaussians(places, values, None, None))
     picture = tiled.assemble(parts, lists)[:height, :width]
-    alpha = picture[..., 4]
-    colour = picture[..., :3]
-    if background is not None:
-        colour = colour + (1 - alpha)[..., None] * background
-    if depth:
-        mean_depth = picture[..., 3] / alpha.clamp(min=ALPHA_MIN / 2)
-        median_rows = tiled.assemble(median_rows, lists)[:height, :width].long()
-        depths = torch.cat([values.detach()[:, 4], values.new_zeros(1)])  # row -1 is the appended 0
-        median_depth = depths[median_rows]
-    else:
-        mean_depth = median_depth = means.new_empty(0, 0)
+    colour, alpha, mean_depth, median_depth = tiled.split_layers(
+        picture, background, tiled.assemble(median_rows, lists)[:height, :width].long() if depth else None,
+        values[:, 4],
+    )  # fmt: skip
     return Rendering(colour, alpha, mean_depth, median_depth, places.detach()[:, :2], radii, gradients)

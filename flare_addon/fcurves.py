@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Keeps F-curves and drivers on the items of a collection property whose indices change."""
+"""Inserts keys in bulk, and keeps F-curves and drivers on the items of a collection property whose indices change."""
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import bpy
+import numpy as np
+from numpy.typing import NDArray
 
 
 def fcurves_of(block: Any) -> list[Any]:
@@ -19,6 +21,31 @@ def fcurves_of(block: Any) -> list[Any]:
         return [data.action.fcurves]
     return [bag.fcurves for layer in data.action.layers for strip in layer.strips for bag in strip.channelbags
             if bag.slot_handle == data.action_slot_handle]
+
+
+def insert_keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -> None:
+    """Insert linear keys on a data block in bulk, in a new action.
+
+    channels: values (frames, components of the property) by RNA path.
+    """
+    action = bpy.data.actions.new(f"{block.name} Action")
+    block.animation_data_create().action = action
+    curves: Any
+    if bpy.app.version >= (4, 4, 0):
+        slot = action.slots.new(id_type=block.id_type, name=block.name)
+        block.animation_data.action_slot = slot
+        strip = action.layers.new("Layer").strips.new(type="KEYFRAME")
+        curves = strip.channelbag(slot, ensure=True).fcurves
+    else:
+        curves = action.fcurves
+    for path, values in channels.items():
+        for index in range(values.shape[1]):
+            curve = curves.new(path, index=index)
+            curve.keyframe_points.add(len(frames))
+            flat = np.stack([np.asarray(frames, np.float32), values[:, index].astype(np.float32)], -1).ravel()
+            curve.keyframe_points.foreach_set("co", flat)
+            curve.keyframe_points.foreach_set("interpolation", [1] * len(frames))  # LINEAR
+            curve.update()
 
 
 def renumber(block: Any, path: str, new_index: Callable[[int], int | None]) -> None:

@@ -236,7 +236,7 @@ def _draw_in_camera_view(draw: Callable[[Any, Any, Any, stereo.Eye], None]) -> N
                 and not is_composited(space, scene))
     if not is_shown or camera is None or camera.type != "CAMERA":
         return
-    camera, eye = stereo.view_camera(scene, camera, stereo.shown_view(context, camera))
+    camera, eye = stereo.view_camera(scene, camera, stereo.displayed_view(context, camera))
     try:
         draw(context, scene, camera, eye)
         last_error = ""

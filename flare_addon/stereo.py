@@ -86,7 +86,7 @@ def view_camera(scene: Any, camera: Any, name: str) -> tuple[Any, Eye]:
     return scene.objects.get(_base_name(render, camera) + suffix, camera), ""
 
 
-def shown_view(context: Any, camera: Any) -> str:
+def displayed_view(context: Any, camera: Any) -> str:
     """Return the name of the view that the 3D view of a context shows through a camera; "" for the camera itself.
 
     Settings of the 3D view and of the window make Blender show one eye, both in turn, or the camera itself. The matrix

@@ -43,7 +43,7 @@ from .camera_solve import (
 )
 from .colmap import PointCloud, PosedFrame
 from .frame_files import mask_pictures, matching_pictures, view_name
-from .frame_sizes import checked_size, size_or_model_size
+from .frame_sizes import matching_size, size_or_model_size
 from .layout import check_is_folder
 from .lens import PINHOLES, Lens
 from .lights import Light, LightState, check_places, light_paths, read_lights
@@ -477,7 +477,7 @@ def _open_views_in_steps(folder: Path, solve: CameraSolve, files: Mapping[str, P
         if path is None and need_frames and files:
             continue  # left out; if no pose has a picture, the check of the first size says so
         path = path or safe_join(solve.root, frame.name, CaptureError)
-        read_size = checked_size if need_frames else size_or_model_size
+        read_size = matching_size if need_frames else size_or_model_size
         size = read_size(path, frame.lens, upright_frames.get(frame.name))
         name = view_name(frame.name, solve.root == folder)
         if name in opened.files:

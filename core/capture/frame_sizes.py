@@ -13,7 +13,7 @@ from .lens import Lens
 from .orientation import TurnedFrame
 
 
-def checked_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:
+def matching_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:
     """Return the size (width, height) of a frame's picture, turned as it was for the camera solve.
 
     turned: given where the solve saw the picture turned by its Exif orientation; None where it saw the stored pixels.
@@ -31,6 +31,6 @@ def checked_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> t
 def size_or_model_size(path: Path, lens: Lens, turned: TurnedFrame | None = None) -> tuple[int, int]:
     """Return the picture's size, or the model's where the picture is missing or unusable."""
     try:
-        return checked_size(path, lens, turned)
+        return matching_size(path, lens, turned)
     except FrameError:
         return lens.width, lens.height

@@ -160,9 +160,12 @@ class _Occluders(NamedTuple):
         return _Occluders(*(part[rows] for part in self))
 
 
-class _ViewOfLight(NamedTuple):
-    """A small camera's pose (4, 4), world to camera, the distance of the light that it looks at, and the rows of the
-    scene's Gaussians that may hide the light from it."""
+class _SightLine(NamedTuple):
+    """The line of sight to a light.
+
+    pose: (4, 4), world to camera, of a small camera that looks along it. distance: of the light, world units. rows: of
+    the scene's Gaussians that may hide the light.
+    """
 
     pose: Tensor
     distance: float
@@ -176,32 +179,32 @@ def _visibilities(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor], 
     The Gaussians that may hide any of the lights are selected together: the gradient of each selection has the size of
     the whole scene.
     """
-    views = [_view_of_light(scene, eye, light, settings) for light in lights]
-    all_rows = [view.rows for view in views if view is not None]
+    sight_lines = [_sight_line(scene, eye, light, settings) for light in lights]
+    all_rows = [sight_line.rows for sight_line in sight_lines if sight_line is not None]
     if not all_rows:
         return [scene.means.new_ones(()) for _ in lights]
     rows = torch.unique(torch.cat(all_rows)) if len(all_rows) > 1 else all_rows[0]
     occluders = _Occluders(scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits).select(rows)
     visibilities = []
-    for view in views:
-        if view is None:
+    for sight_line in sight_lines:
+        if sight_line is None:
             visibilities.append(scene.means.new_ones(()))
             continue
-        hidden_by = occluders if len(view.rows) == len(rows) else occluders.select(torch.searchsorted(rows, view.rows))
-        visibilities.append(_mean_transmittance(hidden_by, view.pose, _near_plane(scene, view.distance), settings,
-                                                kernels))
+        is_subset = len(sight_line.rows) < len(rows)
+        light_occluders = occluders.select(torch.searchsorted(rows, sight_line.rows)) if is_subset else occluders
+        near = _near_plane(scene, sight_line.distance)
+        visibilities.append(_mean_transmittance(light_occluders, sight_line.pose, near, settings, kernels))
     return visibilities
 
 
-def _view_of_light(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings
-                   ) -> _ViewOfLight | None:
-    """Return the view of a light from a small camera at `eye`; None for a light at the eye, which nothing hides."""
+def _sight_line(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings) -> _SightLine | None:
+    """Return the line of sight from `eye` (3,) to a light (3,); None for a light at the eye, which nothing hides."""
     direction = (light - eye).float()
     distance = float(direction.norm())
     if distance <= 0:
         return None
     pose = _look_along(eye.float(), direction / distance)
-    return _ViewOfLight(pose, distance, _occluders(scene, pose, distance, settings))
+    return _SightLine(pose, distance, _occluder_rows(scene, pose, distance, settings))
 
 
 def _mean_transmittance(occluders: _Occluders, pose: Tensor, near: float, settings: VisibilitySettings,
@@ -231,14 +234,14 @@ def _near_plane(scene: SceneGaussians, distance: float) -> float:
     return min(1e-3 * distance, scene.near)
 
 
-def _occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
+def _occluder_rows(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
     """Return the rows of Gaussians between camera and light that may touch the small picture, without the far layer.
 
     pose: world_to_camera (4, 4) of the small camera. distance: from camera to light. On the CPU it uses numpy, which
     takes a third of torch's time here.
     """
     if not scene.means.is_cpu:
-        return _occluders_on_device(scene, pose.to(scene.means), distance, settings)
+        return _occluder_rows_on_device(scene, pose.to(scene.means), distance, settings)
     means, scales, rigid = (part.detach().numpy() for part in (scene.means, scene.log_scales, pose))
     # Sums of columns, since a product of matrices this narrow waits for the threads of the BLAS.
     x, y, depth = (sum(means[:, axis] * row[axis] for axis in range(3)) + row[3] for row in rigid[:3])
@@ -252,8 +255,9 @@ def _occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: V
 
 
 @torch.no_grad()
-def _occluders_on_device(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
-    """Return the rows of `_occluders` for a scene on a GPU, computed there. pose: (4, 4), on the scene's device."""
+def _occluder_rows_on_device(scene: SceneGaussians, pose: Tensor, distance: float,
+                             settings: VisibilitySettings) -> Tensor:
+    """Return the rows of `_occluder_rows` for a scene on a GPU, computed there. pose: (4, 4), on the scene's device."""
     x, y, depth = (scene.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     reach = 3 * scene.log_scales.amax(-1).exp()
     between = (depth > _near_plane(scene, distance)) & (depth < (1 - settings.margin) * distance)

@@ -174,16 +174,20 @@ class Plate:
 
     @property
     def warning(self) -> str:
-        """Sentences for the user, "" for none: that the file's suffix does not fit its contents, and what is lost when
-        the plate is written with changed codes."""
-        suffix, kind = self.path.suffix.lower(), file_kind(self.path)
-        written_kind, kind_warning = SUFFIX_KINDS.get(_format_suffix(self.path, self)), ""
-        # Only where the clean plate keeps the file's name, and with it the suffix.
-        if clean_name(self.path) == self.path and kind not in ("", SUFFIX_KINDS.get(suffix)):
-            kind_warning = f"{self.path} holds {kind.upper()} data, whatever its name; " + (
-                "so does the result of that name." if written_kind == kind else
-                f"the result of that name holds {str(written_kind).upper()} data.")
-        return " ".join(filter(None, (kind_warning, dropped_parts_warning(self.path))))
+        """Sentences for the user, "" for none, read from the file: that its suffix does not fit its contents, and what
+        is lost when the plate is written with changed codes."""
+        return " ".join(filter(None, (self._kind_warning(), dropped_parts_warning(self.path))))
+
+    def _kind_warning(self) -> str:
+        """Return a sentence where the file's suffix does not fit its contents and the clean plate keeps the name, and
+        with it the suffix; "" elsewhere."""
+        kind = file_kind(self.path)
+        if clean_name(self.path) != self.path or kind in ("", SUFFIX_KINDS.get(self.path.suffix.lower())):
+            return ""
+        written_kind = SUFFIX_KINDS.get(_format_suffix(self.path, self))
+        result = ("so does the result of that name." if written_kind == kind else
+                  f"the result of that name holds {str(written_kind).upper()} data.")
+        return f"{self.path} holds {kind.upper()} data, whatever its name; {result}"
 
     @property
     def placement(self) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import bpy
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core.capture import REMOVED, Capture, PictureIndex, PointCloud, View
 from ...core.capture.camera import Camera, quaternion_from_rotation
@@ -314,10 +313,11 @@ def _animate_camera(camera: Any, views: Sequence[View], numbers: Sequence[int], 
     for index in range(1, len(rotations)):  # q and -q are the same rotation; the nearer one interpolates correctly
         if rotations[index] @ rotations[index - 1] < 0:
             rotations[index] *= -1
-    insert_keys(camera, {"location": positions, "rotation_quaternion": rotations}, numbers)
+    fcurves.insert_keys(camera, {"location": positions, "rotation_quaternion": rotations}, numbers)
     lenses = np.array([cameras.lens_of(view.camera, SENSOR, aspect) for view in views])
     if np.ptp(lenses, axis=0).max() > 1e-6:
-        insert_keys(camera.data, {"lens": lenses[:, :1], "shift_x": lenses[:, 1:2], "shift_y": lenses[:, 2:]}, numbers)
+        channels = {"lens": lenses[:, :1], "shift_x": lenses[:, 1:2], "shift_y": lenses[:, 2:]}
+        fcurves.insert_keys(camera.data, channels, numbers)
 
 
 def set_exposures(root: Any, exposures: Mapping[str, float]) -> None:
@@ -337,31 +337,6 @@ def set_exposures(root: Any, exposures: Mapping[str, float]) -> None:
             if Path(frame.view).parent.as_posix() == state.view:
                 state.exposure = exposures[frame.view]
                 camera.keyframe_insert(EXPOSURE_PATH, frame=frame.number)
-
-
-def insert_keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -> None:
-    """Insert linear keys on a data block in bulk, in a new action.
-
-    channels: values (frames, components of the property) by RNA path.
-    """
-    action = bpy.data.actions.new(f"{block.name} Action")
-    block.animation_data_create().action = action
-    curves: Any
-    if bpy.app.version >= (4, 4, 0):
-        slot = action.slots.new(id_type=block.id_type, name=block.name)
-        block.animation_data.action_slot = slot
-        strip = action.layers.new("Layer").strips.new(type="KEYFRAME")
-        curves = strip.channelbag(slot, ensure=True).fcurves
-    else:
-        curves = action.fcurves
-    for path, values in channels.items():
-        for index in range(values.shape[1]):
-            curve = curves.new(path, index=index)
-            curve.keyframe_points.add(len(frames))
-            flat = np.stack([np.asarray(frames, np.float32), values[:, index].astype(np.float32)], -1).ravel()
-            curve.keyframe_points.foreach_set("co", flat)
-            curve.keyframe_points.foreach_set("interpolation", [1] * len(frames))  # LINEAR
-            curve.update()
 
 
 def _show_sequence(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequence[int]) -> bool:

@@ -81,7 +81,7 @@ def is_view_node(node: Any) -> bool:
     return bool(node.name.startswith((_OF_VIEW, _SWITCH)))
 
 
-def shown_views(scene: Any) -> set[str]:
+def composited_views(scene: Any) -> set[str]:
     """Return the names of the views whose own layers the compositor of a scene shows; none without stereo."""
     tree = tree_of(scene)
     switches = [node for node in tree.nodes if node.name.startswith(_SWITCH)] if tree is not None else []

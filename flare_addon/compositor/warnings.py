@@ -54,7 +54,7 @@ def warnings(scene: Any, views: Sequence[LayerFolder], live: bool) -> Iterator[s
 
 def stereo_warnings(scene: Any) -> Iterator[str]:
     """Yield a warning for each reason why views of a scene do not get their own flares."""
-    views, shown = [view.name for view in stereo.rendered_views(scene.render)], layer_nodes.shown_views(scene)
+    views, shown = [view.name for view in stereo.rendered_views(scene.render)], layer_nodes.composited_views(scene)
     if not views and shown:
         yield ("This scene does not render stereo, and its compositor has the flare of one view; bake and composite "
                "again.")

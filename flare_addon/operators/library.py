@@ -182,7 +182,7 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
             return False
         x, y = event.mouse_x - region.x, event.mouse_y - region.y
         with context.temp_override(area=area, region=region, space_data=space, region_data=space.region_3d):
-            self.view = stereo.shown_view(bpy.context, context.scene.camera)
+            self.view = stereo.displayed_view(bpy.context, context.scene.camera)
             core_camera = _core_camera(context.scene, bpy.context.view_layer.depsgraph, self.view)
             frame = overlay.camera_frame(bpy.context, core_camera)
         if frame is None:

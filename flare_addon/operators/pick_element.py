@@ -90,7 +90,7 @@ def choose_element_at(context: Any, position: tuple[float, float]) -> bool:
     there is one. Raises FitFlareError."""
     scene = context.scene
     camera = camera_of(context.space_data, scene)
-    camera, eye = stereo.view_camera(scene, camera, stereo.shown_view(context, camera))
+    camera, eye = stereo.view_camera(scene, camera, stereo.displayed_view(context, camera))
     window = overlay.drawn_part(context, scene, camera, eye)
     if window is None:
         return False

@@ -71,7 +71,7 @@ def test_a_camera_without_a_partner_serves_every_view(facts: Any) -> None:
     assert facts["no partner"] == [["left", "Alone", "Alone_L"], ["right", "Alone", "Alone_R"]]
 
 
-def test_each_view_renders_its_own_flare_at_the_light(facts: Any) -> None:
+def test_each_view_renders_the_flare_of_its_camera_at_the_light(facts: Any) -> None:
     """Block of stereo.py: "a bake and its render"."""
     assert facts["baked"] == ""
     assert facts["files"] == [f"Camera_{eye}/layers.{frame:04d}.exr" for eye in "LR" for frame in (1, 3)]
@@ -111,7 +111,7 @@ def test_layers_of_another_number_of_views_are_reported(facts: Any) -> None:
     assert facts["removed"] == [True, []]
 
 
-def test_views_have_sequences_of_their_own(facts: Any) -> None:
+def test_each_view_has_a_separate_sequence(facts: Any) -> None:
     """Block of stereo.py: "one view alone, equal suffixes, and selected cameras"."""
     assert facts["right alone"] == ["Camera_R"]
     assert facts["equal suffixes"] == ["Camera_left", "Camera_right"]
@@ -124,6 +124,6 @@ def test_a_reading_ends_where_the_stereo_settings_change(facts: Any) -> None:
     assert facts["changed meanwhile"] == ["The stereo settings changed while the scene was read; bake again."] * 2
 
 
-def test_the_overlay_is_of_the_view_that_is_shown(facts: Any) -> None:
+def test_the_overlay_matches_the_displayed_view(facts: Any) -> None:
     """Block of stereo.py: "the view that a 3D view shows"."""
     assert facts["shown"] == [[name, name] for name in ("", "left", "right")]

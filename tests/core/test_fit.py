@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -60,13 +59,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return Capture.open(flared_capture(tmp_path_factory.mktemp("capture")))
 
 
-@pytest.fixture(autouse=True)
-def _same_threads() -> Iterator[None]:
-    """One thread: the sums of a fit are then the same in every process, whatever else the machine does."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def quick(iterations: int = 40, **changes: Any) -> FitSettings:

@@ -2,7 +2,6 @@
 """Fits, scores, bakes and transfers on a GPU: on a simulated one, whose kernels run on Warp's CPU device."""
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -37,12 +36,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return Capture.open(flared_capture(tmp_path_factory.mktemp("capture")))
 
 
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture

@@ -42,13 +42,9 @@ def files(tmp_path: Path) -> Path:
     return copy
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_a_fit_stopped_in_format_0_resumes_to_the_same_flare_and_scene(files: Path) -> None:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        run = fit(Capture.open(files / "capture"), preset("draft"), files / "stopped_split", resume=True)
-    finally:
-        torch.set_num_threads(threads)
+    run = fit(Capture.open(files / "capture"), preset("draft"), files / "stopped_split", resume=True)
     assert run.finished
     made, expected = (load_file(files / folder / "flare.flare") for folder in ("stopped_split", "finished_split"))
     assert made.keys() == expected.keys()

@@ -54,7 +54,7 @@ class TestStaticLight:
             i, (*path[i], 0.0 if 6 <= i < 9 else 1.0)))).lights
         np.testing.assert_allclose([key.xy for key in list(light.keys.values())[:16]], path[:16], atol=2.5)
 
-    def test_without_texture_continues_at_its_own_velocity(self, tmp_path: Path) -> None:
+    def test_without_texture_continues_at_constant_velocity(self, tmp_path: Path) -> None:
         path = [(230.0 - TURN_PX * i, 80.0) for i in range(16)]
         (light,) = track_lights(make_shot(tmp_path, 16, lambda i: lit([(*path[i], 1.0)]))).lights
         assert light.doubtful

@@ -92,14 +92,15 @@ def _init_row(
     v = deinterleave((load(d_image, colour_index), load(d_image, colour_index + 16), load(d_image, colour_index + 32)))
     alpha = load(alphas, pixel)
     transmittance = ONE - alpha
-    behind = fma(v[0], background[0], fma(v[1], background[1], v[2] * background[2]))
-    v_alpha = (load(d_alphas, pixel) if d_alphas.size > 0 else splat(ZERO)) - behind
-    s_before = fma(v[0], colour[0], fma(v[1], colour[1], v[2] * colour[2])) - transmittance * behind
+    v_background = fma(v[0], background[0], fma(v[1], background[1], v[2] * background[2]))
+    v_alpha = (load(d_alphas, pixel) if d_alphas.size > 0 else splat(ZERO)) - v_background
+    # The colours' part of S: v . (picture - T background).
+    s_colour = fma(v[0], colour[0], fma(v[1], colour[1], v[2] * colour[2])) - transmittance * v_background
     if with_depth:
         weight = where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN)
         store(state, state_row + V_DEPTH, load(d_depths, pixel) / weight)
         store(state, state_row + MEAN_DEPTH, load(depths, pixel))
-    store(state, state_row + S_PLANE, fma(v_alpha, alpha, s_before))
+    store(state, state_row + S_PLANE, fma(v_alpha, alpha, s_colour))
     store(state, state_row + V_RED, v[0])
     store(state, state_row + V_GREEN, v[1])
     store(state, state_row + V_BLUE, v[2])

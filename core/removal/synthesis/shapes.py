@@ -90,10 +90,10 @@ def _draw_ray_profile(random: Random) -> Callable[[Array], Array]:
 
 
 def draw_halo(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Draw one or two rings, white or in the colours of diffraction, whole or partial: (size, size, 3), maximum 1.
+    """Draw one or two rings, whole or partial: (size, size, 3), maximum 1.
 
-    They are centred on the light, in three of ten flares on another point of the line through the light and the middle.
-    x, y: `canvas_grid`.
+    They have one random tint or the colours of diffraction. They are centred on the light, in three of ten flares on
+    another point of the line through the light and the middle. x, y: `canvas_grid`.
     """
     centre = np.array(light) * (random.uniform(-0.5, 1) if random.random() < 0.3 else 1)
     dx, dy = x - centre[0], y - centre[1]
@@ -105,12 +105,14 @@ def draw_halo(random: Random, light: Point, x: Array, y: Array) -> Array:
         wavelengths = np.linspace(0.42, 0.68, 9)
         colours = spectral_colour(wavelengths)
         colours = colours / colours.sum(0)
-        spread = random.uniform(-1, 1) if random.random() < 0.7 else 0.0
+        # Relative change of the radius per micrometre; below 0, red is inside.
+        dispersion = random.uniform(-1, 1) if random.random() < 0.7 else 0.0
         ring = np.zeros_like(layer)
         for wavelength, colour in zip(wavelengths, colours.astype(np.float32), strict=True):
-            wave_radius = radius * (1 + spread * (wavelength - GREEN_WAVELENGTH))
-            side = np.where(r < wave_radius, random.uniform(0.7, 1.3), 1.0)
-            ring += np.exp(-((r - wave_radius) / (width * side)) ** 2)[..., None] * colour
+            wave_radius = radius * (1 + dispersion * (wavelength - GREEN_WAVELENGTH))
+            # The inner flank is up to 30 % narrower or wider, differently for each wavelength.
+            width_ratio = np.where(r < wave_radius, random.uniform(0.7, 1.3), 1.0)
+            ring += np.exp(-((r - wave_radius) / (width * width_ratio)) ** 2)[..., None] * colour
         if random.random() < 0.4:  # partial
             direction, opening_angle = random.uniform(-math.pi, math.pi), random.uniform(0.3, 2)
             angle_offset = np.arctan2(np.sin(angle - direction), np.cos(angle - direction))
@@ -119,7 +121,7 @@ def draw_halo(random: Random, light: Point, x: Array, y: Array) -> Array:
             ray_pattern = sum(random.normal(0, 0.3) * np.cos(k * angle + random.uniform(0, 7))
                               for k in random.integers(8, 120, 6))
             ring *= np.exp(np.asarray(ray_pattern, np.float32))[..., None]
-        layer += level * ring * (random_tint(random, 0.5) if spread == 0 else random_tint(random, 0.15))
+        layer += level * ring * (random_tint(random, 0.5) if dispersion == 0 else random_tint(random, 0.15))
     return layer / max(float(layer.max()), 1e-9)
 
 

@@ -140,7 +140,7 @@ written = [path.stat().st_mtime_ns for path in sorted(folder.rglob("*.exr"))]
 ops.bake()
 facts["kept"] = written == [path.stat().st_mtime_ns for path in sorted(folder.rglob("*.exr"))]
 scene.camera.name = "Renamed"
-facts["renamed"] = [refusal(ops.set_up_baked), sorted(layer_nodes.shown_views(scene))]
+facts["renamed"] = [refusal(ops.set_up_baked), sorted(layer_nodes.composited_views(scene))]
 scene.camera.name = "Camera"
 settings.use_spherical_stereo = True
 facts["spherical"] = stereo_warnings()
@@ -151,7 +151,7 @@ scene.render.use_multiview = False
 facts["no stereo now"] = [stereo_warnings(), note(), refusal(ops.set_up_baked)]
 scene.fit_flare.layers = str(Path(out) / "mono")
 ops.bake(composite=True)
-facts["mono"] = [stereo_warnings(), sorted(layer_nodes.shown_views(scene)), [
+facts["mono"] = [stereo_warnings(), sorted(layer_nodes.composited_views(scene)), [
     node.name for node in flare_node.tree_of(scene).nodes if layer_nodes.is_view_node(node)]]
 scene.render.use_multiview = True
 facts["mono layers"] = [refusal(ops.set_up_baked), stereo_warnings()]
@@ -203,5 +203,5 @@ for name in ("", "left", "right"):
     matrix = stereo.eye_matrix(viewed.evaluated_get(depsgraph), eye).inverted()
     region = SimpleNamespace(view_matrix=matrix)
     context = SimpleNamespace(scene=scene, view_layer=bpy.context.view_layer, region_data=region)
-    facts["shown"].append([name, stereo.shown_view(context, scene.camera)])
+    facts["shown"].append([name, stereo.displayed_view(context, scene.camera)])
 leave(facts)

@@ -9,7 +9,6 @@ of another checkout is fitted in turn with this one's, at the first width. The c
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import subprocess
 import sys
@@ -21,6 +20,9 @@ from typing import NamedTuple
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import report
+from core.conventions.run_files import EVALUATION
+from core.errors import RunError
+from core.system.files import read_json
 
 COLUMNS = ("fit", "minutes", "ratio", "composite", "scene", "flare", "linear flare", "its error")
 
@@ -34,7 +36,7 @@ class Fit(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Seconds of a fit, and its `eval.json`."""
+    """Seconds of a fit, and its evaluation."""
 
     seconds: float
     scores: dict[str, dict[str, float]]
@@ -48,7 +50,7 @@ def run_fit(fit: Fit, capture: Path, folder: Path) -> Outcome:
                    stdout=subprocess.DEVNULL)
     seconds = time.perf_counter() - started
     subprocess.run([sys.executable, program, "eval", folder], check=True, stdout=subprocess.DEVNULL)
-    return Outcome(seconds, json.loads((folder / "eval.json").read_text(encoding="utf-8")))
+    return Outcome(seconds, read_json(folder / EVALUATION, RunError))
 
 
 def table_row(fit: Fit, outcomes: list[Outcome], first_seconds: float) -> list[str]:
@@ -79,8 +81,8 @@ def main() -> None:
         out = args.out or Path(temporary)
         outcomes: dict[Fit, list[Outcome]] = {fit: [] for fit in fits}
         for number in range(args.rounds):
-            for place, fit in enumerate(fits):
-                outcomes[fit].append(run_fit(fit, args.capture, out / f"{number}_{place}"))
+            for index, fit in enumerate(fits):
+                outcomes[fit].append(run_fit(fit, args.capture, out / f"{number}_{index}"))
                 print(f"{fit.name}: {outcomes[fit][-1].seconds:.0f} s", flush=True)
     first_seconds = statistics.median(outcome.seconds for outcome in outcomes[fits[0]])
     print(report.conditions())

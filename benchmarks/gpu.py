@@ -34,9 +34,10 @@ from benchmarks.raster import Case, Iteration, Raster, gsplat_rasterizer, our_ra
 from benchmarks.report import milliseconds, table
 from benchmarks.timing import median_times, on_threads
 from core.capture import Capture
-from core.errors import EngineError
+from core.conventions.run_files import EVALUATION, METRICS
+from core.errors import EngineError, RunError
 from core.gaussians.device import select_device
-from core.system.reading import read_bytes
+from core.system.files import read_json
 
 CASES = (Case(50_000, 480, 270), Case(150_000, 960, 540), Case(1_000_000, 1920, 1080))
 FRAME_CASE = Case(173_000, 1920, 1080)
@@ -49,19 +50,19 @@ MIN_SECONDS = 20.0
 ROUNDS = 3
 
 
-class Clock:
+class Deadline:
     """The time that is left of `minutes`."""
 
     def __init__(self, minutes: float) -> None:
         self._end = time.monotonic() + 60 * minutes
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Seconds left."""
         return self._end - time.monotonic()
 
 
-def measure_iterations(_: Clock, __: Path) -> str:
+def measure_iterations(_: Deadline, __: Path) -> str:
     """Return a table of forward pass, forward and backward pass, and whole training iteration, by size and rasterizer.
     """
     names = ["cuda", *(["gsplat"] if _is_gsplat_usable() else [])]
@@ -92,14 +93,14 @@ def _is_gsplat_usable() -> bool:
     return True
 
 
-def measure_frames(_: Clock, __: Path) -> str:
+def measure_frames(_: Deadline, __: Path) -> str:
     """Return a table of the time of a frame of the paper's size."""
     raster = Raster(FRAME_CASE, our_rasterizer("cuda"), "cuda", "cuda")
     seconds = median_times({"frame": raster.forward}, ROUNDS)["frame"]
     return table(["a frame, ms", "cuda"], [[str(FRAME_CASE), milliseconds(seconds)]])
 
 
-def measure_thread_scaling(_: Clock, __: Path) -> str:
+def measure_thread_scaling(_: Deadline, __: Path) -> str:
     """Return a table of the time of one training iteration on the CPU by number of threads, with the speed-up over the
     smallest number."""
     counts = [count for count in THREADS if count <= torch.get_num_threads()]
@@ -112,7 +113,7 @@ def measure_thread_scaling(_: Clock, __: Path) -> str:
     return table([f"iteration, {THREADS_CASE}", "ms", f"speed-up over {counts[0]} threads"], rows)
 
 
-def measure_fits(clock: Clock, capture: Path) -> str:
+def measure_fits(deadline: Deadline, capture: Path) -> str:
     """Return a table of whole `standard` fits of a capture by width of the frames: seconds, and held-out PSNR, dB.
 
     A fit that does not end in the time left is stopped, and the table has its iterations.
@@ -122,36 +123,37 @@ def measure_fits(clock: Clock, capture: Path) -> str:
     for width in FIT_WIDTHS:
         if width > frame_width:
             rows.append([str(width), f"left out: the frames are {frame_width} pixels wide", "–", "–"])
-        elif clock.left < MIN_SECONDS:
+        elif deadline.seconds_left < MIN_SECONDS:
             rows.append([str(width), "left out: no time left", "–", "–"])
         else:
             with tempfile.TemporaryDirectory() as folder:
-                rows.append([str(width), *_time_fit(capture, width, Path(folder) / "run", clock)])
+                rows.append([str(width), *_time_fit(capture, width, Path(folder) / "run", deadline)])
     return table(["`fit --preset standard --device cuda`, width", "seconds", "composite, dB", "flare, dB"], rows)
 
 
-def _time_fit(capture: Path, width: int, run: Path, clock: Clock) -> tuple[str, str, str]:
+def _time_fit(capture: Path, width: int, run: Path, deadline: Deadline) -> tuple[str, str, str]:
     """Fit and score a capture; return seconds, and the PSNR of composite and flare, as text."""
     command = [sys.executable, str(ROOT / "headless" / "run.py")]
     start = time.monotonic()
     try:
         subprocess.run([*command, "fit", str(capture), "--out", str(run), "--preset", "standard", "--size", str(width),
-                        "--device", "cuda"], check=True, timeout=max(clock.left, 1), capture_output=True)
+                        "--device", "cuda"], check=True, timeout=max(deadline.seconds_left, 1), capture_output=True)
         seconds = time.monotonic() - start
-        subprocess.run([*command, "eval", str(run), "--device", "cuda"], check=True, timeout=max(clock.left, 1),
+        subprocess.run([*command, "eval", str(run), "--device", "cuda"], check=True,
+                       timeout=max(deadline.seconds_left, 1),
                        capture_output=True)
     except subprocess.CalledProcessError as problem:
         return f"failed: {problem.stderr.decode(errors='replace').strip().splitlines()[-1:]}", "–", "–"
     except subprocess.TimeoutExpired:
-        metrics = run / "metrics.jsonl"
+        metrics = run / METRICS
         lines = metrics.read_text(encoding="utf-8").splitlines() if metrics.is_file() else []
         done = json.loads(lines[-1])["iteration"] if lines else 0
         return f"not finished: {done} iterations in {time.monotonic() - start:.0f} s", "–", "–"
-    scores = json.loads(read_bytes(run / "eval.json"))
+    scores = read_json(run / EVALUATION, RunError)
     return f"{seconds:.0f}", f"{scores['composite']['psnr']:.2f}", f"{scores['flare']['psnr']:.2f}"
 
 
-PARTS: dict[str, Callable[[Clock, Path], str]] = {
+PARTS: dict[str, Callable[[Deadline, Path], str]] = {
     "iterations": measure_iterations, "frames": measure_frames, "threads": measure_thread_scaling, "fits": measure_fits}
 
 
@@ -167,10 +169,11 @@ def main() -> int:
     except EngineError as problem:
         print(f"Nothing is measured: {problem}")
         return 0
-    clock = Clock(args.minutes)
+    deadline = Deadline(args.minutes)
     print(report.conditions(), flush=True)
     for part in args.only:
-        text = PARTS[part](clock, args.capture) if clock.left > MIN_SECONDS else f"{part} is left out: no time left."
+        has_time = deadline.seconds_left > MIN_SECONDS
+        text = PARTS[part](deadline, args.capture) if has_time else f"{part} is left out: no time left."
         print(f"\n{text}", flush=True)
     return 0
 

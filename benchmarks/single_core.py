@@ -40,7 +40,7 @@ class KernelTimer:
     def __init__(self) -> None:
         self.seconds = 0.0
 
-    def traced(self, call: Callable[..., None]) -> Callable[..., None]:
+    def timed(self, call: Callable[..., None]) -> Callable[..., None]:
         """Return `_ThreadPool.call` with its time added to `seconds`."""
         def timed_call(pool: Any, function: Any, scratch_size: int, arguments: Any, thread_count: int) -> None:
             started = time.perf_counter()
@@ -60,7 +60,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     timer = KernelTimer()
-    threads._ThreadPool.call = timer.traced(threads._ThreadPool.call)  # type: ignore[method-assign]
+    threads._ThreadPool.call = timer.timed(threads._ThreadPool.call)  # type: ignore[method-assign]
     trainer = Trainer(Capture.open(args.capture), preset(args.preset, iterations=args.iterations))
     rows = []
     for part in range(PARTS):

@@ -72,7 +72,7 @@ def upright_frames_of(frames: Iterable[PosedFrame], files: Mapping[str, Path],
 
     files: pictures by pose name. points: of the solve; None without one, where all turned frames count.
     """
-    turned = [frame for pose in frames if (frame := turned_frame(pose, files.get(pose.name))) is not None]
+    turned = [frame for posed in frames if (frame := turned_frame(posed, files.get(posed.name))) is not None]
     upright, warnings = ({frame.posed.name for frame in turned}, []) if points is None else find_upright(turned, points)
     return {frame.posed.name: frame for frame in turned if frame.posed.name in upright}, warnings
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Decodes a capture's frames for a fit, at its working size and in its display encoding, without black borders.
 
-`trainer` and `initialise` take them from `Frames.targets`.
+`initialise` and the measurements take them from `Frames.targets`, the trainers from `DeviceFrames.read`.
 """
 from __future__ import annotations
 
@@ -69,6 +69,10 @@ class Targets(NamedTuple):
     def to(self, device: torch.device) -> Targets:
         """Return the targets with their pictures on a device."""
         return Targets(self.camera, self.frame.to(device), None if self.clean is None else self.clean.to(device))
+
+
+MaskedTargets = tuple[Targets, Tensor | None]
+"""Targets, and the mask (height, width) of the pixels that count in the losses; None if all do."""
 
 
 class Frames:
@@ -232,19 +236,16 @@ class DeviceFrames:
     """The frames of a fit on its device. On a GPU they stay there, up to `memory` bytes; others are copied each time.
     """
 
-    def __init__(self, frames: Frames, device: torch.device, memory: int | None = None) -> None:
-        """Take the frames, none of which is read yet. memory: bytes for them on a GPU, None for DEVICE_MEMORY or a
-        quarter of what is free there."""
+    def __init__(self, frames: Frames, device: torch.device) -> None:
+        """Take the frames, none of which is read yet."""
         self.device = device
-        if memory is None:
-            memory = DEVICE_MEMORY
-            if device.type == "cuda" and torch.cuda.is_available():
-                memory = min(memory, torch.cuda.mem_get_info(device)[0] // 4)
-        self._frames, self._free_bytes = frames, memory
+        self._frames, self._free_bytes = frames, DEVICE_MEMORY
+        if device.type == "cuda":
+            self._free_bytes = min(DEVICE_MEMORY, torch.cuda.mem_get_info(device)[0] // 4)
         self._reduced = {1: frames}
-        self._stored: dict[tuple[str, int], tuple[Targets, Tensor | None]] = {}
+        self._stored: dict[tuple[str, int], MaskedTargets] = {}
 
-    def read(self, view: View, reduction: int = 1) -> tuple[Targets, Tensor | None]:
+    def read(self, view: View, reduction: int = 1) -> MaskedTargets:
         """Return `Frames.targets` and `Frames.mask` of a view, on the device; at the working size divided by
         `reduction`."""
         if (view.name, reduction) in self._stored:

@@ -110,9 +110,9 @@ def triangulate_pair(first: Camera, second: Camera, pixels: Floats, other_pixels
     A point is sound if it lies before both cameras, its rays differ by more than MIN_ANGLE, and it projects to less
     than MAX_ERROR_PX from both pixels.
     """
-    points, cosines, is_before = triangulate_midpoints(first.position, first.rays(pixels),
+    points, cosines, is_in_front = triangulate_midpoints(first.position, first.rays(pixels),
                                                        second.position, second.rays(other_pixels))
-    is_sound = is_before & (np.arccos(cosines.clip(-1, 1)) > MIN_ANGLE)
+    is_sound = is_in_front & (np.arccos(cosines.clip(-1, 1)) > MIN_ANGLE)
     for camera, observed in ((first, pixels), (second, other_pixels)):
         places, depth = camera.project(points)
         with np.errstate(invalid="ignore"):

@@ -98,8 +98,7 @@ def select_lights(flare: FlareModel, names: Sequence[str]) -> FlareModel:
     model = FlareModel([flare.names[row] for row in rows], flare.positions[rows],
                        [flare.lights[row] for row in rows], lights)
     model.clear.copy_(flare.clear[rows])
-    if rows:
-        model.move_to(model.lights[0].device)
+    model.move_to(model.device)
     return model
 
 

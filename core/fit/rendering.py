@@ -116,7 +116,7 @@ def _device_of(scene: Scene, flare: FlareModel | None) -> torch.device:
     """Return the device of a fitted model: that of its scene, or of its flare over plates."""
     if isinstance(scene, SceneGaussians):
         return scene.means.device
-    return flare.lights[0].device if flare is not None and flare.lights else torch.device("cpu")
+    return torch.device("cpu") if flare is None else flare.device
 
 
 def _move(pictures: T, device: torch.device) -> T:

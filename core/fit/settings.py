@@ -346,8 +346,6 @@ COARSE_TO_FINE = CoarseToFineSettings(scene_width=240, flare_width=120)
 """`coarse_to_fine` of `standard`."""
 STANDARD_SCENE_RATES = {"features": 5e-3, "features_rest": 5e-3 / 20, "scale": 0.02}
 """Learning rates of the scene in `standard`: above the paper's, for a fit a fifteenth as long."""
-TRAINED_SCENE_RATES = {f"scene.rates.{name}": getattr(SceneRates(), name) for name in STANDARD_SCENE_RATES}
-"""The rates, by dotted name, of a scene that was trained before and has to keep its detail."""
 SCENE_ONLY_UNTIL = 0.08
 """`flare.scene_only_until` of our form."""
 CORRECTION_WEIGHT = 0.1
@@ -411,6 +409,12 @@ def adapt_to_plates(settings: FitSettings) -> FitSettings:
     flare = replace(settings.flare, form=form, occlusion=False, snap_lights=False, scene_only_until=0.0,
                     density=density)
     return replace(settings, scene=replace(settings.scene, kind="plates"), flare=flare)
+
+
+def adapt_to_trained_scene(settings: FitSettings) -> FitSettings:
+    """Return settings whose learning rates keep the detail of a scene that was trained before."""
+    rates = replace(settings.scene.rates, **{name: getattr(SceneRates(), name) for name in STANDARD_SCENE_RATES})
+    return replace(settings, scene=replace(settings.scene, rates=rates))
 
 
 def _scale_schedule(settings: FitSettings, factor: float) -> FitSettings:

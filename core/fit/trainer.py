@@ -37,7 +37,7 @@ from . import metering
 from .checkpoint import FitInputs, State
 from .far_layer import far_layer_messages
 from .flare_trainer import FlareTrainer, load_parameters
-from .frames import DeviceFrames, Frames, Targets, masked, subsample
+from .frames import DeviceFrames, Frames, MaskedTargets, Targets, masked, subsample
 from .initialise import has_frame_lights, initial_flare, initial_scene
 from .optimisers import Optimisers
 from .parallax_losses import (
@@ -111,7 +111,7 @@ class Trainer(FlareTrainer):
         if self.flare is not None:
             self.flare.move_to(self.device)
         self._light_discs: dict[tuple[str, int], Tensor | None] = {}
-        """On a GPU, the light discs of views that were used, by name."""
+        """On a GPU, the light discs of views that were used, by name and width of the picture."""
 
         # Optimisers and strategy hold the parameters of the models.
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
@@ -163,7 +163,7 @@ class Trainer(FlareTrainer):
         loss = (scene_picture.new_zeros(()) if scene_only else
                 l1_ssim(masked(composite_picture, composite_target, flare_mask), composite_target, l1_weight))
         metrics = {} if scene_only else {"loss": float(loss.detach())}
-        scene_term = self._scene_loss(targets, mask, composite_picture, scene_picture, flare, light_discs)
+        scene_term = self._scene_term(targets, mask, composite_picture, scene_picture, flare, light_discs)
         if scene_term is not None:
             metrics["scene_loss"] = float(scene_term.detach())
             loss = loss + scene_term
@@ -183,21 +183,21 @@ class Trainer(FlareTrainer):
             self._change_flare_density()
         return metrics
 
-    def _load_targets_of_step(self, view: View) -> tuple[tuple[Targets, Tensor | None], tuple[Targets, Tensor | None]]:
+    def _load_targets_of_step(self, view: View) -> tuple[MaskedTargets, MaskedTargets]:
         """Return targets and mask of this iteration, for the loss of the scene and for that of the composite.
 
         They differ in size only while the flare is composited over the clean frame of the view.
         """
-        settings, size = self.settings.coarse_to_fine, self.frames.camera(view).size
+        schedule, size = self.settings.coarse_to_fine, self.frames.camera(view).size
         progress = self.iteration / self.settings.iterations
         # A scene that starts from a PLY has fine detail, which small pictures would destroy.
         is_coarse = self.settings.supervised and self.fits_scene and not self.settings.scene.start
-        scene_reduction = settings.scene_reduction(size, progress) if is_coarse else 1
-        of_scene = self._device_frames.read(view, scene_reduction)
-        if not self._is_separate or of_scene[0].clean is None:
-            return of_scene, of_scene
-        flare_reduction = settings.flare_reduction(size, progress) if settings.flare_width else scene_reduction
-        return of_scene, self._device_frames.read(view, flare_reduction)
+        scene_reduction = schedule.scene_reduction(size, progress) if is_coarse else 1
+        scene_targets = self._device_frames.read(view, scene_reduction)
+        if not self._is_separate or scene_targets[0].clean is None:
+            return scene_targets, scene_targets
+        flare_reduction = schedule.flare_reduction(size, progress) if schedule.flare_width else scene_reduction
+        return scene_targets, self._device_frames.read(view, flare_reduction)
 
     @property
     def _is_separate(self) -> bool:
@@ -348,7 +348,7 @@ class Trainer(FlareTrainer):
             return targets.frame
         return torch.where(light_discs[..., None], picture.clamp_min(1), targets.frame)
 
-    def _scene_loss(self, targets: Targets, mask: Tensor | None, composite_picture: Tensor, scene_picture: Tensor,
+    def _scene_term(self, targets: Targets, mask: Tensor | None, composite_picture: Tensor, scene_picture: Tensor,
                     flare: Splats | None, light_discs: Tensor | None) -> Tensor | None:
         """Return the loss of the scene's rendering, a scalar; None if the scene is frozen or only the composite
         supervises it.

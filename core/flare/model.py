@@ -272,6 +272,11 @@ class FlareModel(nn.Module):
         return [cast(LightFlare, flare) for flare in self.flares]
 
     @property
+    def device(self) -> torch.device:
+        """The device of the flares; the CPU without any."""
+        return self.lights[0].device if self.lights else torch.device("cpu")
+
+    @property
     def count(self) -> int:
         """Number of Gaussians in all flares."""
         return sum(flare.count for flare in self.lights)

@@ -180,15 +180,16 @@ def _visibilities(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor], 
     the whole scene.
     """
     sight_lines = [_sight_line(scene, eye, light, settings) for light in lights]
+    clear = scene.means.new_ones(())
     all_rows = [sight_line.rows for sight_line in sight_lines if sight_line is not None]
     if not all_rows:
-        return [scene.means.new_ones(()) for _ in lights]
+        return [clear for _ in lights]
     rows = torch.unique(torch.cat(all_rows)) if len(all_rows) > 1 else all_rows[0]
     occluders = _Occluders(scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits).select(rows)
     visibilities = []
     for sight_line in sight_lines:
         if sight_line is None:
-            visibilities.append(scene.means.new_ones(()))
+            visibilities.append(clear)
             continue
         is_subset = len(sight_line.rows) < len(rows)
         light_occluders = occluders.select(torch.searchsorted(rows, sight_line.rows)) if is_subset else occluders
@@ -242,9 +243,9 @@ def _occluder_rows(scene: SceneGaussians, pose: Tensor, distance: float, setting
     """
     if not scene.means.is_cpu:
         return _occluder_rows_on_device(scene, pose.to(scene.means), distance, settings)
-    means, scales, rigid = (part.detach().numpy() for part in (scene.means, scene.log_scales, pose))
+    means, scales, camera_pose = (part.detach().numpy() for part in (scene.means, scene.log_scales, pose))
     # Sums of columns, since a product of matrices this narrow waits for the threads of the BLAS.
-    x, y, depth = (sum(means[:, axis] * row[axis] for axis in range(3)) + row[3] for row in rigid[:3])
+    x, y, depth = (sum(means[:, axis] * row[axis] for axis in range(3)) + row[3] for row in camera_pose[:3])
     reach = 3 * np.exp(np.maximum(np.maximum(scales[:, 0], scales[:, 1]), scales[:, 2]))
     between = (depth > _near_plane(scene, distance)) & (depth < (1 - settings.margin) * distance)
     if scene.far is not None:

@@ -122,9 +122,9 @@ def _triangulate(observations: Observations, first: NDArray[np.int64], second: N
     behind a camera.
     """
     origins, other_origins = (observations.position[observations.view[index]] for index in (first, second))
-    midpoints, cosines, is_before = triangulate_midpoints(origins, observations.ray[first],
+    midpoints, cosines, is_in_front = triangulate_midpoints(origins, observations.ray[first],
                                                           other_origins, observations.ray[second])
-    valid = is_before & (1 - cosines ** 2 > MIN_SQUARED_SINE)
+    valid = is_in_front & (1 - cosines ** 2 > MIN_SQUARED_SINE)
     return np.concatenate([np.where(valid[:, None], midpoints, 0.0), valid[:, None].astype(float)], axis=1)
 
 

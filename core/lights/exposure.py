@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..conventions.smoothstep import smoothstep
 from ..images.picture import Picture
 from .detection import Detection, measure_detection
 
@@ -144,12 +145,6 @@ def _attached_share(core: NDArray[np.bool_], region: NDArray[np.bool_]) -> float
     middle = max(1.5, 0.5 * radius)
     ring = (distance > middle - 1) & (distance <= middle + 1)
     return float(np.pad(region, room)[ring].mean())
-
-
-def smoothstep(value: Any, low: float, high: float) -> Any:
-    """Return 0 below `low`, 1 above `high`, a cubic between; reversed for low > high. value: a number or an array."""
-    t = np.clip((value - low) / (high - low), 0.0, 1.0)
-    return t * t * (3 - 2 * t)
 
 
 def shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..colour.srgb import LUMINANCE
-from .exposure import smoothstep
+from ..conventions.smoothstep import smoothstep
 
 Floats = NDArray[np.float64]
 

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture.camera import Floats
+from ..conventions.smoothstep import smoothstep
 from ..images.picture import Picture
 from .detection import Detection, Mask, measure_detection
-from .exposure import MAX_AREA_SHARE, open_by_disc, shape_score, smoothstep
+from .exposure import MAX_AREA_SHARE, open_by_disc, shape_score
 
 OPENING_RATIO = 0.75
 """Radius of the opening that removes spikes and separates spots, relative to the thickest part's."""

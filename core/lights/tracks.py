@@ -157,13 +157,13 @@ def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], 
     return messages
 
 
-def _is_ghost(chain: Chain, lamps: Sequence[Chain], centre: Floats, diagonal: float) -> bool:
-    """Return whether a chain is a ghost of another one of `lamps`, whose spots are larger and move.
+def _is_ghost(chain: Chain, lights: Sequence[Chain], centre: Floats, diagonal: float) -> bool:
+    """Return whether a chain is a ghost of another one of `lights`, whose spots are larger and move.
 
     A ghost keeps to one ratio of the way from the principal point to its light. centre: principal point (2,), pixels.
     diagonal: length of the frame's diagonal, pixels.
     """
-    for light in lamps:
+    for light in lights:
         shared = sorted(set(chain.frames) & set(light.frames))
         if light is chain or len(shared) < max(3, 0.7 * len(chain.frames)):
             continue

@@ -74,7 +74,7 @@ class TrainedCamera:
 
 
 @dataclass(frozen=True, eq=False)
-class _Deformed:
+class _DeformedGaussians:
     """What the Gaussians of a light have from canonical parameters and offsets alone, wherever the light is.
 
     positions (n, 1) on the line, or (n, 2) on the plane. shift (n, 2): on the plane, or None. scales, rotations: of the
@@ -163,7 +163,7 @@ class LightLook:
         offsets = self._network.offsets(features, budget, name)
         if offsets.deformed is None:
             offsets.deformed = self._deform(offsets.by_name)
-        deformed: _Deformed = offsets.deformed
+        deformed: _DeformedGaussians = offsets.deformed
         light = view.light
         if form.light_correction:
             light = light + self._network.light_correction(features)
@@ -180,7 +180,7 @@ class LightLook:
             sh_colours = colours(rays, deformed.sh, form.sh_degree)
         return PlaneGaussians(means, covariances, deformed.opacities, sh_colours, deformed.rings, deformed.arcs), light
 
-    def _deform(self, offsets: Mapping[str, Floats]) -> _Deformed:
+    def _deform(self, offsets: Mapping[str, Floats]) -> _DeformedGaussians:
         """Return the canonical Gaussians with the offsets (n, width) of a view."""
         form, rows = self.form, self._canonical
         shift = offsets.get("plane_offset")
@@ -199,7 +199,7 @@ class LightLook:
             ellipse_arcs = rows["arcs"] + offsets["arcs"]
             opacities = opacities * opacity_gain(ellipse_arcs, rings)
             arcs = arcs_of_ellipse(ellipse_arcs, scales, rotations)
-        return _Deformed(positions, shift, scales, rotations,
+        return _DeformedGaussians(positions, shift, scales, rotations,
                          None if form.solid else covariance_of_ellipse(scales, rotations), opacities, sh,
                          None if form.sh_degree else colours(np.zeros((len(sh), 3), np.float32), sh, 0), rings, arcs)
 

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..choices import Follows
+from ..conventions.smoothstep import smoothstep
 from ..errors import FlareFileError
-from ..lights.exposure import smoothstep
 from ..look import LightLook, LookEdits, PlaneGaussians, ViewOfLight
 from ..look.look import read_description
 

@@ -123,7 +123,7 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
 
     Raises SettingsError if no picture has a light, and for two pictures of one name.
     """
-    path_by_name = _unique_names(paths)
+    path_by_name = _paths_by_name(paths)
     frames, unlit = [], []
     for frame in number_views(path_by_name):
         path = path_by_name[frame.view]
@@ -152,7 +152,7 @@ def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple
     return target
 
 
-def _unique_names(paths: Sequence[Path]) -> dict[str, Path]:
+def _paths_by_name(paths: Sequence[Path]) -> dict[str, Path]:
     """Return paths by their file names. Raises SettingsError for two different paths of one name."""
     path_by_name: dict[str, Path] = {}
     for path in paths:

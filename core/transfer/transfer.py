@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from ..bake.bake import BakeSettings, bake_frames
 from ..bake.layers import FrameLayers
 from ..capture import Camera
-from ..choices import Follows
+from ..choices import Device, Follows
 from ..colour import ColourSpace, colour_space
 from ..colour.srgb import Pixels
 from ..colour.srgb_torch import decode, encode
@@ -31,6 +31,7 @@ from ..fit.run import ViewLayers
 from ..flare.compositing import linear_layers as linear_layers
 from ..flare.visibility import VisibilitySettings, visibility_behind
 from ..gaussians import Splats
+from ..gaussians.device import select_device
 from ..images.picture import Picture
 from ..images.window import DataWindow, crop_to_display_window, move_to_window
 from ..lights.highlights import find_highlights
@@ -82,10 +83,10 @@ class Transfer:
 
     def __init__(self, flare: Path, target: Target, settings: TransferSettings | None = None,
                  training: Sequence[ArrayLike] | None = None, config: str | None = None,
-                 device: torch.device | None = None) -> None:
+                 device: Device = "cpu") -> None:
         """Read the look of `flare`, and index the target's frames. device: of the rasterizer, to which the target's
-        scene is moved; None for the CPU. Raises FlareFileError."""
-        self.device = device or torch.device("cpu")
+        scene is moved. Raises FlareFileError."""
+        self.device = select_device(device)
         if target.scene is not None:
             target.scene.to(self.device)
         self.flare, self.target, self.settings, self.config = flare, target, settings or TransferSettings(), config

@@ -120,7 +120,7 @@ def _fit_list(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress) -> FitSettings:
     """Return the settings from the arguments. Raises SettingsError."""
     from ...core.fit.overrides import override_settings
-    from ...core.fit.settings import TRAINED_SCENE_RATES, adapt_to_plates, preset
+    from ...core.fit.settings import adapt_to_plates, adapt_to_trained_scene, preset
 
     kind = scene_kind(args.scene, capture, progress)
     overrides = {"model": args.model} if args.model else {}
@@ -134,7 +134,7 @@ def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress)
         if not args.scene.is_file():
             raise SettingsError(f"--scene {args.scene} is missing.")
         changes["scene.start"] = str(args.scene.resolve())
-        changes |= TRAINED_SCENE_RATES
+        settings = adapt_to_trained_scene(settings)
     changes["scene.frozen"] = args.freeze_scene or None
     changes = {name: value for name, value in changes.items() if value is not None}
     return override_settings(settings, {**changes, **dict(map(parse_setting, args.changes))}, progress)

@@ -166,7 +166,6 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     step, which --jobs starts. flare: the .flare. training_poses: of training views, for a .flare that does not store
     its own. Returns the command's result.
     """
-    from ...core.gaussians.device import select_device
     from ...core.transfer.target import resized
     from ...core.transfer.transfer import Transfer, TransferSettings
 
@@ -180,7 +179,7 @@ def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, tar
     settings = TransferSettings(options.query, options.scale, options.smooth, options.plate_space,
                                 fall_off=options.fall_off, highlights=options.highlights,
                                 highlight_gain=1.0 if options.highlight_gain is None else options.highlight_gain)
-    transfer = Transfer(flare, target, settings, training_poses, args.ocio, select_device(args.device))
+    transfer = Transfer(flare, target, settings, training_poses, args.ocio, args.device)
     selected = frames.select_task([target_frame.frame for target_frame in target.frames], args, progress)
     if not selected:
         return layers.empty_result(args.out)

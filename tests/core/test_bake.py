@@ -23,7 +23,7 @@ from core.images.exr import exr_colour_space, read_exr, read_exr_header
 from core.images.write import write_exr
 from core.look import KeyedEdits, LookEdits
 from core.system.files import write_json
-from core.system.progress import Progress
+from tests.core.recording_progress import StopAfter
 
 HALF = 2.0 ** -11  # the relative rounding error of 16 bit floats
 
@@ -248,18 +248,6 @@ def test_edits_by_frame_reach_the_renderer_or_the_layers(tmp_path: Path) -> None
     np.testing.assert_allclose(np.ptp(second.flares["key light"], axis=-1), 0, atol=2e-3)
     with pytest.raises(RunError, match="other settings"):
         bake(renderer, FRAMES, CAMERAS, tmp_path, BakeSettings(edits=("key light.saturation=0",)))
-
-
-class StopAfter(Progress):
-    def __init__(self, steps: int) -> None:
-        super().__init__()
-        self.steps = steps
-
-    def advance(self, steps: int = 1, **figures: float) -> None:
-        self.steps -= steps
-        if self.steps <= 0:
-            self.request_stop()
-        super().advance(steps, **figures)
 
 
 def test_a_stopped_bake_resumes(tmp_path: Path) -> None:

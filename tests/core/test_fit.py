@@ -47,9 +47,8 @@ from core.images.write import write_png
 from core.look import LookEdits, draw
 from core.look.form import FORM_BOUNDS
 from core.system.folder_lock import folder_lock
-from core.system.progress import Progress
 from tests.core.flared import flared_capture
-from tests.core.recording_progress import RecordingProgress
+from tests.core.recording_progress import RecordingProgress, StopAfter
 
 ROOT = Path(__file__).parents[2]
 
@@ -72,21 +71,6 @@ def quick(iterations: int = 40, **changes: Any) -> FitSettings:
         "flare.count": 60, "flare.occlusion": False, "holdout": 4, "preview_every": 15, "flare.density.start": 10,
         "flare.density.every": 10, "flare.density.stop": 30, "scene.classic.start": 5, "scene.classic.every": 10,
         "scene.reorder_every": 12, "scene.sh_every": 8, **changes})
-
-
-class StopAt(Progress):
-    """Asks for a stop once the given number of steps of a stage were made."""
-
-    def __init__(self, steps: int, stage: str = "fit") -> None:
-        super().__init__()
-        self.steps, self.counted = steps, stage
-
-    def advance(self, steps: int = 1, **figures: float) -> None:
-        if self._stage == self.counted:
-            self.steps -= steps
-            if self.steps <= 0:
-                self.request_stop()
-        super().advance(steps, **figures)
 
 
 def tensors_of(run: Run) -> dict[str, torch.Tensor]:
@@ -169,7 +153,7 @@ def test_a_resumed_fit_equals_the_uninterrupted_one_bit_for_bit(tmp_path: Path, 
     whole = fit(capture, quick(), tmp_path / "whole")
     for steps in (7, 11, 13):
         with pytest.raises(Cancelled):
-            fit(capture, quick(), tmp_path / "broken", StopAt(steps), resume=True)
+            fit(capture, quick(), tmp_path / "broken", StopAfter(steps, "fit"), resume=True)
     broken = fit(capture, quick(), tmp_path / "broken", resume=True)
     assert json.loads((tmp_path / "broken/metrics.jsonl").read_text().splitlines()[-1])["iteration"] == 40
     expected, got = tensors_of(whole), tensors_of(broken)
@@ -180,7 +164,7 @@ def test_a_resumed_fit_equals_the_uninterrupted_one_bit_for_bit(tmp_path: Path, 
 
 def test_a_second_fit_in_one_folder_is_refused(tmp_path: Path, capture: Capture) -> None:
     with pytest.raises(Cancelled):
-        fit(capture, quick(), tmp_path / "run", StopAt(2))
+        fit(capture, quick(), tmp_path / "run", StopAfter(2, "fit"))
     with folder_lock(tmp_path / "run"):
         for resume in (True, False):
             with pytest.raises(RunError, match="Another process"):
@@ -488,7 +472,7 @@ def test_a_fit_finishes_while_another_program_holds_its_checkpoint(tmp_path: Pat
 
 def test_a_run_folder_is_not_overwritten(tmp_path: Path, capture: Capture) -> None:
     with pytest.raises(Cancelled):
-        fit(capture, quick(), tmp_path / "run", StopAt(2))
+        fit(capture, quick(), tmp_path / "run", StopAfter(2, "fit"))
     with pytest.raises(RunError, match="resume"):
         fit(capture, quick(), tmp_path / "run")
     with pytest.raises(RunError, match="scene"):
@@ -498,12 +482,12 @@ def test_a_run_folder_is_not_overwritten(tmp_path: Path, capture: Capture) -> No
 def test_a_run_resumes_only_with_its_own_capture(tmp_path: Path, capture: Capture) -> None:
     other = Capture.open(shutil.copytree(capture.folder, tmp_path / "other"))
     with pytest.raises(Cancelled):
-        fit(capture, quick(), tmp_path / "run", StopAt(2))
+        fit(capture, quick(), tmp_path / "run", StopAfter(2, "fit"))
     with pytest.raises(RunError, match=r"holds a fit of .*, not of .*other"):
         fit(other, quick(), tmp_path / "run", resume=True)
     (tmp_path / "run" / "capture.txt").write_text(str(tmp_path / "gone"))  # it moved: here it lies elsewhere
     with pytest.raises(Cancelled):
-        fit(other, quick(), tmp_path / "run", StopAt(1), resume=True)
+        fit(other, quick(), tmp_path / "run", StopAfter(1, "fit"), resume=True)
 
 
 def test_a_fit_resumes_only_with_unchanged_lights(tmp_path: Path, capture: Capture) -> None:
@@ -517,7 +501,7 @@ def test_a_fit_resumes_only_with_unchanged_lights(tmp_path: Path, capture: Captu
         return own
 
     with pytest.raises(Cancelled):
-        fit(with_lights(*both), quick(), tmp_path / "run", StopAt(2))
+        fit(with_lights(*both), quick(), tmp_path / "run", StopAfter(2, "fit"))
     for lights, what in (
             (both[::-1], "were 'lamp', 'sun', and are 'sun', 'lamp' now"), (both[:1], "are 'lamp' now"),
             ((lamp, Light("moon", both[1].xyz)), "are 'lamp', 'moon' now"),
@@ -526,14 +510,14 @@ def test_a_fit_resumes_only_with_unchanged_lights(tmp_path: Path, capture: Captu
             fit(with_lights(*lights), quick(), tmp_path / "run", resume=True)
     as_blender_has_it = (lamp, Light("sun", both[1].xyz.astype(np.float32) + 1e-6))
     with pytest.raises(Cancelled):
-        fit(with_lights(*as_blender_has_it), quick(), tmp_path / "run", StopAt(1), resume=True)
+        fit(with_lights(*as_blender_has_it), quick(), tmp_path / "run", StopAfter(1, "fit"), resume=True)
 
 
 @pytest.mark.parametrize("what", ["images", "removed", "the camera"])
 def test_a_fit_resumes_only_with_unchanged_views(what: str, tmp_path: Path, capture: Capture) -> None:
     own = Capture.open(shutil.copytree(capture.folder, tmp_path / "own"))
     with pytest.raises(Cancelled):
-        fit(own, quick(), tmp_path / "run", StopAt(1))
+        fit(own, quick(), tmp_path / "run", StopAfter(1, "fit"))
     view = own.views[1]
     if what == "the camera":
         turned = replace(view, camera=replace(view.camera, fx=view.camera.fx * 1.01))
@@ -588,7 +572,7 @@ def test_a_capture_in_small_units_has_a_nearer_near_plane(capture: Capture) -> N
 def test_a_damaged_checkpoint_or_result_is_one_line(tmp_path: Path, capture: Capture) -> None:
     folder = tmp_path / "run"
     with pytest.raises(Cancelled):
-        fit(capture, quick(), folder, StopAt(2))
+        fit(capture, quick(), folder, StopAfter(2, "fit"))
     state = folder / "checkpoint/state.safetensors"
     whole = state.read_bytes()
     for data in (b"", whole[: len(whole) // 2], b"\x80\x04pickle"):

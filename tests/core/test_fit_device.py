@@ -22,10 +22,10 @@ from core.gaussians.device import select_device
 from core.look import PlacedLight, read_look
 from core.look.shot import Shot, ShotFrame
 from core.metrics.evaluation import evaluate
-from core.system.progress import Progress
 from core.transfer.target import shot_target
 from core.transfer.transfer import Transfer
 from tests.core.flared import flared_capture
+from tests.core.recording_progress import StopAfter
 from tests.core.simulated_gpu import GPU, SimulatedGpu, simulate
 
 MAX_DIFFERENCE_DB = 0.2
@@ -64,20 +64,6 @@ def scores(run: Run) -> dict[str, float]:
     return {layer: means[layer]["psnr"] for layer in ("composite", "scene", "flare", "flare_linear")}
 
 
-class _StopAfter(Progress):
-    """Requests a stop after some iterations."""
-
-    def __init__(self, iterations: int) -> None:
-        super().__init__()
-        self._left = iterations
-
-    def advance(self, steps: int = 1, **figures: float) -> None:
-        self._left -= steps if self._stage == "fit" else 0
-        if self._left == 0:
-            self.request_stop()
-        super().advance(steps, **figures)
-
-
 def test_a_fit_on_a_gpu_scores_as_one_on_the_processor(tmp_path: Path, capture: Capture, gpu: SimulatedGpu) -> None:
     on_cpu = scores(fit(capture, quick(40, device="cpu"), tmp_path / "cpu"))
     with gpu:
@@ -102,9 +88,9 @@ def test_every_kind_of_fit_runs_on_a_gpu(model: str, mode: str, changes: dict[st
 
 def test_a_fit_resumes_on_another_device(tmp_path: Path, capture: Capture, gpu: SimulatedGpu) -> None:
     with gpu, pytest.raises(Cancelled):
-        fit(capture, quick(12, device="cuda"), tmp_path / "run", _StopAfter(4))
+        fit(capture, quick(12, device="cuda"), tmp_path / "run", StopAfter(4, "fit"))
     with pytest.raises(Cancelled):
-        fit(capture, quick(12), tmp_path / "run", _StopAfter(4), resume=True, device="cpu")
+        fit(capture, quick(12), tmp_path / "run", StopAfter(4, "fit"), resume=True, device="cpu")
     with gpu:
         resumed = fit(capture, quick(12), tmp_path / "run", resume=True)
     whole = fit(capture, quick(12, device="cpu"), tmp_path / "whole")
@@ -121,7 +107,7 @@ def test_a_shot_and_a_transfer_are_rendered_on_a_gpu(tmp_path: Path, capture: Ca
     def layers(device: str) -> list[np.ndarray[Any, Any]]:
         """Return scene and flare of the shot, and of its transfer in the scene of the run."""
         target = replace(shot_target(shot, look, {}, scene=run.folder / "scene.ply"), scene_is_background=True)
-        transfer = Transfer(flare, target, device=select_device(device))  # type: ignore[arg-type]
+        transfer = Transfer(flare, target, device=device)  # type: ignore[arg-type]
         renderings = (ShotRenderer(shot, device).render(shot.frames[0], camera),  # type: ignore[arg-type]
                       transfer.frame_renderer(target.frames[0].frame).render(camera))
         return [part for each in renderings for part in (each.scene, each.flare_by_light["lamp"], each.depth)]

@@ -26,8 +26,8 @@ from core.fit.trainer import Trainer
 from core.images.write import write_png
 from core.system.files import write_text
 from tests.core.flared import cameras, flared_capture
-from tests.core.recording_progress import RecordingProgress
-from tests.core.test_fit import StopAt, quick
+from tests.core.recording_progress import RecordingProgress, StopAfter
+from tests.core.test_fit import quick
 
 Light = NDArray[np.float32]
 SCALE, SIDE, COUNT = 3, 20, 12
@@ -241,7 +241,7 @@ def test_a_resumed_fit_keeps_its_exposures(drifting: tuple[Capture, dict[str, fl
     monkeypatch.setattr(metering, "measure_exposures", lambda *_: exposures)
     whole = fit(capture, quick(30), tmp_path / "whole")
     with pytest.raises(Cancelled):
-        fit(capture, quick(30), tmp_path / "run", StopAt(12))
+        fit(capture, quick(30), tmp_path / "run", StopAfter(12, "fit"))
     monkeypatch.setattr(metering, "measure_exposures", lambda *_: pytest.fail("they are known"))
     assert fit(capture, quick(30), tmp_path / "run", resume=True).fingerprint == whole.fingerprint
 
@@ -249,7 +249,7 @@ def test_a_resumed_fit_keeps_its_exposures(drifting: tuple[Capture, dict[str, fl
 def test_a_fit_stops_while_exposures_are_measured(drifting: tuple[Capture, dict[str, float]],
                                                   tmp_path: Path) -> None:
     with pytest.raises(Cancelled, match="look at exposures"):
-        fit(drifting[0], quick(10), tmp_path / "run", StopAt(3, "look at exposures"))
+        fit(drifting[0], quick(10), tmp_path / "run", StopAfter(3, "look at exposures"))
     assert not (tmp_path / "run").exists()
 
 
@@ -259,7 +259,7 @@ def test_a_resumed_fit_without_exposures_gets_none(drifting: tuple[Capture, dict
     capture, exposures = drifting
     monkeypatch.setattr(metering, "measure_exposures", lambda *_: {})
     with pytest.raises(Cancelled):
-        fit(capture, quick(30), tmp_path / "run", StopAt(12))
+        fit(capture, quick(30), tmp_path / "run", StopAfter(12, "fit"))
     monkeypatch.setattr(metering, "measure_exposures", lambda *_: exposures)
     assert fit(capture, quick(30), tmp_path / "run", resume=True).exposures == {}
 

@@ -24,7 +24,7 @@ from core.images.write import write_png
 from core.metrics.pictures import relative_l2
 from core.removal.jobs.fitted import remove_fitted_flare
 from core.system.progress import Progress
-from tests.core.test_fit import StopAt
+from tests.core.recording_progress import StopAfter
 
 WIDTH, HEIGHT, FRAMES = 96, 54, 16
 OFF = {7, 8}
@@ -175,7 +175,7 @@ def test_a_stopped_fit_continues_as_if_it_had_not_stopped(shot: Path, tmp_path: 
     capture = Capture.open(shot, need_cameras=False)
     whole = fit(capture, quick(30), tmp_path / "whole")
     with pytest.raises(Cancelled):
-        fit(capture, quick(30), tmp_path / "parts", StopAt(17))
+        fit(capture, quick(30), tmp_path / "parts", StopAfter(17, "fit"))
     assert (tmp_path / "parts" / CHECKPOINT).is_file()
     parts = fit(capture, quick(30), tmp_path / "parts", resume=True)
     assert parts.fingerprint == whole.fingerprint

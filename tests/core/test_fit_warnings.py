@@ -17,8 +17,8 @@ from core.fit.warnings import footage_warnings, outlier_warnings
 from core.images.write import write_png
 from core.metrics.evaluation import is_worse_than_empty
 from tests.core.flared import HEIGHT, WIDTH, flared_capture
-from tests.core.recording_progress import RecordingProgress
-from tests.core.test_fit import StopAt, quick
+from tests.core.recording_progress import RecordingProgress, StopAfter
+from tests.core.test_fit import quick
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_a_frame_of_another_scene_is_named(tmp_path: Path) -> None:
     tiles = np.random.default_rng(5).random((4, 8, 3)).repeat(HEIGHT // 4, 0).repeat(WIDTH // 8, 1)
     write_png(folder / "images" / "0005.png", tiles)
     with pytest.raises(Cancelled):
-        fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "odd", StopAt(118))
+        fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "odd", StopAfter(118, "fit"))
     fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "odd", heard, resume=True)
     assert [text.split(":")[0] for text in heard.texts if "does not reproduce the shot" in text] == ["0005.png"]
 

@@ -35,7 +35,7 @@ from core.removal.training.shared_arrays import SharedArrays
 from core.removal.training.trainer import RemovalTrainer
 from core.removal.training.workers import SINGLE_WORKER, SharedBuffers, Worker, worker_group
 from core.system.folder_lock import folder_lock
-from core.system.progress import Progress
+from tests.core.recording_progress import StopAfter
 
 torch.set_num_threads(1)  # small tensors, on which threads only wait for each other
 
@@ -53,26 +53,11 @@ def widths_of(path: Path) -> tuple[int, ...]:
     return tuple(see.out_channels for see in weights.load_network(path).input_convs)  # type: ignore[union-attr, misc]
 
 
-class StopAfter(Progress):
-    """Asks for a stop at a step of the training."""
-
-    def __init__(self, steps: int) -> None:
-        super().__init__()
-        self._steps = steps
-
-    def advance(self, steps: int = 1, **figures: float) -> None:
-        if self._stage == "train":
-            self._steps -= 1
-            if self._steps == 0:
-                self.request_stop()
-        super().advance(steps, **figures)
-
-
 def test_a_resumed_training_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
     whole = run.train(RECIPE, tmp_path / "whole", backgrounds(), built_in_lenses(), processes=1)
     with pytest.raises(Cancelled):
         run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in_lenses(), processes=1,
-                  progress=StopAfter(2))
+                  progress=StopAfter(2, "train"))
     with pytest.raises(RunError, match="--resume"):
         run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in_lenses())
     with folder_lock(tmp_path / "parts"), pytest.raises(RunError, match="Another process"):
@@ -403,7 +388,7 @@ def test_the_log_of_a_killed_training_restarts_at_its_checkpoint(tmp_path: Path,
     """Lines that were logged after the last checkpoint are logged again, once."""
     monkeypatch.setattr(run, "VALIDATE_EVERY", 1)
     with pytest.raises(Cancelled):
-        run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), processes=1, progress=StopAfter(2))
+        run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), processes=1, progress=StopAfter(2, "train"))
     log = tmp_path / run.LOG
     log.write_text(log.read_text(encoding="utf-8") + '{"iteration": 3, "loss": 7.0}\n{"iterat', encoding="utf-8")
     run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), resume=True, processes=1)
@@ -425,7 +410,7 @@ def test_the_weights_of_the_best_validation_are_written(tmp_path: Path, monkeypa
     train(tmp_path / "whole", validation=tests)
     assert kept("whole") == "2"
     with pytest.raises(Cancelled):
-        train(tmp_path / "parts", validation=tests, progress=StopAfter(3))
+        train(tmp_path / "parts", validation=tests, progress=StopAfter(3, "train"))
     assert weights.read_weights(tmp_path / "parts" / run.CHECKPOINT)[1]["iteration"] == "3"
     train(tmp_path / "parts", validation=tests, resume=True)
     assert kept("parts") == "2", "what a part before had found is still the best"
@@ -621,7 +606,8 @@ def test_final_weights_contain_a_share_of_the_initial_ones(tmp_path: Path) -> No
     for share in (0.0, 0.5, 1.0):
         folder, recipe = tmp_path / str(share), replace(RECIPE, initial_weights_mix=share, seed=2)
         with pytest.raises(Cancelled):
-            run.train(recipe, folder, backgrounds(), built_in_lenses(), start=first, processes=1, progress=StopAfter(2))
+            run.train(recipe, folder, backgrounds(), built_in_lenses(), start=first, processes=1,
+                      progress=StopAfter(2, "train"))
         run.train(recipe, folder, backgrounds(), built_in_lenses(), start=first, processes=1, resume=True)
         kept[share] = weights.read_weights(folder / run.WEIGHTS)[0]
     initial = weights.read_weights(first)[0]

@@ -36,8 +36,10 @@ class Preparation:
     """A scene that is being read for a bake."""
 
     def __init__(self, reading: ShotReading, own_folder: bool, folder: Path) -> None:
-        """Begin at the first frame. own_folder: the layers of a single camera have a subfolder too. folder: where the
-        layers are written."""
+        """Prepare the bake of a scene; `step` reads its frames.
+
+        own_folder: the layers of a single camera have a subfolder too. folder: where the layers are written.
+        """
         self.reading, self.error = reading, ""
         self._own_folder, self._folder = own_folder, folder
 

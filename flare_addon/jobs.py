@@ -80,7 +80,10 @@ class Job:
 
     def __init__(self, kind: str, folder: Path, origin: Origin, args: Sequence[str] = (),
                  process: subprocess.Popen[bytes] | None = None) -> None:
-        """Begin to watch a job in its folder. process: the running process, if this Blender started it."""
+        """Represent a job in its folder; `poll` reads its events.
+
+        process: the running process, if this Blender started it.
+        """
         self.kind, self.folder, self.origin = kind, folder, origin
         self.args = [arg for arg in args if arg != "--overwrite"]
         self.state: State = "running"

@@ -86,7 +86,7 @@ def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add:
             flare.target = lamp
     _place_flares(scene, look, targets, add)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
-    # The label of `native` is Of This Capture.
+    # Blender shows this property as "Of This Capture".
     state.native = _is_of_this_capture(look, state, objects, depsgraph_of(scene))
     return look
 
@@ -291,7 +291,7 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
     item: the flare. hides: whether objects hide the light. rendered: the collections that renders show.
     occluders: boxes of the objects that may hide lights, None to cast all rays.
     """
-    eye, target = camera.translation, item.target
+    camera_position, target = camera.translation, item.target
     is_dark = item.follow_visibility and not lamp_drive.is_visible(target, depsgraph, rendered)
     try:
         matrix = world_matrix(target, depsgraph)
@@ -301,21 +301,21 @@ def place_light(scene: Any, depsgraph: Any, camera: Any, to_capture: NDArray[np.
         # Of a disabled object the last known position is good enough, since its flare is dark.
         xyz = (to_capture @ np.array([*target.matrix_world.translation, 1.0]))[:3]
         return PlacedLight(item.name, item.source, xyz, 0.0, factor=lamp_drive.DARK)
-    position = light_position(target, matrix, eye)
+    position = light_position(target, matrix, camera_position)
     xyz = (to_capture @ np.array([*position, 1.0]))[:3]
     # A dark light has its visibility too, since a transfer smooths visibilities over neighbouring frames.
-    gain = lamp_drive.DARK if is_dark else lamp_drive.flare_gain(scene, depsgraph, item, matrix, eye)
+    gain = lamp_drive.DARK if is_dark else lamp_drive.flare_gain(scene, depsgraph, item, matrix, camera_position)
     reference = item.reference_distance if item.follow_distance and not lamp_drive.is_sun(target) else 0.0
     reference *= float(np.cbrt(abs(np.linalg.det(to_capture[:3, :3]))))  # scene units to units of the capture
     extent = light_extents.extent_of(item, depsgraph, matrix)
     if extent is None:
-        visibility = occlusion.visibility(scene, depsgraph, eye, item, occluders) if hides else 1.0
+        visibility = occlusion.visibility(scene, depsgraph, camera_position, item, occluders) if hides else 1.0
         return PlacedLight(item.name, item.source, xyz, visibility, factor=gain, reference_distance=reference)
     extent, shares = extent.transformed(to_capture[:3, :3]), None
     if hides:
         cells = extent.sampled(xyz, cameras.transformed_pose(camera, to_capture))
         points = (np.pad(cells.points, ((0, 0), (0, 1)), constant_values=1) @ np.linalg.inv(to_capture).T)[:, :3]
-        shares = tuple(cells.shares(occlusion.visible_points(scene, depsgraph, eye, item, points)).tolist())
+        shares = tuple(cells.shares(occlusion.visible_points(scene, depsgraph, camera_position, item, points)).tolist())
     return PlacedLight(item.name, item.source, xyz, 1.0, extent, shares, gain, reference)
 
 

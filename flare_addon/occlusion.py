@@ -83,11 +83,16 @@ def visibility(scene: Any, depsgraph: Any, eye: Any, item: Any, occluders: Occlu
     the instances of these. occluders: boxes of what may hide it; None to cast all rays.
     """
     position = light_position(item.target, world_matrix(item.target, depsgraph), eye)
-    radius = item.radius or DISC_RADIUS_FRACTION * (position - eye).length
+    radius = _disc_radius(item.radius, (position - eye).length)
     if occluders is not None and not occluders.may_hide(eye, position, radius):
         return _CLEAR
     ignored, instances = _lamp_parts(item, depsgraph)
     return disc_visibility(scene, depsgraph, eye, position, ignored, item.radius, instances)
+
+
+def _disc_radius(radius: float, distance: float) -> float:
+    """Return the radius of a light's disc, world units: `radius`, or for 0 the default part of the distance."""
+    return radius or DISC_RADIUS_FRACTION * distance
 
 
 def _lamp_parts(item: Any, depsgraph: Any) -> tuple[set[str], set[tuple[str, Any]]]:
@@ -116,7 +121,7 @@ def disc_visibility(scene: Any, depsgraph: Any, eye: Any, light: Any, ignored: s
     distance = offset.length
     if distance < 1e-6:
         return 1.0
-    radius = disc_radius or DISC_RADIUS_FRACTION * distance
+    radius = _disc_radius(disc_radius, distance)
     forward = offset / distance
     right = forward.orthogonal().normalized()
     up = forward.cross(right)

@@ -30,7 +30,7 @@ from . import baking, highlight, looks, stereo
 from .compositor.flare_node import find_node
 from .overlay_quads import LEVELS, DrawnRegion, QuadMemory, Quads, quads_by_level
 from .overlay_shaders import gaussian_shader, sum_shader
-from .properties import redraw_viewports
+from .properties import redraw_viewports, schedule_redraw
 from .scene_changes import change_count
 from .views import camera_of, has_display_footage
 from .working_space import working_space
@@ -41,8 +41,6 @@ to rounding."""
 
 NETWORK_S, NETWORK_AT_REST_S = 0.02, 0.25
 """Time for the look's network in one drawing while the camera moves, and at rest; more lights than fit take turns."""
-REFINE_S = 0.02
-"""Time after which a drawing in which lights wait for their turn is followed by another."""
 
 Floats = NDArray[np.float32]
 
@@ -173,7 +171,7 @@ def render_levels(gaussians: PlaneGaussians | None, window: DrawnRegion, look: L
     return buffers
 
 
-def composite_levels(buffers: list[Any], box: tuple[float, float, float, float], blend: str, region: DrawnRegion,
+def composite_levels(buffers: list[Any], box: tuple[float, float, float, float], blend: str, window: DrawnRegion,
                      space: NDArray[np.float64]) -> None:
     """Add rendered levels to the bound framebuffer, inside box (left, bottom, right, top; 0..1 of its size).
 
@@ -187,7 +185,7 @@ def composite_levels(buffers: list[Any], box: tuple[float, float, float, float],
     shader = _shader("sum")
     shader.bind()
     shader.uniform_float("box", box)
-    shader.uniform_float("extent", (region.width, region.height))
+    shader.uniform_float("extent", (window.width, window.height))
     shader.uniform_float("is_display", 1.0 if blend == "over" else 0.0)
     shader.uniform_float("working_space", Matrix(space.tolist()).to_4x4())
     for number, offscreen in enumerate(buffers):
@@ -295,8 +293,8 @@ def _render_region(context: Any, scene: Any, camera: Any, window: DrawnRegion, l
     budget = _budgets.setdefault((camera.name_full, eye), OffsetsBudget(NETWORK_S, NETWORK_AT_REST_S))
     budget.begin()
     flares = looks.evaluate_flares(scene, context.view_layer.depsgraph, camera, edits, budget, eye=eye)
-    if not budget.is_complete and not bpy.app.timers.is_registered(redraw_viewports):
-        bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
+    if not budget.is_complete:  # lights wait for their turn
+        schedule_redraw()
     gaussians = concatenate(list(flares.values()))
     if gaussians is None:
         return None

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.conventions.splatting import OPACITY_MAX
 from ..core.look import Look, PlaneGaussians, to_pixels
-from ..core.look.drawing import OPACITY_MAX, cutoff_radii
+from ..core.look.drawing import cutoff_radii
 from ..core.look.plane import arc_log_peak, arcs_to_pixels
 
 LEVELS = (1, 2, 4, 8, 16)
@@ -86,7 +87,7 @@ class QuadMemory:
         return self._triangles[:2 * count]
 
 
-def level_indices(short: Floats, rings: Floats | None) -> NDArray[np.uint8]:
+def overlay_level_indices(short: Floats, rings: Floats | None) -> NDArray[np.uint8]:
     """Return the index in LEVELS (n,) that each Gaussian is drawn in.
 
     short: (n,) standard deviations along the short axes, pixels. rings: (n, 2) r0 and w, or None.
@@ -126,7 +127,7 @@ def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look, m
     if look.blend == "over":
         levels = np.zeros(len(rows), np.uint8)  # all at full size
     else:
-        levels = level_indices(short, None if gaussians.rings is None else gaussians.rings[rows])
+        levels = overlay_level_indices(short, None if gaussians.rings is None else gaussians.rings[rows])
     order = np.argsort(levels, kind="stable")
     rows, long, short, axes, levels = rows[order], long[order], short[order], axes[order], levels[order]
     divisors = np.array(LEVELS, np.float32)[levels]

@@ -8,14 +8,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .properties import redraw_viewports
+from .properties import schedule_redraw
 
 ATTRIBUTE = "Col"
 MAX_VERTICES = 400_000  # that are drawn; larger clouds are thinned to every second, third, ... vertex
 VERTICES_PER_DRAWING = 25_000
 """Vertices that one drawing sends to the GPU at most."""
-REFINE_S = 0.02
-"""Time after which a drawing of a part of a cloud is followed by another."""
 
 Floats = NDArray[np.float32]
 
@@ -118,8 +116,8 @@ def _draw() -> None:
             gpu.matrix.multiply_matrix(item.matrix_world)
             cloud.draw()
         gpu.state.depth_test_set("NONE")
-        if not cloud.is_complete and not bpy.app.timers.is_registered(redraw_viewports):
-            bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
+        if not cloud.is_complete:
+            schedule_redraw()
 
 
 def clear_cache() -> None:

@@ -34,6 +34,9 @@ PATH_OPTIONS = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) 
 OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
 """Option for properties of linked objects, whose values would otherwise not be saved."""
 
+REFINE_S = 0.02
+"""Time after which a drawing that is not complete is followed by another."""
+
 PRESETS: tuple[tuple[Preset, str, str], ...] = (
     ("draft", "Draft", f"A first result in minutes: {ITERATIONS['draft']:,} iterations"),
     ("standard", "Standard", f"Good for most shots: {ITERATIONS['standard']:,} iterations"),
@@ -43,8 +46,7 @@ MODES: tuple[tuple[Mode, str, str, int], ...] = (  # a .blend stores the numbers
     ("default", "Exact Clean Frames", "Use the clean frames in the capture's folder removed/ (or truth/scene/) and "
      "take them as exact", 0),
     ("estimated", "Estimated Clean Frames", "Use the clean frames of Make Clean Frames, or those that the "
-     "removal network makes when the fit starts. Parallax separates their remaining flare. The fit takes a fifth "
-     "longer", 2),
+     "removal network makes when the fit starts. Parallax separates their remaining flare. The fit takes longer", 2),
     ("split", "No Clean Frames", "Separate scene and flare by parallax alone. The fit takes longer", 1),
 )
 
@@ -56,6 +58,12 @@ def redraw_viewports(_self: Any = None, _context: Any = None) -> None:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
                 area.tag_redraw()
+
+
+def schedule_redraw() -> None:
+    """Redraw every 3D view after REFINE_S."""
+    if not bpy.app.timers.is_registered(redraw_viewports):
+        bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
 
 
 def _update_target(self: Any, context: Any) -> None:

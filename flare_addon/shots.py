@@ -252,8 +252,8 @@ def camera_folder(layers: Path, camera: Any, render: Any) -> Path:
     name = camera.name if camera is not None else ""
     # Where the last bake wrote into the folder itself (""), or EXRs are there, they serve any camera.
     if name not in folders and "" not in last_folders.values() and not any(layers.glob("*.exr")):
-        stereo_names = {f"{name}{suffix}" for view in render.views for suffix in (view.file_suffix, f"_{view.name}")}
-        hint = "" if render.use_multiview or stereo_names.isdisjoint(folders) else (
+        labels = stereo.possible_labels(render, name)
+        hint = "" if render.use_multiview or labels.isdisjoint(folders) else (
             " Layers of a stereo render need Stereoscopy switched on.")
         raise FrameError(f"{layers} has no layers of the camera {name!r}, only of {', '.join(map(repr, folders))}; "
                          "bake it too, or make one of those the scene's camera. A renamed camera needs its old name."

@@ -64,6 +64,11 @@ def view_suffixes(render: Any) -> dict[str, str]:
             for view in views}
 
 
+def possible_labels(render: Any, name: str) -> set[str]:
+    """Return the labels that views of a camera of this name can have, in any stereo mode."""
+    return {f"{name}{suffix}" for view in render.views for suffix in (view.file_suffix, f"_{view.name}")}
+
+
 def _base_name(render: Any, camera: Any) -> str:
     """Return the name of a camera object without the suffix of a view, the longest where several match."""
     matching = [view.file_suffix for view in render.views if camera.name.endswith(view.file_suffix)]

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..choices import Blend
 from ..conventions.pixel_grid import PixelGrid
-from ..conventions.splatting import ALPHA_MIN, PROFILE_MIN
-from ..conventions.splatting import OPACITY_MAX as OPACITY_MAX
+from ..conventions.splatting import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN
 from .plane import Floats, PlaneGaussians, arc_log_peak, arc_strengths, arcs_to_pixels, concatenate, to_pixels
 
 Box = tuple[int, int, int, int]

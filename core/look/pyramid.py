@@ -2,8 +2,7 @@
 """Draws flares that add light quickly in numpy: each Gaussian on the coarsest grid that still resolves it.
 
 The grids halve the size of the picture from one to the next. Their sum is taken from the coarsest to the finest, by
-cubic interpolation. `drawing.draw` is the definition. A bake without an engine calls `draw_layers`; the overlay uses
-`level_indices`.
+cubic interpolation. `drawing.draw` is the definition. A bake without an engine calls `draw_layers`.
 """
 from __future__ import annotations
 
@@ -35,11 +34,10 @@ _WEIGHTS = (-0.0703125, 0.8671875, 0.2265625, -0.0234375)
 """Weights of Catmull-Rom interpolation a quarter of a texel after the second of four; reversed for three quarters."""
 
 
-def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, ...] = LEVELS,
-                  min_texels: float = MIN_TEXELS) -> NDArray[np.int64]:
-    """Return the index in `levels` (n,) of the grid for each Gaussian; covariances (n, 3) in px².
+def level_indices(covariances: Floats, rings: Floats | None) -> NDArray[np.int64]:
+    """Return the index in LEVELS (n,) of the grid for each Gaussian; covariances (n, 3) in px².
 
-    It is the coarsest grid on which the standard deviation of the Gaussian's narrow side is `min_texels` or more, else
+    It is the coarsest grid on which the standard deviation of the Gaussian's narrow side is MIN_TEXELS or more, else
     the finest. rings (n, 2): r0 and w, or None.
     """
     xx, xy, yy = covariances.T
@@ -48,7 +46,7 @@ def level_indices(covariances: Floats, rings: Floats | None, levels: tuple[int, 
     narrow = np.sqrt(np.maximum(mean_variance - half_difference, 0))
     if rings is not None:  # the line of a ring is w times as wide as its ellipse
         narrow = narrow * np.minimum(rings[:, 1], 1)
-    return np.clip(np.searchsorted(np.array(levels), narrow / min_texels, side="right") - 1, 0, len(levels) - 1)
+    return np.clip(np.searchsorted(np.array(LEVELS), narrow / MIN_TEXELS, side="right") - 1, 0, len(LEVELS) - 1)
 
 
 def draw_added(gaussians: PlaneGaussians, look: Look, intrinsics: ArrayLike, width: int, height: int) -> Floats:

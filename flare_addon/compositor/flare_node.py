@@ -113,6 +113,12 @@ def new_node(tree: Any, kind: str, column: float, row: float) -> Any:
     return node
 
 
+def set_name(node: Any, name: str) -> Any:
+    """Set name and label of a node; return it."""
+    node.name = node.label = name
+    return node
+
+
 def scale_to_render_size(tree: Any, socket: Any, column: float, row: float) -> Any:
     """Add a node that scales a picture to the size of the render, which Blender does not do by itself; return it."""
     node = new_node(tree, "CompositorNodeScale", column, row)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The nodes that show baked layers: an Image node, in a stereo scene one for each view of its renders.
+"""The nodes that show baked layers: one Image node, or in a stereo scene one for each rendered view.
 
-A Switch View node for each layer then gives the view that Blender renders its own. The settings of images for stereo
-files would be fewer nodes, but Blender reads them for files without layers only. `setup` adds and removes these nodes.
+In a stereo scene, a Switch View node for each layer selects the layers of the view that Blender renders. Blender's own
+stereo settings of an image would need fewer nodes, but they work only for files without layers. `setup` adds and
+removes these nodes.
 """
 from __future__ import annotations
 
@@ -17,22 +18,16 @@ from ...core.errors import FrameError
 from ...core.images.exr import channel_names, exr_colour_space
 from ..images import load_image
 from ..paths import absolute
-from .flare_node import new_node
+from .flare_node import new_node, set_name
 from .trees import tree_of
 
 LAYERS = "Fit Flare Layers"
 """Name of the node that shows the layers, in a stereo scene those of the first view."""
-_OF_VIEW = f"{LAYERS} of "
+_VIEW_LAYERS_PREFIX = f"{LAYERS} of "
 """Start of the names of the nodes that show the layers of the other views."""
-_SWITCH = "Fit Flare View "
+_SWITCH_PREFIX = "Fit Flare View "
 """Start of the names of the nodes that choose the view, one for each layer."""
 _MAX_FRAMES = 1048574  # the limit of Blender; frames without a file have no flare
-
-
-def set_name(node: Any, name: str) -> Any:
-    """Set name and label of a node; return it."""
-    node.name = node.label = name
-    return node
 
 
 def show_layers(node: Any, layers: LayerFolder) -> None:
@@ -64,12 +59,12 @@ def switch_views(scene: Any, tree: Any, views: Mapping[str, LayerFolder], names:
     """
     sources = [tree.nodes[LAYERS]]
     for row, (view, layers) in enumerate(list(views.items())[1:], 1):
-        sources.append(set_name(new_node(tree, "CompositorNodeImage", -4, -1.5 * row), f"{_OF_VIEW}{view}"))
+        sources.append(set_name(new_node(tree, "CompositorNodeImage", -4, -1.5 * row), f"{_VIEW_LAYERS_PREFIX}{view}"))
         show_layers(sources[-1], layers)
     sockets = {}
     for row, name in enumerate(names):
         with bpy.context.temp_override(scene=scene):  # the node has the views of the scene in the context
-            switch = set_name(new_node(tree, "CompositorNodeSwitchView", -3.2, -0.7 * row), f"{_SWITCH}{name}")
+            switch = set_name(new_node(tree, "CompositorNodeSwitchView", -3.2, -0.7 * row), f"{_SWITCH_PREFIX}{name}")
         for view, source in zip(views, sources, strict=True):
             tree.links.new(source.outputs[name], switch.inputs[view])
         sockets[name] = switch.outputs[0]
@@ -78,19 +73,19 @@ def switch_views(scene: Any, tree: Any, views: Mapping[str, LayerFolder], names:
 
 def is_view_node(node: Any) -> bool:
     """Return whether a node was added by `switch_views`."""
-    return bool(node.name.startswith((_OF_VIEW, _SWITCH)))
+    return bool(node.name.startswith((_VIEW_LAYERS_PREFIX, _SWITCH_PREFIX)))
 
 
 def composited_views(scene: Any) -> set[str]:
     """Return the names of the views whose own layers the compositor of a scene shows; none without stereo."""
     tree = tree_of(scene)
-    switches = [node for node in tree.nodes if node.name.startswith(_SWITCH)] if tree is not None else []
+    switches = [node for node in tree.nodes if node.name.startswith(_SWITCH_PREFIX)] if tree is not None else []
     return {socket.name for switch in switches for socket in switch.inputs if socket.is_linked}
 
 
 def view_images(tree: Any) -> list[Any]:
     """Return the images of the nodes that show the layers of the views after the first one."""
-    return [node.image for node in tree.nodes if node.name.startswith(_OF_VIEW)]
+    return [node.image for node in tree.nodes if node.name.startswith(_VIEW_LAYERS_PREFIX)]
 
 
 def remove_view_nodes(tree: Any) -> None:

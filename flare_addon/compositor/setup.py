@@ -24,13 +24,13 @@ from .flare_node import (
     new_node,
     node_group,
     scale_to_render_size,
+    set_name,
 )
 from .layer_nodes import (
     LAYERS,
     check_views,
     is_view_node,
     remove_view_nodes,
-    set_name,
     show_layers,
     switch_views,
     view_images,
@@ -48,7 +48,6 @@ _ENDS = (trees.OUTPUT_TYPE, "NodeGroupInput", "CompositorNodeViewer")
 """Nodes of a tree without a picture of its own."""
 STATE_PROPERTY = "fit_flare_compositor"  # of the scene: the state before the set-up
 _IMAGE_NODE_SETTINGS = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
-_OUTPUT_TYPE = trees.OUTPUT_TYPE
 
 
 def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: Any = None,
@@ -390,7 +389,7 @@ def _bypass_node(tree: Any, node: Any, state: dict[str, Any]) -> None:
     if picture_below is None and not state["tree"]:
         picture_below = _render_picture(tree)
     for fed_input in [link.to_socket for link in tree.links if link.from_node == node
-                      and (link.from_socket.name == "Image" or link.to_node.bl_idname == _OUTPUT_TYPE)]:
+                      and (link.from_socket.name == "Image" or link.to_node.bl_idname == trees.OUTPUT_TYPE)]:
         if picture_below is not None:
             tree.links.new(picture_below, fed_input)
 
@@ -406,7 +405,7 @@ def _restore_tree(scene: Any, tree: Any, state: dict[str, Any]) -> None:
         if state.get("nodes") is not None:
             earlier_names = state["nodes"].split("\n")
             for extra in [node for node in tree.nodes
-                          if node.name not in earlier_names and node.bl_idname == _OUTPUT_TYPE]:
+                          if node.name not in earlier_names and node.bl_idname == trees.OUTPUT_TYPE]:
                 if not any(socket.is_linked for socket in extra.inputs):
                     tree.nodes.remove(extra)
         if not GROUPS_ARE_TREES:
@@ -448,13 +447,13 @@ def _final_input(tree: Any, add: bool = True) -> Any:
 
     add: add it where there is none, instead of returning None.
     """
-    outputs = sorted((node for node in tree.nodes if node.bl_idname == _OUTPUT_TYPE),
+    outputs = sorted((node for node in tree.nodes if node.bl_idname == trees.OUTPUT_TYPE),
                      key=lambda node: not trees.is_active_output(tree, node))
     if not add:
         return outputs[0].inputs[0] if outputs and len(outputs[0].inputs) else None
     if GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-    node = outputs[0] if outputs else new_node(tree, _OUTPUT_TYPE, 1, 0)
+    node = outputs[0] if outputs else new_node(tree, trees.OUTPUT_TYPE, 1, 0)
     return node.inputs[0]
 
 

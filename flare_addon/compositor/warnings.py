@@ -11,15 +11,14 @@ from ...core.images.picture import same_aspect
 from .. import stereo
 from . import drivers, flare_node, layer_nodes, setup, trees
 
-SPHERICAL = ("The camera has Spherical Stereo, with which the flares do not lie on the lights; switch it off in the "
-             "camera's Stereoscopy settings.")
+_SPHERICAL = ("The camera has Spherical Stereo, with which the flares do not lie on the lights; switch it off in the "
+              "camera's Stereoscopy settings.")
 
 
-def warnings(scene: Any, views: Sequence[LayerFolder], live: bool) -> Iterator[str]:
+def warnings(scene: Any, layer_folders: Sequence[LayerFolder], live: bool) -> Iterator[str]:
     """Yield a warning for each problem of a scene whose compositor shows layers.
 
-    views: the layers of each view of a stereo scene, else one folder. live: the sliders of the panel drive the
-    compositor.
+    layer_folders: that of each view of a stereo scene, else one. live: the sliders of the panel drive the compositor.
     """
     render = scene.render
     if not render.use_compositing:
@@ -35,12 +34,12 @@ def warnings(scene: Any, views: Sequence[LayerFolder], live: bool) -> Iterator[s
     if render.film_transparent and setup.is_over_render(scene) and _loses_light(render.image_settings):
         yield (f"The film is transparent, and {render.image_settings.file_format} files lose the flare where alpha is "
                "0; render to OpenEXR, or without alpha (RGB).")
-    width, height = views[0].size()
+    width, height = layer_folders[0].size()
     if not same_aspect((width, height), (render.resolution_x, render.resolution_y)):
         yield (f"The layers have {width} x {height} pixels and the scene renders {render.resolution_x} x "
                f"{render.resolution_y}, another aspect ratio, to which they are stretched; bake them again.")
-    baked = [NumberedFrame(view="", number=number, file="") for number in views[0].files
-             if all(number in layers.files for layers in views)]
+    baked = [NumberedFrame(view="", number=number, file="") for number in layer_folders[0].files
+             if all(number in layers.files for layers in layer_folders)]
     if missing := missing_numbers(baked, f"{max(scene.frame_start, 0)}-{max(scene.frame_end, scene.frame_start, 0)}"):
         effect = "this version of Blender shows in magenta" if flare_node.MISSING_IS_MAGENTA else "are without flare"
         yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}, and there are no layers of {missing}, "
@@ -65,7 +64,7 @@ def stereo_warnings(scene: Any) -> Iterator[str]:
     camera = scene.camera
     if views and camera is not None and camera.type == "CAMERA" and scene.render.views_format == "STEREO_3D" and \
             camera.data.stereo.use_spherical_stereo:
-        yield SPHERICAL
+        yield _SPHERICAL
 
 
 def _active_strips(scene: Any) -> Any:

@@ -57,7 +57,7 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
     """Whether a person called the operator, who sees the window; a script waits for the end."""
     _is_complete = False
     """Whether all is imported, after which ESC cancels nothing."""
-    _rests = False
+    _is_window_turn = False
     """Whether the present turn is the window's own."""
     _timer: Any = None
     """The timer of an import in steps; None before it and after its end."""
@@ -108,8 +108,8 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"RUNNING_MODAL"}
-        self._rests = not self._rests
-        if self._rests:
+        self._is_window_turn = not self._is_window_turn
+        if self._is_window_turn:
             return {"RUNNING_MODAL"}
         start = time.perf_counter()
         with report_errors(self) as outcome:

@@ -206,21 +206,21 @@ class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
         depsgraph = context.evaluated_depsgraph_get()
         core_camera = _core_camera(scene, depsgraph, self.view)
         ray = Vector(core_camera.rays([[self.x * core_camera.width, self.y * core_camera.height]])[0].tolist())
-        eye = Vector(core_camera.position.tolist())
-        hit, position, *_ = scene.ray_cast(depsgraph, eye, ray)
+        camera_position = Vector(core_camera.position.tolist())
+        hit, position, *_ = scene.ray_cast(depsgraph, camera_position, ray)
         if not hit:
-            position = eye + ray * (self.distance or 10.0 * max(scene.camera.matrix_world.to_scale()))
+            position = camera_position + ray * (self.distance or 10.0 * max(scene.camera.matrix_world.to_scale()))
         look, state = looks.look_of(scene), scene.fit_flare
         placeholder = next((flare.target for flare in state.lights if looks.is_placed(flare, scene)
                             and flare.target.fit_flare.is_placeholder), None)
         if placeholder is not None:
             placeholder.location, placeholder.fit_flare.is_placeholder = position, False
-            placeholder.empty_display_size = 0.02 * (position - eye).length
+            placeholder.empty_display_size = 0.02 * (position - camera_position).length
             return
         item = next((flare for flare in state.lights if flare.target is None), None)
         light = lights.add_to_scene(scene, position, item.name if item is not None else "light1")
         light.fit_flare.is_light = state.root is not None
-        light.empty_display_size = 0.02 * (position - eye).length
+        light.empty_display_size = 0.02 * (position - camera_position).length
         if item is None:
             item = looks.add_flare(scene, light, state.lights[state.light].source if state.lights
                                    else look.names[0])

@@ -83,22 +83,29 @@ def test_a_cancelled_import_leaves_nothing(facts: Any) -> None:
 
 
 def test_the_scene_gets_the_objects_of_a_capture_in_portions(facts: Any) -> None:
-    """Block of projects.py: "an import that is cancelled"."""
+    """Block of projects.py: "the objects of an import, in portions"."""
     portions, count, unused_collections = facts["portions of objects"]
     assert count > 4 and portions == list(range(2, count + 1, 2))
     assert unused_collections == []
 
 
 def test_an_import_leaves_every_other_turn_to_the_window(facts: Any) -> None:
-    """Block of projects.py: "an import that is cancelled". Steps that were done after each turn."""
+    """Block of projects.py: "an import that leaves every other turn to the window".
+
+    Steps that were done after each turn.
+    """
     assert facts["turns"] == [0, 1, 1, 2, 2, 3, 3]
 
 
 def test_an_import_ends_where_its_scene_is_deleted(facts: Any) -> None:
-    """Block of projects.py: "an import that is cancelled". Whether nothing of it remains, and what ended."""
+    """Block of projects.py: "an import whose scene is deleted". Whether nothing of it remains, and what ended."""
     *ended, calls = facts["scene deleted meanwhile"]
     assert ended == [True] * 3
     assert calls == ["window_manager.event_timer_remove", "workspace.status_text_set"]
+
+
+def test_missing_footage_is_left_out_when_it_is_loaded(facts: Any) -> None:
+    """Block of projects.py: "footage that is missing when it is loaded". Pictures that were tried."""
     assert facts["missing pictures"] == 2, "each is left out"
 
 

@@ -263,7 +263,7 @@ facts["among walls"] = compared
 overlay, cameras = part("flare_addon.overlay"), part("flare_addon.cameras")
 scene, lamp, item = lit_scene()
 wall = object_in(scene, "Wall", bpy.data.meshes.new("Wall"), (50, 0, 0))
-state, rendered, budgets = scene.fit_flare, [], overlay._budgets
+state, rendered = scene.fit_flare, []
 
 
 def render_levels(gaussians, _window, _look):

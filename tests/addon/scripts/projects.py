@@ -183,12 +183,15 @@ for kind in ("each", "animated"):
             break
     steps.close()
     facts["cancelled import"].append(before == all_of_it())
+
+# ---- the objects of an import, in portions --------------------------------------------------------------
 importer.OBJECTS_PER_LINK = 2
 portions = [len(scene.objects) for pause in importer.import_in_steps(scene, capture, importer.ImportSettings("each"))
             if pause is not None]
 facts["portions of objects"] = [portions, len(scene.objects),
                                 [item.name for item in bpy.data.collections if not item.users]]
 
+# ---- an import that leaves every other turn to the window -----------------------------------------------
 operators = part("flare_addon.operators.capture")
 done = []
 
@@ -199,20 +202,22 @@ def three_steps():
         yield operators.PAUSE
 
 
-operator = SimpleNamespace(_steps=three_steps(), _rests=False, _is_complete=False, cancel=lambda _context: None,
-                           report=lambda *_words: None, _timer=object())
+operator = SimpleNamespace(_steps=three_steps(), _is_window_turn=False, _is_complete=False,
+                           cancel=lambda _context: None, report=lambda *_words: None, _timer=object())
 turns, turn = [], partial(operators.FITFLARE_OT_import_capture.modal, operator, bpy.context,
                          SimpleNamespace(type="TIMER"))
 while "FINISHED" not in turn():
     turns.append(len(done))
 facts["turns"] = turns
+
+# ---- an import whose scene is deleted -------------------------------------------------------------------
 scene = empty()
 doomed, kind, calls = bpy.data.scenes.new("Doomed"), operators.FITFLARE_OT_import_capture, MagicMock()
 before, steps = all_of_it()[-6:], importer.import_in_steps(doomed, capture, importer.ImportSettings("each"))
 while not bpy.data.cameras:
     next(steps)
 bpy.data.scenes.remove(doomed)
-operator = SimpleNamespace(_steps=steps, _rests=True, _is_complete=False, report=print, _timer=object())
+operator = SimpleNamespace(_steps=steps, _is_window_turn=True, _is_complete=False, report=print, _timer=object())
 operator.cancel = partial(kind.cancel, operator)
 turn, raised = partial(kind.modal, operator, calls, SimpleNamespace(type="TIMER")), ""
 while not raised:
@@ -222,6 +227,8 @@ while not raised:
         raised = "ReferenceError"
 facts["scene deleted meanwhile"] = [before == all_of_it()[-6:], operator._timer is None, "CANCELLED" in turn(),
                                     [call[0] for call in calls.mock_calls]]
+
+# ---- footage that is missing when it is loaded ----------------------------------------------------------
 operators._load_footage(scene)
 missing = MagicMock()
 missing.gl_load.side_effect = RuntimeError("Failed to load image")

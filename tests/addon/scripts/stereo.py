@@ -18,11 +18,9 @@ package, flare, out = sys.argv[1:4]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-shots, stereo, setup, flare_node, layer_nodes, warnings, panels, overlay, core_shot = (
-    part(name) for name in ("flare_addon.shots", "flare_addon.stereo", "flare_addon.compositor.setup",
-                            "flare_addon.compositor.flare_node", "flare_addon.compositor.layer_nodes",
-                            "flare_addon.compositor.warnings", "flare_addon.panel_parts", "flare_addon.overlay",
-                            "core.look.shot"))
+shots, stereo, flare_node, layer_nodes, warnings, panels = (
+    part(f"flare_addon.{name}") for name in ("shots", "stereo", "compositor.flare_node", "compositor.layer_nodes",
+                                             "compositor.warnings", "panel_parts"))
 facts: dict[str, object] = {}
 
 

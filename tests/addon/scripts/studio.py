@@ -15,8 +15,8 @@ package, capture, flare, layers, out, *space = sys.argv[1:]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-layer_nodes, rendering, overlay = (
-    part(f"flare_addon.{name}") for name in ("compositor.layer_nodes", "render_settings", "overlay"))
+layer_nodes, rendering, working_space = (
+    part(f"flare_addon.{name}") for name in ("compositor.layer_nodes", "render_settings", "working_space"))
 facts: dict[str, object] = {}
 PICKED = 0.8, 0.5, 0.4
 """A tint, components in the working space."""
@@ -30,7 +30,7 @@ ops.open_flare(filepath=flare)
 scene.fit_flare.layers, scene.fit_flare.over = layers, "scene"
 ops.set_up_baked()
 facts["misread"] = layer_nodes.colour_space_warning(scene)
-facts["red in the camera view"] = overlay.working_space()[:, 0].tolist()
+facts["red in the camera view"] = working_space.working_space()[:, 0].tolist()
 rendering.render_frames(scene, [1], lambda _number, suffix: Path(out) / f"shown{suffix}")
 
 # ---- the tint that an artist picks ------------------------------------------------------------------------
@@ -44,7 +44,7 @@ stored = looks.edits_to_store(state, looks.look_of(scene))  # by Save to Library
 tints = {"camera view": looks.edits_of(state).elements[item.name, element.name].tint}
 for name, texts, light in (("bake", shot.frames[0].edits, item.name), ("transfer", stored.texts(), item.source)):
     tints[name] = core_look.LookEdits.parse(texts, [light]).elements[light, element.name].tint
-facts["tints"] = {name: (overlay.working_space() @ tint).tolist() for name, tint in tints.items()}
+facts["tints"] = {name: (working_space.working_space() @ tint).tolist() for name, tint in tints.items()}
 part("flare_addon.properties").set_slider(element, "tint", tints["bake"])
 facts["tint of a file"] = list(element.tint)
 element.tint = (1, 1, 1)

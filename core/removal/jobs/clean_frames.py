@@ -6,10 +6,13 @@ cleaned. The manifest decides which results are kept.
 """
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from types import TracebackType
+from typing import NamedTuple, Self
 
 from ...system.progress import Progress
 from .manifest import KeepReason, Manifest
@@ -30,8 +33,8 @@ class CleanFrame(NamedTuple):
 class PreparedResults(NamedTuple):
     """The results of a frame before they are written.
 
-    write: writes the files. confidence: how sure the remover is that the removed light is a flare, 0..1; None where a
-    matte or a fit decided it.
+    write: writes the files; it runs in another thread. confidence: how sure the remover is that the removed light is a
+    flare, 0..1; None where a matte or a fit decided it.
     """
 
     write: Callable[[], None]
@@ -45,29 +48,92 @@ def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progres
                        ) -> tuple[int, Counter[KeepReason]]:
     """Write every frame that is not finished; return how many were written, and how many were kept for which reason.
 
+    The results of a frame are written while the next frame is cleaned.
+
     digest: a text that changes whenever the result would (`digest_inputs`). clean: reads and cleans a frame; nothing is
     deleted if it raises. keep_finished: keep results that are up to date, and edited ones unless `overwrite`.
     overwrite: replace files that are not in the manifest or were edited. on_error: called with a frame and its
     exception; it raises to stop, or returns to go on to the next frame. None: the first exception stops.
     """
-    written, kept_counts = 0, Counter[KeepReason]()
-    for frame in frames:
-        try:
-            key = digest(frame)
-            reason = manifest.reason_to_keep(frame.name, frame.source, key, frame.results) if keep_finished else None
-            if reason == "up to date":
-                manifest.record_missing_results(frame.results)
-            if reason is not None and not (overwrite and reason == "edited"):
-                kept_counts[reason] += 1
+    kept_counts = Counter[KeepReason]()
+    with _BackgroundWriter(manifest, progress, on_error) as writer:
+        for frame in frames:
+            prepared = None
+            with writer.errors_of(frame):
+                key = digest(frame)
+                reason = (manifest.reason_to_keep(frame.name, frame.source, key, frame.results) if keep_finished
+                          else None)
+                if reason == "up to date":
+                    manifest.record_missing_results(frame.results)
+                if reason is not None and not (overwrite and reason == "edited"):
+                    kept_counts[reason] += 1
+                else:
+                    prepared = clean(frame)
+            if prepared is None:
+                progress.advance()
             else:
-                prepared = clean(frame)
-                manifest.begin_frame(frame.name, frame.source, key, frame.results, overwrite, prepared.confidence)
-                prepared.write()
-                manifest.record_results(frame.results)
-                written += 1
+                writer.start(frame, key, prepared, overwrite=overwrite)
+        writer.finish()
+    return writer.written, kept_counts
+
+
+class _BackgroundWriter:
+    """Writes the results of one frame at a time in another thread, and enters them in the manifest.
+
+    Leaving its context waits for the thread. on_error: as in `write_clean_frames`. written: the number of frames whose
+    results were written.
+    """
+
+    def __init__(self, manifest: Manifest, progress: Progress,
+                 on_error: Callable[[CleanFrame, Exception], None] | None) -> None:
+        self._manifest, self._progress, self._on_error = manifest, progress, on_error
+        self._thread = ThreadPoolExecutor(1, "clean-frames")
+        self._unfinished: tuple[CleanFrame, Future[None]] | None = None
+        self.written = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
+        self._thread.shutdown()
+        if self._unfinished is not None:  # an exception left the loop: the finished files are no one's edits
+            with contextlib.suppress(Exception):
+                self._record(*self._unfinished)
+
+    def start(self, frame: CleanFrame, digest: str, prepared: PreparedResults, *, overwrite: bool) -> None:
+        """Finish the frame before, and begin to write the results of this one.
+
+        digest, overwrite: as in `Manifest.begin_frame`.
+        """
+        self.finish()
+        with self.errors_of(frame):
+            self._manifest.begin_frame(frame.name, frame.source, digest, frame.results, overwrite, prepared.confidence)
+            self._unfinished = frame, self._thread.submit(prepared.write)
+        if self._unfinished is None:
+            self._progress.advance()
+
+    def finish(self) -> None:
+        """Wait for the results that are being written, if any, and enter them in the manifest."""
+        if self._unfinished is None:
+            return
+        (frame, writing), self._unfinished = self._unfinished, None
+        with self.errors_of(frame):
+            self._record(frame, writing)
+        self._progress.advance()
+
+    def _record(self, frame: CleanFrame, writing: Future[None]) -> None:
+        writing.result()
+        self._manifest.record_results(frame.results)
+        self.written += 1
+
+    @contextlib.contextmanager
+    def errors_of(self, frame: CleanFrame) -> Iterator[None]:
+        """Pass exceptions of the body to `on_error` as exceptions of this frame, after those of the frame before."""
+        try:
+            yield
         except Exception as error:
-            if on_error is None:
+            if self._on_error is None:
                 raise
-            on_error(frame, error)
-        progress.advance()
-    return written, kept_counts
+            self.finish()
+            self._on_error(frame, error)

@@ -48,7 +48,7 @@ def draw_frames(folder: Path, count: int, width: int, height: int) -> list[Path]
     grain = random.normal(0, 0.01, (height, width + 2 * count, 3)).astype(np.float32)
     x, y = np.meshgrid(np.arange(width + 2 * count, dtype=np.float32), np.arange(height, dtype=np.float32))
     waves = 0.25 + 0.1 * np.sin(x / 40) * np.cos(y / 55) + 0.05 * np.sin(x / 7 + y / 11)
-    scene = waves[..., None] * np.float32([1, 0.8, 0.6]) + grain
+    scene = waves[..., None] * np.array([1, 0.8, 0.6], np.float32) + grain
     for number, path in enumerate(paths):
         light_x, light_y = 0.6 * width - 3 * number, 0.35 * height
         distance = np.hypot(x[:, :width] - light_x, y[:, :width] - light_y) / width

@@ -22,17 +22,12 @@ from .paths import is_folder
 from .user_settings import PACKAGE
 
 
-class _SidebarPanel:
+class _SidebarPanel(handbook.LinkedPanel):
     """Mixin that puts a panel into the tab of the sidebar."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = jobs.SIDEBAR_TAB
-    page = ""
-    """The page of the handbook about the panel."""
-
-    def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        handbook.draw_button(self.layout, self.page)  # type: ignore[attr-defined]
 
 
 class _FitPanel(_SidebarPanel):

@@ -26,18 +26,51 @@ HIDDEN = ("show_floor", "show_axis_x", "show_axis_y", "show_axis_z", "show_ortho
 """Overlays that a viewport render leaves out. Footage behind the camera is an overlay too, and stays."""
 
 
-def check_output(scene: Any) -> None:
-    """Raise SettingsError where the scene's output cannot be that of a viewport render."""
-    if scene.render.is_movie_format:
-        raise SettingsError("Viewport renders with the flare are pictures: choose an image format such as PNG in "
-                            "Output > File Format.")
+PICTURE_FORMATS = {"OPEN_EXR_MULTILAYER": "OPEN_EXR"}
+"""The formats of pictures in place of those that a single picture cannot have. PNG replaces every format of videos."""
+
+
+def check_scene(scene: Any) -> None:
+    """Raise SettingsError where the scene has no camera to render from."""
     if scene.camera is None or scene.camera.type != "CAMERA":
         raise SettingsError("The scene has no camera to render from; add one.")
 
 
+def picture_format(scene: Any) -> str:
+    """Return Blender's name of the format in which pictures are saved: PNG if the scene's output is a video."""
+    file_format: str = scene.render.image_settings.file_format
+    return "PNG" if scene.render.is_movie_format else PICTURE_FORMATS.get(file_format, file_format)
+
+
+@contextlib.contextmanager
+def _picture_output(scene: Any) -> Iterator[None]:
+    """Give the scene's output the format and path of pictures, if it is a video or has layers."""
+    render, settings = scene.render, scene.render.image_settings
+    file_format = picture_format(scene)
+    if file_format == settings.file_format:
+        yield
+        return
+    # The order matters: a medium (Blender 5.0 on) limits the formats, a format limits colours and depth.
+    names = ("media_type", "file_format", "color_mode", "color_depth")
+    previous = {name: getattr(settings, name) for name in names if hasattr(settings, name)}
+    previous_path = render.filepath
+    try:
+        if "media_type" in previous:
+            settings.media_type = "IMAGE"
+        settings.file_format = file_format
+        if Path(previous_path).suffix.lower() in bpy.path.extensions_movie:
+            render.filepath = previous_path.removesuffix(Path(previous_path).suffix)
+        yield
+    finally:
+        render.filepath = previous_path
+        for name, value in previous.items():
+            setattr(settings, name, value)
+
+
 def output_path(scene: Any, frame: int) -> Path:
-    """Return the file of a frame, as a render names it."""
-    return Path(bpy.path.abspath(scene.render.frame_path(frame=frame)))
+    """Return the file of a frame, as a render to pictures names it."""
+    with _picture_output(scene):
+        return Path(bpy.path.abspath(scene.render.frame_path(frame=frame)))
 
 
 def picture_size(scene: Any) -> tuple[int, int]:
@@ -96,14 +129,14 @@ def _without_overlays(space: Any) -> Iterator[None]:
 
 def save_picture(scene: Any, pixels: NDArray[np.float32], path: Path) -> None:
     """Save pixels (height, width, 4), scene-linear, row 0 at the bottom, as the scene's output settings and view
-    transform say. Raises FrameError."""
+    transform say, in `picture_format`. Raises FrameError."""
     height, width = pixels.shape[:2]
     image = bpy.data.images.new("Viewport Render", width, height, alpha=True, float_buffer=True)
     try:
         opaque = pixels.copy()
         opaque[..., 3] = 1.0
         image.pixels.foreach_set(opaque.ravel())
-        with atomic_path(path) as temporary:
+        with atomic_path(path) as temporary, _picture_output(scene):
             try:
                 image.save_render(str(temporary), scene=scene)
             except RuntimeError as problem:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the Movie Clip Editor: tracks as lights, and the lights of lights.json as tracks; and their panel."""
+"""Operators of the Movie Clip Editor: tracks as lights, and the lights of lights.json as tracks.
+
+`editor_panels` has their buttons.
+"""
 from __future__ import annotations
 
 import bpy
@@ -46,17 +49,5 @@ class FITFLARE_OT_tracks_from_lights(_ClipOperator, bpy.types.Operator):
         self.report({"INFO"}, f"Lights added as tracks: {count}")
 
 
-class FITFLARE_PT_clip_lights(bpy.types.Panel):
-    bl_label = "Lights"
-    bl_idname = "FITFLARE_PT_clip_lights"
-    bl_space_type, bl_region_type, bl_category = "CLIP_EDITOR", "UI", "Fit Flare"
-
-    def draw(self, _context: bpy.types.Context) -> None:
-        column = self.layout.column(align=True)
-        column.operator("fit_flare.tracks_from_lights", icon="IMPORT")
-        column.operator("fit_flare.lights_from_tracks", icon="EXPORT").only_selected = False
-        column.operator("fit_flare.lights_from_tracks", text="Selected Tracks to Lights").only_selected = True
-
-
 register, unregister = bpy.utils.register_classes_factory(
-    (FITFLARE_OT_lights_from_tracks, FITFLARE_OT_tracks_from_lights, FITFLARE_PT_clip_lights))
+    (FITFLARE_OT_lights_from_tracks, FITFLARE_OT_tracks_from_lights))

@@ -87,9 +87,9 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
             context.workspace.status_text_set(None)
 
     def _prepare_frames(self, context: bpy.types.Context) -> None:
-        """Check the output, note the current frame, and prepare the frames to render. Raises SettingsError."""
+        """Check the scene, note the current frame, and prepare the frames to render. Raises SettingsError."""
         scene = context.scene
-        viewport_render.check_output(scene)
+        viewport_render.check_scene(scene)
         self._frame_before = scene.frame_current, scene.frame_subframe
         self._frame_count, self._timer = 0, None
         numbers = (list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)) if self.animation
@@ -119,19 +119,24 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
             scene.frame_set(frame, subframe=subframe)
 
     def _report_result(self, context: bpy.types.Context) -> None:
-        """Report what was rendered."""
-        path = viewport_render.output_path(context.scene, context.scene.frame_current)
+        """Report what was rendered, and that it is pictures where the scene's output is a video."""
+        scene = context.scene
+        path = viewport_render.output_path(scene, scene.frame_current)
         subject = f"{self._frame_count} frames are" if self.animation else f"{path.name} is"
-        self.report({"INFO"}, f"{subject} in {path.parent}")
+        hint = (". Viewport renders with the flare are PNG pictures; to make a video of them, use Add > "
+                "Image/Sequence in the Video Sequencer" if scene.render.is_movie_format else "")
+        self.report({"INFO"}, f"{subject} in {path.parent}{hint}")
 
 
 def _draw_menu(self: Any, _context: Any) -> None:
     """Draw the entries of the menu View."""
     layout = self.layout
     layout.separator()
-    name = FITFLARE_OT_viewport_render.bl_idname
-    layout.operator(name, text="Viewport Render Image with Flare", icon="RENDER_STILL").animation = False
-    layout.operator(name, text="Viewport Render Animation with Flare", icon="RENDER_ANIMATION").animation = True
+    image = layout.operator("fit_flare.viewport_render", text="Viewport Render Image with Flare", icon="RENDER_STILL")
+    image.animation = False
+    frames = layout.operator("fit_flare.viewport_render", text="Viewport Render Animation with Flare",
+                             icon="RENDER_ANIMATION")
+    frames.animation = True
 
 
 def register() -> None:

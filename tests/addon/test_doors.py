@@ -55,10 +55,58 @@ def test_files_are_imported_and_dropped(facts: Any) -> None:
 
 def test_every_panel_links_a_page_of_the_handbook(facts: Any) -> None:
     """Block of doors.py: "links to the handbook"."""
-    pages, exist = facts["pages"]
-    assert "" not in pages and all(exist)
-    assert all(facts["online manual"]) and facts["topics"]
+    pages = facts["pages"]
+    assert {name: page for name, page in pages.items() if not page} == {}
+    assert {"FITFLARE_PT_library", "FITFLARE_PT_node_look", "FITFLARE_PT_image_picture", "FITFLARE_PT_clip_lights"
+            } <= set(pages)
+    assert (pages["FITFLARE_PT_image_picture"], pages["FITFLARE_PT_clip_lights"]) == ("transfer", "first_fit")
     assert facts["index"] == [True, False]
+
+
+def test_the_online_manual_of_each_operator_is_a_page_that_names_it(facts: Any) -> None:
+    """By its label, or by the text of its button.
+
+    Block of doors.py: "links to the handbook".
+    """
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "flare_addon").rglob("*.py")]
+    texts = re.findall(r'operator\(\s*"fit_flare\.(\w+)"[^)]*?text="([^"]+)"', "\n".join(sources))
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "handbook").glob("*.md")}
+    operators = facts["operators"]
+    assert len(operators) > 40 and facts["topics"] and facts["stray topics"] == []
+    unnamed = {name: page for name, (label, page) in operators.items()
+               if not any(f"**{text}**" in pages[page] for text in (
+                   label, *(text for operator, text in texts if operator == name)))}
+    assert unnamed == {}
+
+
+def test_the_online_manual_of_each_property_is_the_page_about_its_panel(facts: Any) -> None:
+    """Block of doors.py: "links to the handbook"."""
+    pages = facts["pages of properties"]
+    assert len(pages) > 50 and set(pages.values()) == {"install", "first_fit", "transfer", "editing"}
+    for name, page in {"ap_preferences.engine": "install", "ap_preferences.library": "transfer",
+                       "pg_scene.preset": "first_fit", "pg_scene.over": "editing",
+                       "pg_light.follow_power": "editing"}.items():
+        assert pages[name] == page, name
+
+
+def test_panels_draw_without_a_clip_a_flare_or_a_node(facts: Any) -> None:
+    """Blocks of doors.py: "what panels draw", "bake and composite"."""
+    without, flared = facts["drawn without a flare"], facts["drawn with a flare"]
+    assert facts["drawn with a node"] == flared
+    assert without["node_look"] == without["node_bake"] == [True, False]
+    assert without["image_look"] == without["image_bake"] == [False, False, False]
+    assert flared["image_look"] == flared["image_bake"] == [True, True, True]
+    assert without["image_picture"] == flared["image_picture"] == [False, True, False]
+    assert without["clip_lights"] == flared["clip_lights"] == [True, True]
+    assert without["look"] == flared["look"] == [True]
+
+
+def test_headings_separate_the_sliders_of_all_flares_of_a_light_and_of_an_element(facts: Any) -> None:
+    """Block of doors.py: "what panels draw"."""
+    drawn, light, element = facts["headings"]
+    sliders = [(drawn[index - 1], subject) for index, subject in enumerate(drawn) if subject.endswith(".intensity")]
+    assert sliders == [("All Flares", "FITFLARE_PG_master.intensity"), (light, "FITFLARE_PG_light.intensity"),
+                       (element.capitalize(), "FITFLARE_PG_element.intensity")]
 
 
 def test_one_button_bakes_and_composites(facts: Any) -> None:

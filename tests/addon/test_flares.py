@@ -159,8 +159,27 @@ def test_a_viewport_render_is_saved_as_the_view_transform_shows_it(facts: Any) -
     *names_and_sizes, colour = facts["viewport render"]
     assert names_and_sizes == ["view_0007.png", [8, 4], [8, 4]]
     assert colour == pytest.approx([255, 128, 128], abs=1)  # Blender 4.3 rounds 127.5 down
-    video, camera, window = facts["viewport render refused"]
-    assert "choose an image format" in video and "no camera" in camera and "need Blender's window" in window
+    camera, window = facts["viewport render refused"]
+    assert "no camera" in camera and "need Blender's window" in window
+
+
+def test_a_viewport_render_to_a_video_saves_pictures_and_says_so(facts: Any) -> None:
+    """The output settings of the scene stay.
+
+    Block of flares.py: "a viewport render".
+    """
+    assert facts["viewport render of a video"] == [["play0007.png", "PNG", [8, 4], True],
+                                                   ["shot_0007.png", "PNG", [8, 4], True],
+                                                   ["layers_0007.exr", "OPEN_EXR", [8, 4], True]]
+    sentence, = facts["viewport render reported"]
+    assert sentence.startswith("3 frames are in ") and "PNG pictures" in sentence and "Image/Sequence" in sentence
+
+
+def test_viewport_renders_are_in_the_menu_view(facts: Any) -> None:
+    """Block of flares.py: "a viewport render"."""
+    assert facts["entries of the menu View"] == [
+        ["fit_flare.viewport_render", "Viewport Render Image with Flare"],
+        ["fit_flare.viewport_render", "Viewport Render Animation with Flare"]]
 
 
 def test_a_viewport_render_that_fails_leaves_the_timeline_where_it_was(facts: Any) -> None:

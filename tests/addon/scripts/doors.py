@@ -14,6 +14,7 @@ from urllib.request import url2pathname
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
+from panel_drawing import draw_panel, subclasses
 from start import NAME, install, leave, object_in, part, refusal, scene_with, select
 
 package, capture, flare, out = sys.argv[1:5]
@@ -79,16 +80,72 @@ def path_of(url):
     return Path(url2pathname(urlparse(url).path))
 
 
-pages = {panel.page for panel in panels._CLASSES}
-facts["pages"] = [sorted(pages), [path_of(handbook.url(page)).is_file() for page in sorted(pages)]]
+def header_link(panel):
+    """The page that the header of a panel opens."""
+    layout = MagicMock()
+    getattr(panel, "draw_header_preset", lambda _self, _context: None)(SimpleNamespace(
+        layout=layout, page=getattr(panel, "page", "")), bpy.context)
+    return path_of(layout.operator.return_value.url) if layout.operator.call_args == (
+        ("wm.url_open",), {"text": "", "icon": "HELP", "emboss": False}) else None
+
+
+links = {panel.bl_idname: header_link(panel) for panel in subclasses(bpy.types.Panel)}
+facts["pages"] = {name: path.stem if path is not None and path.is_file() else "" for name, path in links.items()}
 prefix, topics = handbook._manual_map()
-identifiers = {"bpy.ops.fit_flare.bake": "editing", "bpy.ops.fit_flare.set_up_engine": "install",
-               "bpy.ops.fit_flare.import_capture": "first_fit", "bpy.types.fitflare_pg_light.follow_power": "editing"}
-facts["online manual"] = [next(page for pattern, page in topics if fnmatch.fnmatch(name, pattern)) == f"{page}.html"
-                          for name, page in identifiers.items()]
+
+
+def online_manual(identifier):
+    """The name of the page that the entry Online Manual opens."""
+    return next((page.removesuffix(".html") for pattern, page in topics if fnmatch.fnmatchcase(identifier, pattern)),
+                "")
+
+
+operators = {cls.bl_idname.removeprefix("fit_flare."): cls.bl_label for cls in subclasses(bpy.types.Operator)}
+facts["operators"] = {name: [label, online_manual(f"bpy.ops.fit_flare.{name}")] for name, label in operators.items()}
+properties = [f"bpy.types.{cls.__name__.lower()}.{item.identifier}"
+              for kind in (bpy.types.PropertyGroup, bpy.types.AddonPreferences) for cls in subclasses(kind)
+              for item in cls.bl_rna.properties if item.identifier not in kind.bl_rna.properties]
+facts["pages of properties"] = {name.removeprefix("bpy.types.fitflare_"): online_manual(name) for name in properties}
+known = {*(f"bpy.ops.fit_flare.{name}" for name in operators), *properties,
+         "bpy.types.windowmanager.fit_flare_library"}
+facts["stray topics"] = [pattern for pattern, _ in topics if not fnmatch.filter(known, pattern)]
 facts["topics"] = all(path_of(prefix + page).is_file() for _, page in topics)
 index = path_of(handbook.url()).read_text(encoding="utf-8")
 facts["index"] = ['href="editing.html"' in index, ".md" in index]
+
+# ---- what panels draw -----------------------------------------------------------------------------------
+picture = str(Path(out) / "picture.png")
+image = bpy.data.images.new("Picture", 8, 4)
+image.filepath_raw, image.file_format = picture, "PNG"
+image.save()
+
+
+def draw_everything(where):
+    """Draw every panel in its editor, with or without what it works on; note which were drawn in facts."""
+    nodes = [SimpleNamespace(type="NODE_EDITOR", tree_type=kind) for kind in ("CompositorNodeTree", "ShaderNodeTree")]
+    clips = [None, bpy.data.movieclips.load(picture)]
+    spaces = {"VIEW_3D": [None], "NODE_EDITOR": nodes, "PROPERTIES": [None],
+              "IMAGE_EDITOR": [SimpleNamespace(type="IMAGE_EDITOR", image=item)
+                               for item in (None, bpy.data.images.load(picture), bpy.data.images.new("Made", 4, 4))],
+              "CLIP_EDITOR": [SimpleNamespace(type="CLIP_EDITOR", clip=clip) for clip in clips]}
+    drawn = {}
+    for cls in subclasses(bpy.types.Panel):
+        drawn[cls.bl_idname.removeprefix("FITFLARE_PT_")] = [
+            draw_panel(cls, space_data=space, edit_movieclip=getattr(space, "clip", None)) is not None
+            for space in spaces[cls.bl_space_type]]
+    facts[f"drawn {where}"] = drawn
+
+
+scene, (lamp, _) = scene_with((0.4, 8, 0.3), (1, 8, 0.3))
+draw_everything("without a flare")
+select(scene, lamp)
+ops.open_flare(filepath=flare)
+draw_everything("with a flare")
+scene.fit_flare.lights[0].show_elements = True
+headings = [subject for function, subject in draw_panel(panels.FITFLARE_PT_look)
+            if (function, subject) != ("label", "") and (function == "label" or subject.endswith(".intensity"))]
+item = scene.fit_flare.lights[0]
+facts["headings"] = [headings, item.name, item.elements[item.element].name]
 
 # ---- bake and composite ---------------------------------------------------------------------------------
 trees, flare_node, shots = (part(f"flare_addon.{name}") for name in ("compositor.trees", "compositor.flare_node",
@@ -119,4 +176,5 @@ ops.bake(replace=True)
 kept = layer_sockets()
 ops.bake(replace=True, composite=True)
 facts["anew"] = [kept == one, len(layer_sockets()) - len(one)]
+draw_everything("with a node")
 leave(facts)

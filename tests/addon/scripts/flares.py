@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from start import empty, install, leave, part, refusal
+from start import NAME, empty, install, leave, part, refusal
 
 package, flare, layers, more, out = sys.argv[1:6]
 install(package)
@@ -369,27 +369,48 @@ viewport_render.save_picture(scene, pixels, path)
 image = bpy.data.images.load(str(path))
 facts["viewport render"] = [path.name, list(viewport_render.picture_size(scene)), list(image.size),
                             [round(255 * image.pixels[index]) for index in (0, 4, 4 * 31)]]
-if hasattr(render.image_settings, "media_type"):
-    render.image_settings.media_type = "VIDEO"
-else:
-    render.image_settings.file_format = "FFMPEG"
-refusals = []
-for gone in (False, True):
-    if gone:
-        scene.camera = None
-        if hasattr(render.image_settings, "media_type"):
-            render.image_settings.media_type = "IMAGE"
-        render.image_settings.file_format = "PNG"
-    try:
-        viewport_render.check_output(scene)
-    except errors.SettingsError as problem:
-        refusals.append(str(problem))
-facts["viewport render refused"] = [*refusals, refusal(ops.viewport_render)]
+
+
+def set_output(medium, file_format, filepath):
+    """Set format and path of the scene's output. medium: since Blender 5.0."""
+    if hasattr(render.image_settings, "media_type"):
+        render.image_settings.media_type = medium
+    render.image_settings.file_format, render.filepath = file_format, str(Path(out) / filepath)
+
+
+def output_settings():
+    return [getattr(render.image_settings, name, "") for name in ("media_type", "file_format", "color_mode",
+                                                                   "color_depth")] + [render.filepath]
+
+
+saved = []
+for medium, file_format, filepath in (("VIDEO", "FFMPEG", "play.mp4"), ("VIDEO", "FFMPEG", "shot_"),
+                                      ("MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER", "layers_")):
+    set_output(medium, file_format, filepath)
+    render.image_settings.color_mode = "BW" if file_format == "FFMPEG" else "RGBA"
+    before = output_settings()
+    path = viewport_render.output_path(scene, 7)
+    viewport_render.save_picture(scene, pixels, path)
+    image = bpy.data.images.load(str(path))
+    saved.append([path.name, image.file_format, list(image.size), output_settings() == before])
+facts["viewport render of a video"] = saved
+menu = MagicMock()
+ours_in_menu_view = [function for function in bpy.types.VIEW3D_MT_view._dyn_ui_initialize()
+                     if function.__module__.startswith(NAME)]
+for function in ours_in_menu_view:
+    function(SimpleNamespace(layout=menu), bpy.context)
+facts["entries of the menu View"] = [[*call.args, call.kwargs["text"]] for call in menu.operator.call_args_list]
+set_output("VIDEO", "FFMPEG", "play.mp4")
+camera, scene.camera = scene.camera, None
+try:
+    viewport_render.check_scene(scene)
+except errors.SettingsError as problem:
+    facts["viewport render refused"] = [str(problem), refusal(ops.viewport_render)]
+scene.camera = camera
 renders = part("flare_addon.operators.viewport_render")
 kind, largest_view = renders.FITFLARE_OT_viewport_render, renders.largest_view
 renders.largest_view = lambda _context: None  # as after the view was closed
 reports: list[str] = []
-scene.camera = bpy.data.objects["Camera"]
 operator = type("Operator", (), {name: getattr(kind, name) for name in (
     "execute", "_prepare_frames", "_render_frames", "_restore_frame", "_report_result")})()
 operator.animation, operator.report = True, lambda _kind, text: reports.append(text)
@@ -398,5 +419,9 @@ scene.frame_set(7, subframe=0.5)
 status = operator.execute(bpy.context)
 renders.largest_view = largest_view
 facts["viewport render failed"] = [sorted(status), scene.frame_current, scene.frame_subframe, *reports]
+reports.clear()
+operator._frame_count = 3
+operator._report_result(bpy.context)
+facts["viewport render reported"] = reports
 
 leave(facts)

@@ -41,7 +41,8 @@ def test_the_versions_agree() -> None:
 def test_the_package_holds_the_program_and_nothing_else(package: Path) -> None:
     names = zipfile.ZipFile(package).namelist()
     assert {"__init__.py", "blender_manifest.toml", "LICENSE", "core/errors.py", "headless/run.py",
-            "headless/set_up.py", "constraints.txt", "pyproject.toml"} <= set(names)
+            "headless/set_up.py", "constraints.txt", "pyproject.toml",
+            "flare_addon/library_looks/LICENSE.txt"} <= set(names)
     strangers = [name for name in names if name.split("/")[0].startswith(".") or "__pycache__" in name
                  or name.split("/")[0] in ("tests", "benchmarks", "sample_scenes", "build", "tmp", "docs", "Makefile",
                                            "ARCHITECTURE.md", "CONTRIBUTING.md", "README.md")
@@ -51,9 +52,11 @@ def test_the_package_holds_the_program_and_nothing_else(package: Path) -> None:
 
 
 def test_the_manifest_passes_the_platforms_rules(package: Path) -> None:
-    """The tags of the platform, a website, a reason for each permission."""
+    """The tags of the platform, a website, a reason for each permission, the licences of program and looks."""
     manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
     assert manifest["website"].startswith("https://")
+    assert manifest["license"] == ["SPDX:GPL-3.0-or-later", "SPDX:CC0-1.0"]
+    assert f"**Tagline:** {manifest['tagline']}\n" in (ROOT / "docs" / "listing.md").read_text(encoding="utf-8")
     for text in (manifest["tagline"], *manifest["permissions"].values()):
         assert 0 < len(text) <= 64 and text[-1].isalnum()
     assert set(manifest["permissions"]) == {"files", "network"}

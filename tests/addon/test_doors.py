@@ -2,6 +2,7 @@
 """People come in through Blender's menus, its search, dropped files and the handbook."""
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,12 @@ import pytest
 from blenders import ROOT
 
 from headless.handbook import render_pages
+
+BLENDERS_LABELS = {"Online Manual", "Install from Disk", "Add Remote Repository", "Color Management",
+                   "Crop to Render Region", "Disable in Renders", "Disable in Viewports", "Ray Visibility", "Stereo 3D",
+                   "Multi-View", "Spherical Stereo"}
+NO_LABELS = {"+", "Follow", "Memory", "Black borders", "White balance", "Motion blur, rolling shutter"}
+"""A button without a label, the beginning of several labels, and subjects of rows and sections."""
 
 
 @pytest.fixture(scope="session")
@@ -87,6 +94,17 @@ def test_the_online_manual_of_each_property_is_the_page_about_its_panel(facts: A
                        "pg_scene.preset": "first_fit", "pg_scene.over": "editing",
                        "pg_light.follow_power": "editing"}.items():
         assert pages[name] == page, name
+
+
+def test_the_labels_in_the_handbook_are_those_of_the_interface() -> None:
+    """Bold and italic words are labels."""
+    literals = {node.value.strip(" .") for path in (ROOT / "flare_addon").rglob("*.py")
+                for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+                if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    for page in (ROOT / "docs" / "handbook").glob("*.md"):
+        text = re.sub("`[^`]*`", "", page.read_text(encoding="utf-8"))
+        labels = {bold or italic for bold, italic in re.findall(r"\*\*([^*\n]+)\*\*|\*([^*\n]+)\*", text)}
+        assert labels - literals - BLENDERS_LABELS - NO_LABELS == set(), page.name
 
 
 def test_panels_draw_without_a_clip_a_flare_or_a_node(facts: Any) -> None:

@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import bpy
 from ..core.errors import FitFlareError, RunError, os_error_message
 from ..core.system.files import remove_file, write_json
 from ..core.system.processes import available_cores
+from ..core.system.steps import PAUSE, Steps, finish
 from . import engine, jobs, lamp_drive, looks, shots
 from .compositor.flare_node import find_node
 from .compositor.trees import forget_composited_frames
@@ -25,9 +27,9 @@ from .properties import redraw_viewports
 from .shots import ShotReading
 
 STEP_S = 0.02
-"""Time for which the reading of a scene holds the window in one go; a frame that takes longer is not interrupted."""
+"""Time for which a bake holds the window in one go; a step that takes longer is not interrupted."""
 INTERVAL_S = 0.005
-"""Pause of the reading between two such times."""
+"""Pause between two such times."""
 MAX_PROCESSES = 8
 """Most processes that draw without an engine; each needs about a gigabyte for frames of 4K."""
 
@@ -42,6 +44,7 @@ class Preparation:
         """
         self.reading, self.error = reading, ""
         self._own_folder, self._folder = own_folder, folder
+        self._start: Steps[None] | None = None
 
     @property
     def fraction_done(self) -> float:
@@ -49,21 +52,39 @@ class Preparation:
         return self.reading.done / max(self.reading.total, 1)
 
     def step(self) -> bool:
-        """Read one frame; after the last one, start the bake. Returns whether more is to be done."""
+        """Read one frame, after the last one write some frames of the shot; at the end start the bake. Returns whether
+        more is to be done."""
         if self.reading.done < self.reading.total:
             self.reading.step()
             return True
+        self._start = self._start or self._start_in_steps()
+        try:
+            next(self._start)
+        except StopIteration:
+            return False
+        return True
+
+    def end(self) -> None:
+        """Restore the timeline; leave no half-written shot."""
+        if self._start is not None:
+            self._start.close()
         self.reading.restore()
+
+    def _start_in_steps(self) -> Steps[None]:
+        """Write the shot that was read, and start the process that bakes it."""
+        self.reading.restore()
+        yield
         scene = self.reading.scene
         shot = self.reading.shot(looks.look_of(scene).path.resolve(), shots.run_to_bake(scene))
         shot = replace(shot, own_folder=self._own_folder)
-        shot.write(self._folder / shots.SHOT_FILE)
+        yield from shot.write_in_steps(self._folder / shots.SHOT_FILE)
+        scene = self.reading.scene  # an undo between two steps replaces it
         if scene.fit_flare.bake_live:
             write_json(self._folder / shots.LIVE_FILE, shots.live_record(scene.fit_flare, shot.lights))
         else:
             remove_file(self._folder / shots.LIVE_FILE)
+        yield
         _start_process(self._folder, len(shot.frames))
-        return False
 
 
 _preparation: Preparation | None = None
@@ -123,7 +144,7 @@ def start_bake(scene: Any, camera_objects: Sequence[Any], *, replace_others: boo
             while new_preparation.step():
                 pass
         finally:
-            reading.restore()
+            new_preparation.end()
         return
     _preparation = new_preparation
     bpy.app.timers.register(_read_scene, first_interval=INTERVAL_S)
@@ -158,7 +179,7 @@ def _end_reading(error: str) -> None:
     global _preparation, _last_error
     assert _preparation is not None
     finished, _preparation, _last_error = _preparation, None, error
-    finished.reading.restore()
+    finished.end()
     jobs.redraw_bars()
     redraw_viewports()
 
@@ -174,12 +195,16 @@ def _start_process(folder: Path, frame_count: int) -> None:
     engine.run_without_engine("bake", folder, [*args, "--without-engine", *jobs_option])
 
 
-ON_BAKED: list[Callable[[jobs.Job, Any], None]] = []
-"""Functions to call with the job and the scene when the layers of a scene are baked."""
+ON_BAKED: list[Callable[[jobs.Job, Any], Steps[None] | None]] = []
+"""Functions to call with the job and the scene when the layers of a scene are baked; they return steps to run, or None.
+"""
 
 
 def _on_finished(job: jobs.Job) -> None:
-    """Reload the layers that Blender shows; after success, call `ON_BAKED` for each scene with these layers."""
+    """Reload the layers that Blender shows; after success, call `ON_BAKED` for each scene with these layers.
+
+    With a window, a timer runs the steps that these functions return.
+    """
     from .images import reload_images
 
     if reload_images(job.folder):
@@ -190,7 +215,29 @@ def _on_finished(job: jobs.Job) -> None:
     for scene in bpy.data.scenes if job.state == "done" else ():
         if scene.fit_flare.layers and os.path.normcase(shots.layers_folder(scene).absolute()) == folder:
             for function in ON_BAKED:
-                function(job, scene)
+                steps = function(job, scene)
+                if steps is not None and bpy.app.background:
+                    finish(steps)
+                elif steps is not None:
+                    bpy.app.timers.register(partial(_run_steps, steps, job), first_interval=INTERVAL_S)
+
+
+def _run_steps(steps: Steps[None], job: jobs.Job) -> float | None:
+    """Run steps that follow a bake for `STEP_S`; return the seconds to the next call, None to stop the timer.
+
+    An unexpected exception is shown in the panel and the console, as one of the job.
+    """
+    start = time.perf_counter()
+    try:
+        while next(steps) != PAUSE and time.perf_counter() - start <= STEP_S:
+            pass
+        return INTERVAL_S
+    except StopIteration:
+        pass
+    except Exception as problem:
+        jobs.report_exception(job, problem)
+    jobs.redraw_bars()
+    return None
 
 
 jobs.ON_FINISHED["bake"] = _on_finished

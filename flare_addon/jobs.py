@@ -382,11 +382,16 @@ def _poll_safely(job: Job) -> bool:
     try:
         return job.poll()
     except Exception as problem:
-        traceback.print_exc()
-        job.error = (f"The result of the engine in {job.folder} cannot be shown ({' '.join(str(problem).split())}); "
-                     "report it with what the console says.")
-        job.state = "failed" if job.running else job.state
+        report_exception(job, problem)
         return True
+
+
+def report_exception(job: Job, problem: Exception) -> None:
+    """Show an unexpected exception, which is being handled, in the panel of a job and in the console."""
+    traceback.print_exc()
+    job.error = (f"The result of the engine in {job.folder} cannot be shown ({' '.join(str(problem).split())}); "
+                 "report it with what the console says.")
+    job.state = "failed" if job.running else job.state
 
 
 def redraw_bars() -> None:

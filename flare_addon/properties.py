@@ -281,7 +281,7 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         name="Layers", description="Folder for the EXR layers", subtype="DIR_PATH",
         options=PATH_OPTIONS)
     bake_range: EnumProperty(  # type: ignore[valid-type]
-        name="Frames", description="Which frames are baked",
+        name="Frames", description="Which frames are baked; ranges follow the scene's Frame Step",
         items=(("scene", "Scene Range", "All frames of the scene"), ("current", "Current", "The current frame alone"),
                ("custom", "Custom", "From a first to a last frame")))
     bake_first: IntProperty(name="First", description="First frame to bake", default=1)  # type: ignore[valid-type]

@@ -5,8 +5,8 @@
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -22,6 +22,7 @@ from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
 from ..core.system.files import hash_files
 from ..core.system.reading import parse_json, read_text
+from ..core.system.steps import Steps
 from . import fits, jobs, library, looks, stereo
 from .jobs import Job
 from .objects import view_layer_of
@@ -32,12 +33,12 @@ LIVE_FILE = "live.json"  # the lights whose intensity and tint the compositor ap
 
 
 def frames_to_bake(scene: Any) -> list[int]:
-    """Return the frames to bake, as set in the panel."""
+    """Return the frames to bake, as set in the panel. A range has every frame that the scene's Frame Step reaches."""
     state = scene.fit_flare
     if state.bake_range == "current":
         return [scene.frame_current]
     if state.bake_range == "custom":
-        return list(range(state.bake_first, max(state.bake_last, state.bake_first) + 1))
+        return list(range(state.bake_first, max(state.bake_last, state.bake_first) + 1, scene.frame_step))
     return list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
 
 
@@ -57,6 +58,7 @@ class ShotReading:
                                 "frame 0 or later.")
         self.scene_name, self._cameras = scene.name, [camera.name for camera in camera_objects]
         self._frames, self._frame_before = list(frames), (scene.frame_current, scene.frame_subframe)
+        self._is_moved = False
         self._shot_frames: list[ShotFrame] = []
         self._labels: list[str] = []  # names of the sequences of layers at the first frame
         self._views: list[tuple[str, stereo.Eye]] = []  # names and eyes of the views at the first frame
@@ -81,6 +83,7 @@ class ShotReading:
         if missing is not None or scene.camera is None:
             raise CaptureError(f"The camera {missing or 'of the scene'} was deleted while the scene was read; bake "
                                "again.")
+        self._is_moved = True
         scene.frame_set(frame)
         depsgraph = view_layer_of(scene).depsgraph
         camera_objects = [scene.objects[name] for name in self._cameras] or [scene.camera]
@@ -95,9 +98,10 @@ class ShotReading:
         self.done += 1
 
     def restore(self) -> None:
-        """Move the timeline back to where it was."""
-        if self.scene_name in bpy.data.scenes:
+        """Move the timeline back to where it was, once."""
+        if self._is_moved and self.scene_name in bpy.data.scenes:
             self.scene.frame_set(self._frame_before[0], subframe=self._frame_before[1])
+        self._is_moved = False
 
     def shot(self, flare: Path, run: Path | None) -> Shot:
         """Return the shot of the frames that were read."""
@@ -215,60 +219,75 @@ def choose_layers_folder(scene: Any) -> Path:
     return layers_folder(scene)
 
 
-def view_folders(scene: Any, layers: Path) -> dict[str, Path]:
+@dataclass(frozen=True)
+class BakedFolders:
+    """The subfolders of a folder of layers by camera: those of the last bake, and those of all bakes.
+
+    is_of_scene_camera: the last bake was of the scene's camera, not of chosen ones.
+    """
+
+    layers: Path
+    last: dict[str, str]
+    all: dict[str, str]
+    is_of_scene_camera: bool
+
+    @classmethod
+    def read_in_steps(cls, layers: Path) -> Steps[BakedFolders | None]:
+        """Read the subfolders of a folder of layers; None for a folder that no bake of a scene wrote."""
+        try:
+            shot = yield from Shot.read_in_steps(layers / SHOT_FILE)
+        except SettingsError:
+            return None
+        try:
+            entries = (yield from bakes.read_manifest_in_steps(layers))["frames"]
+        except RunError:
+            entries = []
+        baked = {entry["view"].rpartition("/")[0]: entry["file"].rpartition("/")[0] for entry in entries
+                 if "/" in entry["view"]}
+        return cls(layers, shot.folders, {**baked, **shot.folders}, not shot.own_folder)
+
+    def of_views(self, scene: Any) -> dict[str, Path]:
+        """Return the folder of the layers of each view that the scene renders, by the view's name ("" without stereo).
+
+        Layers of one camera alone are for all views: {"": folder}. Raises FrameError where there are layers of other
+        cameras only.
+        """
+        suffixes = stereo.view_suffixes(scene.render)
+        # A bake of the scene's camera is for the scene's camera, whatever its name is now.
+        if suffixes and self.is_of_scene_camera and len(self.last) == len(suffixes) and all(
+                name.endswith(suffix) for name, suffix in zip(self.last, suffixes.values(), strict=True)):
+            return {view: self.layers / folder for view, folder in zip(suffixes, self.last.values(), strict=True)}
+        views = stereo.camera_views(scene, scene.camera) if suffixes and scene.camera is not None else []
+        if views and all(view.label in self.all for view in views):
+            return {view.name: self.layers / self.all[view.label] for view in views}
+        return {"": self._of_camera(scene.camera, scene.render)}
+
+    def _of_camera(self, camera: Any, render: Any) -> Path:
+        """Return the folder of a camera's layers, inside the folder of a bake or that folder itself.
+
+        camera: a camera object, or None. render: the scene's render settings. Raises FrameError where there are layers
+        of other cameras only.
+        """
+        name = camera.name if camera is not None else ""
+        # Where the last bake wrote into the folder itself (""), or EXRs are there, they serve any camera.
+        if name not in self.all and "" not in self.last.values() and not any(self.layers.glob("*.exr")):
+            labels = stereo.possible_labels(render, name)
+            hint = "" if render.use_multiview or labels.isdisjoint(self.all) else (
+                " Layers of a stereo render need Stereoscopy switched on.")
+            raise FrameError(f"{self.layers} has no layers of the camera {name!r}, only of "
+                             f"{', '.join(map(repr, self.all))}; bake it too, or make one of those the scene's camera. "
+                             f"A renamed camera needs its old name.{hint}")
+        return self.layers / self.all.get(name, "")
+
+
+def view_folders_in_steps(scene_now: Callable[[], Any], layers: Path) -> Steps[dict[str, Path]]:
     """Return the folder of the layers of each view that the scene renders, by the view's name ("" without stereo).
 
-    Layers of one camera alone are for all views: {"": folder}. layers: the folder of a bake, or of one camera's layers
-    in it. Raises FrameError where there are layers of other cameras only.
+    scene_now: returns the scene, which an undo between two steps replaces. layers: the folder of a bake, or of one
+    camera's layers in it. Raises what `BakedFolders.of_views` raises.
     """
-    suffixes = stereo.view_suffixes(scene.render)
-    try:
-        last_shot = Shot.read(layers / SHOT_FILE)
-    except SettingsError:
-        return {"": layers}
-    folders = last_shot.folders
-    # A bake of the scene's camera is for the scene's camera, whatever its name is now.
-    if suffixes and not last_shot.own_folder and len(folders) == len(suffixes) and all(
-            name.endswith(suffix) for name, suffix in zip(folders, suffixes.values(), strict=True)):
-        return {view: layers / folder for view, folder in zip(suffixes, folders.values(), strict=True)}
-    folders = {**_baked_folders(layers), **folders}
-    views = stereo.camera_views(scene, scene.camera) if suffixes and scene.camera is not None else []
-    if views and all(view.label in folders for view in views):
-        return {view.name: layers / folders[view.label] for view in views}
-    return {"": camera_folder(layers, scene.camera, scene.render)}
-
-
-def camera_folder(layers: Path, camera: Any, render: Any) -> Path:
-    """Return the folder of a camera's layers, inside the folder of a bake or that folder itself.
-
-    camera: a camera object, or None. render: the scene's render settings. Raises FrameError where there are layers of
-    other cameras only.
-    """
-    try:
-        last_folders = Shot.read(layers / SHOT_FILE).folders
-    except SettingsError:
-        return layers
-    folders = {**_baked_folders(layers), **last_folders}
-    name = camera.name if camera is not None else ""
-    # Where the last bake wrote into the folder itself (""), or EXRs are there, they serve any camera.
-    if name not in folders and "" not in last_folders.values() and not any(layers.glob("*.exr")):
-        labels = stereo.possible_labels(render, name)
-        hint = "" if render.use_multiview or labels.isdisjoint(folders) else (
-            " Layers of a stereo render need Stereoscopy switched on.")
-        raise FrameError(f"{layers} has no layers of the camera {name!r}, only of {', '.join(map(repr, folders))}; "
-                         "bake it too, or make one of those the scene's camera. A renamed camera needs its old name."
-                         f"{hint}")
-    return layers / folders.get(name, "")
-
-
-def _baked_folders(layers: Path) -> dict[str, str]:
-    """Return the subfolder of each camera in a folder of layers, also of cameras of earlier bakes."""
-    try:
-        entries = bakes.read_manifest(layers)["frames"]
-    except RunError:
-        return {}
-    return {entry["view"].rpartition("/")[0]: entry["file"].rpartition("/")[0] for entry in entries
-            if "/" in entry["view"]}
+    folders = yield from BakedFolders.read_in_steps(layers)
+    return {"": layers} if folders is None else folders.of_views(scene_now())
 
 
 def frames_to_replace(scene: Any, camera_objects: Sequence[Any]) -> list[int]:

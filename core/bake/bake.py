@@ -26,6 +26,7 @@ from ..look import KeyedEdits, LookEdits
 from ..system.files import file_lock, read_json, remove_file, safe_join, write_json
 from ..system.progress import Progress
 from ..system.reading import open_regular
+from ..system.steps import FRAMES_PER_STEP, Steps, finish
 from ..typed import parse_value
 from .exr import read_description, write_layers
 from .layers import FrameLayers, layer_names, to_layers
@@ -336,10 +337,15 @@ def _add_to_manifest(out: Path, cache_key: dict[str, Any], layer_by_light: dict[
 
 def read_manifest(out: Path | str) -> dict[str, Any]:
     """Read bake.json of a folder of layers. Raises RunError if it is missing or damaged."""
+    return finish(read_manifest_in_steps(out))
+
+
+def read_manifest_in_steps(out: Path | str) -> Steps[dict[str, Any]]:
+    """Read bake.json as `read_manifest` does, some frames a step. Raises RunError."""
     path = Path(out) / MANIFEST
-    manifest = read_json(path, RunError)
+    manifest: dict[str, Any] = read_json(path, RunError)
     try:
-        for entry in manifest["frames"]:
+        for index, entry in enumerate(manifest["frames"], 1):
             extra_files = entry.get("rest", [])
             if not isinstance(extra_files, list):
                 raise TypeError(f"rest {extra_files!r:.100}")
@@ -347,6 +353,8 @@ def read_manifest(out: Path | str) -> dict[str, Any]:
                 safe_join(out, file, RunError)
             for name in ("frame", "width", "height"):
                 parse_value(int, entry[name])
+            if index % FRAMES_PER_STEP == 0:
+                yield
         if manifest["version"] != VERSION or not isinstance(manifest["made_from"], dict):
             raise ValueError(f"version {manifest['version']}")
         dict(manifest["layers"]).items()

@@ -17,6 +17,7 @@ else any.
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import re
 from collections import Counter
@@ -30,14 +31,18 @@ import numpy as np
 from ..capture.camera import Camera
 from ..capture.light_extent import LightExtent
 from ..errors import SettingsError
-from ..system.files import avoid_device_name, read_json, write_json
-from ..system.reading import read_bytes
+from ..system.files import atomic_path, avoid_device_name, read_json
+from ..system.reading import UTF8_SIG, parse_json, read_bytes, read_text
+from ..system.steps import FRAMES_PER_STEP, Steps, finish
 from .look import PlacedLight, Query
 
 VERSION = 1
 MAX_SIDE = 1 << 15  # pixels of a side
 MAX_FRAME = 10**9
 MAX_FACTOR = 1e9  # of a light
+_FRAMES_END = "]}"
+"""The last line of a file of `Shot.write`: its first line ends where the list of frames begins, and each frame has a
+line, so that `Shot.read_in_steps` need not parse the file whole."""
 LIGHT_RADIUS = 0.01
 """Default radius of a light, relative to its distance: the standard deviation of the soft disc whose visible part is
 its visibility."""
@@ -104,25 +109,40 @@ class Shot:
 
     def write(self, path: Path | str) -> None:
         """Write the shot as the JSON file that `read` reads."""
-        frames = [{"frame": frame.frame, "name": frame.name, "width": frame.camera.width, "height": frame.camera.height,
-                   "intrinsics": [frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy],
-                   "world_to_camera": frame.camera.world_to_camera.tolist(), "exposure": frame.camera.exposure,
-                   "edits": list(frame.edits),
-                   "lights": [_light_entry(light) for light in frame.lights]} for frame in self.frames]
-        write_json(path, {"version": VERSION, "flare": str(self.flare), "run": str(self.run) if self.run else None,
-                          "query": self.query, "live": self.live, "apart": self.own_folder, "frames": frames})
+        finish(self.write_in_steps(path))
+
+    def write_in_steps(self, path: Path | str) -> Steps[None]:
+        """Write the shot, some frames a step; the file appears, or replaces an earlier one, at the end."""
+        head = {"version": VERSION, "flare": str(self.flare), "run": str(self.run) if self.run else None,
+                "query": self.query, "live": self.live, "apart": self.own_folder, "frames": []}
+        with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as stream:
+            stream.write(json.dumps(head).removesuffix(_FRAMES_END))
+            for index, frame in enumerate(self.frames):
+                stream.write(("," if index else "") + "\n" + json.dumps(_frame_entry(frame), allow_nan=False))
+                if index % FRAMES_PER_STEP == FRAMES_PER_STEP - 1:
+                    yield
+            stream.write(f"\n{_FRAMES_END}\n")
 
     @classmethod
     def read(cls, path: Path | str) -> Shot:
         """Read a shot; its relative paths start at the file's folder. Raises SettingsError for a missing or invalid
         file."""
-        data = read_json(path, SettingsError)
+        return finish(cls.read_in_steps(path))
+
+    @classmethod
+    def read_in_steps(cls, path: Path | str) -> Steps[Shot]:
+        """Read a shot as `read` does, some frames a step where `write` wrote the file. Raises SettingsError."""
+        data = (yield from _parse_lines(Path(path))) or read_json(path, SettingsError)
         try:
             if data["version"] != VERSION:
                 raise ValueError(f"version {data['version']}")
             if data.get("query", "target") not in get_args(Query):
                 raise ValueError(f"query {data['query']!r}")
-            frames = tuple(_read_frame(entry, data) for entry in data["frames"])
+            frames: list[ShotFrame] = []
+            for entry in data["frames"]:
+                frames.append(_read_frame(entry, data))
+                if len(frames) % FRAMES_PER_STEP == 0:
+                    yield
             if not frames:
                 raise ValueError("it has no frames")
             counts = Counter((frame.name, frame.frame) for frame in frames)
@@ -131,8 +151,8 @@ class Shot:
                 raise ValueError(f"frame {duplicates[0][1]} of {duplicates[0][0]!r} is listed twice")
             folder_of_file = Path(path).parent
             run = folder_of_file / data["run"] if data.get("run") else None
-            return cls(folder_of_file / data["flare"], frames, data.get("query", "target"), run, bool(data.get("live")),
-                       bool(data.get("apart")))
+            return cls(folder_of_file / data["flare"], tuple(frames), data.get("query", "target"), run,
+                       bool(data.get("live")), bool(data.get("apart")))
         except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as problem:
             raise SettingsError(f"{path} is not a shot that can be rendered ({problem!r}); "
                                 "export it again.") from problem
@@ -143,6 +163,35 @@ class Shot:
             return self
         return replace(self, frames=tuple(replace(frame, camera=frame.camera.scaled(width, height))
                                           for frame in self.frames))
+
+
+def _parse_lines(path: Path) -> Steps[dict[str, Any] | None]:
+    """Parse the lines of a file of `Shot.write`, some a step; return its data, None for a file of other lines."""
+    try:
+        head, *lines = read_text(path, encoding=UTF8_SIG).rstrip("\n").split("\n")
+        if not head.endswith("[") or not lines or lines[-1] != _FRAMES_END:
+            return None
+        data = parse_json(head + _FRAMES_END)
+        frames: list[Any] = []
+        for line in lines[:-1]:
+            is_last = len(frames) == len(lines) - 2
+            if line.endswith(",") == is_last:
+                return None
+            frames.append(parse_json(line.removesuffix(",")))
+            if len(frames) % FRAMES_PER_STEP == 0:
+                yield
+    except (OSError, ValueError):
+        return None
+    return {**data, "frames": frames} if isinstance(data, dict) and data.get("frames") == [] else None
+
+
+def _frame_entry(frame: ShotFrame) -> dict[str, Any]:
+    """Return the JSON form of a frame."""
+    camera = frame.camera
+    return {"frame": frame.frame, "name": frame.name, "width": camera.width, "height": camera.height,
+            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+            "world_to_camera": camera.world_to_camera.tolist(), "exposure": camera.exposure,
+            "edits": list(frame.edits), "lights": [_light_entry(light) for light in frame.lights]}
 
 
 def _read_frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:

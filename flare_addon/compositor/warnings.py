@@ -40,10 +40,13 @@ def warnings(scene: Any, layer_folders: Sequence[LayerFolder], live: bool) -> It
                f"{render.resolution_y}, another aspect ratio, to which they are stretched; bake them again.")
     baked = [NumberedFrame(view="", number=number, file="") for number in layer_folders[0].files
              if all(number in layers.files for layers in layer_folders)]
-    if missing := missing_numbers(baked, f"{max(scene.frame_start, 0)}-{max(scene.frame_end, scene.frame_start, 0)}"):
+    first, last, step = scene.frame_start, max(scene.frame_end, scene.frame_start), scene.frame_step
+    start = first if first >= 0 else first % step  # layers have no negative numbers
+    if missing := missing_numbers(baked, f"{start}-{max(last, start)}:{step}"):
         effect = "this version of Blender shows in magenta" if flare_node.MISSING_IS_MAGENTA else "are without flare"
-        yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}, and there are no layers of {missing}, "
-               f"which {effect}; bake them too.")
+        steps = f" in steps of {step}" if step > 1 else ""
+        yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}{steps}, and there are no layers of "
+               f"{missing}, which {effect}; bake them too.")
     if live and drivers.is_animated(scene):
         yield ("Sliders that act on it are animated: without this extension, as on a farm, they do not move; bake "
                "without Keep Colours Live for that.")

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ...core.bake.folder import LayerFolder
-from ...core.errors import CaptureError, FitFlareError
+from ...core.errors import CaptureError, FitFlareError, RunError
+from ...core.system.steps import PAUSE, Steps, finish
 from .. import baking, jobs, render_settings, shots
 from ..compositor import drivers, flare_node, setup, warnings
 from ..paths import absolute, is_folder
@@ -96,10 +99,25 @@ def set_up_compositor(operator: Any, scene: Any, folder: str, *, keep_image: boo
     scene, the compositor's present output (`keep_image`), or the footage behind the camera (`plate`). match: set the
     frames and the size of the scene to the layers'. Raises FrameError.
     """
-    views = {view: LayerFolder.open(path) for view, path in shots.view_folders(scene, absolute(folder)).items()}
-    layers = next(iter(views.values()))
+    finish(_set_up_in_steps(operator, lambda: scene, folder, keep_image=keep_image, plate=plate, match=match))
+
+
+def _set_up_in_steps(operator: Any, scene_now: Callable[[], Any], folder: str, *, keep_image: bool, plate: bool,
+                     match: bool = False) -> Steps[None]:
+    """Set the compositor up as `set_up_compositor` does, in steps.
+
+    scene_now: returns the scene, which an undo between two steps replaces.
+    """
+    views: dict[str, LayerFolder] = {}
+    folders = yield from shots.view_folders_in_steps(scene_now, absolute(folder))
+    for view, path in folders.items():
+        views[view] = yield from LayerFolder.open_in_steps(path)
+    yield PAUSE
+    scene, layers = scene_now(), next(iter(views.values()))
     footage = setup.footage_behind_camera(scene) if plate else None
     setup.set_up_nodes(scene, layers, keep_image=keep_image, plate=footage, views=views if len(views) > 1 else None)
+    yield PAUSE
+    scene = scene_now()
     if match:
         render_settings.match_scene(scene, layers, layers.size())
     live = "; Intensity and Tint of the panel act on it" if connect_sliders(scene, layers) else ""
@@ -207,8 +225,8 @@ class _JobReports:
             self._job.warnings.append(text)
 
 
-def _set_up_after_bake(job: jobs.Job, scene: Any) -> None:
-    """Set the compositor of a scene up for new layers, if the panel says so.
+def _set_up_compositor_after_bake(job: jobs.Job, scene: Any) -> Steps[None] | None:
+    """Return the steps that set the compositor of a scene up for new layers; None where the panel does not say so.
 
     A compositor that is set up already stays as it is, unless the bake was started to set it up again.
     """
@@ -216,15 +234,31 @@ def _set_up_after_bake(job: jobs.Job, scene: Any) -> None:
     _scenes_to_set_up.discard(scene.name)
     if not state.bake_composite or scene.library is not None or (
             flare_node.find_node(scene) is not None and not set_up_again):
-        return
+        return None
     reports = _JobReports(job)
+    steps = _set_up_in_steps(reports, partial(_scene_of_name, scene.name), state.layers,
+                             keep_image=state.over == "present", plate=state.over == "plate")
+    return _finish_set_up(reports, steps)
+
+
+def _finish_set_up(reports: _JobReports, steps: Steps[None]) -> Steps[None]:
+    """Run the steps of a set-up, report its error, and store an undo step."""
     try:
-        set_up_compositor(reports, scene, state.layers, keep_image=state.over == "present", plate=state.over == "plate")
+        yield from steps
     except FitFlareError as problem:
         reports.report({"ERROR"}, f"The compositor was not set up: {problem}")
         return
+    yield PAUSE
     with contextlib.suppress(RuntimeError):  # without a window there are no undo steps
         bpy.ops.ed.undo_push(message="Set Up Compositor")
+
+
+def _scene_of_name(name: str) -> Any:
+    """Return the scene of this name. Raises RunError where it was deleted."""
+    scene = bpy.data.scenes.get(name)
+    if scene is None:
+        raise RunError(f"The scene {name!r} was deleted or renamed meanwhile.")
+    return scene
 
 
 class FITFLARE_OT_open_folder(bpy.types.Operator):
@@ -250,11 +284,11 @@ _CLASSES = (FITFLARE_OT_bake, FITFLARE_OT_set_up_compositor, FITFLARE_OT_set_up_
 def register() -> None:
     for cls in _CLASSES:
         bpy.utils.register_class(cls)
-    baking.ON_BAKED.append(_set_up_after_bake)
+    baking.ON_BAKED.append(_set_up_compositor_after_bake)
 
 
 def unregister() -> None:
-    baking.ON_BAKED.remove(_set_up_after_bake)
+    baking.ON_BAKED.remove(_set_up_compositor_after_bake)
     baking.unregister()
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)

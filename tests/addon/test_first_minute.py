@@ -99,6 +99,14 @@ def test_layers_are_baked_without_an_engine(facts: Any) -> None:
     assert "needs the engine" in facts["scene of a fit"]
 
 
+def test_the_frame_step_counts_in_ranges_and_warnings(facts: Any) -> None:
+    """Block of first_minute.py: "bake without an engine"."""
+    assert facts["warnings after the bake"] == [], "the frames between those of the Frame Step need no layers"
+    assert facts["custom frames"] == [2, 5]
+    (warning,) = facts["custom frame of a longer scene"]
+    assert "has the frames 1-10 in steps of 3, and there are no layers of 10," in warning
+
+
 def test_the_first_render_shows_the_flare(facts: Any) -> None:
     """Block of first_minute.py: "bake without an engine"."""
     assert facts["set up by itself"] and facts["is seen"]
@@ -127,6 +135,17 @@ def test_a_scene_is_read_a_frame_at_a_time(facts: Any) -> None:
     assert "was deleted while" in facts["camera deleted while it reads"]
     during, ended = facts["another file is opened"]
     assert "A bake is running" in during and ended
+
+
+def test_a_timer_reads_the_scene_and_can_be_cancelled(facts: Any) -> None:
+    """Block of first_minute.py: "reading a scene in steps"."""
+    calls, interval, fraction = facts["a frame in each call"]
+    assert calls == [[interval, 1, 2], [interval, 2, 5], [interval, 3, 8]] and fraction == 1
+    stopped = "Stopped before it began."
+    assert facts["cancelled"] == [["FINISHED"], 4, True, stopped, None, 0], "the frame is the artist's again"
+    assert facts["cancelled while the shot is written"] == [6, 0, True, 1, []]
+    assert facts["read to the end"] == [True, 4, "", [3], True]
+    assert facts["camera deleted between calls"] == [None, True, 4, True]
 
 
 def test_a_single_picture_is_rendered_with_its_flare(facts: Any) -> None:

@@ -85,6 +85,15 @@ def test_a_frame_that_was_baked_again_is_shown(facts: Any) -> None:
     assert facts["keeps frames"], "the cache of composited frames (5.3) is on as before"
 
 
+def test_composited_frames_are_forgotten_after_a_bake(facts: Any) -> None:
+    """Block of flares.py: "a frame that is shown is baked again".
+
+    A render bypasses the cache of composited frames (5.3), so the assignments that free it are recorded.
+    """
+    switch = "use_compositor_frames_cache"
+    assert facts["frames are forgotten"] == [[[[switch, False], [switch, True]], []], True]
+
+
 def test_frames_without_layers_are_reported_and_show_no_flare(facts: Any) -> None:
     """Block of flares.py: "warnings about frames without layers and animated sliders"."""
     assert facts["all frames"] == []

@@ -192,6 +192,8 @@ folder = shots.layers_folder(scene)
 facts["in the user's folder"] = Path(bpy.utils.user_resource("DATAFILES")) in folder.parents
 facts["frames"] = [sorted(path.name for path in folder.glob("*.exr")), scene.frame_current]
 facts["set up by itself"] = flare_node.find_node(scene) is not None
+job = part("flare_addon.jobs").find_job(folder)
+facts["warnings after the bake"] = list(job.warnings)
 errors = []
 for number in (1, 4):
     scene.frame_set(number)
@@ -212,6 +214,14 @@ scene.fit_flare.bake_scene, scene.fit_flare.bake_composite = False, False
 ops.remove_compositor()
 ops.bake()
 facts["left alone"] = flare_node.find_node(scene) is None
+state = scene.fit_flare
+state.bake_range, state.bake_first, state.bake_last = "custom", 2, 6
+facts["custom frames"] = shots.frames_to_bake(scene)
+scene.frame_end, state.bake_composite, state.bake_range = 10, True, "scene"
+scene.fit_flare.bake_first, scene.fit_flare.bake_last, state.bake_range = 4, 4, "custom"
+ops.bake()
+facts["custom frame of a longer scene"] = part("flare_addon.jobs").find_job(folder).warnings
+ops.remove_compositor()
 
 # ---- a stack of effects ---------------------------------------------------------------------------------
 def effect(scene, name, factor):
@@ -277,6 +287,45 @@ try:
 except part("core.errors").FitFlareError as problem:
     facts["camera deleted while it reads"] = str(problem)
 scene.camera = lens
+def prepare():
+    """Begin a bake of the frames 2, 5 and 8 as with a window."""
+    scene.frame_set(4)
+    baking._preparation = baking.Preparation(shots.ShotReading(scene, [], range(2, 9, 3)), False, folder)
+    baking._last_error, baking._last_scene = "", scene.name
+
+
+started, start_process, step_s = [], baking._start_process, baking.STEP_S
+baking._start_process, baking.STEP_S = lambda _folder, count: started.append(count), 0.0
+prepare()
+shot_before = (folder / shots.SHOT_FILE).read_text()
+calls = [[baking._read_scene(), baking.preparation().reading.done, scene.frame_current] for _ in range(3)]
+facts["a frame in each call"] = [calls, baking.INTERVAL_S, baking.preparation().fraction_done]
+facts["cancelled"] = [list(ops.cancel_bake()), scene.frame_current, baking.preparation() is None,
+                      baking.last_error(scene), baking._read_scene(), len(started)]
+prepare()
+for _ in range(4):
+    baking._read_scene()
+scene.frame_set(6)  # by the artist, after the frames are read
+part("core.look.shot").FRAMES_PER_STEP, frames_per_step = 1, part("core.look.shot").FRAMES_PER_STEP
+baking._read_scene()
+writing = [path.name for path in folder.iterdir() if "partial" in path.name]
+ops.cancel_bake()
+part("core.look.shot").FRAMES_PER_STEP = frames_per_step
+facts["cancelled while the shot is written"] = [
+    scene.frame_current, len(started), (folder / shots.SHOT_FILE).read_text() == shot_before, len(writing),
+    [path.name for path in folder.iterdir() if "partial" in path.name]]
+prepare()
+ends = 0
+while baking._read_scene() is not None:
+    ends += 1
+facts["read to the end"] = [ends < 20, scene.frame_current, baking.last_error(scene), started,
+                            (folder / shots.SHOT_FILE).read_text() != shot_before]
+prepare()
+baking._read_scene()
+lens, scene.camera = scene.camera, None
+facts["camera deleted between calls"] = [baking._read_scene(), baking.preparation() is None, scene.frame_current,
+                                         "was deleted while" in baking.last_error(scene)]
+scene.camera, baking._start_process, baking.STEP_S = lens, start_process, step_s
 baking._preparation = baking.Preparation(reading, False, folder)
 during = refusal(ops.bake)
 bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)

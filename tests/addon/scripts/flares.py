@@ -238,6 +238,38 @@ facts["baked again"].append(shown(scene))
 facts["keeps frames"] = getattr(scene.render, "use_compositor_frames_cache", True)
 first.write_bytes(kept)
 
+
+class RecordedRender:
+    """Render settings that record what is assigned to the switch of the cache of composited frames (5.3)."""
+
+    def __init__(self, is_on):
+        vars(self).update(assigned=[], use_compositor_frames_cache=is_on)
+
+    def __setattr__(self, name, value):
+        self.assigned.append([name, value])
+        vars(self)[name] = value
+
+
+class RecordedScene:
+    """The scene with recorded render settings."""
+
+    def __init__(self, is_on):
+        self.render = RecordedRender(is_on)
+
+    def __getattr__(self, name):
+        return getattr(scene, name)
+
+
+forgotten = []
+for recorded in (RecordedScene(True), RecordedScene(False)):
+    part("flare_addon.compositor.trees").forget_composited_frames(recorded)
+    forgotten.append(recorded.render.assigned)
+baking, reset = part("flare_addon.baking"), []
+forget, baking.forget_composited_frames = baking.forget_composited_frames, lambda scene: reset.append(scene.name)
+baking._on_finished(SimpleNamespace(folder=Path(layers), state="failed"))
+baking.forget_composited_frames = forget
+facts["frames are forgotten"] = [forgotten, reset == [scene.name]]
+
 # ---- a row is touched -----------------------------------------------------------------------------------
 scene = shot(["lamp", "second"])
 scene.camera.rotation_euler = (math.pi / 2, 0, 0)

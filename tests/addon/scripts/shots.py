@@ -124,19 +124,24 @@ state.lights[0].intensity, state.bake_live = 1.0, True
 state.lights.remove(len(state.lights) - 1)
 
 # ---- chosen cameras ---------------------------------------------------------------------------------
+def layers_of_camera():
+    """The folder of the layers of the scene's camera."""
+    return part("core.system.steps").finish(shots.view_folders_in_steps(lambda: scene, folder))[""]
+
+
 one = shots._panel_shot(scene, [scene.camera], [0])
 facts["one chosen"] = list(one.folders.values())
 one.write(folder / "shot.json")
-facts["one chosen, read again"] = shots.camera_folder(folder, scene.camera, scene.render).name
+facts["one chosen, read again"] = layers_of_camera().name
 scene.camera.name = "Other"
 try:
-    shots.camera_folder(folder, scene.camera, scene.render)
+    layers_of_camera()
 except part("core.errors").FrameError as problem:
     facts["renamed since"] = str(problem)
 write_json(folder / "bake.json", {"version": 1, "made_from": {}, "layers": {}, "frames": [
     {"file": f"Other_2/layers.{number:04d}.exr", "frame": number, "view": f"Other/{number}", "width": 8, "height": 8}
     for number in range(2)]})
-facts["of an earlier bake"] = shots.camera_folder(folder, scene.camera, scene.render).name
+facts["of an earlier bake"] = layers_of_camera().name
 (folder / "bake.json").unlink()
 facts["the scene's own"] = list(shots._panel_shot(scene, [], [0]).folders.values())
 for item in scene.objects:

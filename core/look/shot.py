@@ -40,9 +40,9 @@ VERSION = 1
 MAX_SIDE = 1 << 15  # pixels of a side
 MAX_FRAME = 10**9
 MAX_FACTOR = 1e9  # of a light
-_FRAMES_END = "]}"
-"""The last line of a file of `Shot.write`: its first line ends where the list of frames begins, and each frame has a
-line, so that `Shot.read_in_steps` need not parse the file whole."""
+_FRAMES_BEGIN, _FRAMES_END = '"frames": [', "]}"
+"""The end of the first line of a file of `Shot.write`, and its last line. Between them each frame has a line, so that
+`Shot.read_in_steps` need not parse the file whole."""
 LIGHT_RADIUS = 0.01
 """Default radius of a light, relative to its distance: the standard deviation of the soft disc whose visible part is
 its visibility."""
@@ -169,7 +169,7 @@ def _parse_lines(path: Path) -> Steps[dict[str, Any] | None]:
     """Parse the lines of a file of `Shot.write`, some a step; return its data, None for a file of other lines."""
     try:
         head, *lines = read_text(path, encoding=UTF8_SIG).rstrip("\n").split("\n")
-        if not head.endswith("[") or not lines or lines[-1] != _FRAMES_END:
+        if not head.endswith(_FRAMES_BEGIN) or not lines or lines[-1] != _FRAMES_END:
             return None
         data = parse_json(head + _FRAMES_END)
         frames: list[Any] = []

@@ -15,6 +15,7 @@ from core.bake.folder import LayerFolder
 from core.bake.layers import FrameLayers
 from core.errors import FrameError
 from core.images.window import DataWindow
+from core.system.steps import finish
 
 
 def frame(folder: Path, number: int, lights: Sequence[str]) -> Path:
@@ -75,3 +76,15 @@ def test_a_damaged_frame_is_named(tmp_path: Path) -> None:
     (tmp_path / "layers.0002.exr").write_bytes(whole[:-20])
     with pytest.raises(FrameError, match=r"layers\.0002\.exr ends before its last lines"):
         LayerFolder.open(tmp_path)
+
+
+def test_a_folder_is_opened_some_frames_a_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("core.bake.folder.FRAMES_PER_STEP", 2)
+    files = {number: frame(tmp_path, number, ["sun"]) for number in range(1, 6)}
+    assert sum(1 for _ in LayerFolder.open_in_steps(tmp_path)) == 2
+    assert finish(LayerFolder.open_in_steps(tmp_path)).files == files
+    steps = LayerFolder.open_in_steps(tmp_path)
+    next(steps)
+    files[5].unlink()  # by a bake that begins anew
+    with pytest.raises(FrameError, match=r"layers\.0005\.exr cannot be read"):
+        finish(steps)

@@ -535,6 +535,29 @@ def test_a_shot_is_restored_from_its_file(tmp_path: Path) -> None:
             Shot.read(tmp_path / "bad.json")
 
 
+def test_a_shot_is_written_and_read_in_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("core.look.shot.FRAMES_PER_STEP", 1)
+    shot, file = a_shot(tmp_path), tmp_path / "shot.json"
+    file.write_text("earlier")
+    writing = shot.write_in_steps(file)
+    next(writing)
+    assert len(list(tmp_path.glob(".*partial*"))) == 1
+    writing.close()
+    assert file.read_text() == "earlier" and not list(tmp_path.glob(".*partial*"))
+    assert sum(1 for _ in shot.write_in_steps(file)) == 3
+    keys = [frame.cache_key() for frame in shot.frames]
+    assert sum(1 for _ in Shot.read_in_steps(file)) == 6, "each frame is parsed in a step, and checked in another"
+    assert [frame.cache_key() for frame in Shot.read(file).frames] == keys
+    lines = file.read_text().splitlines()
+    assert [json.loads(line.rstrip(","))["frame"] for line in lines[1:-1]] == [1, 2, 3]
+    file.write_text(json.dumps(json.loads(file.read_text()), indent=1))  # as another program writes it
+    assert [frame.cache_key() for frame in Shot.read(file).frames] == keys
+    for damaged in (lines[:-1], [*lines[:2], lines[2].rstrip(","), *lines[3:]], [*lines[:-1], *lines[1:]]):
+        file.write_text("\n".join(damaged))
+        with pytest.raises(SettingsError, match=r"shot\.json is not valid JSON"):
+            Shot.read(file)
+
+
 def test_a_shot_bake_equals_the_overlay(tmp_path: Path) -> None:
     from core.bake.exr import read_layers
     from core.bake.shot import bake_shot

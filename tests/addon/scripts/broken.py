@@ -283,9 +283,9 @@ def full(*_words: object, **_named: object) -> None:
 
 
 lights, library, shots = (part(f"flare_addon.{name}") for name in ("lights", "library", "shots"))
-write_shot, shots.Shot.write = shots.Shot.write, full
+write_shot, shots.Shot.write_in_steps = shots.Shot.write_in_steps, full
 said["bake on a full disk"] = refusal(lambda: ops.bake())
-shots.Shot.write = write_shot
+shots.Shot.write_in_steps = write_shot
 write_annotated, library.write_annotated = library.write_annotated, full
 said["save on a full disk"] = refusal(lambda: ops.save_flare(name="full"))
 said["library after"] = [path.name for path in library.user_files()]

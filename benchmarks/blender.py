@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Times of the add-on in Blender: import of a large capture, polling of a fit's events, and the overlay's numpy part.
+"""Times of the add-on in Blender: import of a large capture, polling of a fit's events, and the overlay.
 
-    python benchmarks/blender.py            in a Python that has bpy; prints a table
+    python benchmarks/blender.py                             in a Python that has bpy; prints a table
+    python benchmarks/blender.py --shares [--against TREE]   prints the parts of a redraw
+    blender [-b] --python benchmarks/blender.py -- WORDS     the same in Blender
 
 Import: 400 cameras, 100,000 points. Events: polled in the window's thread, with 400 cameras in the scene. Overlay: one
-light of 2,000 Gaussians at 1920 x 1080, without the drawing on the GPU.
+light of 2,000 Gaussians at 1920 x 1080, without the drawing on the GPU. Parts of a redraw: see `overlay_shares.py`.
 """
 from __future__ import annotations
 
@@ -26,9 +28,9 @@ ROOT = Path(__file__).resolve().parents[1]
 CAMERAS, POINTS, GAUSSIANS, LEVELS, LAMPS = 400, 100_000, 2_000, 16, 100
 
 
-def load_module(name: str) -> Any:
-    """Import the module of this name in the tree, as a part of the package that run.py registers."""
-    spec = importlib.util.spec_from_file_location("run", ROOT / "headless" / "run.py")
+def load_module(name: str, tree: Path = ROOT) -> Any:
+    """Import the module of this name in a tree, as a part of the package that its run.py registers."""
+    spec = importlib.util.spec_from_file_location("run", tree / "headless" / "run.py")
     assert spec is not None
     assert spec.loader is not None
     run = importlib.util.module_from_spec(spec)
@@ -69,13 +71,14 @@ def make_capture(folder: Path, cameras: int = CAMERAS) -> Path:
     return folder
 
 
-def make_flare(path: Path) -> Path:
-    """Write a .flare of one light with numpy alone: random weights, empty hash tables."""
+def make_flare(path: Path, count: int = GAUSSIANS, smallest: float = 0.01) -> Path:
+    """Write a .flare of one light with numpy alone: random weights, hash tables with their coarsest level alone.
+
+    count: number of Gaussians. smallest: least standard deviation, normalised coordinates; the largest is 0.06."""
     random = np.random.default_rng(1)
     widths = {"positions": 1, "log_scales": 2, "rotations": 2, "opacity_logits": 1, "sh": 3, "rings": 2}
-    count = GAUSSIANS
     arrays = {f"0.gaussians.{name}": random.normal(size=(count, width)) for name, width in widths.items()}
-    arrays["0.gaussians.log_scales"] = np.log(random.uniform(0.01, 0.06, (count, 2)))
+    arrays["0.gaussians.log_scales"] = np.log(random.uniform(smallest, 0.06, (count, 2)))
     arrays["0.gaussians.opacity_logits"] -= 3
     arrays["0.gaussians.rings"] = np.zeros((count, 2))
     arrays["0.gaussians.offsets"], arrays["0.gaussians.latent"] = np.zeros((count, 2)), random.normal(size=(count, 4))
@@ -87,16 +90,17 @@ def make_flare(path: Path) -> Path:
         arrays[f"0.network.{name}.weight"] = random.normal(size=shape) * 0.02
         arrays[f"0.network.{name}.bias"] = np.zeros(shape[0])
     arrays["0.network.gaussian_layer.weight"] = random.normal(size=(128, 10)) * 0.02
+    for grid in ("light_grid", "camera_grid"):
+        # The coarsest level, so that the features differ from view to view.
+        arrays[f"0.network.{grid}.table.weight.rows"] = np.arange(17**3)
+        arrays[f"0.network.{grid}.table.weight.values"] = random.normal(size=(17**3, 2)) * 0.1
     header: dict[str, Any] = {}
     body = b""
     for name, array in arrays.items():
-        data = np.ascontiguousarray(array, "<f4").tobytes()
-        header[name] = {"dtype": "F32", "shape": list(array.shape), "data_offsets": [len(body), len(body) + len(data)]}
+        kind, letters = ("I32", "<i4") if name.endswith(".rows") else ("F32", "<f4")
+        data = np.ascontiguousarray(array, letters).tobytes()
+        header[name] = {"dtype": kind, "shape": list(array.shape), "data_offsets": [len(body), len(body) + len(data)]}
         body += data
-    for grid in ("light_grid", "camera_grid"):
-        for part, kind, shape in (("rows", "I32", [0]), ("values", "F32", [0, 2])):
-            header[f"0.network.{grid}.table.weight.{part}"] = {"dtype": kind, "shape": shape,
-                                                               "data_offsets": [len(body), len(body)]}
     form = {"line": True, "light_correction": True, "plane_offset": True, "solid": False, "sh_degree": 0,
             "static_offset": True, "rings": True, "latent": 4, "levels": LEVELS}
     query_range = {"camera_low": [-5, -5, -5], "camera_high": [5, 5, 5], "light_high": [0.6, 0.4, 0.7]}
@@ -218,6 +222,13 @@ def main() -> None:
     """Time the import of a capture, the reading of events, and the overlay, inside Blender."""
     import bpy
 
+    words = sys.argv[sys.argv.index("--") + 1:] if "--" in sys.argv else sys.argv[1:]
+    if "--shares" in words:
+        sys.path.insert(0, str(Path(__file__).parent))
+        import overlay_shares
+
+        overlay_shares.main([word for word in words if word != "--shares"])
+        return
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     load_module("flare_addon").register()
     importing, looks, overlay, cameras, jobs, library = (load_module(f"flare_addon.{name}") for name in (

@@ -30,10 +30,40 @@ CORNERS = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in ra
 """Corners of a cell, (8, 3)."""
 
 
-ROWS_PER_BLOCK = 400
+GAUSSIANS_PER_BLOCK = 400
 """Gaussians that the network is evaluated for in one go; their activations stay in a processor's cache."""
+OPTIMISED_BLAS = ("openblas", "mkl", "accelerate", "blis", "flexiblas", "armpl", "nvpl")
+"""Names of libraries whose products of matrices are faster than numpy's einsum."""
 MAX_CACHE_BYTES = 64 << 20
 """Most bytes of offsets that are kept: those of some hundred lights of a look."""
+
+
+def has_optimised_blas(config: Any) -> bool:
+    """Return whether numpy was built with one of OPTIMISED_BLAS.
+
+    It depends on the installation alone, so that bakes repeat to the bit. config: numpy's record of its build,
+    `numpy.__config__`."""
+    if hasattr(config, "CONFIG"):
+        name = config.CONFIG.get("Build Dependencies", {}).get("blas", {}).get("name", "")
+    else:  # numpy below 1.26
+        info = getattr(config, "blas_opt_info", {})
+        name = [*info.get("libraries", []), *info.get("extra_link_args", [])]
+    return any(library in str(name).lower() for library in OPTIMISED_BLAS)
+
+
+_uses_blas = has_optimised_blas(vars(np)["__config__"])
+
+
+def multiply(weights: Floats, columns: Floats, out: Floats | None = None) -> Floats:
+    """Return the product of weights (k, c) and columns (c, n). out: where to write it.
+
+    Without an optimised BLAS numpy's matmul is slow. Its einsum needs none and is several times faster, if the
+    columns, which are many, lie side by side in memory.
+    """
+    if _uses_blas:
+        return np.asarray(np.matmul(weights, columns, out=out))
+    return np.asarray(np.einsum("kc,cn->kn", weights, columns, out=out))
+
 
 _numbers = itertools.count()
 """Numbers of the networks, for their entries in the cache."""
@@ -250,8 +280,9 @@ class Network:
         tensors: by their names in the file, without the light's number. heads: width of each offset by name. levels,
         base: number of levels of the hash grids, and resolution of the coarsest. encoded: (n, d) frequency-encoded
         canonical positions, then latent codes."""
-        self._tensors = {name: np.asarray(tensor, np.float32) for name, tensor in tensors.items()
-                         if not name.endswith(".rows")}
+        # Copies, since a tensor in a file may begin anywhere, and numpy is slow where numbers are not aligned.
+        self._tensors = {name: np.array(tensor, np.float32, order="C") for name, tensor in tensors.items()
+                         if not name.endswith((".rows", ".values"))}
         self._heads, self._range = dict(heads), query_range
 
         def read_grid(name: str, bits: int, growth: float) -> HashGrid:
@@ -269,7 +300,7 @@ class Network:
 
     @cached_property
     def _gaussian_features(self) -> Floats:
-        """The Gaussians' contribution to the first layer, which is independent of the view."""
+        """The Gaussians' contribution to the first layer (width, n), which is independent of the view."""
         return self._encode_gaussians(self._encoded)
 
     def view_features(self, camera: Floats, light: Floats) -> Floats:
@@ -310,35 +341,36 @@ class Network:
         return _cache.get(key, compute) if budget is None else budget.get((self._number, light), key, compute)
 
     def _encode_gaussians(self, encoded: Floats) -> Floats:
-        """Return the contribution of encoded Gaussians (n, d) to the first layer, (n, width)."""
-        return np.asarray(encoded @ self._tensors["network.gaussian_layer.weight"].T, np.float32)
+        """Return the contribution of encoded Gaussians (n, d) to the first layer, (width, n)."""
+        return multiply(self._tensors["network.gaussian_layer.weight"], np.ascontiguousarray(encoded.T))
 
     def _concatenated_offsets(self, gaussian_features: Floats, features: Floats) -> Floats:
         """Return the offsets of all heads, (n, sum of their widths).
 
-        gaussian_features (n, width): contribution of each Gaussian to the first layer. features: those of the view.
+        gaussian_features (width, n): contribution of each Gaussian to the first layer. features: those of the view.
         """
-        from_view = self._linear("network.view_layer", features[None])
-        result = np.empty((len(gaussian_features), len(self._tensors["network.head.weight"])), np.float32)
-        x, y = np.empty((2, min(ROWS_PER_BLOCK, len(result)), from_view.shape[1]), np.float32)
-        for start in range(0, len(result), ROWS_PER_BLOCK):
-            rows = slice(start, min(start + ROWS_PER_BLOCK, len(result)))
-            x, y = x[:rows.stop - start], y[:rows.stop - start]
-            np.add(gaussian_features[rows], from_view, out=x)
+        from_view = self._linear("network.view_layer", features[:, None])
+        count = gaussian_features.shape[1]
+        result = np.empty((count, len(self._tensors["network.head.weight"])), np.float32)
+        buffers = np.empty((2, len(from_view), min(GAUSSIANS_PER_BLOCK, count)), np.float32)
+        for start in range(0, count, GAUSSIANS_PER_BLOCK):
+            block = slice(start, min(start + GAUSSIANS_PER_BLOCK, count))
+            x, y = buffers[:, :, :block.stop - start]
+            np.add(gaussian_features[:, block], from_view, out=x)
             np.maximum(x, 0, out=x)
             for name in self._hidden_layers:
                 x, y = self._linear(name, x, y), x  # two buffers, in turn input and output
                 np.maximum(x, 0, out=x)
-            self._linear("network.head", x, result[rows])
+            result[block] = self._linear("network.head", x).T
         return result
 
     def light_correction(self, features: Floats) -> Floats:
         """Return delta_l (2,), normalised coordinates."""
-        hidden = np.maximum(self._linear("network.correction.0", features[None]), 0)
-        return self._linear("network.correction.2", hidden)[0]
+        hidden = np.maximum(self._linear("network.correction.0", features[:, None]), 0)
+        return self._linear("network.correction.2", hidden)[:, 0]
 
     def _linear(self, name: str, inputs: Floats, out: Floats | None = None) -> Floats:
-        """Return the outputs (n, d) of the linear layer of this name for inputs (n, c); out: where to write them."""
-        outputs: Floats = np.matmul(inputs, self._tensors[f"{name}.weight"].T, out=out)
-        outputs += self._tensors[f"{name}.bias"]
+        """Return the outputs (d, n) of the linear layer of this name for inputs (c, n); out: where to write them."""
+        outputs = multiply(self._tensors[f"{name}.weight"], inputs, out)
+        outputs += self._tensors[f"{name}.bias"][:, None]
         return outputs

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The store of computed offsets in core.look.network, and drawings in which lights take turns."""
+"""The deformation network in numpy: its store of computed offsets, products of matrices without a BLAS, and drawings in
+which lights take turns."""
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 
+import core.look.network as network_module
 from core.look import Look, PlacedLight, PlaneGaussians, read_look
-from core.look.network import ROWS_PER_BLOCK, OffsetsBudget, _OffsetsCache
+from core.look.network import GAUSSIANS_PER_BLOCK, Network, OffsetsBudget, _OffsetsCache, has_optimised_blas
 from tests.core.flared import LIGHT, cameras
 from tests.core.test_look import saved
 
@@ -91,11 +96,44 @@ def test_time_for_all_lights_is_an_exact_drawing(tmp_path: Path) -> None:
         assert len(exact_lights(look, view, drawn(look, view, budget))) == len(LIGHTS) and budget.is_complete
 
 
-def test_the_network_does_not_depend_on_the_blocks_of_its_rows(tmp_path: Path) -> None:
-    saved(tmp_path / "a.flare", lights=1, count=2 * ROWS_PER_BLOCK + 7)
-    network = read_look(tmp_path / "a.flare").lights[0]._network
+def offsets(network: Network, size: int) -> np.ndarray:
+    """The offsets of all Gaussians for one view, computed for `size` Gaussians at a time."""
     features = network.view_features(np.zeros(3, np.float32), np.array([0.1, 0.2], np.float32))
-    rows = network._gaussian_features
-    whole = network._concatenated_offsets(rows, features)
-    parts = [network._concatenated_offsets(rows[start:start + 50], features) for start in range(0, len(rows), 50)]
-    np.testing.assert_allclose(whole, np.concatenate(parts), atol=1e-5)
+    columns = network._gaussian_features
+    return np.concatenate([network._concatenated_offsets(columns[:, start:start + size], features)
+                           for start in range(0, columns.shape[1], size)])
+
+
+@pytest.mark.parametrize("uses_blas", [True, False])
+def test_the_network_does_not_depend_on_the_blocks_of_its_gaussians(tmp_path: Path, uses_blas: bool,
+                                                                    monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_module, "_uses_blas", uses_blas)
+    saved(tmp_path / "a.flare", lights=1, count=2 * GAUSSIANS_PER_BLOCK + 7)
+    network = read_look(tmp_path / "a.flare").lights[0]._network
+    np.testing.assert_allclose(offsets(network, 10**6), offsets(network, 50), atol=1e-5)
+
+
+def test_the_network_without_blas_gives_the_same_offsets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved(tmp_path / "a.flare", lights=1, count=700)
+    network = read_look(tmp_path / "a.flare").lights[0]._network
+    monkeypatch.setattr(network_module, "_uses_blas", True)
+    expected = offsets(network, 700)
+    monkeypatch.setattr(network_module, "_uses_blas", False)
+    monkeypatch.setattr(np, "matmul", None)  # whatever BLAS it has
+    computed = offsets(network, 700)
+    assert np.abs(expected).max() > 0.01
+    np.testing.assert_allclose(computed, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("config", "is_optimised"), [
+    ({"CONFIG": {"Build Dependencies": {"blas": {"name": "scipy-openblas"}}}}, True),
+    ({"CONFIG": {"Build Dependencies": {"blas": {"name": "accelerate"}}}}, True),
+    ({"CONFIG": {"Build Dependencies": {"blas": {"name": "blas"}}}}, False),  # the reference BLAS
+    ({"CONFIG": {"Build Dependencies": {"blas": {"name": "none"}}}}, False),
+    ({"CONFIG": {}}, False),
+    ({"blas_opt_info": {"libraries": ["openblas64_", "openblas64_"]}}, True),  # numpy below 1.26
+    ({"blas_opt_info": {"extra_link_args": ["-Wl,-framework", "-Wl,Accelerate"]}}, True),
+    ({"blas_opt_info": {"define_macros": [("NO_ATLAS_INFO", 1)], "libraries": ["blas"]}}, False),
+    ({}, False)])
+def test_an_optimised_blas_is_recognised(config: dict[str, Any], is_optimised: bool) -> None:
+    assert has_optimised_blas(SimpleNamespace(**config)) is is_optimised

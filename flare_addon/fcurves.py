@@ -66,9 +66,35 @@ def renumber(block: Any, path: str, new_index: Callable[[int], int | None]) -> N
                     curve.data_path = f"{path}[{index}]{match[2]}"
 
 
+def is_animated(block: Any, path: str) -> bool:
+    """Return whether an F-curve or a driver of a data block acts on the property at `path`, or on one below it."""
+    drivers = [block.animation_data.drivers] if block.animation_data is not None else []
+    return any(curve.data_path == path or curve.data_path.startswith((f"{path}.", f"{path}["))
+               for curves in (*fcurves_of(block), *drivers) for curve in curves)
+
+
+def _unshare_action(block: Any) -> None:
+    """Give a data block an action of its own where another one has the same curves, as a linked copy of a scene has."""
+    data = block.animation_data
+    if data is None or data.action is None:
+        return
+    if bpy.app.version < (4, 4, 0):
+        users = data.action.users - data.action.use_fake_user
+    else:
+        users = len(data.action_slot.users()) if data.action_slot is not None else 0
+    if users > 1:
+        slot = getattr(data, "action_slot", None)
+        identifier = slot.identifier if slot is not None else ""
+        data.action = data.action.copy()
+        if identifier:
+            data.action_slot = data.action.slots[identifier]
+
+
 def remove_item(collection: Any, path: str, index: int) -> None:
     """Remove an item of the collection property at `path` of its data block, with the animation of that item."""
     collection.remove(index)
     # Blender counts no change for an item that Python removes, and the overlay would keep drawing the removed item.
     collection.id_data.update_tag()
+    if is_animated(collection.id_data, path):
+        _unshare_action(collection.id_data)
     renumber(collection.id_data, path, lambda old: None if old == index else old - (old > index))

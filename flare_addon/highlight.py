@@ -41,7 +41,7 @@ _current: Highlight | None = None
 def start_highlight(item: Any) -> None:
     """Highlight the chosen element of a flare for `DURATION_S`."""
     global _current
-    if not 0 <= item.element < len(item.elements):
+    if not 0 <= item.element < len(item.elements) or item.elements[item.element].is_absent:
         return
     _current = Highlight(item.id_data.name, item.name, item.elements[item.element].name, time.monotonic() + DURATION_S)
     if not bpy.app.background:

@@ -31,6 +31,7 @@ _items: list[tuple[str, str, str, int, int]] = []
 _notes: dict[str, str] = {}  # by path
 _stamps: tuple[tuple[str, float], ...] | None = None
 _chosen = 0  # number of the chosen item
+_displayed = ""  # file of the item that the panel displays as chosen
 
 
 def folder(create: bool = False) -> Path:
@@ -169,14 +170,32 @@ def notes(path: str) -> str:
 
 def chosen(_self: Any = None) -> int:
     """Return the number of the chosen item; that of the first where none is chosen or the chosen one was deleted."""
-    numbers = [item[-1] for item in menu_items()]
-    return _chosen if _chosen in numbers else numbers[0]
+    global _displayed
+    items = menu_items()
+    item = next((item for item in items if item[-1] == _chosen), items[0])
+    _displayed = item[0]
+    return item[-1]
 
 
 def choose(_self: Any, number: int) -> None:
     """Choose the item with this number."""
-    global _chosen
-    _chosen = number
+    global _chosen, _displayed
+    _chosen, _displayed = number, ""
+
+
+def chosen_path() -> str:
+    """Return the file of the chosen item.
+
+    Raises FlareFileError where the library has none, and where the file that the panel displays was deleted or renamed.
+    """
+    if _displayed and not Path(_displayed).is_file():
+        name = Path(_displayed).stem
+        chosen()  # displays the first one
+        raise FlareFileError(f"{name} is not in the library any more; choose another look.")
+    path = str(bpy.context.window_manager.fit_flare_library)
+    if not path:
+        raise FlareFileError("The library has no flare that can be read; save one to it first.")
+    return path
 
 
 def register() -> None:

@@ -2,6 +2,7 @@
 """The look of a scene: its .flare, the flares with their light objects and edits, and their evaluation for a camera."""
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import CaptureError, FlareFileError
+from ..core.errors import CaptureError, FlareFileError, SettingsError
 from ..core.look import Edit, LightLook, Look, LookEdits, PlacedLight, PlaneGaussians, read_look
 from ..core.look.look import Query
 from ..core.look.network import OffsetsBudget
@@ -61,13 +62,15 @@ def is_placed(item: Any, scene: Any) -> bool:
 def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add: bool = False) -> Look:
     """Set the scene's .flare and match its flares to the lights of the new look. Raises FlareFileError.
 
-    Each existing flare is matched to a light of the new look: by the name of the light that it showed before, else by
-    that light's number among those shown before. It keeps its light object and its sliders; sliders that the artist has
-    not moved follow the edits in the file.
+    Each existing flare is matched to a light of the new look: by the name of the light that it showed first, else of
+    the one that it showed last, else by that first light's number among those of all flares. It keeps its light object
+    and its sliders, those of elements that the look lacks too. Sliders that the artist has not moved follow the edits
+    in the file.
 
     A light of the look without a flare gets one if a light object has its name, or if the scene had no flare at all.
-    Flares without a light object are placed at the objects `targets`. add: each remaining target gets a flare of its
-    own. Targets that have a flare already are skipped. Returns the look.
+    Flares without a light object are placed at the objects `targets`, without `add` also those whose light object was
+    deleted. add: each remaining target gets a flare of its own. Targets that have a flare already are skipped. Returns
+    the look.
     """
     path = Path(path)
     look = read_look(path)
@@ -75,6 +78,7 @@ def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add:
     is_first = not state.lights
     _change_look(scene, _stored_edits(scene), look)
     state.flare = blend_relative(path)
+    state.file_edits = json.dumps([list(look.names), look.edits.texts()])
     objects = {light_name(lamp): lamp for lamp in scene_lights(scene)}
     for light in look.lights:
         flare = next((entry for entry in state.lights if entry.source == light.name), None)
@@ -100,7 +104,8 @@ def _place_flares(scene: Any, look: Look, targets: Sequence[Any], add: bool) -> 
     """Place flares without a light object at these targets; with `add`, add a flare at each of the remaining ones."""
     state = scene.fit_flare
     remaining = [target for target in targets if target not in _used_targets(state)]
-    for item in [item for item in state.lights if item.target is None][:len(remaining)]:
+    unplaced = [item for item in state.lights if item.target is None or not (add or is_placed(item, scene))]
+    for item in unplaced[:len(remaining)]:
         item.target = remaining.pop(0)
         if len(look.lights) == 1 and item.name == item.source:  # a name of the file tells an artist nothing
             item.name = free_name(item.target.name, {entry.name for entry in state.lights if entry != item})
@@ -110,7 +115,12 @@ def _place_flares(scene: Any, look: Look, targets: Sequence[Any], add: bool) -> 
 
 
 def _stored_edits(scene: Any) -> LookEdits:
-    """Return the edits in the scene's .flare; none where it cannot be read."""
+    """Return the edits that the scene's .flare had when it was opened, whatever has become of the file since."""
+    try:
+        names, texts = json.loads(scene.fit_flare.file_edits)
+        return LookEdits.parse(texts, names)
+    except (ValueError, TypeError, SettingsError):  # a .blend of an earlier version does not store them
+        pass
     try:
         return look_of(scene).edits
     except FlareFileError:
@@ -118,18 +128,21 @@ def _stored_edits(scene: Any) -> LookEdits:
 
 
 def _change_look(scene: Any, before: LookEdits, look: Look) -> None:
-    """Give each flare a light of the look: the light of the same name as before, else the light with the same number.
+    """Give each flare a light of the look, as `show_look` describes.
 
     before: the edits in the earlier file. Sliders that still have these values get the values of the look's file. A
-    flare without a light object is removed where another flare has the look of its light.
+    flare without a light object is removed where another flare has the look of its light, unless the artist has edited
+    it.
     """
     state, neutral, after = scene.fit_flare, Edit(), look.edits
-    earlier_sources = list(dict.fromkeys(item.source for item in state.lights))
+    for item in state.lights:
+        item.first_source = item.first_source or item.source
+    first_sources = list(dict.fromkeys(item.first_source for item in state.lights))
     _follow_edit(state.master, before.master, after.master)
     for item in state.lights:
         old_source = item.source
-        if old_source not in look.names:
-            item.source = look.names[earlier_sources.index(old_source) % len(look.names)]
+        number = first_sources.index(item.first_source) % len(look.names)
+        item.source = next((name for name in (item.first_source, old_source) if name in look.names), look.names[number])
         _follow_edit(item, before.lights.get(old_source, neutral), after.lights.get(item.source, neutral))
         for element in item.elements:
             _follow_edit(element, before.elements.get((old_source, element.name), neutral),
@@ -137,16 +150,27 @@ def _change_look(scene: Any, before: LookEdits, look: Look) -> None:
         _sync_elements(item, look, next(light for light in look.lights if light.name == item.source))
     for index in reversed(range(len(state.lights))):
         sources = [item.source for item in state.lights]
-        if sources.count(sources[index]) > 1 and not is_placed(state.lights[index], scene):
+        if (sources.count(sources[index]) > 1 and not is_placed(state.lights[index], scene)
+                and not _is_edited(state.lights[index])):
             remove_flare(scene, index)
 
 
 def _follow_edit(sliders: Any, before: Edit, after: Edit) -> None:
-    """Set each slider that still has the value of `before` to that of `after`."""
-    current = edit_of(sliders)
+    """Set each slider that still has the value of `before` to that of `after`; the others count as chosen from now on,
+    and stay."""
+    current, chosen = edit_of(sliders), set(sliders.chosen.split())
+    chosen |= {name for name in EDIT_NAMES
+               if not np.allclose(getattr(current, name), getattr(before, name), rtol=1e-5, atol=1e-6)}
     for name in EDIT_NAMES:
-        if np.allclose(getattr(current, name), getattr(before, name), rtol=1e-5, atol=1e-6):
+        if name not in chosen:
             set_slider(sliders, name, getattr(after, name))
+    sliders.chosen = " ".join(sorted(chosen))
+
+
+def _is_edited(item: Any) -> bool:
+    """Return whether the artist has moved or animated sliders of a flare; `_follow_edit` has compared them."""
+    return (bool(item.chosen) or any(element.chosen for element in item.elements)
+            or fcurves.is_animated(item.id_data, item.path_from_id()))
 
 
 def _new_flare(state: Any, look: Look, light: LightLook) -> Any:
@@ -169,6 +193,26 @@ def edits_to_store(state: Any, look: Look) -> LookEdits:
     names = {name: source for source, name in sources.items() if source in look.names}
     return LookEdits(edits.master, {names[name]: edit for name, edit in edits.lights.items() if name in names},
                      {(names[name], part): edit for (name, part), edit in edits.elements.items() if name in names})
+
+
+def unstored_settings(scene: Any, stored: LookEdits) -> list[str]:
+    """Return names of what a file of the library does not store of the scene's flares.
+
+    stored: the edits that it stores, of `edits_to_store`.
+    """
+    state, edits, neutral = scene.fit_flare, edits_of(scene.fit_flare), Edit()
+    result = [f"the sliders of {item.name}" for item in state.lights
+              if edits.lights.get(item.name, neutral) != stored.lights.get(item.source, neutral)
+              or any(edits.elements.get((item.name, element.name), neutral)
+                     != stored.elements.get((item.source, element.name), neutral) for element in item.elements)]
+    if any(fcurves.is_animated(scene, f"fit_flare.{name}") for name in ("master", "lights")):
+        result.append("keys and drivers")
+    switched = [item.name for item in state.lights if item.target is not None and (
+        item.extent != "auto" or item.radius > 0
+        or any(getattr(item, name) != item.is_at_artists_light for name in lamp_drive.SWITCHES))]
+    if switched:
+        result.append(f"switches, Extent and Light Size of {', '.join(switched)}")
+    return result
 
 
 def lost_flares(scene: Any) -> list[int]:
@@ -230,11 +274,13 @@ def add_flare(scene: Any, target: Any, source: str) -> Any:
 
 def _sync_elements(item: Any, look: Look, light: LightLook) -> None:
     """Give a flare the elements of its look's light; elements that it had keep their sliders, new ones start with the
-    edits in the look's file."""
+    edits in the look's file.
+
+    Elements that the light lacks are marked as absent. They keep their indices, and so their keys and drivers.
+    """
     kinds = {element.name: element.kind for element in light.elements}
-    for index in reversed(range(len(item.elements))):
-        if item.elements[index].name not in kinds:
-            fcurves.remove_item(item.elements, f"{item.path_from_id()}.elements", index)
+    for element in item.elements:
+        element.is_absent = element.name not in kinds
     existing = {element.name for element in item.elements}
     for name, kind in kinds.items():
         if name not in existing:
@@ -244,11 +290,16 @@ def _sync_elements(item: Any, look: Look, light: LightLook) -> None:
         next(element for element in item.elements if element.name == name).kind = kind
 
 
+def present_elements(item: Any) -> list[Any]:
+    """Return the elements of a flare that its look has."""
+    return [element for element in item.elements if not element.is_absent]
+
+
 def edits_of(state: Any) -> LookEdits:
-    """Return the edits that all sliders of a scene make."""
+    """Return the edits that all sliders of a scene make; those of absent elements make none."""
     neutral = Edit()
     lights = {item.name: edit for item in state.lights if (edit := edit_of(item)) != neutral}
-    elements = {(item.name, element.name): edit for item in state.lights for element in item.elements
+    elements = {(item.name, element.name): edit for item in state.lights for element in present_elements(item)
                 if (edit := edit_of(element)) != neutral}
     return LookEdits(edit_of(state.master), lights, elements)
 

@@ -288,7 +288,8 @@ def _render_region(context: Any, scene: Any, camera: Any, window: DrawnRegion, l
         return _rendered[1]
     edits = looks.edits_of(scene.fit_flare)
     if chosen is not None:
-        names = {item.name: [element.name for element in item.elements] for item in scene.fit_flare.lights}
+        names = {item.name: [element.name for element in looks.present_elements(item)]
+                 for item in scene.fit_flare.lights}
         edits = highlight.emphasise(edits, chosen, names)
     budget = _budgets.setdefault((camera.name_full, eye), OffsetsBudget(NETWORK_S, NETWORK_AT_REST_S))
     budget.begin()

@@ -341,7 +341,7 @@ def _draw_flare(layout: Any, scene: Any, item: Any, look: Look) -> None:
     column.prop(item, "extent")
     if item.extent == "point" or item.target is None or light_extents.is_point(item):
         column.prop(item, "radius")
-    if not item.elements:
+    if not looks.present_elements(item):
         return
     row = box.row()
     row.alignment = "LEFT"
@@ -349,9 +349,10 @@ def _draw_flare(layout: Any, scene: Any, item: Any, look: Look) -> None:
     row.operator("fit_flare.pick_element", text="Pick", icon="EYEDROPPER")
     if item.show_elements:
         box.template_list("FITFLARE_UL_elements", "", item, "elements", item, "element", rows=4)
-        if 0 <= item.element < len(item.elements):
-            box.label(text=item.elements[item.element].name.capitalize(), icon="DOT")
-            _draw_sliders(box, item.elements[item.element], item.elements[item.element].kind == "streak")
+        element = item.elements[item.element] if 0 <= item.element < len(item.elements) else None
+        if element is not None and not element.is_absent:
+            box.label(text=element.name.capitalize(), icon="DOT")
+            _draw_sliders(box, element, element.kind == "streak")
 
 
 class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):

@@ -132,6 +132,7 @@ class Edits:
     solo: BoolProperty(  # type: ignore[valid-type]
         name="Solo", description="Show only this flare or element, and others that are solo", default=False,
         update=redraw_viewports)
+    chosen: StringProperty()  # type: ignore[valid-type]  # sliders that the artist has moved; no other look moves them
 
 
 EDIT_NAMES = tuple(entry.name for entry in dataclasses.fields(Edit))
@@ -160,6 +161,7 @@ class FITFLARE_PG_element(Edits, bpy.types.PropertyGroup):
     """The sliders of one element; `name` is the name of the element in the .flare."""
 
     kind: StringProperty()  # type: ignore[valid-type]
+    is_absent: BoolProperty()  # type: ignore[valid-type]  # from the current look; it waits, hidden, for a look that has it
 
 
 class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
@@ -170,6 +172,7 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
 
     source: StringProperty(  # type: ignore[valid-type]
         name="Look", description="The light of the .flare that this flare looks like", update=redraw_viewports)
+    first_source: StringProperty()  # type: ignore[valid-type]  # its light in the first look; preferred in later looks
     target: PointerProperty(  # type: ignore[valid-type]
         name="Light", description="The light object of this flare; the flare follows it",
         type=bpy.types.Object, update=_update_target)
@@ -263,6 +266,7 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     flare: StringProperty(  # type: ignore[valid-type]
         name="Flare", description="The .flare file that the scene shows", subtype="FILE_PATH",
         options=PATH_OPTIONS, update=redraw_viewports)
+    file_edits: StringProperty()  # type: ignore[valid-type]  # the edits in the .flare when it was opened, as JSON
     native: BoolProperty(  # type: ignore[valid-type]
         name="Of This Capture", description="The flare was learned from the imported capture, so its appearance "
         "follows the camera; in another scene it keeps the appearance of one training view", default=False,

@@ -222,7 +222,7 @@ def footage_behind_camera(scene: Any) -> tuple[Any, int, int, int]:
         if background.source == "IMAGE" and background.image is not None:
             user = background.image_user
             return background.image, user.frame_start, user.frame_offset, user.frame_duration
-    raise FrameError("The camera has no footage behind it; put the flare over the present image instead.")
+    raise FrameError("The camera has no footage behind it; choose Render under Over instead.")
 
 
 def show_plate(scene: Any) -> bool:

@@ -11,7 +11,7 @@ from mathutils import Vector
 from ...core.errors import FlareFileError
 from .. import cameras, lamp_drive, library, lights, looks
 from ..objects import depsgraph_of, world_matrix
-from ..reports import GuardedOperator
+from ..reports import GuardedOperator, report_errors
 from ..views import look_through_camera
 
 FRAME_MARGIN = 0.25
@@ -47,7 +47,10 @@ class FITFLARE_OT_add_library_flare(GuardedOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if not self.properties.is_property_set("look") and not _has_look(context.scene):
-            self.look = context.window_manager.fit_flare_library
+            with report_errors(self) as outcome:
+                self.look = library.chosen_path()
+            if outcome.status == {"CANCELLED"}:
+                return outcome.status
         return self.execute(context)
 
     def act(self, context: bpy.types.Context) -> None:
@@ -64,13 +67,14 @@ class FITFLARE_OT_add_library_flare(GuardedOperator, bpy.types.Operator):
         if self.properties.is_property_set("look"):
             path: Any = self.look
         else:
-            path = looks.path_of(scene) if _has_look(scene) else context.window_manager.fit_flare_library
-        if not path:
-            raise FlareFileError("The library has no flare that can be read; save one to it first.")
+            path = looks.path_of(scene) if _has_look(scene) else library.chosen_path()
         is_first = not scene.fit_flare.lights
+        targets_before = {item.target for item in scene.fit_flare.lights}
         looks.show_look(scene, Path(path), targets, add=True)
         if is_first:
             _remove_unplaced(scene)
+        if again := sorted(item.name for item in targets if item in targets_before):
+            self.report({"INFO"}, f"{', '.join(again)}: a flare is there already, and none was added")
         scene.fit_flare.show = True
         lamp_drive.report_dark(self, scene)
         look_through_camera(context)

@@ -47,7 +47,9 @@ class FITFLARE_OT_save_flare(GuardedOperator, bpy.types.Operator):
         path = library.save_look(look, edits, self.name, self.notes or look.notes, self.licence or look.licence)
         asset_browser.update_assets()
         sliders = "" if edits.is_neutral else ", with the sliders of the panel Look as they are now"
-        self.report({"INFO"}, f"{path.stem} is in the library{sliders}")
+        unstored = looks.unstored_settings(context.scene, edits)
+        note = f". Not stored: {', '.join(unstored)}" if unstored else ""
+        self.report({"WARNING"} if unstored else {"INFO"}, f"{path.stem} is in the library{sliders}{note}")
 
 
 class FITFLARE_OT_list_assets(GuardedOperator, bpy.types.Operator):
@@ -102,12 +104,10 @@ class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         """Show `filepath`, else the look that is chosen in the panel Library; warn of flares without a light object."""
-        path = self.filepath or context.window_manager.fit_flare_library
-        if not path:
-            raise FlareFileError("Choose a flare of the library first.")
+        path = self.filepath or library.chosen_path()
         selected = [item for item in context.selected_objects if item.type != "CAMERA"]
         looks.show_look(context.scene, Path(path), selected, add=self.add)
-        missing = [item.name for item in context.scene.fit_flare.lights if item.target is None]
+        missing = [item.name for item in context.scene.fit_flare.lights if not looks.is_placed(item, context.scene)]
         if missing:
             self.report({"WARNING"}, f"{', '.join(missing)}: choose the light object in the panel Look")
         lamp_drive.report_dark(self, context.scene)

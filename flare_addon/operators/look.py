@@ -71,10 +71,18 @@ class FITFLARE_OT_add_flare(GuardedOperator, bpy.types.Operator):
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
-        look = looks.look_of(context.scene)
+        """Add the flares; name the objects that have a flare of this look already, which get no second one."""
+        scene, look = context.scene, looks.look_of(context.scene)
+        source, skipped = self.source or look.names[0], []
+        placed = {(item.target, item.source) for item in scene.fit_flare.lights}
         for item in context.selected_objects:
-            if item.type != "CAMERA":
-                looks.add_flare(context.scene, item, self.source or look.names[0])
+            if (item, source) in placed:
+                skipped.append(item.name)
+            elif item.type != "CAMERA":
+                looks.add_flare(scene, item, source)
+        if skipped:
+            others = ". Adjust Last Operation offers the other looks of the .flare" if len(look.names) > 1 else ""
+            self.report({"WARNING"}, f"{', '.join(sorted(skipped))}: the flare of {source} is there already{others}")
         lamp_drive.report_dark(self, context.scene)
 
 
@@ -134,7 +142,7 @@ class FITFLARE_OT_reset_look(bpy.types.Operator):
         """Reset the sliders of all flares together, of each flare and of each element."""
         state = context.scene.fit_flare
         for sliders in (state.master, *state.lights, *(part for item in state.lights for part in item.elements)):
-            for name in EDIT_NAMES:
+            for name in (*EDIT_NAMES, "chosen"):
                 sliders.property_unset(name)
         return {"FINISHED"}
 
@@ -166,7 +174,18 @@ class FITFLARE_UL_lights(bpy.types.UIList):
 
 
 class FITFLARE_UL_elements(bpy.types.UIList):
-    """The list of the elements of a flare, with mute and solo."""
+    """The list of the elements of a flare, with mute and solo; elements that the look lacks are left out."""
+
+    def filter_items(self, _context: Any, data: Any, property_name: str) -> tuple[list[int], list[int]]:
+        """Return the flags that show or hide each item, and their order, for Blender's list."""
+        elements, helpers = getattr(data, property_name), bpy.types.UI_UL_list
+        # Without this flag (before Blender 4.4), Blender itself inverts the filter.
+        never = getattr(self, "bitflag_item_never_show", 0)
+        flags = helpers.filter_items_by_name(self.filter_name, self.bitflag_filter_item, elements, "name",
+                                             reverse=bool(never and self.use_filter_invert))
+        flags = flags or [self.bitflag_filter_item] * len(elements)
+        order = helpers.sort_items_by_name(elements, "name") if self.use_filter_sort_alpha else []
+        return [never if element.is_absent else flag for element, flag in zip(elements, flags, strict=True)], order
 
     def draw_item(self, _context: Any, layout: Any, _data: Any, item: Any, _icon: Any, _active: Any, _property: Any,
                   _index: int = 0) -> None:

@@ -48,22 +48,29 @@ class FITFLARE_MT_object(bpy.types.Menu):
     bl_idname = "FITFLARE_MT_object"
     bl_label = "Fit Flare"
 
-    def draw(self, _context: bpy.types.Context) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """Draw the main buttons; the menu Object of the 3D view shows this menu."""
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
-        for name, icon in (("add_library_flare", "LIGHT_SUN"), ("open_flare", "FILE_FOLDER"),
-                           ("add_flare", "ADD"), ("choose_flare", "RESTRICT_SELECT_OFF"),
+        # The search (F3) compares these texts: "lens flare" finds the first.
+        layout.operator(FITFLARE_OT_add_library_flare.bl_idname, text="Add Lens Flare", icon="LIGHT_SUN")
+        apply = layout.operator("fit_flare.apply_flare", icon="LIGHT_SUN")
+        apply.add = not context.scene.fit_flare.flare
+        for name, icon in (("open_flare", "FILE_FOLDER"), ("make_flare", "CAMERA_STEREO"), ("add_flare", "ADD"),
+                           ("pick_light", "EYEDROPPER"), ("choose_flare", "RESTRICT_SELECT_OFF"),
                            ("pick_element", "EYEDROPPER")):
             layout.operator(f"fit_flare.{name}", icon=icon)
+        layout.operator("fit_flare.reset_look", text="Reset Look", icon="LOOP_BACK")
         layout.separator()
         for name, icon in (("import_capture", "IMPORT"), ("find_lights", "VIEWZOOM"),
-                           ("fit", "RENDER_ANIMATION"), ("clean_frames", "BRUSH_DATA"),
+                           ("flare_from_footage", "FILE_MOVIE"), ("fit", "RENDER_ANIMATION"),
+                           ("clean_frames", "BRUSH_DATA"),
                            ("shot_from_picture", "IMAGE_DATA")):
             layout.operator(f"fit_flare.{name}", icon=icon)
         layout.separator()
         _draw_bake(layout)
         layout.operator("fit_flare.set_up_baked", icon="NODE_COMPOSITING")
+        layout.operator("fit_flare.remove_compositor", icon="X")
         layout.operator("fit_flare.save_flare", icon="FILE_TICK")
         handbook.draw_button(layout, text="Fit Flare Handbook")
 

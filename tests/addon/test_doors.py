@@ -15,7 +15,7 @@ from headless.handbook import render_pages
 
 BLENDERS_LABELS = {"Online Manual", "Install from Disk", "Add Remote Repository", "Color Management",
                    "Crop to Render Region", "Disable in Renders", "Disable in Viewports", "Ray Visibility", "Stereo 3D",
-                   "Multi-View", "Spherical Stereo"}
+                   "Multi-View", "Spherical Stereo", "Adjust Last Operation"}
 NO_LABELS = {"+", "Follow", "Memory", "Black borders", "White balance", "Motion blur, rolling shutter"}
 """A button without a label, the beginning of several labels, and subjects of rows and sections."""
 
@@ -45,9 +45,12 @@ def test_the_context_menu_of_a_lamp_adds_and_chooses_its_flare(facts: Any) -> No
 
 def test_the_search_finds_the_work_by_its_words(facts: Any) -> None:
     """Block of doors.py: "menus"."""
-    assert {"Add Flare", "Open Flare", "Import Capture", "Find in Frames", "Fit", "Make Clean Frames",
-            "Bake and Composite Flares", "Set Up Compositor", "Save to Library", "Fit Flare Handbook"
+    assert {"Add Lens Flare", "Use This Look", "Open Flare", "Make from Lens", "Flare from Selected",
+            "Pick Light in Picture", "Pick Element", "Reset Look", "Import Capture", "Find in Frames",
+            "Flare from Footage", "Fit", "Make Clean Frames", "Single Picture", "Bake and Composite Flares",
+            "Set Up Compositor", "Remove from Compositor", "Save to Library", "Fit Flare Handbook"
             } <= set(facts["words"])
+    assert facts["adds at selected"] == [True, False], "only the first look of a scene"
     assert facts["unknown"] == []
 
 

@@ -53,9 +53,7 @@ def test_another_look_keeps_lamps_and_sliders(facts: Any) -> None:
     """Block of first_minute.py: "another look"."""
     placed = [["sun", "lamp", "Lamp 1"], ["moon", "lamp", "Lamp 2"]]
     assert facts["another look"] == [placed, 0.25, 0.5, [1, 0.5, 0.25]]
-    rows, intensity, rotation = facts["back again"]
-    assert [row[2] for row in rows] == ["Lamp 1", "Lamp 2"]
-    assert (intensity, rotation) == (0.25, 0.5)
+    assert facts["back again"] == [[["sun", "sun", "Lamp 1"], ["moon", "moon", "Lamp 2"]], 0.25, 0.5, 2.0]
 
 
 def test_an_entry_of_the_library_keeps_its_edits(facts: Any) -> None:

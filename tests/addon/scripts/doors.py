@@ -58,6 +58,11 @@ facts["of a lamp with a flare"] = [name for name, _ in entries(menus._draw_conte
 ops.choose_flare()
 facts["chosen"] = scene.fit_flare.lights[scene.fit_flare.light].target.name
 facts["render"] = entries(menus._draw_render)
+layouts = [MagicMock(), MagicMock()]
+for layout, path in zip(layouts, ("", flare), strict=True):
+    state = SimpleNamespace(fit_flare=SimpleNamespace(flare=path))
+    menus.FITFLARE_MT_object.draw(SimpleNamespace(layout=layout), SimpleNamespace(scene=state))
+facts["adds at selected"] = [layout.operator.return_value.add for layout in layouts]
 words = [[name, text or getattr(ops, name.removeprefix("fit_flare.")).get_rna_type().name]
          for name, text in entries(menus.FITFLARE_MT_object.draw)]
 facts["words"] = [text for _, text in words]

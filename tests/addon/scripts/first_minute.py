@@ -92,7 +92,8 @@ cube = object_in(scene, "Cube", bpy.data.meshes.new("Cube"), (0, 5, 0))
 select(scene, cube)
 ops.apply_flare(filepath=path_of["Clean Prime"], add=False)
 ops.apply_flare(filepath=two, add=False)
-facts["back again"] = [rows(scene), state.lights[0].intensity, round(state.lights[1].rotation, 5)]
+facts["back again"] = [rows(scene), state.lights[0].intensity, round(state.lights[1].rotation, 5),
+                       next(entry.scale for entry in state.lights[0].elements if entry.name == element)]
 
 # ---- the library keeps edits ----------------------------------------------------------------------------
 scene, (near, far) = scene_with((0.4, 8, 0.3), (3, 8, 1))

@@ -23,7 +23,7 @@ from ..errors import FrameError, RunError
 from ..images.exr import is_exr_truncated
 from ..images.formats import exr_header
 from ..look import KeyedEdits, LookEdits
-from ..system.files import file_lock, read_json, remove_file, safe_join, write_json
+from ..system.files import check_names, file_lock, read_json, remove_file, write_json
 from ..system.progress import Progress
 from ..system.reading import open_regular
 from ..system.steps import FRAMES_PER_STEP, Steps, finish
@@ -345,14 +345,15 @@ def read_manifest_in_steps(out: Path | str) -> Steps[dict[str, Any]]:
     path = Path(out) / MANIFEST
     manifest: dict[str, Any] = read_json(path, RunError)
     try:
-        for index, entry in enumerate(manifest["frames"], 1):
+        files: list[str] = []
+        for entry in manifest["frames"]:
             extra_files = entry.get("rest", [])
             if not isinstance(extra_files, list):
                 raise TypeError(f"rest {extra_files!r:.100}")
-            for file in (entry["file"], *extra_files):
-                safe_join(out, file, RunError)
+            files += [entry["file"], *extra_files]
             for name in ("frame", "width", "height"):
                 parse_value(int, entry[name])
+        for index, _ in enumerate(check_names(out, files, RunError), 1):
             if index % FRAMES_PER_STEP == 0:
                 yield
         if manifest["version"] != VERSION or not isinstance(manifest["made_from"], dict):

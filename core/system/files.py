@@ -41,6 +41,8 @@ _ABANDONED_AFTER_S = 3600.0
 """Age from which a temporary file of another machine counts as abandoned."""
 _DRIVE = re.compile(r".*:" if WINDOWS else r"[A-Za-z]:")
 """Start of a path with a drive letter; on Windows any colon, which would name a stream of a file as well."""
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
+"""File names that lead to no other folder on any system, unless they are links or devices of Windows."""
 _DEVICE_NAME = re.compile(r"^(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[\d¹²³])\s*(\.|$)", re.IGNORECASE)
 """File names that Windows takes for a device: con, prn, aux, nul, com1 and their like, whatever suffix follows."""
 
@@ -330,6 +332,22 @@ def safe_join(folder: Path | str, name: str, error: type[FitFlareError]) -> Path
     if not path.resolve().is_relative_to(folder.resolve()):
         raise error(f"{path} is a link that leads out of {folder}; put the file itself there.")
     return path
+
+
+def check_names(folder: Path | str, names: Iterable[str], error: type[FitFlareError]) -> Iterator[None]:
+    """Check each name as `safe_join` does, with one iteration a name; raises `error` where one leads out of the folder.
+
+    A subfolder is resolved once, so that this is fast for the names of many files.
+    """
+    inside: set[str] = set()
+    for name in names:
+        parent, _, file = name.rpartition("/")
+        is_plain = bool(_PLAIN_NAME.fullmatch(file)) and not Path(folder, parent, file).is_symlink()
+        if not (is_plain and parent in inside) or (WINDOWS and _DEVICE_NAME.match(file)):
+            safe_join(folder, name, error)
+            if is_plain:
+                inside.add(parent)
+        yield
 
 
 def check_no_overwrite(sources: Iterable[Path], results: Iterable[Path]) -> None:

@@ -19,6 +19,7 @@ from core.system.files import (
     atomic_folder,
     atomic_path,
     avoid_device_name,
+    check_names,
     check_no_overwrite,
     content_hash,
     file_lock,
@@ -238,6 +239,21 @@ def test_links_that_leave_the_folder_are_refused(tmp_path: Path) -> None:
         safe_join(folder, "a.png", CaptureError)
     assert safe_join(folder, "b.png", CaptureError) == folder / "b.png"
     assert safe_join(folder, "sub/c.png", CaptureError) == folder / "sub/c.png"
+
+
+def test_many_names_are_checked_as_single_ones(tmp_path: Path) -> None:
+    folder = tmp_path / "layers"
+    (folder / "sub").mkdir(parents=True)
+    (tmp_path / "out").mkdir()
+    (folder / "link.exr").symlink_to(tmp_path / "secret")
+    (folder / "away").symlink_to(tmp_path / "out")
+    (tmp_path / "out" / "home.exr").symlink_to(folder / "c.exr")
+    harmless = ["a.exr", "sub/a.exr", "sub/b.exr", "c.exr", "un\u00efcode.exr", "away/home.exr"]
+    assert sum(1 for _ in check_names(folder, harmless, CaptureError)) == len(harmless)
+    for name in ("link.exr", "sub/../../b", "sub/..", "..", "", "/etc/a", "sub/a\0b", "away/b.exr", "sub\\..\\..\\a",
+                 "sub/" + 256 * "a"):
+        with pytest.raises(CaptureError):
+            list(check_names(folder, [*harmless, name], CaptureError))
 
 
 def test_a_write_replaces_a_link_unless_it_is_followed(tmp_path: Path) -> None:

@@ -123,16 +123,21 @@ _cache = _OffsetsCache(MAX_CACHE_BYTES)
 class OffsetsBudget:
     """Bounds the time that drawings of many lights spend in the network while the camera moves.
 
-    Lights whose features changed get new offsets in turn, those that have waited longest first, as many in a drawing as
-    fit into its time and one at least. The others are drawn with their last offsets, at their exact places. Further
-    drawings complete them. A light that is drawn for the first time is always computed. For one camera.
+    Lights whose features changed get new offsets in turn, those that have waited longest first, as many as the time
+    pays. Time that drawings of a moving view do not spend is kept for the next, so that a light that takes longer than
+    a drawing has is computed in some of the drawings, and the mean holds. The others are drawn with their last offsets,
+    at their exact places. Drawings at rest complete them, one light at least in each. A light that is drawn for the
+    first time is always computed. For one camera.
     """
 
-    def __init__(self, seconds: float, seconds_at_rest: float = 0.0) -> None:
+    def __init__(self, seconds: float, seconds_at_rest: float = 0.0,
+                 clock: Callable[[], float] = time.perf_counter) -> None:
         """Begin without offsets. seconds: for the network in one drawing. seconds_at_rest: the same while view and
-        lights are those of the last two drawings; the larger of both holds then."""
-        self._seconds, self._seconds_at_rest = seconds, max(seconds, seconds_at_rest)
+        lights are those of the last two drawings; the larger of both holds then. clock: returns seconds."""
+        self._seconds, self._seconds_at_rest, self._clock = seconds, max(seconds, seconds_at_rest), clock
         self._seconds_per_light = 0.0
+        self._kept_seconds = 0.0  # of earlier drawings
+        self._has_rested = True  # whether the next drawing is the first of a moving view; it has time for a light
         # Cache key and offsets of each light, by number of its network and its name; the longest waiting first.
         self._offsets: OrderedDict[tuple[int, str], tuple[tuple[int, bytes], Offsets]] = OrderedDict()
         # Cache key of each light in the drawing since `begin`, and in the one before.
@@ -171,15 +176,23 @@ class OffsetsBudget:
 
     def _choose_due(self, is_at_rest: bool) -> None:
         """Choose the lights that get exact offsets in this drawing: the longest waiting, as many as its time allows."""
-        seconds = self._seconds_at_rest if is_at_rest else self._seconds
-        count = max(int(seconds / self._seconds_per_light), 1) if self._seconds_per_light else len(self._offsets)
+        cost = self._seconds_per_light
+        if not cost:
+            count = len(self._offsets)
+        elif is_at_rest:
+            count = max(int(self._seconds_at_rest / cost), 1)
+        else:
+            seconds = max(self._seconds, cost) if self._has_rested else self._kept_seconds + self._seconds
+            count = int(seconds / cost)
+            self._kept_seconds = seconds - count * cost  # less than a light takes
+        self._has_rested = is_at_rest or not cost
         self._due = set(itertools.islice(self._offsets, count))
 
     def _measure(self, compute: Callable[[], Offsets]) -> Offsets:
         """Compute offsets, and update the mean time of it."""
-        began = time.perf_counter()
+        began = self._clock()
         offsets = compute()
-        seconds = time.perf_counter() - began
+        seconds = self._clock() - began
         self._seconds_per_light = 0.9 * self._seconds_per_light + 0.1 * seconds if self._seconds_per_light else seconds
         return offsets
 

@@ -3,6 +3,7 @@
 which lights take turns."""
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -50,6 +51,12 @@ def drawn(look: Look, view: int, budget: OffsetsBudget | None) -> dict[str, Plan
     return look.evaluate_lights(cameras(3)[view].world_to_camera, LIGHTS, budget=budget)
 
 
+def budget_of(seconds: float, seconds_at_rest: float = 0.0, cost: float = 1.0) -> OffsetsBudget:
+    """A budget for which the network takes `cost` seconds for each light."""
+    ticks = itertools.count()
+    return OffsetsBudget(seconds, seconds_at_rest, lambda: cost * next(ticks))
+
+
 def exact_lights(look: Look, view: int, flares: dict[str, PlaneGaussians]) -> list[str]:
     return [name for name, expected in drawn(look, view, None).items()
             if np.array_equal(flares[name].colours, expected.colours)]
@@ -57,7 +64,7 @@ def exact_lights(look: Look, view: int, flares: dict[str, PlaneGaussians]) -> li
 
 def test_lights_take_turns_until_all_are_exact(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
-    look, budget = read_look(tmp_path / "a.flare"), OffsetsBudget(1e-9)
+    look, budget = read_look(tmp_path / "a.flare"), budget_of(1.0)
     assert len(exact_lights(look, 0, drawn(look, 0, budget))) == len(LIGHTS) and budget.is_complete
     counts = []
     for _ in LIGHTS:
@@ -72,7 +79,7 @@ def test_lights_take_turns_until_all_are_exact(tmp_path: Path) -> None:
 
 def test_lights_are_completed_faster_at_rest(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
-    look, budget = read_look(tmp_path / "a.flare"), OffsetsBudget(1e-9, 60.0)
+    look, budget = read_look(tmp_path / "a.flare"), budget_of(1.0, 60.0)
     drawn(look, 0, budget)
     counts = [len(exact_lights(look, view, drawn(look, view, budget))) for view in (1, 2, 2, 2, 1)]
     assert counts == [1, 1, 2, 5, 1]
@@ -80,7 +87,7 @@ def test_lights_are_completed_faster_at_rest(tmp_path: Path) -> None:
 
 def test_a_moving_camera_lets_no_light_wait_for_ever(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
-    look, budget = read_look(tmp_path / "a.flare"), OffsetsBudget(1e-9)
+    look, budget = read_look(tmp_path / "a.flare"), budget_of(1.0)
     drawn(look, 0, budget)
     turns = set()
     for number in range(2 * len(LIGHTS)):
@@ -88,10 +95,33 @@ def test_a_moving_camera_lets_no_light_wait_for_ever(tmp_path: Path) -> None:
     assert turns == {light.name for light in LIGHTS}
 
 
+@pytest.mark.parametrize(("cost", "exact"), [
+    (3.0, [1, 0, 0, 1, 0, 0, 1, 0, 0]), (2.5, [1, 0, 0, 1, 0, 1, 0, 0, 1]), (1.0, [1] * 9), (0.1, [1] * 9)])
+def test_a_light_that_takes_longer_than_a_drawing_has_is_computed_in_some(tmp_path: Path, cost: float,
+                                                                          exact: list[int]) -> None:
+    """In a moving view the mean time is that of a drawing."""
+    saved(tmp_path / "a.flare", lights=1)
+    look, budget, counts = read_look(tmp_path / "a.flare"), budget_of(1.0, 60.0, cost), []
+    poses = [camera.world_to_camera.copy() for camera in cameras(len(exact) + 1)]
+
+    def draw(pose: np.ndarray) -> bool:
+        budget.begin()
+        flare = look.evaluate_lights(pose, LIGHTS[:1], budget=budget)["lamp 0"]
+        is_exact = np.array_equal(flare.colours, look.evaluate_lights(pose, LIGHTS[:1])["lamp 0"].colours)
+        assert budget.is_complete == is_exact
+        return is_exact
+
+    assert draw(poses[0])
+    counts = [int(draw(pose)) for pose in poses[1:]]
+    assert counts == exact
+    assert [draw(poses[-1]) for _ in range(2)][-1], "complete once the view rests"
+    assert draw(poses[0]), "at once, after a rest"
+
+
 def test_time_for_all_lights_is_an_exact_drawing(tmp_path: Path) -> None:
     """With a budget of time that suffices for all lights, every light is exact in every view."""
     saved(tmp_path / "a.flare", lights=1)
-    look, budget = read_look(tmp_path / "a.flare"), OffsetsBudget(60.0)
+    look, budget = read_look(tmp_path / "a.flare"), budget_of(60.0)
     for view in (0, 1, 2):
         assert len(exact_lights(look, view, drawn(look, view, budget))) == len(LIGHTS) and budget.is_complete
 

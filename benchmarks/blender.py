@@ -144,9 +144,9 @@ def time_lamp_overlay(looks: Any, overlay: Any, look: Path, window: Any) -> list
         lamp.location = random.uniform(-4, 4), 10, random.uniform(-2, 2)
     looks.show_look(scene, look, lamps, add=True)
     lines = []
-    context = SimpleNamespace(view_layer=bpy.context.view_layer)
+    context = SimpleNamespace(view_layer=bpy.context.view_layer, region=None)
     render_levels = overlay.render_levels
-    overlay.render_levels = lambda gaussians, window, look: [
+    overlay.render_levels = lambda gaussians, window, look, _view: [
         overlay.quads_by_level(gaussians, window, look, overlay._memory)]
 
     def draw_view(moves: bool) -> None:

@@ -2,11 +2,12 @@
 """The parts of one redraw of the camera view: network, other evaluation, quads, upload, drawing by level, sum pass.
 
     python benchmarks/blender.py --shares [--against TREE] [--rounds N] [--redraws N]
-    blender --python benchmarks/blender.py -- --shares …     in a window: the parts on the GPU too
+    blender -b --python benchmarks/blender.py -- --shares …     from Blender 5.2 on: the parts on the GPU too
 
 One light of 2,600 Gaussians at 1920 x 1080, with a camera that moves between the redraws. Each part is the fastest of
 all its redraws. The GPU is waited for after each of its parts. --against measures another tree, such as an earlier
-commit, in the same process, in turns with this one. Without a GPU the parts in numpy are measured.
+commit, in the same process, in turns with this one. A Blender that cannot draw on the GPU, as one without a window
+below 5.2, gives the parts in numpy.
 """
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ import os
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,20 @@ class Stopwatch:
                 return inner(*values, **named)
 
         setattr(owner, name, call)
+
+
+def has_gpu_context() -> bool:
+    """Return whether this Blender can draw on the GPU."""
+    import bpy
+    import gpu
+
+    if not bpy.app.background:
+        return True
+    try:
+        gpu.init()  # from Blender 5.2 on
+    except (AttributeError, SystemError, RuntimeError):
+        return False
+    return True
 
 
 def finish_gpu() -> None:
@@ -153,11 +169,15 @@ def _redraw(scene: Any, camera: Any, window: Any, modules: tuple[Any, Any], watc
     import gpu
 
     target = gpu.types.GPUOffScreen(*SIZE, format="RGBA16F")
-    with target.bind():
-        with watch.part("clearing the levels", finish_gpu):
-            buffers = overlay.render_levels(gaussians, window, look)
-        with watch.part("sum pass", finish_gpu):
-            overlay.composite_levels(buffers, (0, 0, 1, 1), look.blend, window, np.eye(3))
+
+    def finish_target() -> None:
+        with target.bind():
+            finish_gpu()
+
+    with watch.part("clearing the levels", finish_target):
+        levels = overlay.render_levels(gaussians, window, look)
+    with watch.part("sum pass", finish_target), target.bind():
+        overlay.composite_levels(levels, (0, 0, 1, 1), look.blend, window, np.eye(3))
     target.free()
 
 
@@ -186,13 +206,18 @@ def measure(words: Sequence[str]) -> None:
     trees = {} if options.against is None else {"reference": options.against.resolve()}
     trees["this tree"] = ROOT
     columns: dict[str, Times] = {}
+    has_gpu = has_gpu_context()
     with tempfile.TemporaryDirectory() as folder:
         flare = make_flare(Path(folder) / "lamp.flare", COUNT, SMALLEST)
         for _ in range(options.rounds):
             for name, tree in trees.items():
-                times = measure_tree(tree, flare, options.redraws, not bpy.app.background)
+                times = measure_tree(tree, flare, options.redraws, has_gpu)
                 known = columns.setdefault(name, {})
                 known.update({part: min(seconds, known.get(part, seconds)) for part, seconds in times.items()})
+    if has_gpu:
+        import gpu
+
+        print(f"GPU: {gpu.platform.renderer_get()}, {gpu.platform.backend_type_get()}")
     print(f"Blender {bpy.app.version_string}, numpy {np.__version__}, {os.cpu_count()} cores, {COUNT} Gaussians, "
           f"{SIZE[0]} x {SIZE[1]}; shares of the first tree's redraw")
     print(table(columns))
@@ -209,7 +234,10 @@ def main(words: Sequence[str]) -> None:
             measure(words)
             status = 0
         finally:
+            if status:
+                traceback.print_exc()
             sys.stdout.flush()
+            sys.stderr.flush()
             os._exit(status)  # Blender as a module may crash at the end of its process
 
     if bpy.app.background:

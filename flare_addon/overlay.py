@@ -28,6 +28,7 @@ from ..core.look.network import OffsetsBudget
 from ..core.look.plane import concatenate
 from . import baking, highlight, looks, stereo
 from .compositor.flare_node import find_node
+from .overlay_buffers import PICTURE, BuffersByView, DrawnLevels, ViewBuffers, part_of_quads
 from .overlay_quads import LEVELS, DrawnRegion, QuadMemory, Quads, quads_by_level
 from .overlay_shaders import gaussian_shader, sum_shader
 from .properties import redraw_viewports, schedule_redraw
@@ -40,7 +41,8 @@ MAX_IN_HALF_FLOAT = 6_000
 to rounding."""
 
 NETWORK_S, NETWORK_AT_REST_S = 0.02, 0.25
-"""Time for the look's network in one drawing while the camera moves, and at rest; more lights than fit take turns."""
+"""Time for the look's network in one drawing, the mean while the camera moves, and at rest; more lights than fit take
+turns."""
 
 Floats = NDArray[np.float32]
 
@@ -50,12 +52,10 @@ last_error = ""
 _handles: list[Any] = []
 _scene_buffer: Any = None  # the framebuffer with the scene-linear picture of the region that is being drawn
 _shaders: dict[str, Any] = {}
-_offscreens: dict[tuple[int, int, int, str], Any] = {}
+_buffers = BuffersByView()
 _budgets: dict[tuple[str, stereo.Eye], OffsetsBudget] = {}
 """By the camera's full name and the eye."""
 _memory = QuadMemory()
-_rendered: tuple[Any, list[Any]] | None = None
-"""What the offscreen buffers hold: the key of `_render_region`, and the buffers of `render_levels`. None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -112,22 +112,6 @@ def _shader(name: str) -> Any:
     return _shaders[name]
 
 
-def _offscreen_buffer(divisor: int, width: int, height: int, texture_format: str) -> Any:
-    """Return the cached buffer of a level, whose size is that of the region (pixels) divided by `divisor`, rounded up.
-
-    A buffer of this level with another size or format is freed.
-    """
-    import gpu
-
-    size = max(-(-width // divisor), 1), max(-(-height // divisor), 1)
-    key = (divisor, *size, texture_format)
-    if key not in _offscreens:
-        for outdated in [other for other in _offscreens if other[0] == divisor]:
-            _offscreens.pop(outdated).free()
-        _offscreens[key] = gpu.types.GPUOffScreen(*size, format=texture_format)
-    return _offscreens[key]
-
-
 def _upload_quads(vertices: Quads) -> Any:
     """Upload quads to the GPU."""
     import gpu
@@ -142,42 +126,46 @@ def _upload_quads(vertices: Quads) -> Any:
     return gpu.types.GPUBatch(type="TRIS", buf=buffer, elem=triangles)
 
 
-def render_levels(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look) -> list[Any]:
-    """Draw Gaussians of a look into the offscreen buffers; return the buffer of each level, full size first.
+def render_levels(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look,
+                  view: ViewBuffers | None = None) -> DrawnLevels:
+    """Draw Gaussians of a look into the offscreen buffers of a view, by default that of pictures; return the levels.
 
-    Needs a GPU context.
+    A level without Gaussians is neither cleared nor drawn. Needs a GPU context.
     """
-    global _rendered
     import gpu
 
-    _rendered = None  # the buffers get another content
-    by_level = {} if gaussians is None else quads_by_level(gaussians, window, look, _memory)
-    texture_format = "RGBA16F" if gaussians is None or len(gaussians) <= MAX_IN_HALF_FLOAT else "RGBA32F"
-    buffers = []
-    for divisor in LEVELS:
-        offscreen = _offscreen_buffer(divisor, window.width, window.height, texture_format)
+    view = view or _buffers.of(PICTURE)
+    view.content = None  # the buffers get another content
+    if gaussians is None:
+        return DrawnLevels({}, (0, 0, 0, 0))
+    by_level = quads_by_level(gaussians, window, look, _memory)
+    texture_format = "RGBA16F" if len(gaussians) <= MAX_IN_HALF_FLOAT else "RGBA32F"
+    offscreens = {}
+    for divisor, quads in by_level.items():
+        offscreen = offscreens[divisor] = view.offscreen(divisor, window.width, window.height, texture_format)
         with offscreen.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
-            if divisor in by_level:
-                gpu.state.blend_set("ADDITIVE" if look.blend == "add" else "ALPHA_PREMULT")
-                gpu.state.depth_test_set("NONE")
-                shader = _shader("gaussian")
-                shader.bind()
-                shader.uniform_float("is_over", 0.0 if look.blend == "add" else 1.0)
-                # The size of the level, whose last pixels may reach past the edge of the region.
-                shader.uniform_float("size", (offscreen.width, offscreen.height))
-                _upload_quads(by_level[divisor]).draw(shader)
-        buffers.append(offscreen)
-    return buffers
+            gpu.state.blend_set("ADDITIVE" if look.blend == "add" else "ALPHA_PREMULT")
+            gpu.state.depth_test_set("NONE")
+            shader = _shader("gaussian")
+            shader.bind()
+            shader.uniform_float("is_over", 0.0 if look.blend == "add" else 1.0)
+            # The size of the level, whose last pixels may reach past the edge of the region.
+            shader.uniform_float("size", (offscreen.width, offscreen.height))
+            _upload_quads(quads).draw(shader)
+    return DrawnLevels(offscreens, part_of_quads(by_level, window))
 
 
-def composite_levels(buffers: list[Any], box: tuple[float, float, float, float], blend: str, window: DrawnRegion,
+def composite_levels(levels: DrawnLevels, box: tuple[float, float, float, float], blend: str, window: DrawnRegion,
                      space: NDArray[np.float64]) -> None:
     """Add rendered levels to the bound framebuffer, inside box (left, bottom, right, top; 0..1 of its size).
 
-    buffers: one for each level, full size first. With the blend "over" they hold display values, which the shader
-    converts to linear light. space: matrix (3, 3) from linear Rec. 709 to the framebuffer's space.
+    levels: with the blend "over" they hold display values, which the shader converts to linear light. space: matrix
+    (3, 3) from linear Rec. 709 to the framebuffer's space.
     """
+    left, bottom, right, top = levels.part
+    if not levels.offscreens or right <= left or top <= bottom:
+        return
     import gpu
     from gpu_extras.batch import batch_for_shader
     from mathutils import Matrix
@@ -188,9 +176,12 @@ def composite_levels(buffers: list[Any], box: tuple[float, float, float, float],
     shader.uniform_float("extent", (window.width, window.height))
     shader.uniform_float("is_display", 1.0 if blend == "over" else 0.0)
     shader.uniform_float("working_space", Matrix(space.tolist()).to_4x4())
-    for number, offscreen in enumerate(buffers):
-        shader.uniform_sampler(f"level{number}", offscreen.texture_color)
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    shader.uniform_int("drawn", sum(1 << number for number, divisor in enumerate(LEVELS)
+                                    if divisor in levels.offscreens))
+    any_offscreen = next(iter(levels.offscreens.values()))  # the shader does not read the levels that were not drawn
+    for number, divisor in enumerate(LEVELS):
+        shader.uniform_sampler(f"level{number}", levels.offscreens.get(divisor, any_offscreen).texture_color)
+    corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]], np.float32)
     gpu.state.blend_set("ADDITIVE")
     gpu.state.depth_test_set("NONE")
     batch_for_shader(shader, "TRIS", {"corner": corners}, indices=((0, 1, 2), (0, 2, 3))).draw(shader)
@@ -260,32 +251,32 @@ def draw_region(context: Any, scene: Any, camera: Any, eye: stereo.Eye = "") -> 
         return
     region = context.region.width, context.region.height
     look = looks.look_of(scene)
-    buffers = _render_region(context, scene, camera, window, look, eye)
-    if buffers is None:
+    levels = _render_region(context, scene, camera, window, look, eye)
+    if levels is None:
         return
     viewport = gpu.state.viewport_get()
     box = (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
            (window.y + window.height) / region[1])
     if _scene_buffer is None or has_display_footage(camera):
-        composite_levels(buffers, box, look.blend, window, np.eye(3))  # Blender's overlays are linear Rec. 709
+        composite_levels(levels, box, look.blend, window, np.eye(3))  # Blender's overlays are linear Rec. 709
     else:
         with _scene_buffer.bind():
             gpu.state.viewport_set(*viewport)
-            composite_levels(buffers, box, look.blend, window, working_space())
+            composite_levels(levels, box, look.blend, window, working_space())
     gpu.state.viewport_set(*viewport)
 
 
 def _render_region(context: Any, scene: Any, camera: Any, window: DrawnRegion, look: Look, eye: stereo.Eye = ""
-                   ) -> list[Any] | None:
-    """Return the offscreen buffers with the flares of a scene, full size first; None without a flare.
+                   ) -> DrawnLevels | None:
+    """Return the levels with the flares of a scene; None without a flare.
 
-    They are rendered only if anything has changed since they were. Raises FitFlareError.
+    They are rendered only if anything has changed since they were for this region and eye. Raises FitFlareError.
     """
-    global _rendered
     chosen = highlight.current_highlight(scene)
     key = (camera.name_full, eye, chosen, look, *_drawing_key(context, scene, window))
-    if _rendered is not None and _rendered[0] == key:
-        return _rendered[1]
+    buffers = _buffers.of((context.region.as_pointer() if context.region else 0, eye))
+    if buffers.content is not None and buffers.content[0] == key:
+        return buffers.content[1]
     edits = looks.edits_of(scene.fit_flare)
     if chosen is not None:
         names = {item.name: [element.name for element in looks.present_elements(item)]
@@ -299,10 +290,10 @@ def _render_region(context: Any, scene: Any, camera: Any, window: DrawnRegion, l
     gaussians = concatenate(list(flares.values()))
     if gaussians is None:
         return None
-    buffers = render_levels(gaussians, window, look)
+    levels = render_levels(gaussians, window, look, buffers)
     if budget.is_complete:
-        _rendered = key, buffers
-    return buffers
+        buffers.content = key, levels
+    return levels
 
 
 def _drawing_key(context: Any, scene: Any, window: DrawnRegion) -> tuple[Any, ...]:
@@ -355,9 +346,10 @@ def add_to_picture(target: Any, scene: Any, depsgraph: Any, camera: Any, width: 
     window = drawn_region(CameraFrame(0, 0, width, height), (width, height), core)
     assert window is not None
     look = looks.look_of(scene)
-    buffers = render_levels(concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values())), window, look)
+    levels = render_levels(concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values())), window, look)
     with target.bind():
-        composite_levels(buffers, (0, 0, 1, 1), look.blend, window, working_space())
+        composite_levels(levels, (0, 0, 1, 1), look.blend, window, working_space())
+    _buffers.free(PICTURE)
 
 
 def render_picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> Floats:
@@ -385,14 +377,12 @@ def register() -> None:
 
 
 def unregister() -> None:
-    global _scene_buffer, _rendered, last_error
+    global _scene_buffer, last_error
     for handle in _handles:
         bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
     _handles.clear()
-    _scene_buffer = _rendered = None
-    for offscreen in _offscreens.values():
-        offscreen.free()
-    _offscreens.clear()
+    _scene_buffer = None
+    _buffers.free()
     _shaders.clear()
     _budgets.clear()
     if bpy.app.timers.is_registered(redraw_viewports):

@@ -49,9 +49,10 @@ def gaussian_shader() -> Any:
 def sum_shader(levels: Sequence[int]) -> Any:
     """Compile the shader that adds up the buffers of levels, given by the divisors of their size.
 
-    Its push constants are box, where the sum is drawn (left, bottom, right, top, 0..1 of the framebuffer); extent, the
-    size of the drawn region in pixels; is_display, 1 where the buffers hold display values; and working_space, the
-    matrix from linear Rec. 709.
+    Its vertices are corners of the part of the region that is drawn, 0..1 of the region. Its push constants, at most
+    128 bytes, are box, where the region lies (left, bottom, right, top, 0..1 of the framebuffer); extent, the size of
+    the region in pixels; drawn, the sum of 2 ** number for each level that is added; is_display, 1 where the buffers
+    hold display values; and working_space, the matrix from linear Rec. 709.
     """
     import gpu
 
@@ -60,6 +61,7 @@ def sum_shader(levels: Sequence[int]) -> Any:
     info = gpu.types.GPUShaderCreateInfo()
     info.push_constant("VEC4", "box")
     info.push_constant("VEC2", "extent")
+    info.push_constant("INT", "drawn")
     info.push_constant("FLOAT", "is_display")
     info.push_constant("MAT4", "working_space")
     for number in range(len(levels)):
@@ -73,8 +75,11 @@ def sum_shader(levels: Sequence[int]) -> Any:
                        "}\n")
     # Texels are filtered here, so that the result does not depend on the settings of a texture. The size of a level is
     # rounded up, so its rows are counted from the top, where the picture begins.
-    samples = "".join(f"  sum += bilinear(level{number}, extent / {divisor}.0);\n"
-                      for number, divisor in enumerate(levels))
+    full = "texelFetch(level{number}, min(ivec2(position * extent), ivec2(extent) - 1), 0).rgb"
+    reduced = "bilinear(level{number}, extent / {divisor}.0)"
+    samples = "".join(f"  if ((drawn & {1 << number}) != 0) {{\n    sum += "
+                      + (full if divisor == 1 else reduced).format(number=number, divisor=divisor)
+                      + ";\n  }\n" for number, divisor in enumerate(levels))
     info.fragment_source("vec3 bilinear(sampler2D picture, vec2 covered) {\n"
                          "  ivec2 size = textureSize(picture, 0);\n"
                          "  float y = float(size.y) - (1.0 - position.y) * covered.y;\n"

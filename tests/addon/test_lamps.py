@@ -89,6 +89,21 @@ def test_a_camera_view_is_rendered_anew_only_where_something_changed(facts: Any)
     assert sums[0] == sums[2] > 1.2 * one and sums[1] == sums[3] == one == 1
 
 
+def test_views_and_eyes_do_not_redraw_each_other(facts: Any) -> None:
+    """Block of lamps.py: "a camera view that is drawn again". The buffers of few views are kept, of others freed."""
+    assert facts["in turns"] == {"two regions": 2, "two eyes": 2}
+    assert facts["buffers"] == {"sizes": [[26, 13, "RGBA16F"]], "freed": 1, "kept": [1, 3, 4, 5], "another size": 2,
+                                "all": 6}
+
+
+def test_the_sum_is_drawn_where_the_flare_is(facts: Any) -> None:
+    """Block of lamps.py: "the part of a region that the sum is drawn in". Area of the part, light in it, all light."""
+    areas, inside, light = map(list, zip(*facts["parts"], strict=True))
+    assert inside == pytest.approx(light, rel=1e-6) and min(light[:4]) > 0
+    assert areas[0] > areas[1] > areas[2] > 0 and max(areas[2:4]) < 0.2
+    assert areas[4] == light[4] == 0, "outside of the region"
+
+
 def test_boxes_of_objects_save_rays_but_change_no_visibility(facts: Any) -> None:
     """Block of lamps.py: "many lamps among walls". Visibility by rays, whether a box is near, and visibility with
     boxes."""

@@ -368,7 +368,7 @@ def speed_of(overlay, scene) -> dict[str, float]:
         overlay.quads_by_level(gaussians, window, look)
         middle = time.perf_counter()
         drawn = overlay.render_levels(gaussians, window, look)
-        with drawn[-1].bind():  # reading back waits for the drawing
+        with list(drawn.offscreens.values())[-1].bind():  # reading back waits for the drawing
             wait_for_gpu()
         numpy_ms.append(middle - began)
         gpu_ms.append(time.perf_counter() - middle)

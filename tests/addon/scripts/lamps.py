@@ -4,6 +4,7 @@ with one light, a folder to write."""
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -12,6 +13,7 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
+from quads import drawn_levels
 from start import install, leave, object_in, part, scene_with, select
 
 package, flare = sys.argv[1:3]
@@ -266,8 +268,8 @@ wall = object_in(scene, "Wall", bpy.data.meshes.new("Wall"), (50, 0, 0))
 state, rendered = scene.fit_flare, []
 
 
-def render_levels(gaussians, _window, _look):
-    overlay._rendered = None
+def render_levels(gaussians, _window, _look, view):
+    view.content = None
     rendered.append(float((gaussians.opacities @ gaussians.colours).sum()))
     return rendered[-1:]
 
@@ -307,5 +309,49 @@ facts["drawn again"]["removed"] = render_twice()
 facts["sums of a flare more and less"] = [round(value / rendered[before - 2], 3) for value in rendered[before - 2:]]
 scene.frame_set(5)
 facts["drawn again"]["frame"] = render_twice()
+
+
+def renderings(*views):
+    """How often drawings of these (region, eye) one after the other render."""
+    before, core = len(rendered), cameras.core_camera(scene.camera.data, scene.camera.matrix_world, scene.render)
+    window = overlay.drawn_region(overlay.CameraFrame(0, 0, 96, 54), (96, 54), core)
+    for number, eye in views:
+        region = SimpleNamespace(as_pointer=lambda number=number: number)
+        context = SimpleNamespace(view_layer=bpy.context.view_layer, region=region)
+        overlay._render_region(context, scene, scene.camera, window, looks.look_of(scene), eye)
+    return len(rendered) - before
+
+
+facts["in turns"] = {"two regions": renderings(*[(1, ""), (2, "")] * 3),
+                     "two eyes": renderings(*[(3, "left"), (3, "right")] * 3)}
+buffers, freed = part("flare_addon.overlay_buffers"), []
+buffers.create_offscreen = lambda *key: SimpleNamespace(key=key, free=lambda: freed.append(key))
+by_view = buffers.BuffersByView()
+sizes = [by_view.of((number, "")).offscreen(4, 101, 50, "RGBA16F").key for number in (1, 1, 2, 3, 4, 1, 5)]
+facts["buffers"] = {"sizes": list(map(list, set(sizes))), "freed": len(freed)}
+kept = [number for number in range(1, 6) if (number, "") in by_view._views]
+by_view.of((1, "")).offscreen(4, 99, 50, "RGBA16F")
+facts["buffers"] |= {"kept": kept, "another size": len(freed)}
+by_view.free()
+facts["buffers"]["all"] = len(freed)
+
+# ---- the part of a region that the sum is drawn in ------------------------------------------------------
+scene, lamp, item = lit_scene()
+core = cameras.core_camera(scene.camera.data, scene.camera.matrix_world, scene.render)
+window = overlay.drawn_region(overlay.CameraFrame(0, 0, 333, 187), (333, 187), core)
+whole = overlay.concatenate(list(looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera)
+                                 .values()))
+facts["parts"] = []
+for shrink, shift in ((1.0, 0.0), (0.1, 0.1), (0.05, -0.1), (0.02, 0.2), (0.1, 9.0)):
+    gaussians = replace(whole, means=(shrink * whole.means + shift).astype(np.float32),
+                        covariances=(shrink**2 * whole.covariances).astype(np.float32),
+                        arcs=(shrink * whole.arcs).astype(np.float32))
+    left, bottom, right, top = buffers.part_of_quads(overlay.quads_by_level(gaussians, window, looks.look_of(scene)),
+                                                     window)
+    picture = drawn_levels(overlay, gaussians, window, looks.look_of(scene)).sum(-1)
+    rows = slice(round((1 - top) * 187), round((1 - bottom) * 187))
+    inside = float(picture[rows, round(left * 333):round(right * 333)].sum()) if right > left and top > bottom else 0.0
+    area = max(right - left, 0) * max(top - bottom, 0)
+    facts["parts"].append([round(area, 3), inside, float(picture.sum())])
 
 leave(facts)

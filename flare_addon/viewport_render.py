@@ -53,16 +53,17 @@ def _picture_output(scene: Any) -> Iterator[None]:
     # The order matters: a medium (Blender 5.0 on) limits the formats, a format limits colours and depth.
     names = ("media_type", "file_format", "color_mode", "color_depth")
     previous = {name: getattr(settings, name) for name in names if hasattr(settings, name)}
-    previous_path = render.filepath
+    previous_path, had_extension = render.filepath, render.use_file_extension
     try:
         if "media_type" in previous:
             settings.media_type = "IMAGE"
         settings.file_format = file_format
+        render.use_file_extension = True
         if Path(previous_path).suffix.lower() in bpy.path.extensions_movie:
             render.filepath = previous_path.removesuffix(Path(previous_path).suffix)
         yield
     finally:
-        render.filepath = previous_path
+        render.filepath, render.use_file_extension = previous_path, had_extension
         for name, value in previous.items():
             setattr(settings, name, value)
 

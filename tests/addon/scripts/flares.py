@@ -411,8 +411,8 @@ def set_output(medium, file_format, filepath):
 
 
 def output_settings():
-    return [getattr(render.image_settings, name, "") for name in ("media_type", "file_format", "color_mode",
-                                                                   "color_depth")] + [render.filepath]
+    names = "media_type", "file_format", "color_mode", "color_depth"
+    return [*(getattr(render.image_settings, name, "") for name in names), render.filepath, render.use_file_extension]
 
 
 saved = []
@@ -420,12 +420,14 @@ for medium, file_format, filepath in (("VIDEO", "FFMPEG", "play.mp4"), ("VIDEO",
                                       ("MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER", "layers_")):
     set_output(medium, file_format, filepath)
     render.image_settings.color_mode = "BW" if file_format == "FFMPEG" else "RGBA"
+    render.use_file_extension = filepath != "shot_"
     before = output_settings()
     path = viewport_render.output_path(scene, 7)
     viewport_render.save_picture(scene, pixels, path)
     image = bpy.data.images.load(str(path))
     saved.append([path.name, image.file_format, list(image.size), output_settings() == before])
 facts["viewport render of a video"] = saved
+render.use_file_extension = True
 menu = MagicMock()
 ours_in_menu_view = [function for function in bpy.types.VIEW3D_MT_view._dyn_ui_initialize()
                      if function.__module__.startswith(NAME)]

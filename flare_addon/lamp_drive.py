@@ -12,8 +12,9 @@ the artist has placed has all of them, one at a light of the capture none: its f
 The reference of the power is the lamp's light in the first frame of the scene:
 
     keyed lamp     computed from its curves, so it follows them
-    driven lamp    measured at the first frame, when the flare gets the lamp or when a bake reads the scene; a lamp
-                   with a keyed temperature counts as driven
+    driven lamp    measured at the first frame: when the flare gets the lamp or, for a later driver, soon after the
+                   camera view is drawn, or before a bake or a transfer; a lamp with a keyed temperature counts as
+                   driven
     other lamp     measured when the flare gets the lamp, so that a change by hand dims the flare
 
 An empty or a mesh has no power; its factor is 1. The reference distance is the one from the camera to the object when
@@ -29,7 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import fcurves
-from .objects import depsgraph_of, enabled_collections, view_layer_of
+from .objects import depsgraph_of, enabled_collections
+from .properties import redraw_viewports
 
 Gain = tuple[float, float, float]
 
@@ -44,6 +46,8 @@ SWITCHES = ("follow_power", "follow_visibility", "follow_direction", "follow_dis
 DARK: Gain = (0.0, 0.0, 0.0)
 _MIN_BLEND = 1e-4
 """Smallest soft edge of a spot's cone, cosines."""
+RENDER_WAIT_S = 0.5
+"""Pause until it is checked again whether a render has ended."""
 
 
 def is_lamp(target: Any) -> bool:
@@ -174,10 +178,10 @@ def keyed_reference(scene: Any, data: Any) -> NDArray[np.float64] | None:
     """Return the light (3,) of a lamp in the first frame of the scene, by its curves; at the brightest key for a lamp
     that is off in the first frame.
 
-    None for a lamp without curves of power or colour, and for one whose temperature is animated.
+    None for a lamp without curves of power or colour, and for one that counts as driven.
     """
     curves = [curve for curve in _curves(data) if curve.data_path in _POWER_PATHS]
-    if not curves or _has_moving_temperature(data):
+    if not curves or _is_data_driven(data):
         return None
     frames = [float(scene.frame_start), *(float(key.co[0]) for curve in curves for key in curve.keyframe_points)]
     lights = [_light_at_frame(data, curves, frame) for frame in frames]
@@ -207,33 +211,37 @@ def _light_at_frame(data: Any, curves: list[Any], frame: float) -> NDArray[np.fl
 
 def is_driven(target: Any) -> bool:
     """Return whether the power or colour of a lamp is moved by drivers, or by keys of its temperature."""
-    animation = target.data.animation_data if is_lamp(target) else None
-    return animation is not None and (_has_moving_temperature(target.data)
-                                      or any(curve.data_path in _POWER_PATHS for curve in animation.drivers))
+    return is_lamp(target) and _is_data_driven(target.data)
 
 
-def _has_moving_temperature(data: Any) -> bool:
-    """Return whether curves or drivers move the temperature of a lamp, whose colour only Blender computes."""
+def _is_data_driven(data: Any) -> bool:
+    """Return whether drivers move the power or colour of a lamp's data, or keys its temperature: only Blender computes
+    these."""
     animation = data.animation_data
-    drivers = () if animation is None else animation.drivers
-    return any(curve.data_path in _TEMPERATURE_PATHS for curve in (*_curves(data), *drivers))
+    return animation is not None and (
+        any(curve.data_path in (*_POWER_PATHS, *_TEMPERATURE_PATHS) for curve in animation.drivers)
+        or any(curve.data_path in _TEMPERATURE_PATHS for curve in _curves(data)))
 
 
 def measure_references(scene: Any, item: Any) -> None:
-    """Store the references of a flare: the distance of its light and the power of its lamp at the current frame.
+    """Store the references of a flare: the distance of its light at the current frame, and the power of its lamp."""
+    item.reference_distance = _camera_distance(scene, item.target)
+    _measure_power(scene, item)
+
+
+def _measure_power(scene: Any, item: Any) -> None:
+    """Store the power of a flare's lamp at the current frame; without a lamp nothing.
 
     The power of a driven lamp is that of the scene's first frame: the timeline moves there and back.
     """
     target = item.target
-    item.reference_distance = _camera_distance(scene, target)
     if not is_lamp(target):
         return
-    layer = view_layer_of(scene)
     current_frame, subframe = scene.frame_current, scene.frame_subframe
     is_at_other_frame = is_driven(target) and current_frame != scene.frame_start
     if is_at_other_frame:
         scene.frame_set(scene.frame_start)
-    light = light_of(target.evaluated_get(layer.depsgraph).data)
+    light = light_of(target.evaluated_get(depsgraph_of(scene)).data)
     if is_at_other_frame:
         scene.frame_set(current_frame, subframe=subframe)
     item.reference_light = light.tolist()
@@ -249,11 +257,41 @@ def _camera_distance(scene: Any, target: Any) -> float:
     return float((light - camera).length)
 
 
+def unmeasured(scene: Any) -> list[Any]:
+    """Return the flares of driven lamps whose reference was measured before the lamp was driven."""
+    return [item for item in scene.fit_flare.lights if item.follow_power and not item.reference_is_driven
+            and is_driven(item.target)]
+
+
 def measure_driven(scene: Any) -> None:
-    """Measure the references of driven lamps that were not driven when they were measured; a bake begins with it."""
-    for item in scene.fit_flare.lights:
-        if item.follow_power and is_lamp(item.target) and is_driven(item.target) and not item.reference_is_driven:
-            measure_references(scene, item)
+    """Measure the power of driven lamps that were not driven when it was measured; bakes and transfers begin with
+    it."""
+    for item in unmeasured(scene):
+        _measure_power(scene, item)
+
+
+def measure_soon(scene: Any) -> None:
+    """Call `measure_driven` from a timer if it has something to measure, since a drawing must not change the scene."""
+    if unmeasured(scene) and not bpy.app.timers.is_registered(measure_in_windows):
+        bpy.app.timers.register(measure_in_windows, first_interval=0.0)
+
+
+def measure_in_windows() -> float | None:
+    """Call `measure_driven` for the scene of each window, and redraw. During a render, return the seconds to wait."""
+    if bpy.app.is_job_running("RENDER"):
+        return RENDER_WAIT_S
+    for scene in {window.scene for window in bpy.context.window_manager.windows}:
+        if unmeasured(scene):
+            measure_driven(scene)
+            scene.update_tag()  # so that the flares are drawn anew
+    redraw_viewports()
+    return None
+
+
+def unregister() -> None:
+    """Stop the timer of `measure_soon`."""
+    if bpy.app.timers.is_registered(measure_in_windows):
+        bpy.app.timers.unregister(measure_in_windows)
 
 
 def update_for_target(item: Any, _context: Any) -> None:

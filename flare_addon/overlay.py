@@ -26,8 +26,9 @@ from ..core.errors import FitFlareError
 from ..core.look import Look, PlaneGaussians, to_pixels
 from ..core.look.network import OffsetsBudget
 from ..core.look.plane import concatenate
-from . import baking, highlight, looks, stereo
+from . import baking, highlight, lamp_drive, looks, stereo
 from .compositor.flare_node import find_node
+from .compositor.trees import is_off_in_preview
 from .overlay_buffers import PICTURE, BuffersByView, DrawnLevels, ViewBuffers, part_of_quads
 from .overlay_quads import LEVELS, DrawnRegion, QuadMemory, Quads, quads_by_level
 from .overlay_shaders import gaussian_shader, sum_shader
@@ -226,6 +227,7 @@ def _draw_in_camera_view(draw: Callable[[Any, Any, Any, stereo.Eye], None]) -> N
     if not is_shown or camera is None or camera.type != "CAMERA":
         return
     camera, eye = stereo.view_camera(scene, camera, stereo.displayed_view(context, camera))
+    lamp_drive.measure_soon(scene)
     try:
         draw(context, scene, camera, eye)
         last_error = ""
@@ -239,7 +241,7 @@ def is_composited(space: Any, scene: Any) -> bool:
     if shading.type not in ("MATERIAL", "RENDERED") or shading.use_compositor == "DISABLED":
         return False
     node = find_node(scene)
-    return node is not None and not node.mute
+    return node is not None and not node.mute and not is_off_in_preview(scene)
 
 
 def draw_region(context: Any, scene: Any, camera: Any, eye: stereo.Eye = "") -> None:
@@ -387,4 +389,5 @@ def unregister() -> None:
     _budgets.clear()
     if bpy.app.timers.is_registered(redraw_viewports):
         bpy.app.timers.unregister(redraw_viewports)
+    lamp_drive.unregister()
     last_error = ""

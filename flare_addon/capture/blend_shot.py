@@ -53,6 +53,7 @@ def read_shot(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[in
     if not light_objects:
         raise CaptureError(f"The scene {scene.name!r} has no lights; name objects with --lights.")
     scene.frame_set(scene.frame_start)
+    lamp_drive.measure_driven(scene)
     items = [_flare_settings(scene, obj, radius) for obj in light_objects]
     shot_frames = []
     for frame in frames:

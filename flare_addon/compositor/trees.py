@@ -104,6 +104,12 @@ def is_off_in_renders(scene: Any) -> bool:
     return effect is not None and NODE in effect.node_group.nodes and not effect.enable_for_render
 
 
+def is_off_in_preview(scene: Any) -> bool:
+    """Return whether the effect with our node is switched off for viewports that composite."""
+    effect = effect_of(scene)
+    return effect is not None and NODE in effect.node_group.nodes and not effect.enable_for_preview
+
+
 def forget_composited_frames(scene: Any) -> None:
     """Make the interactive compositor show new files: composite again, without the frames that Blender 5.3 keeps."""
     tree = tree_of(scene)

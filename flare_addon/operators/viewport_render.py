@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ...core.errors import SettingsError
-from .. import viewport_render
+from .. import lamp_drive, viewport_render
 from ..reports import GuardedOperator, report_errors
 from ..views import largest_view
 
@@ -90,6 +90,7 @@ class FITFLARE_OT_viewport_render(GuardedOperator, bpy.types.Operator):
         """Check the scene, note the current frame, and prepare the frames to render. Raises SettingsError."""
         scene = context.scene
         viewport_render.check_scene(scene)
+        lamp_drive.measure_driven(scene)
         self._frame_before = scene.frame_current, scene.frame_subframe
         self._frame_count, self._timer = 0, None
         numbers = (list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)) if self.animation

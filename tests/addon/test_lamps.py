@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from blenders import Blender
 from test_work import a_flare
@@ -26,6 +27,21 @@ def test_power_and_colour_of_a_lamp_drive_its_flare(facts: Any) -> None:
     assert facts["keyed"] == [[1, 1, 1], [3, 3, 3]], "relative to the first frame"
     assert facts["keyed, in a bake"] == facts["keyed, in a transfer"] == [1, 3]
     assert facts["driven"] == [4, [1, 1, 1], [4, 4, 4]], "and the timeline stays where it was"
+
+
+def test_a_lamp_that_is_animated_later_is_the_same_in_view_bake_and_transfer(facts: Any) -> None:
+    """Factors on red and green in the first and the last frame.
+
+    Block of lamps.py: "lamps that are driven later, and other keys of their power".
+    """
+    exact = {"driven power": [[1, 1], [5, 5]], "driven green": [[1, 1], [1, 9]], "keyed colour": [[1, 1], [0.5, 2]],
+             "keyed colour, driven power": [[1, 1], [2.5, 10]], "keyed exposure": [[1, 1], [4, 4]],
+             "driven exposure": [[1, 1], [4, 4]]}
+    measured = facts["animated later"]
+    assert len(measured) in (4, 6), "lamps have an exposure from Blender 4.5 on"
+    for name, routes in measured.items():
+        for route, factors in routes.items():
+            assert np.ravel(factors) == pytest.approx(np.ravel(exact[name]), abs=2e-3), (name, route)
 
 
 def test_a_flare_follows_all_of_its_lamp_but_nothing_of_a_light_of_the_capture(facts: Any) -> None:

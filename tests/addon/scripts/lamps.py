@@ -20,8 +20,9 @@ package, flare = sys.argv[1:3]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-looks, panels, shots, core_look = (
-    part(name) for name in ("flare_addon.looks", "flare_addon.panels", "flare_addon.shots", "core.look"))
+looks, panels, shots, lamp_drive, core_look = (
+    part(name) for name in ("flare_addon.looks", "flare_addon.panels", "flare_addon.shots", "flare_addon.lamp_drive",
+                            "core.look"))
 facts: dict[str, object] = {}
 
 
@@ -70,7 +71,9 @@ lamp.data.animation_data_clear()
 driver = lamp.data.driver_add("energy").driver
 driver.type, driver.expression = "SCRIPTED", "10 * frame"
 scene.frame_set(4)
-part("flare_addon.lamp_drive").measure_driven(scene)
+ops.apply_flare(filepath=flare)
+scene.fit_flare.lights[0].target = lamp
+lamp_drive.measure_references(scene, scene.fit_flare.lights[0])
 facts["driven"] = [scene.frame_current, factor(scene, 1), factor(scene, 4)]
 lamp.data.driver_remove("energy")
 blend_shot = part("flare_addon.capture.blend_shot")
@@ -179,9 +182,9 @@ facts["hard spot"] = over(scene, [1, 2, 3])
 read = blend_shot.read_shot(scene, Path(flare), [], [1, 3])
 facts["spot, in a transfer"] = [frame.lights[0].factor[0] for frame in read.frames]
 scene.frame_set(3)
-facts["spot, in the panel"] = part("flare_addon.lamp_drive").dark_reason(scene, bpy.context.view_layer.depsgraph, item)
+facts["spot, in the panel"] = lamp_drive.dark_reason(scene, bpy.context.view_layer.depsgraph, item)
 operator = MagicMock()
-part("flare_addon.lamp_drive").report_dark(operator, scene)
+lamp_drive.report_dark(operator, scene)
 facts["spot, reported"] = operator.report.call_args.args[1] == facts["spot, in the panel"]
 item.follow_direction = False
 facts["spot, not followed"] = brightness(scene) > 0
@@ -240,6 +243,82 @@ scene, sun, item = lit_scene((0, 0, 9), "SUN")
 facts["a sun has no distance"] = [item.reference_distance, placed_light(scene).reference_distance]
 
 
+# ---- lamps that are driven later, and other keys of their power -----------------------------------------
+overlay, baking = part("flare_addon.overlay"), part("flare_addon.baking")
+core_shot = part("core.look.shot")
+
+
+def red_green(shot):
+    """The first light's factors on red and green in each frame of a shot."""
+    return [[round(value, 4) for value in frame.lights[0].factor[:2]] for frame in shot.frames]
+
+
+def seen_baked_sent(change):
+    """Light a scene whose lamp `change` animates after it got its flare; return the factors on red and green in frames
+    1 and 9, in a camera view, in a bake and in a transfer, each of a new scene at frame 4."""
+    routes = {}
+    for route in ("view", "bake", "transfer"):
+        scene, lamp, _ = lit_scene()
+        scene.fit_flare.lights[0].reference_distance = 5.0
+        scene.frame_set(4)
+        change(lamp.data)
+        if route == "view":
+            draw_once(scene)
+            routes[route] = [factor(scene, number)[:2] for number in (1, 9)]
+        elif route == "bake":
+            ops.bake()
+            shot = core_shot.Shot.read(shots.layers_folder(scene) / shots.SHOT_FILE)
+            routes[route] = [red_green(shot)[0], red_green(shot)[-1]]
+        else:
+            routes[route] = red_green(blend_shot.read_shot(scene, Path(flare), [], [1, 9]))
+        assert scene.fit_flare.lights[0].reference_distance == 5.0, "the artist chose it"
+    return routes
+
+
+def draw_once(scene):
+    """Call the handler of a camera view's drawing, then the timer that it started; the drawing itself changes nothing.
+    """
+    bpy.context.view_layer.update()
+    space = SimpleNamespace(overlay=SimpleNamespace(show_overlays=True), shading=SimpleNamespace(type="SOLID"),
+                            use_local_camera=False, stereo_3d_camera="LEFT", stereo_3d_eye="LEFT")
+    context = SimpleNamespace(scene=scene, space_data=space, window=None, view_layer=bpy.context.view_layer,
+                              region_data=SimpleNamespace(view_perspective="CAMERA"))
+    before = list(scene.fit_flare.lights[0].reference_light)
+    overlay.bpy = SimpleNamespace(context=context, app=bpy.app)
+    overlay._draw_in_camera_view(lambda *_words: None)
+    overlay.bpy = bpy
+    assert list(scene.fit_flare.lights[0].reference_light) == before
+    if bpy.app.timers.is_registered(lamp_drive.measure_in_windows):
+        bpy.app.timers.unregister(lamp_drive.measure_in_windows)
+        changes = part("flare_addon.scene_changes").change_count()
+        assert lamp_drive.measure_in_windows() is None and scene.frame_current == 4
+        bpy.context.view_layer.update()
+        assert part("flare_addon.scene_changes").change_count() > changes, "the view is drawn anew"
+
+
+def drive(data, path, expression, index=-1):
+    driver = data.driver_add(path, index) if index >= 0 else data.driver_add(path)
+    driver.driver.type, driver.driver.expression = "SCRIPTED", expression
+
+
+def key_colour(data):
+    keyed(data, "color", (1, (1.0, 0.5, 1.0)), (9, (0.5, 1.0, 1.0)))
+
+
+def key_and_drive(data):
+    key_colour(data)
+    drive(data, "energy", "10 * (frame + 1)")
+
+
+baking._start_process = lambda _folder, _count: None
+animations = {"driven power": lambda data: drive(data, "energy", "10 * (frame + 1)"),
+              "driven green": lambda data: drive(data, "color", "frame / 9", 1),
+              "keyed colour": key_colour, "keyed colour, driven power": key_and_drive}
+if "exposure" in bpy.types.Light.bl_rna.properties:
+    animations["keyed exposure"] = lambda data: keyed(data, "exposure", (1, 0.0), (9, 2.0))
+    animations["driven exposure"] = lambda data: drive(data, "exposure", "(frame - 1) / 4")
+facts["animated later"] = {name: seen_baked_sent(change) for name, change in animations.items()}
+
 # ---- many lamps among walls -----------------------------------------------------------------------------
 occlusion = part("flare_addon.occlusion")
 scene, lamp, item = lit_scene()
@@ -262,7 +341,7 @@ for x in np.linspace(-5, 5, 41):
 facts["among walls"] = compared
 
 # ---- a camera view that is drawn again ------------------------------------------------------------------
-overlay, cameras = part("flare_addon.overlay"), part("flare_addon.cameras")
+cameras = part("flare_addon.cameras")
 scene, lamp, item = lit_scene()
 wall = object_in(scene, "Wall", bpy.data.meshes.new("Wall"), (50, 0, 0))
 state, rendered = scene.fit_flare, []

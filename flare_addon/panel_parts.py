@@ -69,6 +69,21 @@ def draw_motion_note(layout: Any, scene: Any, objects: Sequence[Any]) -> None:
                             f"images: {', '.join(names)}.", "INFO")
 
 
+def draw_footage_note(layout: Any, scene: Any, footage: Sequence[Any]) -> None:
+    """Draw why a render differs from a camera view whose footage bypasses the view transform, with switches of the
+    images.
+
+    footage: background images of the camera, from `views.display_footage`.
+    """
+    transform = scene.view_settings.view_transform
+    label_lines(layout, f"The footage behind the camera bypasses the view transform {transform}, so renders differ "
+                "from this view.", "INFO")
+    for image in {background.image: None for background in footage if background.source == "IMAGE"}:
+        layout.prop(image, "use_view_as_render", text=f"View as Render: {image.name}", toggle=True)
+    if any(background.source != "IMAGE" for background in footage):
+        label_lines(layout, "A movie clip always does: show its frames as an image instead.", "INFO")
+
+
 def draw_bake_buttons(row: Any, state: Any) -> None:
     """Draw the buttons that bake, and composite where this is chosen: for the scene's camera, for the selected ones."""
     label = "Bake and Composite" if state.bake_composite else "Bake Layers"

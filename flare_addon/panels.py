@@ -16,10 +16,13 @@ from ..core.errors import FitFlareError
 from ..core.look import Look
 from . import baking, engine, fits, handbook, jobs, library, light_extents, lights, looks, overlay, panel_parts, shots
 from .compositor import drivers, flare_node, setup
+from .compositor.warnings import footage_note
 from .layouts import draw_progress, label_lines, settings_column
 from .operators import make_flare
 from .paths import is_folder
+from .render_settings import is_shown_as_filmed
 from .user_settings import PACKAGE
+from .views import camera_of, display_footage
 
 
 class _SidebarPanel(handbook.LinkedPanel):
@@ -308,6 +311,8 @@ def _draw_view_hint(layout: Any, context: bpy.types.Context) -> None:
         label_lines(layout, "Overlays are switched off in this view, and the flare with them.", "INFO")
     elif view is not None and overlay.is_composited(view, scene):
         label_lines(layout, "This view is composited: it shows the flare as it was baked.", "INFO")
+    elif view is not None and not is_shown_as_filmed(scene) and (footage := display_footage(camera_of(view, scene))):
+        panel_parts.draw_footage_note(layout, scene, footage)
     elif state.show and state.native and state.footage == "images" and fits.has_clean_frames(scene):
         label_lines(layout, "The frames behind the camera contain their own flare, and this one is drawn over it: "
                     "choose Clean under Capture to see this one alone.", "INFO")
@@ -395,6 +400,8 @@ class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
         box = layout.box().column()
         column = settings_column(box)
         column.prop(state, "over")
+        if note := footage_note(scene):
+            label_lines(box, note, "INFO")
         box.operator("fit_flare.set_up_baked", icon="NODE_COMPOSITING")
         if node is not None and node.node_tree is not None:
             # An artist may have renamed the inputs.

@@ -302,7 +302,8 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     over: EnumProperty(  # type: ignore[valid-type]
         name="Over", description="The picture that the compositor adds the flare to",
         items=(("present", "Render", "The render, or the output of your own nodes in the compositor"),
-               ("plate", "Footage", "The frames behind the camera"),
+               ("plate", "Footage", "The frames behind the camera and, where the film is transparent, the objects of "
+                "the scene before them"),
                ("scene", "Baked Scene", "The fitted scene in the layers")))
 
 

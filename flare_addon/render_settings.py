@@ -53,6 +53,13 @@ def show_as_filmed(scene: Any) -> str:
             f"shown by {view.view_transform}: choose another in the scene's colour management.")
 
 
+def is_shown_as_filmed(scene: Any) -> bool:
+    """Return whether the view transform shows pictures unchanged, as `show_as_filmed` sets it."""
+    view = scene.view_settings
+    return (view.view_transform in PLAIN_VIEWS and view.look == "None" and (view.exposure, view.gamma) == (0.0, 1.0)
+            and not view.use_curve_mapping)
+
+
 def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str], Path],
                   done: Callable[[int], None] = lambda _frame: None) -> None:
     """Render frames through the compositor, each to a half-float EXR and an 8 bit PNG, written atomically.

@@ -35,12 +35,23 @@ def camera_of(space: Any, scene: Any) -> Any:
 
 def has_display_footage(camera: Any) -> bool:
     """Return whether a camera shows footage, behind or in front of the scene, that bypasses the view transform."""
-    if not camera.data.show_background_images:
-        return False
-    return any(background.alpha > 0 and not (background.source == "IMAGE" and background.image is not None
-                                             and background.image.use_view_as_render)
-               for background in camera.data.background_images
-               if (background.image if background.source == "IMAGE" else background.clip) is not None)
+    return bool(display_footage(camera))
+
+
+def display_footage(camera: Any) -> list[Any]:
+    """Return the background images of a camera that bypass the view transform: movie clips, and images that are not
+    viewed as renders. A hidden one does not count."""
+    if camera is None or camera.type != "CAMERA" or not camera.data.show_background_images:
+        return []
+    return [background for background in camera.data.background_images
+            if background.alpha > 0 and _bypasses_view_transform(background)]
+
+
+def _bypasses_view_transform(background: Any) -> bool:
+    """Return whether a background image of a camera has footage that bypasses the view transform."""
+    if background.source == "IMAGE":
+        return background.image is not None and not background.image.use_view_as_render
+    return background.clip is not None
 
 
 def view_region_at(area: Any, x: float, y: float) -> Any | None:

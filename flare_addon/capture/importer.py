@@ -25,7 +25,7 @@ from ...core.removal.jobs.provenance import has_exact_clean_frames
 from ...core.system.steps import PAUSE, Steps, finish
 from .. import cameras, fcurves, light_paths
 from ..cameras import FLIP_YZ
-from ..compositor.setup import footage_nodes
+from ..compositor.setup import ARTISTS_COMPOSITOR, footage_nodes, show_plate
 from ..images import load_image
 from ..paths import absolute, blend_relative
 from ..plate_space import show_recorded
@@ -188,6 +188,10 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
     scene.camera = camera_objects[0]
     if settings.match_scene:
         notes += [note for note in [show_as_filmed(scene)] if note]
+        if settings.frames:
+            scene.render.film_transparent = True  # else the world hides the frames
+    if settings.frames and not show_plate(scene):
+        notes.append(ARTISTS_COMPOSITOR)
     if not lights:
         notes.append("The capture has no lights yet; find or add them in the panel Lights.")
     if any(view.lens for view in capture.views) and settings.frames:

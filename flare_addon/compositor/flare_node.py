@@ -133,6 +133,18 @@ def scale_to_render_size(tree: Any, socket: Any, column: float, row: float) -> A
     return node
 
 
+def over(tree: Any, background: Any, foreground: Any, column: float, row: float) -> Any:
+    """Add a node that composites a picture of premultiplied alpha over another; return it.
+
+    background, foreground: output sockets.
+    """
+    node = new_node(tree, "CompositorNodeAlphaOver", column, row)
+    below, above = [socket for socket in node.inputs if socket.type == "RGBA"]
+    tree.links.new(background, below)
+    tree.links.new(foreground, above)
+    return node
+
+
 def crop_to_frame(tree: Any, socket: Any, window: DataWindow, column: float, row: float) -> Any:
     """Add a node that cuts the overscan of a picture off, since Blender ignores data windows; return it.
 

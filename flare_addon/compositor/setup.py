@@ -23,6 +23,7 @@ from .flare_node import (
     layer_of_gain,
     new_node,
     node_group,
+    over,
     scale_to_render_size,
     set_name,
 )
@@ -41,11 +42,15 @@ PLATE = "Fit Flare Footage"
 VIEWER = "Fit Flare Viewer"
 RENDER = "Fit Flare Render"
 SIZE = "Fit Flare Size"
+OBJECTS = "Fit Flare Objects"
+"""Name of the node that composites the render over footage."""
 CROP = "Fit Flare Crop"
 """Start of the names of the nodes that cut the overscan of the layers off, one for each layer."""
-_OUR_NODES = (GROUP, LAYERS, PLATE, SIZE, VIEWER, RENDER)
+_OUR_NODES = (GROUP, LAYERS, PLATE, SIZE, OBJECTS, VIEWER, RENDER)
 _ENDS = (trees.OUTPUT_TYPE, "NodeGroupInput", "CompositorNodeViewer")
 """Nodes of a tree without a picture of its own."""
+ARTISTS_COMPOSITOR = ("The scene has a compositor of its own: renders show the footage when layers are set up over "
+                      "Footage.")
 STATE_PROPERTY = "fit_flare_compositor"  # of the scene: the state before the set-up
 _IMAGE_NODE_SETTINGS = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
 
@@ -106,17 +111,18 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
         scene_picture = _footage_node(tree, plate).outputs["Image"]
     else:
         scene_picture = None if keep_image else sockets["scene"]
-    _insert_node(scene, tree, node, scene_picture)
+    _insert_node(scene, tree, node, scene_picture, objects=plate is not None and scene.render.film_transparent)
     _add_viewer(tree, node)
     _remove_unused(outdated, {})
     return node
 
 
-def _insert_node(scene: Any, tree: Any, node: Any, scene_picture: Any) -> None:
+def _insert_node(scene: Any, tree: Any, node: Any, scene_picture: Any, objects: bool) -> None:
     """Connect our node between the picture under the flare and the output of the compositor.
 
     scene_picture: output socket of the picture; None for the artist's, which feeds the output now, or the render. The
-    artist's picture is stored in the scene: `remove_nodes` connects the output to it again.
+    artist's picture is stored in the scene: `remove_nodes` connects the output to it again. objects: the render lies
+    over `scene_picture`, unless nodes of the artist make a picture of it.
     """
     end = _final_input(tree)
     final_picture = trees.feeding_socket(end)
@@ -127,7 +133,8 @@ def _insert_node(scene: Any, tree: Any, node: Any, scene_picture: Any) -> None:
         artists_picture = _image_under_flare(tree, node, scene[STATE_PROPERTY])
     if artists_picture is not None:
         scene[STATE_PROPERTY].update({"from": artists_picture.node.name, "socket": artists_picture.identifier})
-    _connect_scene_picture(tree, node, scene_picture or artists_picture or _render_picture(tree))
+    objects = objects and (artists_picture is None or artists_picture.node.bl_idname == "CompositorNodeRLayers")
+    _connect_scene_picture(tree, node, scene_picture or artists_picture or _render_picture(tree), objects)
     if not is_set_up or end.links[0].from_node == node:  # else the artist has nodes between ours and the output
         tree.links.new(node.outputs["Image"], end)
 
@@ -164,17 +171,31 @@ def _crop_overscan(tree: Any, window: DataWindow, sockets: dict[str, Any]) -> di
             for row, (name, socket) in enumerate(sockets.items())}
 
 
-def _connect_scene_picture(tree: Any, node: Any, socket: Any) -> None:
+def _connect_scene_picture(tree: Any, node: Any, socket: Any, objects: bool) -> None:
     """Connect the picture under the flare, an output socket, to our node.
 
-    Pictures of files are scaled to the size of the render, which the render itself has.
+    Pictures of files are scaled to the size of the render, which the render itself has. objects: the render, whose film
+    is transparent, lies over the picture.
     """
-    if (size := tree.nodes.get(SIZE)) is not None:
-        tree.nodes.remove(size)
+    for name in (SIZE, OBJECTS):
+        if (previous := tree.nodes.get(name)) is not None:
+            tree.nodes.remove(previous)
     if socket is not None and (
             socket.node.name in (LAYERS, PLATE) or _is_crop(socket.node) or is_view_node(socket.node)):
-        socket = set_name(scale_to_render_size(tree, socket, -3, 1), SIZE).outputs[0]
+        socket = _picture_at_size(tree, socket, objects)
     tree.links.new(socket, node.inputs["Scene"])
+    render = tree.nodes.get(RENDER)
+    if render is not None and not any(output.is_linked for output in render.outputs):
+        tree.nodes.remove(render)  # Blender renders for it even if nothing uses it
+
+
+def _picture_at_size(tree: Any, socket: Any, objects: bool) -> Any:
+    """Add nodes that scale a picture of a file to the size of the render and, with `objects`, put the render over it;
+    return their output socket. socket: output socket of the picture."""
+    picture = set_name(scale_to_render_size(tree, socket, -3, 1), SIZE).outputs[0]
+    if objects:
+        picture = set_name(over(tree, picture, _render_picture(tree), -2.5, 2), OBJECTS).outputs[0]
+    return picture
 
 
 def _is_crop(node: Any) -> bool:
@@ -228,20 +249,21 @@ def footage_behind_camera(scene: Any) -> tuple[Any, int, int, int]:
 def show_plate(scene: Any) -> bool:
     """Make renders show the footage behind the scene's camera, until layers are set up over it.
 
-    Returns whether it was done: nodes of the artist stay as they are. Raises FrameError without footage.
+    If the film is transparent, the render lies over the footage. Returns whether it was done: nodes of the artist and a
+    flare over another picture stay as they are. Raises FrameError without footage.
     """
     plate = footage_behind_camera(scene)
     tree, state = tree_of(scene), _scene_state(scene)
-    # The artist's nodes: a tree that is switched off (None, but stored), or one without any node of ours.
-    if state["tree"] if tree is None else not any(map(_is_ours, tree.nodes)):
+    # The artist's nodes: a tree that is switched off (None, but stored), or one without our node of footage.
+    if state["tree"] if tree is None else PLATE not in tree.nodes:
         return False
     if tree is None:
         tree = _new_tree(scene, keep_image=False)
         scene[STATE_PROPERTY] = {**state, **_tree_state(tree)}
     footage = _footage_node(tree, plate)
-    if find_node(scene) is None:
-        size = tree.nodes.get(SIZE) or set_name(scale_to_render_size(tree, footage.outputs["Image"], -3, 1), SIZE)
-        tree.links.new(size.outputs[0], _final_input(tree))
+    if find_node(scene) is None and SIZE not in tree.nodes:
+        picture = _picture_at_size(tree, footage.outputs["Image"], scene.render.film_transparent)
+        tree.links.new(picture, _final_input(tree))
     return True
 
 
@@ -458,8 +480,9 @@ def _final_input(tree: Any, add: bool = True) -> Any:
 
 
 def is_over_render(scene: Any) -> bool:
-    """Return whether the flare goes over the render of the scene."""
+    """Return whether the flare goes over the render of the scene alone."""
     node = find_node(scene)
-    sources = ("CompositorNodeRLayers", "NodeGroupInput")
-    return node is not None and any(trees.depends_on(node, candidate) for candidate in tree_of(scene).nodes
-                                    if candidate.bl_idname in sources)
+    if node is None or OBJECTS in tree_of(scene).nodes:
+        return False
+    return any(trees.depends_on(node, candidate) for candidate in tree_of(scene).nodes
+               if candidate.bl_idname in ("CompositorNodeRLayers", "NodeGroupInput"))

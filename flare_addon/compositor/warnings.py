@@ -2,11 +2,13 @@
 """Warnings about scene settings that keep a render from showing the composite."""
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from ...core.bake.folder import LayerFolder
 from ...core.conventions.frame_numbers import NumberedFrame, missing_numbers
+from ...core.errors import FrameError
 from ...core.images.picture import same_aspect
 from .. import stereo
 from . import drivers, flare_node, layer_nodes, setup, trees
@@ -28,6 +30,8 @@ def warnings(scene: Any, layer_folders: Sequence[LayerFolder], live: bool) -> It
         yield ("The compositor effect with the flare is switched off for renders, so they have no flare; switch it on "
                "in the list of effects.")
     yield from stereo_warnings(scene)
+    if setup.OBJECTS in trees.tree_of(scene).nodes and (note := footage_note(scene)):
+        yield note
     if strips := _active_strips(scene):
         yield (f"Renders show the video sequencer, which has {strips[0].name!r}, in place of the compositor, without "
                "the flare; switch Sequencer off in the output properties, under Post Processing.")
@@ -52,6 +56,24 @@ def warnings(scene: Any, layer_folders: Sequence[LayerFolder], live: bool) -> It
                "without Keep Colours Live for that.")
     if warning := layer_nodes.colour_space_warning(scene):
         yield warning
+
+
+def footage_note(scene: Any) -> str:
+    """Return how a render over footage differs from the camera view, and what to do; "" where it does not."""
+    tree, is_transparent = trees.tree_of(scene), scene.render.film_transparent
+    nodes = () if tree is None else tree.nodes
+    if setup.OBJECTS in nodes and not is_transparent:
+        return ("The film is opaque, so the world hides the footage in renders; switch Transparent on in the render "
+                "properties, under Film.")
+    if scene.fit_flare.over == "plate" and not is_transparent:
+        return ("Renders over footage have no objects of the scene; for these, switch Transparent on in the render "
+                "properties, under Film, before the compositor is set up.")
+    for node in setup.footage_nodes(scene):
+        with contextlib.suppress(FrameError):
+            if setup.footage_behind_camera(scene)[0] != node.image:
+                return ("Renders show the footage of another camera; bake, or set the compositor up again, for this "
+                        "one.")
+    return ""
 
 
 def stereo_warnings(scene: Any) -> Iterator[str]:

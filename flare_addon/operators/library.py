@@ -273,8 +273,7 @@ class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):
         if note := render_settings.show_as_filmed(scene):
             self.report({"WARNING"}, note)
         if not setup.show_plate(scene):
-            self.report({"WARNING"}, "The scene has a compositor of its own: renders show the picture when layers are "
-                        "set up over Footage")
+            self.report({"WARNING"}, setup.ARTISTS_COMPOSITOR)
         look_through_camera(context)
 
 

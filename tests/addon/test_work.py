@@ -168,7 +168,8 @@ def test_an_import_has_cameras_points_lights_and_frames(facts: Any) -> None:
 
 def test_an_import_is_one_undo_step(facts: Any) -> None:
     """Block of work.py: "one undo step"."""
-    count, after, capture = facts["undo"]
+    count, after, capture, has_no_compositor = facts["undo"]
+    assert has_no_compositor
     assert count > 3
     assert (after, capture) == (0, "")
 

@@ -193,7 +193,8 @@ ops.import_capture(directory=capture)
 bpy.ops.ed.undo_push(message="after")
 count = len(bpy.data.objects)
 bpy.ops.ed.undo()
-facts["undo"] = [count, len(bpy.data.objects), bpy.context.scene.fit_flare.capture]
+facts["undo"] = [count, len(bpy.data.objects), bpy.context.scene.fit_flare.capture,
+                 part("flare_addon.compositor.trees").tree_of(bpy.context.scene) is None]
 
 # ---- lights -----------------------------------------------------------------------------------------
 scene = empty()

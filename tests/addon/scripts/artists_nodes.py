@@ -187,7 +187,8 @@ for item in node.node_tree.interface.items_tree:
         item.name = f"My {item.name}"
 layout = MagicMock()
 FITFLARE_PT_bake._draw_compositor(None, layout, SimpleNamespace(
-    fit_flare=None, **({"compositor_effects": scene.compositor_effects} if hasattr(scene, "compositor_effects") else
+    fit_flare=SimpleNamespace(over="present"), render=scene.render,
+    **({"compositor_effects": scene.compositor_effects} if hasattr(scene, "compositor_effects") else
                        {"compositing_node_group": scene.compositing_node_group} if GROUPS else
                        {"node_tree": scene.node_tree, "use_nodes": True})))
 facts["renamed in the panel"] = [call.kwargs["text"] for call in layout.mock_calls if call[0].endswith(".prop")

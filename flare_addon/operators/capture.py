@@ -46,12 +46,13 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
     scale: bpy.props.FloatProperty(  # type: ignore[valid-type]
         name="Scale", description="Scene units per unit of the capture", default=1.0, min=1e-6, soft_max=100.0)
     frames: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Frames", description="Show the frames as background images of the cameras", default=True)
+        name="Frames", description="Show the frames as background images of the cameras, and in renders if the scene "
+        "has no compositor", default=True)
     points: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Points", description="Import the point cloud as a mesh with colours", default=True)
     match_scene: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Match Scene", description="Set size, frame range and view transform of the scene to those of the frames",
-        default=True)
+        name="Match Scene", description="Set size, frame range and view transform of the scene to those of the frames, "
+        "and make its film transparent", default=True)
 
     _in_steps = False
     """Whether a person called the operator, who sees the window; a script waits for the end."""

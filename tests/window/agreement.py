@@ -29,6 +29,7 @@ VIEWS = os.environ.get("FIT_FLARE_VIEWS", "Standard,AgX,Filmic").split(",")
 FRAMES = {"moving": (1, 3, 5)}
 """Frames that are compared, by scene; else the first."""
 MAX_DIFFERENCE = 2  # codes
+UNCHANGED = 6  # screenshots alike, after which a view that differs from the render counts as finished
 MARGIN = 2  # pixels at the edge of the frame, where the camera's border is drawn
 
 DARK = 0.05  # light of the planks
@@ -232,7 +233,7 @@ def compare(scene, engine: str, over: str, results) -> None:
             path = str(flow.out / name.replace(" ", "_"))
             bpy.ops.render.render(scene=scene.name)
             rendered = saved(scene, Path(f"{path}_render.png"))
-            view = yield from settled_view(scene, Path(f"{path}_view.png"))
+            view = yield from settled_view(scene, Path(f"{path}_view.png"), rendered)
             results[name] = differences(rendered, view)
             placed = module("looks").place_lights(scene, bpy.context.evaluated_depsgraph_get(), scene.camera)[1]
             results[name]["share"] = round(float(placed[0].visibility), 3)
@@ -241,17 +242,29 @@ def compare(scene, engine: str, over: str, results) -> None:
             print(name, results[name], flush=True)
 
 
-def settled_view(scene, path: Path):
-    """Take screenshots into `path` until the view no longer changes. Steps; their value is the camera's frame in it."""
-    before = None
-    for _ in range(12):  # until the viewport's render is finished
+def settled_view(scene, path: Path, rendered):
+    """Take screenshots into `path` until the view no longer changes; return the camera's frame in it, a generator of
+    steps.
+
+    A view that differs from the render may be one of coarse pixels, whose next pass is late on a busy machine: it has
+    to be unchanged for longer.
+    """
+    before, unchanged = None, 0
+    for _ in range(30):
         yield 3
         ui.screenshot(str(path))
         yield 0.5
         window = pixels(path)
-        if before is not None and np.array_equal(before, window):
-            break
+        unchanged = unchanged + 1 if before is not None and np.array_equal(before, window) else 0
         before = window
+        view = camera_part(scene, window)
+        if unchanged >= UNCHANGED or (unchanged and differences(rendered, view)["largest"] <= MAX_DIFFERENCE):
+            break
+    return view
+
+
+def camera_part(scene, window):
+    """The camera's frame in a screenshot of the window."""
     with ui.override():
         frame = module("overlay").camera_frame(bpy.context, module("stereo").eye_camera(scene.camera, scene.render))
     region = ui.region("WINDOW")

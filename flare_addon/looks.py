@@ -290,17 +290,38 @@ def _sync_elements(item: Any, look: Look, light: LightLook) -> None:
         next(element for element in item.elements if element.name == name).kind = kind
 
 
+def update_elements(scene: Any) -> None:
+    """Give all flares the elements of the scene's .flare, which may have been replaced since it was opened.
+
+    Raises FlareFileError.
+    """
+    look = look_of(scene)
+    lights = {light.name: light for light in look.lights}
+    for item in scene.fit_flare.lights:
+        if item.source in lights:
+            _sync_elements(item, look, lights[item.source])
+
+
 def present_elements(item: Any) -> list[Any]:
     """Return the elements of a flare that its look has."""
     return [element for element in item.elements if not element.is_absent]
 
 
 def edits_of(state: Any) -> LookEdits:
-    """Return the edits that all sliders of a scene make; those of absent elements make none."""
+    """Return the edits that all sliders of a scene make.
+
+    Those of elements that the look lacks make none, also where another program has replaced the .flare since it was
+    opened.
+    """
     neutral = Edit()
+    try:
+        lights_of_look = look_of(state.id_data).lights
+    except FlareFileError:  # it cannot be evaluated either
+        lights_of_look = ()
+    names = {(light.name, element.name) for light in lights_of_look for element in light.elements}
     lights = {item.name: edit for item in state.lights if (edit := edit_of(item)) != neutral}
     elements = {(item.name, element.name): edit for item in state.lights for element in present_elements(item)
-                if (edit := edit_of(element)) != neutral}
+                if (item.source, element.name) in names and (edit := edit_of(element)) != neutral}
     return LookEdits(edit_of(state.master), lights, elements)
 
 

@@ -102,6 +102,7 @@ def choose_element(scene: Any, depsgraph: Any, camera: Any, intrinsics: Any, poi
                    eye: stereo.Eye = "") -> bool:
     """Choose the element that is brightest at a point, px of the intrinsics (3, 3), in the lists of the panel Look,
     which highlights it; return whether there is one. Raises FitFlareError."""
+    looks.update_elements(scene)
     state, look, edits = scene.fit_flare, looks.look_of(scene), looks.edits_of(scene.fit_flare)
     flares = looks.evaluate_flares(scene, depsgraph, camera, eye=eye)
     placed = {item.name: (index, item.source) for index, item in enumerate(state.lights)

@@ -77,6 +77,12 @@ def test_a_look_that_has_left_the_library_is_not_replaced_silently(facts: Any) -
     assert facts["after the deletion"] == [False, 0.0, 1.5], "only what the artist has chosen stays"
 
 
+def test_a_file_that_was_replaced_outside_blender(facts: Any) -> None:
+    """Block of looks.py: "files of the library change"."""
+    assert facts["replaced"] == [["Lamp 1/glare.scale=2"], ""]
+    assert facts["updated"]
+
+
 def test_a_look_on_the_flare_of_a_deleted_lamp(facts: Any) -> None:
     """Block of looks.py: "a deleted lamp"."""
     text, rows = facts["no object selected"]

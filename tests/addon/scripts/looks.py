@@ -3,12 +3,15 @@
 .flare with one light, one with two, a folder to write."""
 from __future__ import annotations
 
+import os
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import bpy
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 from start import install, leave, part, refusal, scene_with, select
@@ -207,6 +210,24 @@ looks.clear_cache()
 facts["deleted"] = refusal(lambda: ops.apply_flare(filepath=str(renamed)))
 ops.apply_flare(filepath=rich)
 facts["after the deletion"] = [element_of(item, "ghost 5").mute, round(item.rotation, 4), item.spread]
+
+scene, (near,) = scene_with((0.4, 8, 0.3))
+select(scene, near)
+replaced = Path(out) / "replaced.flare"
+shutil.copy(rich, replaced)
+ops.open_flare(filepath=str(replaced))
+(item,) = scene.fit_flare.lights
+element_of(item, "ghost 6").scale = element_of(item, "glare").scale = 2.0
+scene.fit_flare.lights[0].elements.remove(next(row for row, element in enumerate(item.elements)
+                                               if element.name == "streak"))
+shutil.copy(plain, replaced)
+os.utime(replaced, (1, 1))
+facts["replaced"] = [list(shots.read_scene_shot(scene, [], [1], replaced, None).frames[0].edits),
+                     refusal(lambda: ops.save_flare(name="Replaced"))]
+picking = part("flare_addon.operators.pick_element")
+intrinsics = np.array([[160.0, 0, 96], [0, 160.0, 54], [0, 0, 1]])
+picking.choose_element(scene, bpy.context.evaluated_depsgraph_get(), scene.camera, intrinsics, (104, 48))
+facts["updated"] = sorted(element.name for element in looks.present_elements(item)) == sorted(present)
 
 # ---- a deleted lamp -------------------------------------------------------------------------------------
 scene, (near, far) = scene_with((0.4, 8, 0.3), (3, 8, 1))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The parts of one redraw of the camera view: network, other evaluation, quads, upload, drawing by level, sum pass.
 
-    python benchmarks/blender.py --shares [--against TREE] [--rounds N] [--redraws N]
+    python benchmarks/blender.py --shares [--against TREE] [--rounds N] [--no-gpu]
     blender -b --python benchmarks/blender.py -- --shares …     from Blender 5.2 on: the parts on the GPU too
 
 One light of 2,600 Gaussians at 1920 x 1080, with a camera that moves between the redraws. Each part is the fastest of
@@ -202,11 +202,12 @@ def measure(words: Sequence[str]) -> None:
     parser.add_argument("--against", type=Path, metavar="TREE", help="the tree to compare with")
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--redraws", type=int, default=8, help="redraws of a tree in a round")
+    parser.add_argument("--no-gpu", action="store_true", help="measure the parts in numpy alone")
     options = parser.parse_args(words)
     trees = {} if options.against is None else {"reference": options.against.resolve()}
     trees["this tree"] = ROOT
     columns: dict[str, Times] = {}
-    has_gpu = has_gpu_context()
+    has_gpu = not options.no_gpu and has_gpu_context()
     with tempfile.TemporaryDirectory() as folder:
         flare = make_flare(Path(folder) / "lamp.flare", COUNT, SMALLEST)
         for _ in range(options.rounds):

@@ -19,7 +19,7 @@ from ..core.conventions.frame_numbers import layers_file
 from ..core.conventions.run_files import FLARE, SCENE
 from ..core.errors import CaptureError, FrameError, RunError, SettingsError
 from ..core.look import Edit, LookEdits
-from ..core.look.shot import Shot, ShotFrame
+from ..core.look.shot import Shot, ShotFrame, read_folders_in_steps
 from ..core.system.files import hash_files
 from ..core.system.reading import parse_json, read_text
 from ..core.system.steps import Steps
@@ -235,7 +235,7 @@ class BakedFolders:
     def read_in_steps(cls, layers: Path) -> Steps[BakedFolders | None]:
         """Read the subfolders of a folder of layers; None for a folder that no bake of a scene wrote."""
         try:
-            shot = yield from Shot.read_in_steps(layers / SHOT_FILE)
+            last, own_folder = yield from read_folders_in_steps(layers / SHOT_FILE)
         except SettingsError:
             return None
         try:
@@ -244,7 +244,7 @@ class BakedFolders:
             entries = []
         baked = {entry["view"].rpartition("/")[0]: entry["file"].rpartition("/")[0] for entry in entries
                  if "/" in entry["view"]}
-        return cls(layers, shot.folders, {**baked, **shot.folders}, not shot.own_folder)
+        return cls(layers, last, {**baked, **last}, not own_folder)
 
     def of_views(self, scene: Any) -> dict[str, Path]:
         """Return the folder of the layers of each view that the scene renders, by the view's name ("" without stereo).

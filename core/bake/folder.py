@@ -42,10 +42,12 @@ class LayerFolder:
         """Open a folder as `open` does, some frames a step. Raises FrameError."""
         folder = Path(folder).resolve()
         files = _find_sequence(folder)
-        layers: dict[Path, set[str]] = {}
+        layers: dict[Path, frozenset[str]] = {}
         windows: dict[Path, DataWindow] = {}
+        headers: dict[tuple[frozenset[str], DataWindow], tuple[frozenset[str], DataWindow]] = {}
         for path in files.values():
-            layers[path], windows[path] = _read_header(path)
+            header = _read_header(path)
+            layers[path], windows[path] = headers.setdefault(header, header)  # frames of a bake share one
             if len(layers) % FRAMES_PER_STEP == 0:
                 yield
         first, *others = files.values()
@@ -100,7 +102,7 @@ def _find_sequence(folder: Path) -> dict[int, Path]:
     return dict(sorted(next(iter(sequences.values())).items()))
 
 
-def _read_header(path: Path) -> tuple[set[str], DataWindow]:
+def _read_header(path: Path) -> tuple[frozenset[str], DataWindow]:
     """Return the names of the layers in a file, of which the composite has none, and its data window. Raises FrameError
     where it is missing, truncated or no EXR."""
     try:
@@ -112,7 +114,8 @@ def _read_header(path: Path) -> tuple[set[str], DataWindow]:
             names = exr_header.channel_kinds(stream)
             if not names:
                 raise FrameError(f"{path} has a damaged header; bake it again.")
-            return {name.rpartition(".")[0] for name in names} - {""}, _read_window(path, stream)
+            layers = frozenset(name.rpartition(".")[0] for name in names) - {""}
+            return layers, _read_window(path, stream)
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
 

@@ -21,7 +21,7 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -88,16 +88,7 @@ class Shot:
     @property
     def folders(self) -> dict[str, str]:
         """Folder of each camera's layers, "" for a single camera without `own_folder`; distinct on any file system."""
-        folder_by_name: dict[str, str] = {}
-        for name in dict.fromkeys(frame.name for frame in self.frames):
-            base = re.sub(r"[^\w-]+", "_", name).strip("_") or "camera"
-            base = avoid_device_name(base)
-            used_folders, folder, suffix = {used.casefold() for used in folder_by_name.values()}, base, 1
-            while folder.casefold() in used_folders:
-                suffix += 1
-                folder = f"{base}_{suffix}"
-            folder_by_name[name] = folder
-        return folder_by_name if len(folder_by_name) > 1 or self.own_folder else dict.fromkeys(folder_by_name, "")
+        return camera_folders((frame.name for frame in self.frames), self.own_folder)
 
     def fingerprint(self, run: str = "") -> str:
         """Return a hash of what all frames share: the .flare, the lights' names, the query, and `run`, the fingerprint
@@ -132,7 +123,7 @@ class Shot:
     @classmethod
     def read_in_steps(cls, path: Path | str) -> Steps[Shot]:
         """Read a shot as `read` does, some frames a step where `write` wrote the file. Raises SettingsError."""
-        data = (yield from _parse_lines(Path(path))) or read_json(path, SettingsError)
+        data = (yield from _parse_lines(Path(path), lambda entry: entry)) or read_json(path, SettingsError)
         try:
             if data["version"] != VERSION:
                 raise ValueError(f"version {data['version']}")
@@ -165,8 +156,46 @@ class Shot:
                                           for frame in self.frames))
 
 
-def _parse_lines(path: Path) -> Steps[dict[str, Any] | None]:
-    """Parse the lines of a file of `Shot.write`, some a step; return its data, None for a file of other lines."""
+def camera_folders(names: Iterable[str], own_folder: bool) -> dict[str, str]:
+    """Return the folder of each camera's layers, as `Shot.folders` does. names: of the cameras of all frames."""
+    folder_by_name: dict[str, str] = {}
+    for name in dict.fromkeys(names):
+        base = re.sub(r"[^\w-]+", "_", name).strip("_") or "camera"
+        base = avoid_device_name(base)
+        used_folders, folder, suffix = {used.casefold() for used in folder_by_name.values()}, base, 1
+        while folder.casefold() in used_folders:
+            suffix += 1
+            folder = f"{base}_{suffix}"
+        folder_by_name[name] = folder
+    return folder_by_name if len(folder_by_name) > 1 or own_folder else dict.fromkeys(folder_by_name, "")
+
+
+def read_folders_in_steps(path: Path) -> Steps[tuple[dict[str, str], bool]]:
+    """Read `Shot.folders` and `Shot.own_folder` of a file, some frames a step.
+
+    No frame is kept: thousands of new objects would make Python collect garbage, which holds a window for longer than
+    the reading. Raises SettingsError for a missing or invalid file.
+    """
+    data = (yield from _parse_lines(path, _camera_name)) or read_json(path, SettingsError)
+    try:
+        names = [entry if isinstance(entry, str) else _camera_name(entry) for entry in data["frames"]]
+        if data["version"] != VERSION or not names:
+            raise ValueError(f"version {data['version']}, {len(names)} frames")
+        return camera_folders(names, bool(data.get("apart"))), bool(data.get("apart"))
+    except (AttributeError, KeyError, TypeError, ValueError) as problem:
+        raise SettingsError(f"{path} is not a shot that can be rendered ({problem!r}); export it again.") from problem
+
+
+def _camera_name(entry: Mapping[str, Any]) -> str:
+    """Return the name of a frame's camera. Raises AttributeError for what is no frame."""
+    return str(entry.get("name", "Camera"))
+
+
+def _parse_lines(path: Path, convert: Callable[[Any], Any]) -> Steps[dict[str, Any] | None]:
+    """Parse the lines of a file of `Shot.write`, some a step; return its data, None for a file of other lines.
+
+    convert: returns what is kept of a frame.
+    """
     try:
         head, *lines = read_text(path, encoding=UTF8_SIG).rstrip("\n").split("\n")
         if not head.endswith(_FRAMES_BEGIN) or not lines or lines[-1] != _FRAMES_END:
@@ -177,10 +206,10 @@ def _parse_lines(path: Path) -> Steps[dict[str, Any] | None]:
             is_last = len(frames) == len(lines) - 2
             if line.endswith(",") == is_last:
                 return None
-            frames.append(parse_json(line.removesuffix(",")))
+            frames.append(convert(parse_json(line.removesuffix(","))))
             if len(frames) % FRAMES_PER_STEP == 0:
                 yield
-    except (OSError, ValueError):
+    except (AttributeError, OSError, ValueError):
         return None
     return {**data, "frames": frames} if isinstance(data, dict) and data.get("frames") == [] else None
 

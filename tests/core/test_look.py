@@ -36,7 +36,8 @@ from core.look.container import read_tensors, rewrite_metadata
 from core.look.edits import apply_edits
 from core.look.form import FORM_BOUNDS, FlareForm
 from core.look.look import network_query
-from core.look.shot import Shot, ShotFrame
+from core.look.shot import Shot, ShotFrame, read_folders_in_steps
+from core.system.steps import finish
 from tests.core.flared import cameras
 from tests.core.test_flare import pose, some_flare
 
@@ -550,12 +551,16 @@ def test_a_shot_is_written_and_read_in_steps(tmp_path: Path, monkeypatch: pytest
     assert [frame.cache_key() for frame in Shot.read(file).frames] == keys
     lines = file.read_text().splitlines()
     assert [json.loads(line.rstrip(","))["frame"] for line in lines[1:-1]] == [1, 2, 3]
+    assert finish(read_folders_in_steps(file)) == ({"Camera": ""}, False)
     file.write_text(json.dumps(json.loads(file.read_text()), indent=1))  # as another program writes it
     assert [frame.cache_key() for frame in Shot.read(file).frames] == keys
+    assert finish(read_folders_in_steps(file)) == ({"Camera": ""}, False)
     for damaged in (lines[:-1], [*lines[:2], lines[2].rstrip(","), *lines[3:]], [*lines[:-1], *lines[1:]]):
         file.write_text("\n".join(damaged))
         with pytest.raises(SettingsError, match=r"shot\.json is not valid JSON"):
             Shot.read(file)
+        with pytest.raises(SettingsError, match=r"shot\.json"):
+            finish(read_folders_in_steps(file))
 
 
 def test_a_shot_bake_equals_the_overlay(tmp_path: Path) -> None:

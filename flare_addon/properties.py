@@ -109,14 +109,14 @@ class Edits:
         name="Intensity", description="Brightness: a factor on the linear light", default=1.0, min=0.0, soft_max=4.0,
         max=1000.0, update=redraw_viewports)
     scale: FloatProperty(  # type: ignore[valid-type]
-        name="Scale", description="Size of each ghost, glow and streak about its own centre", default=1.0, min=0.0,
-        soft_max=4.0, max=100.0, update=redraw_viewports)
+        name="Scale", description="Size of each ghost, streak, ring and glare about its own centre", default=1.0,
+        min=0.0, soft_max=4.0, max=100.0, update=redraw_viewports)
     spread: FloatProperty(  # type: ignore[valid-type]
         name="Spread", description="Distance of the ghosts from the light, along the line through the centre of the "
                                    "picture",
         default=1.0, min=0.0, soft_max=3.0, max=100.0, update=redraw_viewports)
     rotation: FloatProperty(  # type: ignore[valid-type]
-        name="Rotation", description="Angle by which each ghost, glow and streak is turned about its own centre",
+        name="Rotation", description="Angle by which each ghost, streak, ring and glare turns about its own centre",
         default=0.0, subtype="ANGLE", update=redraw_viewports)
     tint: FloatVectorProperty(  # type: ignore[valid-type]
         name="Tint", description="Colour that multiplies the flare; white leaves it as filmed", default=(1.0, 1.0, 1.0),
@@ -211,7 +211,7 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
     element: IntProperty(  # type: ignore[valid-type]
         name="Element", description="The element whose sliders are shown", default=0, update=_highlight_element)
     show_elements: BoolProperty(  # type: ignore[valid-type]
-        name="Elements", description="Show the sliders of single ghosts, streaks and rings", default=False)
+        name="Elements", description="Show the sliders of single ghosts, streaks, rings and the glare", default=False)
     radius: FloatProperty(  # type: ignore[valid-type]
         name="Light Size", description="Radius of the light for occlusion, in scene units; 0 uses 2% of its distance. "
         "With a larger radius the flare fades more softly behind objects", default=0.0, min=0.0, subtype="DISTANCE",

@@ -17,7 +17,7 @@ _VIEW_EVENTS = ("MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "TRACKPADPAN", 
 
 
 class FITFLARE_OT_pick_element(GuardedOperator, bpy.types.Operator):
-    """Choose the ghost, streak or glow that is brightest where you click in the camera view"""
+    """Choose the ghost, streak, ring or glare that is brightest where you click in the camera view"""
 
     bl_idname = "fit_flare.pick_element"
     bl_label = "Pick Element"

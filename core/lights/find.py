@@ -5,7 +5,7 @@ The command `lights` and the commands that need lights call it.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,18 +17,20 @@ from ..capture import LIGHTS, Camera, Capture, read_lights
 from ..errors import SettingsError
 from ..system.files import write_json
 from ..system.progress import Progress
-from .detection import Detection, Detector
+from .detection import Detection, Detector, Mask
 from .file import write_lights
 from .found_light import FAR, FoundLight
 from .ghosts import find_blobs, locate_by_ghosts
 from .lifted import lift_to_gaussians
-from .surroundings import brightness_map, split_gaps
+from .surroundings import brightness_map, clipped_area, split_gaps
 from .tracks import TrackedLight, TrackFindings, track_lights
 from .triangulation import TriangulationSettings, triangulate_lights
 
 SHEETS, REPORT = "lights", "report.json"
 MAX_POINT_DISTANCE = 0.05
 """Distance from a detection, diagonals, up to which points give the depth of a light in a single view."""
+CLIPPED_VIEWS = 6
+"""Number of views with a large clipped area from which a light in it is searched."""
 MAX_STATIC_DISTANCE = 0.006
 """Median distance of a light from the projections of one place, diagonals, below which it is static."""
 
@@ -78,11 +80,8 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
         if gaps:
             messages.append(f"{len(gaps)} places are no lights but gaps through which a bright far surrounding shows; "
                             "`lights/report.json` lists them as doubtful.")
-    if not lights and len(views) > 1:
-        lights = _find_by_ghosts(capture, progress, settings.seed)
-        if lights:
-            messages.append("No frame shows a light; one out of frame was found by its ghosts, its direction more "
-                            "exactly than its distance.")
+    if len(views) > 1:
+        lights += _find_by_ghosts(capture, lights, brightness_maps, progress, settings.seed, messages)
     if not lights and not doubtful:
         messages.append("No light was found: none is in frame in enough views, or none is over-exposed.")
     return Findings(lights, doubtful, detections, messages)
@@ -241,13 +240,34 @@ def _lights_from_one_view(capture: Capture, detections: Sequence[Detection]) -> 
     return lights
 
 
-def _find_by_ghosts(capture: Capture, progress: Progress, seed: int) -> list[FoundLight]:
+def _find_by_ghosts(capture: Capture, lights: Sequence[FoundLight], brightness_maps: Mapping[str, Mask],
+                    progress: Progress, seed: int, messages: list[str]) -> list[FoundLight]:
+    """Return a light that no frame shows as such, from its ghosts, and append a sentence about it to `messages`.
+
+    Such a light stands in a clipped area that is too large for a light, as the sun in a bright sky, or, where no light
+    is known, out of frame. lights: those that are known. brightness_maps: by the view's name (`brightness_map`).
+    """
+    views = [(view.name, view.camera) for view in capture.views]
+    areas = [clipped_area(brightness_maps[name], camera, lights) for name, camera in views]
+    search_clipped = sum(bool(area.any()) for area in areas) >= CLIPPED_VIEWS
+    if lights and not search_clipped:
+        return []
     progress.stage("follow ghosts", len(capture.views))
     blobs = []
     for view in capture.views:
         blobs.append(find_blobs(capture.frame(view), capture.clean_frame(view)))
         progress.advance()
-    return locate_by_ghosts([(view.name, view.camera) for view in capture.views], blobs, capture.extent, seed, progress)
+    found: list[FoundLight] = []
+    if search_clipped:
+        found = locate_by_ghosts(views, blobs, capture.extent, seed, progress, areas)
+        if found:
+            messages.append("One light stands in a clipped area, such as a bright sky; its ghosts give its direction.")
+    if not lights and not found:
+        found = locate_by_ghosts(views, blobs, capture.extent, seed, progress)
+        if found:
+            messages.append("No frame shows a light; one out of frame was found by its ghosts, its direction more "
+                            "exactly than its distance.")
+    return found
 
 
 def make_detector(method: str, threshold: float | None = None, boxes: str | Path | None = None,

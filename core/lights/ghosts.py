@@ -1,26 +1,27 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds the direction of a light that is never in frame, from its ghosts.
+"""Finds a light whose own place no frame shows, from its ghosts: one out of frame, or a sun in a clipped sky.
 
 A ghost lies on the line through the principal point p and the light's projection l, and to first order at a fixed ratio
 mu of the way (paraxial optics: Lee and Eisemann 2013): g - p = mu (l - p). So a blob at g claims a light at p + (g - p)
 / mu, and where mu is right the claims of all views meet in one place. Values of mu are tried, and the claims
 triangulated like detections.
 
-Only ghosts on the far side of the principal point (mu < 0) are used: a blob of the scene would then have to come from a
-light behind the camera, so that the scene cannot imitate a ghost.
+Only ghosts on the far side of the principal point (mu < 0) are used: as the camera turns, they move against the scene.
+Where the camera hardly moves, blobs of the scene may agree on a light too. So the blobs of a light are triangulated as
+things of the scene as well: they are no ghosts if one place in the scene explains most of them.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture.camera import Camera
+from ..capture.camera import Camera, Floats
 from ..images.picture import Picture
 from ..system.progress import Progress
-from .detection import Detection
+from .detection import Detection, Mask
 from .found_light import FoundLight
 from .triangulation import TriangulationSettings, triangulate_lights
 
@@ -46,6 +47,18 @@ MIN_STRENGTH = 0.004
 """Strength of a blob, see `Blob`, up to which it is noise."""
 MAX_VISIBLE_SHARE = 0.2
 """Share of the views with a light well inside the frame from which it is not out of frame."""
+MIN_CLIPPED_SHARE = 0.12
+"""Lowest share of the views that must agree on a light in a clipped area: in the others its ghost may be hidden by the
+clipped area, or lie out of the frame."""
+MIN_CLIPPED_VIEWS = 4
+"""Number of these views whose frame must have the light in the clipped area; the others may have it out of frame."""
+MIN_CENTRE_DISTANCE = 0.06
+"""Smallest distance of a light in a clipped area from the principal point, diagonals: nearer by, all ghosts lie on the
+light."""
+MAX_SCENE_SHARE = 0.5
+"""Share of the blobs of a light that one place in the scene may explain."""
+BLOB_TOLERANCE = 0.01
+"""Tolerance of a blob's place, diagonals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,18 +111,21 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
 
 
 def locate_by_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float,
-                     seed: int = 0, progress: Progress | None = None) -> list[FoundLight]:
-    """Return at most one light that is out of frame, from the blobs of each view; none where too few views agree.
+                     seed: int = 0, progress: Progress | None = None,
+                     clipped_areas: Sequence[Mask] | None = None) -> list[FoundLight]:
+    """Return at most one light, from the blobs of each view; none where too few views agree.
 
     The ratio of ghost to light is searched over GHOST_RATIOS, then refined. extent: size of the cameras' path, world
-    units. Raises Cancelled on a stop request.
+    units. clipped_areas: for each view a mask (height, width) of any size, true where the light may stand in the frame;
+    None for a light that hardly any frame has inside. Raises Cancelled on a stop request.
     """
     progress = progress or Progress()
+    search = _Search(views, blobs, extent, seed, clipped_areas)
     best: FoundLight | None = None
     best_ratio = 0.0
     for ratio in GHOST_RATIOS:
         progress.check()
-        light = _light_at_ratio(views, blobs, extent, float(ratio), seed)
+        light = search.light_at_ratio(float(ratio))
         if light is not None and (best is None or _rank(light, float(ratio)) > _rank(best, best_ratio)):
             best, best_ratio = light, float(ratio)
     if best is None:
@@ -117,7 +133,7 @@ def locate_by_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequen
     for step in (0.06, 0.03, 0.015):  # refine the ratio in steps of 6, 3 and 1.5 %
         for ratio in (best_ratio * (1 - step), best_ratio * (1 + step)):
             progress.check()
-            light = _light_at_ratio(views, blobs, extent, ratio, seed)
+            light = search.light_at_ratio(ratio)
             if light is not None and _rank(light, ratio) > _rank(best, best_ratio):
                 best, best_ratio = light, ratio
     # The residual is given in pixels at the ghost; at the light it is 1 / |ratio| times as large.
@@ -130,35 +146,84 @@ def _rank(light: FoundLight, ratio: float) -> tuple[int, float]:
     return len(light.support), -light.residual * abs(ratio)
 
 
-def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float, ratio: float,
-                    seed: int) -> FoundLight | None:
-    """Return the best supported light out of frame that the blobs claim if they are ghosts at this ratio; None where
-    fewer than MIN_VIEWS views, or less than MIN_SHARE of all, agree.
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The blobs of all views, and where a light may stand; see `locate_by_ghosts`."""
 
-    Each blob claims a light at centre + (blob - centre) / ratio in its view; the claims are triangulated. extent: size
-    of the cameras' path, world units. seed: of the triangulation's random choices.
-    """
-    claims = []
-    for (_, camera), in_view in zip(views, blobs, strict=True):
-        centre = np.array([camera.cx, camera.cy])
-        # Triangulation tolerates half a detection's radius: 1 % of the diagonal at the ghost, 1 / |ratio| times as much
-        # at the light.
-        diagonal = float(np.hypot(*camera.size))
-        places = [centre + (blob.xy - centre) / ratio for blob in in_view]
-        claims.append([_claim(place, 0.02 * diagonal / abs(ratio)) for place in places
-                       if not camera.contains([place])[0]])
-    settings = TriangulationSettings(tolerance=0.0, min_views=MIN_VIEWS, max_nfa=MAX_NFA / len(GHOST_RATIOS),
-                                     min_share=MIN_SHARE, allow_out_of_frame=True, max_lights=2, max_candidates=1000,
-                                     seed=seed)
-    first_diagonal = float(np.hypot(*views[0][1].size))
-    for light in triangulate_lights(views, claims, extent, settings):
-        # A blob that stays in place is dirt on the lens.
-        ghost_motion = np.ptp([detection.xy * ratio for _, detection in light.detections], axis=0).max()
-        # A light that many views have well inside the frame is not out of frame.
-        visible = sum(_is_well_inside(camera, light.xyz) for _, camera in views)
-        if visible < MAX_VISIBLE_SHARE * len(views) and ghost_motion > MIN_MOTION * first_diagonal:
-            return light
-    return None
+    views: Sequence[tuple[str, Camera]]
+    blobs: Sequence[Sequence[Blob]]
+    extent: float
+    seed: int
+    clipped_areas: Sequence[Mask] | None
+
+    def light_at_ratio(self, ratio: float) -> FoundLight | None:
+        """Return the best supported light that the blobs claim if they are ghosts at this ratio; None where too few
+        views agree.
+
+        Each blob claims a light at centre + (blob - centre) / ratio in its view; the claims are triangulated.
+        """
+        claims = []
+        for index, ((_, camera), in_view) in enumerate(zip(self.views, self.blobs, strict=True)):
+            centre = np.array([camera.cx, camera.cy])
+            # Triangulation tolerates half a detection's radius: 1 % of the diagonal at the ghost, 1 / |ratio| times as
+            # much at the light.
+            radius = 2 * BLOB_TOLERANCE * float(np.hypot(*camera.size)) / abs(ratio)
+            places = [centre + (blob.xy - centre) / ratio for blob in in_view]
+            claims.append([_claim(place, radius) for place in places if self._may_stand_at(place, index)])
+        min_share = MIN_SHARE if self.clipped_areas is None else MIN_CLIPPED_SHARE
+        settings = TriangulationSettings(tolerance=0.0, min_views=MIN_VIEWS, max_nfa=MAX_NFA / len(GHOST_RATIOS),
+                                         min_share=min_share, allow_out_of_frame=True, max_lights=2,
+                                         max_candidates=1000, seed=self.seed)
+        return next((light for light in triangulate_lights(self.views, claims, self.extent, settings)
+                     if self._is_light_of_ghosts(light, ratio)), None)
+
+    def _may_stand_at(self, place: Floats, view: int) -> bool:
+        """Return whether a light may stand at a place (2,), pixels, of the view of this index."""
+        camera = self.views[view][1]
+        if not camera.contains([place])[0]:
+            return True
+        return self.clipped_areas is not None and self._is_clipped(place, view)
+
+    def _is_clipped(self, place: Floats, view: int) -> bool:
+        """Return whether a place (2,), pixels, in the frame of a view lies in its clipped area, and not at the
+        centre."""
+        assert self.clipped_areas is not None
+        camera = self.views[view][1]
+        if np.linalg.norm(place - (camera.cx, camera.cy)) < MIN_CENTRE_DISTANCE * np.hypot(*camera.size):
+            return False
+        area = self.clipped_areas[view]
+        column, row = (place / camera.size * area.shape[::-1]).astype(int)
+        return bool(area[min(row, area.shape[0] - 1), min(column, area.shape[1] - 1)])
+
+    def _is_light_of_ghosts(self, light: FoundLight, ratio: float) -> bool:
+        """Return whether the blobs that claim a light at a ratio are neither dirt on the lens nor things of the scene,
+        and the light is out of frame where it has to be."""
+        cameras = dict(self.views)
+        centres = {name: np.array([cameras[name].cx, cameras[name].cy]) for name, _ in light.detections}
+        ghosts = {name: centres[name] + (detection.xy - centres[name]) * ratio for name, detection in light.detections}
+        first_diagonal = float(np.hypot(*self.views[0][1].size))
+        if np.ptp(list(ghosts.values()), axis=0).max() <= MIN_MOTION * first_diagonal:  # dirt stays in place
+            return False
+        if self.clipped_areas is None:
+            visible = sum(_is_well_inside(camera, light.xyz) for _, camera in self.views)
+            if visible >= MAX_VISIBLE_SHARE * len(self.views):
+                return False
+        else:
+            places = dict(light.detections)
+            clipped = sum(camera.contains([places[name].xy])[0] for name, camera in self.views if name in places)
+            if clipped < MIN_CLIPPED_VIEWS:
+                return False
+        return self._scene_support(ghosts) < MAX_SCENE_SHARE * len(ghosts)
+
+    def _scene_support(self, pixels: Mapping[str, Floats]) -> int:
+        """Return the number of places (2,) in views, by the view's name, that one place in the scene explains best."""
+        views = [(name, camera) for name, camera in self.views if name in pixels]
+        detections = [[_claim(pixels[name], 2 * BLOB_TOLERANCE * float(np.hypot(*camera.size)))]
+                      for name, camera in views]
+        settings = TriangulationSettings(tolerance=0.0, min_views=2, max_nfa=np.inf, min_share=0.0,
+                                         allow_out_of_frame=True, max_lights=1, seed=self.seed)
+        places = triangulate_lights(views, detections, self.extent, settings)
+        return max((len(place.support) for place in places), default=0)
 
 
 def _claim(place: NDArray[np.float64], radius: float) -> Detection:

@@ -20,6 +20,8 @@ MAP_WIDTH = 160
 CLIPPED, MIN_CLIPPED_SHARE = 0.96, 0.5
 """Smallest value of the largest channel of a bright pixel, display values, and the smallest share of bright pixels in a
 bright pixel of a map."""
+MIN_AREA_SHARE = 0.01
+"""Share of the frame from which a bright area is too large for the disc of a light."""
 SEPARATION = 4.0
 """Smallest distance in a view between a light's place and a detection's direction, in radii of the light, at which the
 view decides."""
@@ -39,6 +41,24 @@ def brightness_map(picture: Picture) -> NDArray[np.bool_]:
     bright = (picture.display().max(axis=2, keepdims=True) >= CLIPPED).astype(np.float32)
     shares = Picture(np.repeat(bright, 3, axis=2), "linear").resized(width, height).pixels[..., 0]
     return np.asarray(shares >= MIN_CLIPPED_SHARE)
+
+
+def clipped_area(bright: NDArray[np.bool_], camera: Camera, lights: Sequence[FoundLight]) -> NDArray[np.bool_]:
+    """Return the mask (height, width) of the large bright areas of a view in which none of the lights stands.
+
+    bright: the view's map (`brightness_map`). An area is large from MIN_AREA_SHARE of the frame.
+    """
+    import cv2
+
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(bright.astype(np.uint8), connectivity=8)
+    large = np.asarray(boxes)[:, cv2.CC_STAT_AREA] >= MIN_AREA_SHARE * bright.size
+    large[0] = False  # label 0 is what is not bright
+    if lights and count > 1:
+        pixels, depth = camera.project(np.stack([light.xyz for light in lights]))
+        for pixel in pixels[camera.contains(pixels, depth)]:
+            column, row = (pixel / camera.size * bright.shape[::-1]).astype(int)
+            large[labels[row, column]] = False
+    return np.asarray(large[labels])
 
 
 def explained_share(light: FoundLight, cameras: Mapping[str, Camera],

@@ -29,9 +29,9 @@ from core.lights import (
 from core.lights.candidates import MAX_LISTED_PAIRS
 from core.lights.exposure import MAX_MORPHOLOGY_COST
 from core.lights.file import check_replaceable, write_lights
-from core.lights.find import _lights_from_one_view
+from core.lights.find import Findings, _lights_from_one_view
 from core.lights.found_light import FoundLight
-from core.lights.ghosts import find_blobs, locate_by_ghosts
+from core.lights.ghosts import Blob, find_blobs, locate_by_ghosts
 from core.lights.lifted import lift_to_gaussians
 from core.lights.merging import remove_ghosts
 from core.lights.triangulation import binomial_tail
@@ -310,11 +310,11 @@ def test_the_binomial_tail_is_exact() -> None:
     assert edges == [1, 0, 1, 0]
 
 
-def turning(number: int) -> list[Camera]:
-    """Cameras that travel and turn, the light of `TestGhosts` above all their frames."""
+def turning(number: int, most: float = 0.12) -> list[Camera]:
+    """Cameras that travel and turn, the light of `TestGhosts` above all their frames. most: largest turn, radians."""
     rng = np.random.default_rng(4)
     return [Camera(*SIZE, 300, 300, 160, 120, rotated @ camera.world_to_camera) for camera, rotated in
-            zip(orbit(number, size=SIZE), (tilt(x, y) for x, y in rng.uniform(-0.12, 0.12, (number, 2))), strict=True)]
+            zip(orbit(number, size=SIZE), (tilt(x, y) for x, y in rng.uniform(-most, most, (number, 2))), strict=True)]
 
 
 def tilt(x: float, y: float) -> NDArray[np.float64]:
@@ -365,6 +365,63 @@ class TestGhosts:
         cameras = turning(16)
         blobs = [find_blobs(frame) for frame in self.frames(cameras, 0.0)]
         assert not locate_by_ghosts(named(cameras), blobs, EXTENT)
+
+
+class TestSunInClippedSky:
+    """A sun far away whose sky is clipped over many times its disc."""
+
+    sun = np.array([30.0, -110.0, 420.0])
+    sky_radius = 60.0
+
+    def find(self, share: float) -> Findings:
+        """Search the frames of turning cameras before a clipped sky; share: the ghost's place on the line from the
+        centre to the sun, 0 for no ghost."""
+        cameras, frames = turning(14, 0.2), {}
+        static = np.random.default_rng(0).uniform((-1, -0.8, -0.5), (1, 0.8, 1), (6, 3))
+        for name, camera in named(cameras):
+            light = np.full((SIZE[1], SIZE[0], 3), 0.1)
+            v, u = np.mgrid[:SIZE[1], :SIZE[0]] + 0.5
+            sun, centre = camera.project(self.sun[None])[0][0], np.array([camera.cx, camera.cy])
+            away = np.hypot(u - sun[0] - 6, v - sun[1])  # the sun is not in the middle of the clipped sky
+            light += np.clip(1 + (self.sky_radius - away) / 120, 0, 1.2)[..., None]
+            for pixel in camera.project(static)[0]:
+                light[np.hypot(u - pixel[0], v - pixel[1]) < 4] = 0.4
+            if share:
+                ghost = centre + share * (sun - centre)
+                light += 0.12 * (np.hypot(u - ghost[0], v - ghost[1]) < 7)[..., None] * np.array([0.5, 0.8, 1.0])
+            frames[name] = stored(light)
+        views = [SimpleNamespace(name=name, camera=camera) for name, camera in named(cameras)]
+        return find_lights(SimpleNamespace(views=views, frame=lambda view: frames[view.name], extent=EXTENT,
+                                           clean_frame=lambda _: None), ExposureDetector(0.3))
+
+    def test_the_sun_is_found_by_its_ghost(self) -> None:
+        findings = self.find(-0.5)
+        (found,) = findings.lights
+        middle = np.mean([camera.position for camera in turning(14, 0.2)], axis=0)
+        a, b = found.xyz - middle, self.sun - middle
+        assert np.degrees(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b))) < 0.7
+        assert any("clipped area" in message for message in findings.messages)
+
+    def test_a_clipped_sky_without_ghosts_is_no_light(self) -> None:
+        assert not self.find(0.0).lights
+
+    def test_things_of_the_scene_are_no_ghosts(self) -> None:
+        """From cameras that look forward and hardly move, things opposite to a window agree on a light in it."""
+        cameras = [Camera(*SIZE, 300, 300, 160, 120, shifted(x, y)) for x in np.linspace(-0.2, 0.2, 6)
+                   for y in (-0.05, 0.05)]
+        things = np.random.default_rng(1).uniform((-4, 0.5, 8), (4, 3, 12), (10, 3))
+        blobs = [[Blob(pixel, 5.0, 0.1) for pixel in camera.project(things)[0] if camera.contains([pixel])[0]]
+                 for camera in cameras]
+        window = np.zeros((60, 80), bool)
+        window[2:25] = True
+        assert not locate_by_ghosts(named(cameras), blobs, 1.0, clipped_areas=[window] * len(cameras))
+
+
+def shifted(x: float, y: float) -> NDArray[np.float64]:
+    """World-to-camera matrix of a camera at (x, y, 0) that looks along z."""
+    matrix = np.eye(4)
+    matrix[:2, 3] = -x, -y
+    return matrix
 
 
 def test_lights_are_lifted_on_to_a_scene() -> None:

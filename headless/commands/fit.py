@@ -100,6 +100,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
     capture = with_supervision(capture, settings, progress)
+    if not settings.uses_plates and not settings.scene.frozen:
+        capture, settings = skip_absent_flare(args, capture, settings, progress, is_resumed=is_resumed)
     result = fit(capture, settings, out, progress, resume=args.resume, device=args.device)
     progress.say(f"The run is in {result.folder}: look at preview.png there, then run `eval` and `bake`.")
     used = {view.name for part in capture.split(settings.holdout) for view in part}
@@ -162,6 +164,30 @@ def with_supervision(capture: Capture, settings: FitSettings, progress: Progress
     has_exact = settings.supervised and capture.has_truth
     needs_clean_frames = settings.needs_clean_frames and not settings.scene.frozen and not has_exact
     return with_clean_frames(capture, progress, is_flared=settings.uses_plates) if needs_clean_frames else capture
+
+
+def skip_absent_flare(args: argparse.Namespace, capture: Capture, settings: FitSettings, progress: Progress, *,
+                      is_resumed: bool) -> tuple[Capture, FitSettings]:
+    """Return capture and settings as they are, or, where `remove` has found no flare in the frames, those of a fit that
+    takes the frames for exact clean frames and has one light; this is reported.
+
+    A mode that the user or the resumed run has chosen stays.
+    """
+    from ...core.removal.jobs.provenance import has_exact_clean_frames, has_unchanged_clean_frames
+
+    is_free = args.mode is None and not is_resumed and settings.mode == "estimated"
+    if not (is_free or settings.mode == "default") or has_exact_clean_frames(capture):
+        return capture, settings
+    if not has_unchanged_clean_frames(capture):
+        return capture, settings
+    names = [light.name for light in capture.lights]
+    others = f", and of the {len(names)} lights only {names[0]} has one" if len(names) > 1 else ""
+    progress.say(f"`remove` has found no flare in the frames of {capture.folder}, so the fit takes them for clean "
+                 f"frames: its flare stays dark{others}. --mode split searches for a flare by parallax alone.")
+    if is_free:
+        args.mode = "default"
+        settings = fit_settings(args, capture, progress)
+    return capture.with_lights(capture.lights[:1]), settings
 
 
 def default_mode(capture: Capture, frozen: bool, progress: Progress) -> Mode:

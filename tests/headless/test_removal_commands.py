@@ -192,9 +192,29 @@ def test_a_fit_in_mode_split_makes_no_clean_frames(capture: Path, tmp_path: Path
         assert "--run" in capsys.readouterr().err
 
 
+def test_a_fit_of_frames_without_flare_stays_dark(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+                                                  monkeypatch: pytest.MonkeyPatch) -> None:
+    """The network removes nothing: parallax alone would make flares of what the scene leaves."""
+    net = network_file(tmp_path / "net.safetensors", bias=-1.0)
+    monkeypatch.setenv("FIT_FLARE_WEIGHTS", str(net))
+    bare, run = tmp_path / "bare", tmp_path / "run"
+    shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
+    lights = json.loads((bare / "lights.json").read_text(encoding="utf-8"))["lights"]
+    other = {**lights[0], "name": "other", "xyz": [0.5, 1.5, 0.2]}
+    (bare / "lights.json").write_text(json.dumps({"lights": [lights[0], other]}), encoding="utf-8")
+    fit_args = ["fit", str(bare), "--out", str(run), "--iterations", "2"]
+    assert cli.main(fit_args) == 0
+    said = capsys.readouterr().err
+    assert "found no flare in the frames" in said and f"of the 2 lights only {lights[0]['name']} has one" in said
+    assert 'mode = "default"' in (run / "config.toml").read_text(encoding="utf-8")
+    assert cli.main([*fit_args, "--resume"]) == 0
+    assert cli.main([*fit_args[:3], str(tmp_path / "explicit"), *fit_args[4:], "--mode", "estimated"]) == 0
+    assert 'mode = "estimated"' in (tmp_path / "explicit" / "config.toml").read_text(encoding="utf-8")
+
+
 def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
                                           monkeypatch: pytest.MonkeyPatch) -> None:
-    net = network_file(tmp_path / "net.safetensors", bias=0.1)
+    net = network_file(tmp_path / "net.safetensors", bias=0.5)
     monkeypatch.setenv("FIT_FLARE_WEIGHTS", str(net))
     bare = tmp_path / "bare"
     shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))

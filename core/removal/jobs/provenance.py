@@ -1,15 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Distinguishes the clean frames in a capture's removed/ that a person made from estimates that `remove` made.
 
-It uses the manifest there, which also shows whether the frames have changed since.
+It uses the manifest there, which also shows whether the frames have changed since. It also tells whether the estimates
+differ from the frames at all.
 """
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from ...capture import REMOVED, Capture
 from ...errors import CaptureError
+from ...images.read import read_picture
 from .manifest import Manifest
+
+MAX_CHANGED_SHARE = 0.02
+"""Share of the frames that `remove` may have changed in a capture without flares: single false detections."""
 
 
 def has_exact_clean_frames(capture: Capture) -> bool:
@@ -31,6 +38,18 @@ def check_clean_frames_current(capture: Capture) -> None:
         raise CaptureError(f"{len(others)} of the {len(sources)} clean frames in {folder} were made from other frames "
                            f"than the capture has now ({others[0].as_posix()} first); delete that folder to make them "
                            "again.")
+
+
+def has_unchanged_clean_frames(capture: Capture) -> bool:
+    """Return whether the clean frames of a capture are its frames, to the last bit, but for MAX_CHANGED_SHARE of them:
+    then `remove` has found no flare."""
+    changed = 0
+    for view in capture.views:
+        frame, clean = read_picture(capture.frame_path(view)), read_picture(capture.clean_frame_path(view))
+        changed += not np.array_equal(frame.pixels, clean.pixels)
+        if changed > MAX_CHANGED_SHARE * len(capture.views):
+            return False
+    return True
 
 
 def _frames_by_clean_name(capture: Capture) -> dict[Path, Path]:

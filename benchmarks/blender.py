@@ -109,6 +109,7 @@ def make_flare(path: Path, count: int = GAUSSIANS, smallest: float = 0.01) -> Pa
     description = {"version": 1, "blend": "add", "camera": camera, "lights": [light]}
     header["__metadata__"] = {"fit_flare": json.dumps(description)}
     text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)  # the tensors are aligned, as in a .flare of a fit
     path.write_bytes(len(text).to_bytes(8, "little") + text + body)
     return path
 

@@ -293,8 +293,7 @@ class Network:
         tensors: by their names in the file, without the light's number. heads: width of each offset by name. levels,
         base: number of levels of the hash grids, and resolution of the coarsest. encoded: (n, d) frequency-encoded
         canonical positions, then latent codes."""
-        # Copies, since a tensor in a file may begin anywhere, and numpy is slow where numbers are not aligned.
-        self._tensors = {name: np.array(tensor, np.float32, order="C") for name, tensor in tensors.items()
+        self._tensors = {name: np.asarray(tensor, np.float32) for name, tensor in tensors.items()
                          if not name.endswith((".rows", ".values"))}
         self._heads, self._range = dict(heads), query_range
 

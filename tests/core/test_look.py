@@ -161,6 +161,16 @@ def test_bad_files_raise_in_one_line(tmp_path: Path) -> None:
         read_look(tmp_path / "absent.flare")
 
 
+@pytest.mark.parametrize("padding", range(4))
+def test_tensors_are_aligned_after_a_header_of_any_length(tmp_path: Path, padding: int) -> None:
+    """numpy multiplies arrays that are not aligned several times slower."""
+    header = json.dumps({"a": {"dtype": "F32", "shape": [2, 3], "data_offsets": [0, 24]}}).encode() + b" " * padding
+    values = np.arange(6, dtype="<f4").reshape(2, 3)
+    (tmp_path / "a.flare").write_bytes(len(header).to_bytes(8, "little") + header + values.tobytes())
+    array = read_tensors(tmp_path / "a.flare")[0]["a"]
+    assert array.flags.aligned and np.array_equal(array, values)
+
+
 def test_the_container_equals_safetensors(tmp_path: Path) -> None:
     from safetensors.numpy import save_file
 

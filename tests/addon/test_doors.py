@@ -15,7 +15,8 @@ from headless.handbook import render_pages
 
 BLENDERS_LABELS = {"Online Manual", "Install from Disk", "Add Remote Repository", "Color Management",
                    "Crop to Render Region", "Disable in Renders", "Disable in Viewports", "Ray Visibility", "Stereo 3D",
-                   "Multi-View", "Spherical Stereo", "Adjust Last Operation", "View as Render", "Step"}
+                   "Multi-View", "Spherical Stereo", "Adjust Last Operation", "View as Render", "Step",
+                   "Render Viewport Preview", "Render Playblast"}
 NO_LABELS = {"+", "Follow", "Memory", "Black borders", "White balance", "Motion blur, rolling shutter"}
 """A button without a label, the beginning of several labels, and subjects of rows and sections."""
 

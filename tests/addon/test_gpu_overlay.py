@@ -10,7 +10,8 @@ from test_work import a_flare
 
 
 def test_the_shaders_draw_what_numpy_draws(blender: Blender, package: Path, tmp_path: Path) -> None:
-    """Whole pictures of two shapes, whose levels end beyond their edges; and one level alone."""
+    """Whole pictures of two shapes, whose levels end beyond their edges; and one level alone. Block of gpu_overlay.py:
+    "beginning"."""
     flare = a_flare(tmp_path / "lamp.flare")
     facts = blender.run(Path(__file__).parent / "scripts" / "gpu_overlay.py", package, flare, user=tmp_path / "user")
     if "missing" in facts:

@@ -14,16 +14,17 @@ from quads import drawn_levels
 from start import install, leave, part, scene_with, select
 
 package, flare = sys.argv[1:3]
+facts: dict[str, object] = {"pictures": []}
 try:
     gpu.init()  # from Blender 5.2 on
     gpu.types.GPUOffScreen(8, 8, format="RGBA32F").free()
 except (AttributeError, SystemError, RuntimeError, ValueError) as problem:
-    leave({"missing": f"this Blender draws nothing without a window ({problem})"})
+    facts["missing"] = f"this Blender draws nothing without a window ({problem})"
+    leave(facts)
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 looks, overlay, cameras, space = (part(f"flare_addon.{name}") for name in (
     "looks", "overlay", "cameras", "working_space"))
-facts: dict[str, object] = {"pictures": []}
 scene, (lamp,) = scene_with((0.4, 8, 0.3))
 select(scene, lamp)
 bpy.ops.fit_flare.apply_flare(filepath=flare)

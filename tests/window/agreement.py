@@ -29,7 +29,7 @@ VIEWS = os.environ.get("FIT_FLARE_VIEWS", "Standard,AgX,Filmic").split(",")
 FRAMES = {"moving": (1, 3, 5)}
 """Frames that are compared, by scene; else the first."""
 MAX_DIFFERENCE = 2  # codes
-UNCHANGED = 6  # screenshots alike, after which a view that differs from the render counts as finished
+UNCHANGED = 10  # screenshots alike, after which a view that differs from the render counts as finished
 MARGIN = 2  # pixels at the edge of the frame, where the camera's border is drawn
 
 DARK = 0.05  # light of the planks
@@ -251,7 +251,7 @@ def settled_view(scene, path: Path, rendered):
     """
     before, unchanged = None, 0
     for _ in range(30):
-        yield 3
+        yield 1.5
         ui.screenshot(str(path))
         yield 0.5
         window = pixels(path)

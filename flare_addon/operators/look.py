@@ -71,15 +71,20 @@ class FITFLARE_OT_add_flare(GuardedOperator, bpy.types.Operator):
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
-        """Add the flares; name the objects that have a flare of this look already, which get no second one."""
+        """Add the flares; name the objects that have a flare of this look already, which get no second one, and the
+        cameras, which get none."""
         scene, look = context.scene, looks.look_of(context.scene)
-        source, skipped = self.source or look.names[0], []
+        source, skipped, cameras = self.source or look.names[0], list[str](), list[str]()
         placed = {(item.target, item.source) for item in scene.fit_flare.lights}
         for item in context.selected_objects:
             if (item, source) in placed:
                 skipped.append(item.name)
-            elif item.type != "CAMERA":
+            elif item.type == "CAMERA":
+                cameras.append(item.name)
+            else:
                 looks.add_flare(scene, item, source)
+        if cameras:
+            self.report({"WARNING"}, f"{', '.join(sorted(cameras))}: a camera gets no flare")
         if skipped:
             others = ". Adjust Last Operation offers the other looks of the .flare" if len(look.names) > 1 else ""
             self.report({"WARNING"}, f"{', '.join(sorted(skipped))}: the flare of {source} is there already{others}")

@@ -158,7 +158,7 @@ scene, (near, far) = scene_with((0.4, 8, 0.3), (3, 8, 1))
 select(scene, near)
 ops.open_flare(filepath=two)
 first = rows(scene)
-select(scene, near, far)
+select(scene, near, far, scene.camera)
 facts["pressed once"] = [reports(look_operators.FITFLARE_OT_add_flare, source="sun"), rows(scene)[len(first):]]
 facts["pressed twice"] = [reports(look_operators.FITFLARE_OT_add_flare, source="sun"), len(rows(scene)) - len(first)]
 select(scene, near)

@@ -49,8 +49,10 @@ def test_each_flare_gets_the_light_back_that_it_had(facts: Any) -> None:
 
 def test_a_selected_light_gets_a_flare_once(facts: Any) -> None:
     """Block of looks.py: "flares from selected"."""
-    assert facts["pressed once"] == [["Camera: a camera gets no flare", "Lamp 1: the flare of sun is there already. Adjust Last Operation offers the "
-                                      "other looks of the .flare"], [["Lamp 2", "sun", "Lamp 2"]]]
+    assert facts["pressed once"] == [
+        ["Camera: a camera gets no flare",
+         "Lamp 1: the flare of sun is there already. Adjust Last Operation offers the other looks of the .flare"],
+        [["Lamp 2", "sun", "Lamp 2"]]]
     reported, added = facts["pressed twice"]
     assert added == 1 and "Lamp 1, Lamp 2" in reported[-1]
     assert facts["another of its looks"] == [["FINISHED"], ["Lamp 1", "moon", "Lamp 1"]]

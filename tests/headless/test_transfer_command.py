@@ -207,8 +207,8 @@ def test_transfer_to_a_blend_whose_objects_hide_the_light(run: Run, made: Path, 
     assert (tmp_path / "part" / "layers.0004.exr").read_bytes() == (out / "layers.0004.exr").read_bytes()
 
 
-def test_the_frame_step_of_a_blend_counts_where_no_frames_are_named(run: Run, made: Path, blend: Path,
-                                                                   tmp_path: Path) -> None:
+@pytest.mark.usefixtures("blend")
+def test_the_frame_step_of_a_blend_counts_where_no_frames_are_named(run: Run, made: Path, tmp_path: Path) -> None:
     stepped = tmp_path / "stepped.blend"
     subprocess.run([sys.executable, "-c", BLEND.replace("frame_end = 1, 9", "frame_end, scene.frame_step = 1, 9, 4"),
                     str(stepped)], check=True, capture_output=True, timeout=120)

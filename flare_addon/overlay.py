@@ -37,10 +37,6 @@ from .scene_changes import change_count
 from .views import camera_of, has_display_footage
 from .working_space import working_space
 
-MAX_IN_HALF_FLOAT = 6_000
-"""Gaussians up to which the buffers are half float. A sum of more, as for an area light, loses the light of faint ones
-to rounding."""
-
 NETWORK_S, NETWORK_AT_REST_S = 0.02, 0.25
 """Time for the look's network in one drawing, the mean while the camera moves, and at rest; more lights than fit take
 turns."""
@@ -140,10 +136,9 @@ def render_levels(gaussians: PlaneGaussians | None, window: DrawnRegion, look: L
     if gaussians is None:
         return DrawnLevels({}, (0, 0, 0, 0))
     by_level = quads_by_level(gaussians, window, look, _memory)
-    texture_format = "RGBA16F" if len(gaussians) <= MAX_IN_HALF_FLOAT else "RGBA32F"
     offscreens = {}
     for divisor, quads in by_level.items():
-        offscreen = offscreens[divisor] = view.offscreen(divisor, window.width, window.height, texture_format)
+        offscreen = offscreens[divisor] = view.offscreen(divisor, window.width, window.height)
         with offscreen.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
             gpu.state.blend_set("ADDITIVE" if look.blend == "add" else "ALPHA_PREMULT")

@@ -51,26 +51,27 @@ def part_of_quads(by_level: Mapping[int, Quads], window: DrawnRegion) -> Part:
     return float(left), float(1 - bottom), float(right), float(1 - top)
 
 
-def create_offscreen(width: int, height: int, texture_format: str) -> Any:
-    """Create an offscreen buffer. Needs a GPU context."""
+def create_offscreen(width: int, height: int) -> Any:
+    """Create an offscreen buffer of 32-bit floats: in the bright core of a flare, a sum of half floats loses the light
+    of faint Gaussians to rounding. Needs a GPU context."""
     import gpu
 
-    return gpu.types.GPUOffScreen(width, height, format=texture_format)
+    return gpu.types.GPUOffScreen(width, height, format="RGBA32F")
 
 
 class ViewBuffers:
     """The offscreen buffers of a view, one for each level that it needed."""
 
     def __init__(self) -> None:
-        self._offscreens: dict[int, tuple[tuple[int, int, str], Any]] = {}
+        self._offscreens: dict[int, tuple[tuple[int, int], Any]] = {}
         self.content: tuple[Any, DrawnLevels] | None = None
         """What the buffers hold: the key of `overlay._render_region`, and the levels. None if unknown."""
 
-    def offscreen(self, divisor: int, width: int, height: int, texture_format: str) -> Any:
+    def offscreen(self, divisor: int, width: int, height: int) -> Any:
         """Return the buffer of a level, whose size is that of the region (pixels) divided by `divisor`, rounded up.
 
-        A buffer of this level with another size or format is freed."""
-        key = max(-(-width // divisor), 1), max(-(-height // divisor), 1), texture_format
+        A buffer of this level with another size is freed."""
+        key = max(-(-width // divisor), 1), max(-(-height // divisor), 1)
         known = self._offscreens.get(divisor)
         if known is None or known[0] != key:
             if known is not None:

@@ -27,9 +27,9 @@ from .properties import redraw_viewports
 from .shots import ShotReading
 
 STEP_S = 0.02
-"""Time for which a bake holds the window in one go; a step that takes longer is not interrupted."""
+"""Seconds for which a bake may block the window at a time; a longer step is not interrupted."""
 INTERVAL_S = 0.005
-"""Pause between two such times."""
+"""Seconds between two such turns."""
 MAX_PROCESSES = 8
 """Most processes that draw without an engine; each needs about a gigabyte for frames of 4K."""
 
@@ -52,8 +52,8 @@ class Preparation:
         return self.reading.done / max(self.reading.total, 1)
 
     def step(self) -> bool:
-        """Read one frame, after the last one write some frames of the shot; at the end start the bake. Returns whether
-        more is to be done."""
+        """Read one frame of the scene; after the last one, write some frames of the shot file; after all, start the
+        bake. Return whether steps remain."""
         if self.reading.done < self.reading.total:
             self.reading.step()
             return True

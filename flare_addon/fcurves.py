@@ -74,7 +74,7 @@ def is_animated(block: Any, path: str) -> bool:
 
 
 def _unshare_action(block: Any) -> None:
-    """Give a data block an action of its own where another one has the same curves, as a linked copy of a scene has."""
+    """Copy the action of a data block if another block uses it too, as after a linked copy of a scene."""
     data = block.animation_data
     if data is None or data.action is None:
         return

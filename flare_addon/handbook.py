@@ -36,7 +36,7 @@ _PROPERTIES = {
 _TOPICS = (*((f"bpy.ops.fit_flare.{name}", page) for page, names in _OPERATORS.items() for name in names),
            *((f"bpy.types.{name}", page) for page, names in _PROPERTIES.items() for name in names),
            ("bpy.ops.fit_flare.*", "editing"), ("bpy.types.fitflare_*", "editing"))
-"""The page of each operator and property, the first match, as patterns of Blender's identifiers in lower case."""
+"""Pairs of a pattern of Blender's identifiers in lower case and its page; the first match counts."""
 
 
 def url(page: str = "") -> str:

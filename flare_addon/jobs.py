@@ -389,8 +389,8 @@ def _poll_safely(job: Job) -> bool:
 def report_exception(job: Job, problem: Exception) -> None:
     """Show an unexpected exception, which is being handled, in the panel of a job and in the console."""
     traceback.print_exc()
-    job.error = (f"The result of the engine in {job.folder} cannot be shown ({' '.join(str(problem).split())}); "
-                 "report it with what the console says.")
+    job.error = (f"An error occurred while Fit Flare showed or composited the result in {job.folder} "
+                 f"({' '.join(str(problem).split())}); report it with the text in the console.")
     job.state = "failed" if job.running else job.state
 
 

@@ -12,9 +12,9 @@ the artist has placed has all of them, one at a light of the capture none: its f
 The reference of the power is the lamp's light in the first frame of the scene:
 
     keyed lamp     computed from its curves, so it follows them
-    driven lamp    measured at the first frame: when the flare gets the lamp or, for a later driver, soon after the
-                   camera view is drawn, or before a bake or a transfer; a lamp with a keyed temperature counts as
-                   driven
+    driven lamp    measured at the first frame when the flare gets the lamp. If the driver is added later, it is
+                   measured soon after the next redraw of the camera view, or before a bake, a transfer or a viewport
+                   render. A lamp with a keyed temperature counts as driven
     other lamp     measured when the flare gets the lamp, so that a change by hand dims the flare
 
 An empty or a mesh has no power; its factor is 1. The reference distance is the one from the camera to the object when
@@ -215,8 +215,10 @@ def is_driven(target: Any) -> bool:
 
 
 def _is_data_driven(data: Any) -> bool:
-    """Return whether drivers move the power or colour of a lamp's data, or keys its temperature: only Blender computes
-    these."""
+    """Return whether drivers move the power, colour or temperature of a lamp's data, or keys its temperature.
+
+    Only Blender can compute the light of such a lamp.
+    """
     animation = data.animation_data
     return animation is not None and (
         any(curve.data_path in (*_POWER_PATHS, *_TEMPERATURE_PATHS) for curve in animation.drivers)
@@ -230,9 +232,10 @@ def measure_references(scene: Any, item: Any) -> None:
 
 
 def _measure_power(scene: Any, item: Any) -> None:
-    """Store the power of a flare's lamp at the current frame; without a lamp nothing.
+    """Store the light of a flare's lamp as its reference; do nothing for an object that is no lamp.
 
-    The power of a driven lamp is that of the scene's first frame: the timeline moves there and back.
+    It is the light of the current frame, for a driven lamp that of the scene's first frame: the timeline moves to it
+    and back.
     """
     target = item.target
     if not is_lamp(target):
@@ -257,22 +260,27 @@ def _camera_distance(scene: Any, target: Any) -> float:
     return float((light - camera).length)
 
 
-def unmeasured(scene: Any) -> list[Any]:
+def outdated_references(scene: Any) -> list[Any]:
     """Return the flares of driven lamps whose reference was measured before the lamp was driven."""
     return [item for item in scene.fit_flare.lights if item.follow_power and not item.reference_is_driven
             and is_driven(item.target)]
 
 
 def measure_driven(scene: Any) -> None:
-    """Measure the power of driven lamps that were not driven when it was measured; bakes and transfers begin with
-    it."""
-    for item in unmeasured(scene):
+    """Measure the power of driven lamps that were not driven when it was measured.
+
+    Bakes, transfers and viewport renders call it first.
+    """
+    for item in outdated_references(scene):
         _measure_power(scene, item)
 
 
 def measure_soon(scene: Any) -> None:
-    """Call `measure_driven` from a timer if it has something to measure, since a drawing must not change the scene."""
-    if unmeasured(scene) and not bpy.app.timers.is_registered(measure_in_windows):
+    """Start a timer that calls `measure_driven`, if a reference is outdated.
+
+    A redraw itself must not change the scene.
+    """
+    if outdated_references(scene) and not bpy.app.timers.is_registered(measure_in_windows):
         bpy.app.timers.register(measure_in_windows, first_interval=0.0)
 
 
@@ -281,7 +289,7 @@ def measure_in_windows() -> float | None:
     if bpy.app.is_job_running("RENDER"):
         return RENDER_WAIT_S
     for scene in {window.scene for window in bpy.context.window_manager.windows}:
-        if unmeasured(scene):
+        if outdated_references(scene):
             measure_driven(scene)
             scene.update_tag()  # so that the flares are drawn anew
     redraw_viewports()

@@ -191,7 +191,7 @@ def chosen_path() -> str:
     if _displayed and not Path(_displayed).is_file():
         name = Path(_displayed).stem
         chosen()  # displays the first one
-        raise FlareFileError(f"{name} is not in the library any more; choose another look.")
+        raise FlareFileError(f"{name} was deleted from the library or renamed; choose another look.")
     path = str(bpy.context.window_manager.fit_flare_library)
     if not path:
         raise FlareFileError("The library has no flare that can be read; save one to it first.")

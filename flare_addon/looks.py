@@ -62,15 +62,15 @@ def is_placed(item: Any, scene: Any) -> bool:
 def show_look(scene: Any, path: Path | str, targets: Sequence[Any] = (), *, add: bool = False) -> Look:
     """Set the scene's .flare and match its flares to the lights of the new look. Raises FlareFileError.
 
-    Each existing flare is matched to a light of the new look: by the name of the light that it showed first, else of
-    the one that it showed last, else by that first light's number among those of all flares. It keeps its light object
-    and its sliders, those of elements that the look lacks too. Sliders that the artist has not moved follow the edits
-    in the file.
+    Each existing flare gets the first of these lights that the new look has: the one named like the flare's first
+    light, the one named like its present light, else the one at the position of its first light among the first lights
+    of all flares. The flare keeps its light object and its sliders, also sliders of elements that the look lacks.
+    Sliders that the artist has not moved take the values of the file.
 
     A light of the look without a flare gets one if a light object has its name, or if the scene had no flare at all.
-    Flares without a light object are placed at the objects `targets`, without `add` also those whose light object was
-    deleted. add: each remaining target gets a flare of its own. Targets that have a flare already are skipped. Returns
-    the look.
+    The objects `targets` become the light objects of flares that have none. Without `add`, flares whose light object
+    was deleted count as such too. add: each remaining target gets a flare of its own. Targets that have a flare already
+    are skipped. Returns the look.
     """
     path = Path(path)
     look = read_look(path)
@@ -156,20 +156,22 @@ def _change_look(scene: Any, before: LookEdits, look: Look) -> None:
 
 
 def _follow_edit(sliders: Any, before: Edit, after: Edit) -> None:
-    """Set each slider that still has the value of `before` to that of `after`; the others count as chosen from now on,
-    and stay."""
-    current, chosen = edit_of(sliders), set(sliders.chosen.split())
-    chosen |= {name for name in EDIT_NAMES
+    """Set each slider that the artist has not moved to the value of `after`.
+
+    A slider whose value differs from `before` counts as moved, for all later looks too.
+    """
+    current, moved = edit_of(sliders), set(sliders.moved_sliders.split())
+    moved |= {name for name in EDIT_NAMES
                if not np.allclose(getattr(current, name), getattr(before, name), rtol=1e-5, atol=1e-6)}
     for name in EDIT_NAMES:
-        if name not in chosen:
+        if name not in moved:
             set_slider(sliders, name, getattr(after, name))
-    sliders.chosen = " ".join(sorted(chosen))
+    sliders.moved_sliders = " ".join(sorted(moved))
 
 
 def _is_edited(item: Any) -> bool:
     """Return whether the artist has moved or animated sliders of a flare; `_follow_edit` has compared them."""
-    return (bool(item.chosen) or any(element.chosen for element in item.elements)
+    return (bool(item.moved_sliders) or any(element.moved_sliders for element in item.elements)
             or fcurves.is_animated(item.id_data, item.path_from_id()))
 
 
@@ -196,7 +198,7 @@ def edits_to_store(state: Any, look: Look) -> LookEdits:
 
 
 def unstored_settings(scene: Any, stored: LookEdits) -> list[str]:
-    """Return names of what a file of the library does not store of the scene's flares.
+    """Return phrases for a message: the settings of the scene's flares that a .flare does not store.
 
     stored: the edits that it stores, of `edits_to_store`.
     """
@@ -211,7 +213,7 @@ def unstored_settings(scene: Any, stored: LookEdits) -> list[str]:
         item.extent != "auto" or item.radius > 0
         or any(getattr(item, name) != item.is_at_artists_light for name in lamp_drive.SWITCHES))]
     if switched:
-        result.append(f"switches, Extent and Light Size of {', '.join(switched)}")
+        result.append(f"the Follow switches, Extent and Light Size of {', '.join(switched)}")
     return result
 
 
@@ -310,8 +312,8 @@ def present_elements(item: Any) -> list[Any]:
 def edits_of(state: Any) -> LookEdits:
     """Return the edits that all sliders of a scene make.
 
-    Those of elements that the look lacks make none, also where another program has replaced the .flare since it was
-    opened.
+    Sliders of elements that the look lacks make no edits. This also holds if another program has replaced the .flare
+    since it was opened.
     """
     neutral = Edit()
     try:

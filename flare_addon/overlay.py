@@ -3,11 +3,10 @@
 
 Each Gaussian is a quad. With the blend "add" it is drawn into the coarsest of five buffers (full size to 1/16) in which
 its narrow side still has four texels, so the cost does not grow with the size of a glow. With "over" all are drawn back
-to front at full size over black, as they are baked. The buffers are linear, and half float for few Gaussians. A last
-pass adds them to the viewport's picture in scene-linear light, before Blender applies the view transform, as the
-compositor does in a render. Blender draws footage behind the camera after the view transform, unless the image is
-viewed as a render. Over such footage the pass adds to the viewport's overlay, which Blender blends in display-linear
-light.
+to front at full size over black, as they are baked. The buffers are linear, of 32-bit floats. A last pass
+adds them to the viewport's picture in scene-linear light, before Blender applies the view transform, as the compositor
+does in a render. Blender draws footage behind the camera after the view transform, unless the image is viewed as a
+render. Over such footage the pass adds to the viewport's overlay, which Blender blends in display-linear light.
 
 Only the visible part of the frame is drawn, at the pixels of the region, so zooming in costs nothing.
 """
@@ -29,7 +28,7 @@ from ..core.look.plane import concatenate
 from . import baking, highlight, lamp_drive, looks, stereo
 from .compositor.flare_node import find_node
 from .compositor.trees import is_off_in_preview
-from .overlay_buffers import PICTURE, BuffersByView, DrawnLevels, ViewBuffers, part_of_quads
+from .overlay_buffers import PICTURE, BuffersByCanvas, CanvasBuffers, DrawnLevels, part_of_quads
 from .overlay_quads import LEVELS, DrawnRegion, QuadMemory, Quads, quads_by_level
 from .overlay_shaders import gaussian_shader, sum_shader
 from .properties import redraw_viewports, schedule_redraw
@@ -38,8 +37,8 @@ from .views import camera_of, has_display_footage
 from .working_space import working_space
 
 NETWORK_S, NETWORK_AT_REST_S = 0.02, 0.25
-"""Time for the look's network in one drawing, the mean while the camera moves, and at rest; more lights than fit take
-turns."""
+"""Seconds for the look's deformation network per redraw: on average while the camera moves, and at most at rest. If
+there are more lights than the time allows, they take turns."""
 
 Floats = NDArray[np.float32]
 
@@ -49,7 +48,7 @@ last_error = ""
 _handles: list[Any] = []
 _scene_buffer: Any = None  # the framebuffer with the scene-linear picture of the region that is being drawn
 _shaders: dict[str, Any] = {}
-_buffers = BuffersByView()
+_buffers = BuffersByCanvas()
 _budgets: dict[tuple[str, stereo.Eye], OffsetsBudget] = {}
 """By the camera's full name and the eye."""
 _memory = QuadMemory()
@@ -124,21 +123,21 @@ def _upload_quads(vertices: Quads) -> Any:
 
 
 def render_levels(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look,
-                  view: ViewBuffers | None = None) -> DrawnLevels:
-    """Draw Gaussians of a look into the offscreen buffers of a view, by default that of pictures; return the levels.
+                  canvas: CanvasBuffers | None = None) -> DrawnLevels:
+    """Draw Gaussians of a look into the offscreen buffers of a canvas, by default that of pictures; return the levels.
 
     A level without Gaussians is neither cleared nor drawn. Needs a GPU context.
     """
     import gpu
 
-    view = view or _buffers.of(PICTURE)
-    view.content = None  # the buffers get another content
+    canvas = canvas or _buffers.of(PICTURE)
+    canvas.content = None  # the buffers get another content
     if gaussians is None:
         return DrawnLevels({}, (0, 0, 0, 0))
     by_level = quads_by_level(gaussians, window, look, _memory)
     offscreens = {}
     for divisor, quads in by_level.items():
-        offscreen = offscreens[divisor] = view.offscreen(divisor, window.width, window.height)
+        offscreen = offscreens[divisor] = canvas.offscreen(divisor, window.width, window.height)
         with offscreen.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
             gpu.state.blend_set("ADDITIVE" if look.blend == "add" else "ALPHA_PREMULT")

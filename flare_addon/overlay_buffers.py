@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The offscreen buffers of the overlay. Each view has its own, so that two views or two eyes do not redraw each other.
+"""The offscreen buffers of the overlay, one set for each canvas.
 
-A view is an eye in a region of a window, or a picture. `overlay` draws the levels into them.
+A canvas is one eye in one region of a window, or a picture. With buffers of its own, a canvas need not be drawn again
+when another one changes. `overlay` draws the levels into the buffers.
 """
 from __future__ import annotations
 
@@ -15,13 +16,13 @@ import numpy as np
 from .overlay_quads import DrawnRegion, Quads
 from .stereo import Eye
 
-MAX_VIEWS = 4
-"""Most views whose buffers are kept; the view that was not drawn for longest loses its buffers."""
+MAX_CANVASES = 4
+"""Most canvases with buffers. Beyond it, the canvas that was drawn longest ago loses its buffers."""
 
-View = tuple[int, Eye]
+Canvas = tuple[int, Eye]
 """A region's address, and an eye."""
-PICTURE: View = (0, "")
-"""The view of pictures, which no region shows."""
+PICTURE: Canvas = (0, "")
+"""The canvas of pictures, which no region shows."""
 
 Part = tuple[float, float, float, float]
 """Left, bottom, right and top of a part of a region, 0..1."""
@@ -31,8 +32,8 @@ Part = tuple[float, float, float, float]
 class DrawnLevels:
     """Levels that were drawn.
 
-    offscreens: the buffer of each level that has Gaussians, by its divisor. part: the part of the region outside of
-    which they are black.
+    offscreens: the buffer of each level that has Gaussians, by its divisor. part: the part of the region that they may
+    cover; outside it they are black.
     """
 
     offscreens: dict[int, Any]
@@ -40,7 +41,7 @@ class DrawnLevels:
 
 
 def part_of_quads(by_level: Mapping[int, Quads], window: DrawnRegion) -> Part:
-    """Return the part of a region that quads touch, with the texels between which the buffers are interpolated."""
+    """Return the part of a region that the quads touch, enlarged by one texel of each level for the interpolation."""
     size = np.array([window.width, window.height], np.float64)
     low, high = size.copy(), np.zeros(2)
     for divisor, quads in by_level.items():
@@ -52,15 +53,17 @@ def part_of_quads(by_level: Mapping[int, Quads], window: DrawnRegion) -> Part:
 
 
 def create_offscreen(width: int, height: int) -> Any:
-    """Create an offscreen buffer of 32-bit floats: in the bright core of a flare, a sum of half floats loses the light
-    of faint Gaussians to rounding. Needs a GPU context."""
+    """Create an offscreen buffer (width, height), pixels, of 32-bit floats. Needs a GPU context.
+
+    Half floats would lose faint Gaussians to rounding in the bright core of a flare.
+    """
     import gpu
 
     return gpu.types.GPUOffScreen(width, height, format="RGBA32F")
 
 
-class ViewBuffers:
-    """The offscreen buffers of a view, one for each level that it needed."""
+class CanvasBuffers:
+    """The offscreen buffers of a canvas, one for each level that it needed."""
 
     def __init__(self) -> None:
         self._offscreens: dict[int, tuple[tuple[int, int], Any]] = {}
@@ -87,23 +90,23 @@ class ViewBuffers:
         self._offscreens.clear()
 
 
-class BuffersByView:
-    """The buffers of the views that were drawn last."""
+class BuffersByCanvas:
+    """The buffers of the canvases that were drawn last."""
 
     def __init__(self) -> None:
-        self._views: OrderedDict[View, ViewBuffers] = OrderedDict()
+        self._canvases: OrderedDict[Canvas, CanvasBuffers] = OrderedDict()
 
-    def of(self, view: View) -> ViewBuffers:
-        """Return the buffers of a view; those of the view that was not drawn for longest are freed."""
-        buffers = self._views.setdefault(view, ViewBuffers())
-        self._views.move_to_end(view)
-        while len(self._views) > MAX_VIEWS:
-            self._views.popitem(last=False)[1].free()
+    def of(self, canvas: Canvas) -> CanvasBuffers:
+        """Return the buffers of a canvas. With too many canvases, those of the one drawn longest ago are freed."""
+        buffers = self._canvases.setdefault(canvas, CanvasBuffers())
+        self._canvases.move_to_end(canvas)
+        while len(self._canvases) > MAX_CANVASES:
+            self._canvases.popitem(last=False)[1].free()
         return buffers
 
-    def free(self, view: View | None = None) -> None:
-        """Free the buffers of a view; None for those of all views."""
-        for name in list(self._views) if view is None else [view]:
-            buffers = self._views.pop(name, None)
+    def free(self, canvas: Canvas | None = None) -> None:
+        """Free the buffers of a canvas; None for those of all canvases."""
+        for key in list(self._canvases) if canvas is None else [canvas]:
+            buffers = self._canvases.pop(key, None)
             if buffers is not None:
                 buffers.free()

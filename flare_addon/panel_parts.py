@@ -81,7 +81,8 @@ def draw_footage_note(layout: Any, scene: Any, footage: Sequence[Any]) -> None:
     for image in {background.image: None for background in footage if background.source == "IMAGE"}:
         layout.prop(image, "use_view_as_render", text=f"View as Render: {image.name}", toggle=True)
     if any(background.source != "IMAGE" for background in footage):
-        label_lines(layout, "A movie clip always does: show its frames as an image instead.", "INFO")
+        label_lines(layout, "A movie clip always bypasses the view transform; load its frames as an image sequence "
+                            "instead.", "INFO")
 
 
 def draw_bake_buttons(row: Any, state: Any) -> None:

@@ -443,8 +443,8 @@ class FITFLARE_PT_transfer(_SidebarPanel, bpy.types.Panel):
         column.operator("fit_flare.shot_from_picture", icon="IMAGE_DATA")
         column.operator("fit_flare.pick_light", icon="EYEDROPPER")
         if state.flare and not state.native and any(item.target for item in state.lights):
-            label_lines(layout, "This flare was not learned from footage of this scene: its look is that of one view "
-                                "and does not follow the camera.", "INFO")
+            label_lines(layout, "This flare was not learned from footage of this scene: its appearance is that of one "
+                                "training view and does not follow the camera.", "INFO")
 
 
 class FITFLARE_PT_library(_SidebarPanel, bpy.types.Panel):

@@ -132,7 +132,7 @@ class Edits:
     solo: BoolProperty(  # type: ignore[valid-type]
         name="Solo", description="Show only this flare or element, and others that are solo", default=False,
         update=redraw_viewports)
-    chosen: StringProperty()  # type: ignore[valid-type]  # sliders that the artist has moved; no other look moves them
+    moved_sliders: StringProperty()  # type: ignore[valid-type]  # names; another look does not set these sliders
 
 
 EDIT_NAMES = tuple(entry.name for entry in dataclasses.fields(Edit))
@@ -161,7 +161,8 @@ class FITFLARE_PG_element(Edits, bpy.types.PropertyGroup):
     """The sliders of one element; `name` is the name of the element in the .flare."""
 
     kind: StringProperty()  # type: ignore[valid-type]
-    is_absent: BoolProperty()  # type: ignore[valid-type]  # from the current look; it waits, hidden, for a look that has it
+    # Whether the current look lacks it; the list hides it until a look has it again.
+    is_absent: BoolProperty()  # type: ignore[valid-type]
 
 
 class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
@@ -172,7 +173,8 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
 
     source: StringProperty(  # type: ignore[valid-type]
         name="Look", description="The light of the .flare that this flare looks like", update=redraw_viewports)
-    first_source: StringProperty()  # type: ignore[valid-type]  # its light in the first look; preferred in later looks
+    # The light of the first look; later looks prefer a light of this name.
+    first_source: StringProperty()  # type: ignore[valid-type]
     target: PointerProperty(  # type: ignore[valid-type]
         name="Light", description="The light object of this flare; the flare follows it",
         type=bpy.types.Object, update=_update_target)
@@ -285,8 +287,10 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         name="Layers", description="Folder for the EXR layers", subtype="DIR_PATH",
         options=PATH_OPTIONS)
     bake_range: EnumProperty(  # type: ignore[valid-type]
-        name="Frames", description="Which frames are baked; ranges follow the scene's Frame Step",
-        items=(("scene", "Scene Range", "All frames of the scene"), ("current", "Current", "The current frame alone"),
+        name="Frames", description="Which frames are baked. Scene Range and Custom bake one frame per Step of Output > "
+        "Frame Range",
+        items=(("scene", "Scene Range", "The frames of the scene's range"),
+               ("current", "Current", "The current frame alone"),
                ("custom", "Custom", "From a first to a last frame")))
     bake_first: IntProperty(name="First", description="First frame to bake", default=1)  # type: ignore[valid-type]
     bake_last: IntProperty(name="Last", description="Last frame to bake", default=1)  # type: ignore[valid-type]
@@ -302,8 +306,8 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     over: EnumProperty(  # type: ignore[valid-type]
         name="Over", description="The picture that the compositor adds the flare to",
         items=(("present", "Render", "The render, or the output of your own nodes in the compositor"),
-               ("plate", "Footage", "The frames behind the camera and, where the film is transparent, the objects of "
-                "the scene before them"),
+               ("plate", "Footage", "The frames behind the camera. If the film is transparent, the objects of the "
+                "scene are in front of them"),
                ("scene", "Baked Scene", "The fitted scene in the layers")))
 
 

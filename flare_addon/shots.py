@@ -33,7 +33,7 @@ LIVE_FILE = "live.json"  # the lights whose intensity and tint the compositor ap
 
 
 def frames_to_bake(scene: Any) -> list[int]:
-    """Return the frames to bake, as set in the panel. A range has every frame that the scene's Frame Step reaches."""
+    """Return the frames to bake, as set in the panel; Scene Range and Custom in steps of the scene's Step."""
     state = scene.fit_flare
     if state.bake_range == "current":
         return [scene.frame_current]

@@ -27,7 +27,7 @@ HIDDEN = ("show_floor", "show_axis_x", "show_axis_y", "show_axis_z", "show_ortho
 
 
 PICTURE_FORMATS = {"OPEN_EXR_MULTILAYER": "OPEN_EXR"}
-"""The formats of pictures in place of those that a single picture cannot have. PNG replaces every format of videos."""
+"""Output formats that a single picture cannot have, and their replacements. PNG replaces all video formats."""
 
 
 def check_scene(scene: Any) -> None:
@@ -44,7 +44,8 @@ def picture_format(scene: Any) -> str:
 
 @contextlib.contextmanager
 def _picture_output(scene: Any) -> Iterator[None]:
-    """Give the scene's output the format and path of pictures, if it is a video or has layers."""
+    """Set the output to a format and path of single pictures, if its format is a video or multilayer; restore both at
+    the end."""
     render, settings = scene.render, scene.render.image_settings
     file_format = picture_format(scene)
     if file_format == settings.file_format:

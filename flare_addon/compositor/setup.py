@@ -49,8 +49,8 @@ CROP = "Fit Flare Crop"
 _OUR_NODES = (GROUP, LAYERS, PLATE, SIZE, OBJECTS, VIEWER, RENDER)
 _ENDS = (trees.OUTPUT_TYPE, "NodeGroupInput", "CompositorNodeViewer")
 """Nodes of a tree without a picture of its own."""
-ARTISTS_COMPOSITOR = ("The scene has a compositor of its own: renders show the footage when layers are set up over "
-                      "Footage.")
+ARTISTS_COMPOSITOR = ("The compositor has nodes of your own, so renders do not show the footage. Bake layers, choose "
+                      "Footage under Over in the panel Bake, and press Set Up Compositor.")
 STATE_PROPERTY = "fit_flare_compositor"  # of the scene: the state before the set-up
 _IMAGE_NODE_SETTINGS = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
 
@@ -111,18 +111,18 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
         scene_picture = _footage_node(tree, plate).outputs["Image"]
     else:
         scene_picture = None if keep_image else sockets["scene"]
-    _insert_node(scene, tree, node, scene_picture, objects=plate is not None and scene.render.film_transparent)
+    _insert_node(scene, tree, node, scene_picture, with_objects=plate is not None and scene.render.film_transparent)
     _add_viewer(tree, node)
     _remove_unused(outdated, {})
     return node
 
 
-def _insert_node(scene: Any, tree: Any, node: Any, scene_picture: Any, objects: bool) -> None:
+def _insert_node(scene: Any, tree: Any, node: Any, scene_picture: Any, with_objects: bool) -> None:
     """Connect our node between the picture under the flare and the output of the compositor.
 
     scene_picture: output socket of the picture; None for the artist's, which feeds the output now, or the render. The
-    artist's picture is stored in the scene: `remove_nodes` connects the output to it again. objects: the render lies
-    over `scene_picture`, unless nodes of the artist make a picture of it.
+    artist's picture is stored in the scene: `remove_nodes` connects the output to it again. with_objects: whether to
+    composite the render over `scene_picture`; this is skipped if nodes of the artist process the render.
     """
     end = _final_input(tree)
     final_picture = trees.feeding_socket(end)
@@ -133,8 +133,9 @@ def _insert_node(scene: Any, tree: Any, node: Any, scene_picture: Any, objects: 
         artists_picture = _image_under_flare(tree, node, scene[STATE_PROPERTY])
     if artists_picture is not None:
         scene[STATE_PROPERTY].update({"from": artists_picture.node.name, "socket": artists_picture.identifier})
-    objects = objects and (artists_picture is None or artists_picture.node.bl_idname == "CompositorNodeRLayers")
-    _connect_scene_picture(tree, node, scene_picture or artists_picture or _render_picture(tree), objects)
+    with_objects = with_objects and (
+        artists_picture is None or artists_picture.node.bl_idname == "CompositorNodeRLayers")
+    _connect_scene_picture(tree, node, scene_picture or artists_picture or _render_picture(tree), with_objects)
     if not is_set_up or end.links[0].from_node == node:  # else the artist has nodes between ours and the output
         tree.links.new(node.outputs["Image"], end)
 
@@ -171,29 +172,29 @@ def _crop_overscan(tree: Any, window: DataWindow, sockets: dict[str, Any]) -> di
             for row, (name, socket) in enumerate(sockets.items())}
 
 
-def _connect_scene_picture(tree: Any, node: Any, socket: Any, objects: bool) -> None:
+def _connect_scene_picture(tree: Any, node: Any, socket: Any, with_objects: bool) -> None:
     """Connect the picture under the flare, an output socket, to our node.
 
-    Pictures of files are scaled to the size of the render, which the render itself has. objects: the render, whose film
-    is transparent, lies over the picture.
+    Pictures of files are scaled to the size of the render, which the render itself has. with_objects: whether to
+    composite the render, whose film is transparent, over such a picture.
     """
     for name in (SIZE, OBJECTS):
         if (previous := tree.nodes.get(name)) is not None:
             tree.nodes.remove(previous)
     if socket is not None and (
             socket.node.name in (LAYERS, PLATE) or _is_crop(socket.node) or is_view_node(socket.node)):
-        socket = _picture_at_size(tree, socket, objects)
+        socket = _picture_at_size(tree, socket, with_objects)
     tree.links.new(socket, node.inputs["Scene"])
     render = tree.nodes.get(RENDER)
     if render is not None and not any(output.is_linked for output in render.outputs):
-        tree.nodes.remove(render)  # Blender renders for it even if nothing uses it
+        tree.nodes.remove(render)  # Blender renders the scene for this node even if nothing uses its output
 
 
-def _picture_at_size(tree: Any, socket: Any, objects: bool) -> Any:
-    """Add nodes that scale a picture of a file to the size of the render and, with `objects`, put the render over it;
-    return their output socket. socket: output socket of the picture."""
+def _picture_at_size(tree: Any, socket: Any, with_objects: bool) -> Any:
+    """Add nodes that scale a picture of a file to the size of the render and, with `with_objects`, put the render over
+    it; return their output socket. socket: output socket of the picture."""
     picture = set_name(scale_to_render_size(tree, socket, -3, 1), SIZE).outputs[0]
-    if objects:
+    if with_objects:
         picture = set_name(over(tree, picture, _render_picture(tree), -2.5, 2), OBJECTS).outputs[0]
     return picture
 
@@ -249,8 +250,8 @@ def footage_behind_camera(scene: Any) -> tuple[Any, int, int, int]:
 def show_plate(scene: Any) -> bool:
     """Make renders show the footage behind the scene's camera, until layers are set up over it.
 
-    If the film is transparent, the render lies over the footage. Returns whether it was done: nodes of the artist and a
-    flare over another picture stay as they are. Raises FrameError without footage.
+    If the film is transparent, the render lies over the footage. Returns whether the tree was set up. Nodes of the
+    artist, and a flare over another picture, stay as they are. Raises FrameError without footage.
     """
     plate = footage_behind_camera(scene)
     tree, state = tree_of(scene), _scene_state(scene)
@@ -480,7 +481,7 @@ def _final_input(tree: Any, add: bool = True) -> Any:
 
 
 def is_over_render(scene: Any) -> bool:
-    """Return whether the flare goes over the render of the scene alone."""
+    """Return whether the flare lies over the render, without footage under it."""
     node = find_node(scene)
     if node is None or OBJECTS in tree_of(scene).nodes:
         return False

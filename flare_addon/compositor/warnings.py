@@ -66,13 +66,13 @@ def footage_note(scene: Any) -> str:
         return ("The film is opaque, so the world hides the footage in renders; switch Transparent on in the render "
                 "properties, under Film.")
     if scene.fit_flare.over == "plate" and not is_transparent:
-        return ("Renders over footage have no objects of the scene; for these, switch Transparent on in the render "
-                "properties, under Film, before the compositor is set up.")
+        return ("The film is opaque, so renders over footage show no objects of the scene. To show them, switch "
+                "Transparent on in the render properties, under Film, then set the compositor up.")
     for node in setup.footage_nodes(scene):
         with contextlib.suppress(FrameError):
             if setup.footage_behind_camera(scene)[0] != node.image:
-                return ("Renders show the footage of another camera; bake, or set the compositor up again, for this "
-                        "one.")
+                return ("Renders show the footage of another camera. To show that of the scene's camera, bake, or "
+                        "press Set Up Compositor again.")
     return ""
 
 

@@ -73,8 +73,8 @@ class FITFLARE_OT_add_library_flare(GuardedOperator, bpy.types.Operator):
         looks.show_look(scene, Path(path), targets, add=True)
         if is_first:
             _remove_unplaced(scene)
-        if again := sorted(item.name for item in targets if item in targets_before):
-            self.report({"INFO"}, f"{', '.join(again)}: a flare is there already, and none was added")
+        if already_placed := sorted(item.name for item in targets if item in targets_before):
+            self.report({"INFO"}, f"{', '.join(already_placed)}: already has a flare, so none was added")
         scene.fit_flare.show = True
         lamp_drive.report_dark(self, scene)
         look_through_camera(context)

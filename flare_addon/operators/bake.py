@@ -226,7 +226,7 @@ class _JobReports:
 
 
 def _set_up_compositor_after_bake(job: jobs.Job, scene: Any) -> Steps[None] | None:
-    """Return the steps that set the compositor of a scene up for new layers; None where the panel does not say so.
+    """Return the steps that set the compositor of a scene up for new layers; None if Composite Too is off.
 
     A compositor that is set up already stays as it is, unless the bake was started to set it up again.
     """

@@ -17,9 +17,9 @@ from ..reports import NO_CAMERA, GuardedOperator, report_errors
 from ..views import look_through_camera
 
 STEP_S = 0.02
-"""Time for which an import holds the window in one go; a step that takes longer is not interrupted."""
+"""Seconds for which an import may block the window at a time; a longer step is not interrupted."""
 INTERVAL_S = 0.005
-"""Pause of the import between two such times."""
+"""Seconds between two such turns."""
 
 
 class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
@@ -46,13 +46,13 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
     scale: bpy.props.FloatProperty(  # type: ignore[valid-type]
         name="Scale", description="Scene units per unit of the capture", default=1.0, min=1e-6, soft_max=100.0)
     frames: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Frames", description="Show the frames as background images of the cameras, and in renders if the scene "
-        "has no compositor", default=True)
+        name="Frames", description="Show the frames as background images of the cameras, in renders too, if the "
+        "compositor has no nodes of your own", default=True)
     points: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Points", description="Import the point cloud as a mesh with colours", default=True)
     match_scene: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Match Scene", description="Set size, frame range and view transform of the scene to those of the frames, "
-        "and make its film transparent", default=True)
+        name="Match Scene", description="Set size, frame range and view transform of the scene to those of the frames. "
+        "With Frames, also make the film of the scene transparent", default=True)
 
     _in_steps = False
     """Whether a person called the operator, who sees the window; a script waits for the end."""

@@ -71,8 +71,8 @@ class FITFLARE_OT_add_flare(GuardedOperator, bpy.types.Operator):
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
-        """Add the flares; name the objects that have a flare of this look already, which get no second one, and the
-        cameras, which get none."""
+        """Add the flares; name the objects that already have a flare from this light of the .flare, which get no second
+        one, and the cameras, which get none."""
         scene, look = context.scene, looks.look_of(context.scene)
         source, skipped, cameras = self.source or look.names[0], list[str](), list[str]()
         placed = {(item.target, item.source) for item in scene.fit_flare.lights}
@@ -86,8 +86,9 @@ class FITFLARE_OT_add_flare(GuardedOperator, bpy.types.Operator):
         if cameras:
             self.report({"WARNING"}, f"{', '.join(sorted(cameras))}: a camera gets no flare")
         if skipped:
-            others = ". Adjust Last Operation offers the other looks of the .flare" if len(look.names) > 1 else ""
-            self.report({"WARNING"}, f"{', '.join(sorted(skipped))}: the flare of {source} is there already{others}")
+            others = ". Adjust Last Operation offers the other lights of the .flare" if len(look.names) > 1 else ""
+            names = ", ".join(sorted(skipped))
+            self.report({"WARNING"}, f"{names}: already has a flare from the light {source}{others}")
         lamp_drive.report_dark(self, context.scene)
 
 
@@ -147,7 +148,7 @@ class FITFLARE_OT_reset_look(bpy.types.Operator):
         """Reset the sliders of all flares together, of each flare and of each element."""
         state = context.scene.fit_flare
         for sliders in (state.master, *state.lights, *(part for item in state.lights for part in item.elements)):
-            for name in (*EDIT_NAMES, "chosen"):
+            for name in (*EDIT_NAMES, "moved_sliders"):
                 sliders.property_unset(name)
         return {"FINISHED"}
 
@@ -185,12 +186,13 @@ class FITFLARE_UL_elements(bpy.types.UIList):
         """Return the flags that show or hide each item, and their order, for Blender's list."""
         elements, helpers = getattr(data, property_name), bpy.types.UI_UL_list
         # Without this flag (before Blender 4.4), Blender itself inverts the filter.
-        never = getattr(self, "bitflag_item_never_show", 0)
+        hide_flag = getattr(self, "bitflag_item_never_show", 0)
         flags = helpers.filter_items_by_name(self.filter_name, self.bitflag_filter_item, elements, "name",
-                                             reverse=bool(never and self.use_filter_invert))
+                                             reverse=bool(hide_flag and self.use_filter_invert))
         flags = flags or [self.bitflag_filter_item] * len(elements)
         order = helpers.sort_items_by_name(elements, "name") if self.use_filter_sort_alpha else []
-        return [never if element.is_absent else flag for element, flag in zip(elements, flags, strict=True)], order
+        return [hide_flag if element.is_absent else flag
+                for element, flag in zip(elements, flags, strict=True)], order
 
     def draw_item(self, _context: Any, layout: Any, _data: Any, item: Any, _icon: Any, _active: Any, _property: Any,
                   _index: int = 0) -> None:

@@ -43,7 +43,7 @@ def test_an_exception_for_one_job_does_not_stop_the_polling_of_others(facts: Any
     again, state, error, is_traced, other = facts["ends badly"]
     assert again and other == "running"
     assert state == "done"
-    assert error.endswith("ends badly cannot be shown (pop from empty list); report it with what the console says.")
+    assert error.endswith("ends badly (pop from empty list); report it with the text in the console.")
     assert is_traced
 
 

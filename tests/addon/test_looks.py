@@ -51,12 +51,12 @@ def test_a_selected_light_gets_a_flare_once(facts: Any) -> None:
     """Block of looks.py: "flares from selected"."""
     assert facts["pressed once"] == [
         ["Camera: a camera gets no flare",
-         "Lamp 1: the flare of sun is there already. Adjust Last Operation offers the other looks of the .flare"],
+         "Lamp 1: already has a flare from the light sun. Adjust Last Operation offers the other lights of the .flare"],
         [["Lamp 2", "sun", "Lamp 2"]]]
     reported, added = facts["pressed twice"]
     assert added == 1 and "Lamp 1, Lamp 2" in reported[-1]
     assert facts["another of its looks"] == [["FINISHED"], ["Lamp 1", "moon", "Lamp 1"]]
-    assert facts["added again"] == [["Lamp 1, Lamp 2: a flare is there already, and none was added"], 2]
+    assert facts["added again"] == [["Lamp 1, Lamp 2: already has a flare, so none was added"], 2]
 
 
 def test_saving_names_what_the_library_does_not_store(facts: Any) -> None:
@@ -65,14 +65,15 @@ def test_saving_names_what_the_library_does_not_store(facts: Any) -> None:
     assert facts["one of two"] == ["One of Two is in the library, with the sliders of the panel Look as they are now. "
                                    "Not stored: the sliders of Lamp 2"]
     (text,) = facts["with switches"]
-    assert text.endswith("Not stored: the sliders of Lamp 2, keys and drivers, switches, Extent and Light Size of "
-                         "Lamp 1, Lamp 2")
+    assert text.endswith("Not stored: the sliders of Lamp 2, keys and drivers, the Follow switches, Extent and Light "
+                         "Size of Lamp 1, Lamp 2")
 
 
 def test_a_look_that_has_left_the_library_is_not_replaced_silently(facts: Any) -> None:
     """Block of looks.py: "files of the library change"."""
     is_chosen, refused, shown = facts["renamed while shown"]
-    assert is_chosen and refused == "Muted is not in the library any more; choose another look." and shown == "Muted"
+    assert is_chosen and shown == "Muted"
+    assert refused == "Muted was deleted from the library or renamed; choose another look."
     assert facts["chosen after"] == ["", True]
     assert facts["of the file"] == [True, 0.5]
     assert "is missing" in facts["deleted"] or "does not exist" in facts["deleted"] or "not found" in facts["deleted"]

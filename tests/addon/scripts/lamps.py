@@ -405,13 +405,13 @@ facts["in turns"] = {"two regions": renderings(*[(1, ""), (2, "")] * 3),
                      "two eyes": renderings(*[(3, "left"), (3, "right")] * 3)}
 buffers, freed = part("flare_addon.overlay_buffers"), []
 buffers.create_offscreen = lambda *key: SimpleNamespace(key=key, free=lambda: freed.append(key))
-by_view = buffers.BuffersByView()
-sizes = [by_view.of((number, "")).offscreen(4, 101, 50).key for number in (1, 1, 2, 3, 4, 1, 5)]
+by_canvas = buffers.BuffersByCanvas()
+sizes = [by_canvas.of((number, "")).offscreen(4, 101, 50).key for number in (1, 1, 2, 3, 4, 1, 5)]
 facts["buffers"] = {"sizes": list(map(list, set(sizes))), "freed": len(freed)}
-kept = [number for number in range(1, 6) if (number, "") in by_view._views]
-by_view.of((1, "")).offscreen(4, 99, 50)
+kept = [number for number in range(1, 6) if (number, "") in by_canvas._canvases]
+by_canvas.of((1, "")).offscreen(4, 99, 50)
 facts["buffers"] |= {"kept": kept, "another size": len(freed)}
-by_view.free()
+by_canvas.free()
 facts["buffers"]["all"] = len(freed)
 
 # ---- the part of a region that the sum is drawn in ------------------------------------------------------

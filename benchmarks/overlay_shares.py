@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The parts of one redraw of the camera view: network, other evaluation, quads, upload, drawing by level, sum pass.
+"""The parts of one redraw of the camera view: deformation network, rest of the evaluation, quads, upload, drawing by
+level, sum pass.
 
     python benchmarks/blender.py --shares [--against TREE] [--rounds N] [--no-gpu]
     blender -b --python benchmarks/blender.py -- --shares …     from Blender 5.2 on: the parts on the GPU too
@@ -114,7 +115,7 @@ def measure_tree(tree: Path, flare: Path, count: int, has_gpu: bool) -> Times:
     bpy.context.view_layer.update()
     core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
     window = overlay.drawn_region(overlay.CameraFrame(0, 0, *SIZE), SIZE, core)
-    watch.wrap(network.Network, "_concatenated_offsets", "network")
+    watch.wrap(network.Network, "_concatenated_offsets", "deformation network")
     watch.wrap(looks, "place_lights", "places of the lights")
     watch.wrap(overlay, "quads_by_level", "quads")
     if has_gpu:
@@ -159,7 +160,7 @@ def _redraw(scene: Any, camera: Any, window: Any, modules: tuple[Any, Any], watc
     import bpy
 
     looks, overlay = modules
-    with watch.part("other evaluation"):
+    with watch.part("rest of the evaluation"):
         flares = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), camera)
         gaussians = overlay.concatenate(list(flares.values()))
     look = looks.look_of(scene)
@@ -204,7 +205,7 @@ def measure(words: Sequence[str]) -> None:
     parser.add_argument("--redraws", type=int, default=8, help="redraws of a tree in a round")
     parser.add_argument("--no-gpu", action="store_true", help="measure the parts in numpy alone")
     options = parser.parse_args(words)
-    trees = {} if options.against is None else {"reference": options.against.resolve()}
+    trees = {} if options.against is None else {"earlier tree": options.against.resolve()}
     trees["this tree"] = ROOT
     columns: dict[str, Times] = {}
     has_gpu = not options.no_gpu and has_gpu_context()

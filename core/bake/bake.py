@@ -341,7 +341,7 @@ def read_manifest(out: Path | str) -> dict[str, Any]:
 
 
 def read_manifest_in_steps(out: Path | str) -> Steps[dict[str, Any]]:
-    """Read bake.json as `read_manifest` does, some frames a step. Raises RunError."""
+    """Read bake.json as `read_manifest` does, in steps of FRAMES_PER_STEP frames. Raises RunError."""
     path = Path(out) / MANIFEST
     manifest: dict[str, Any] = read_json(path, RunError)
     try:

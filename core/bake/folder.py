@@ -39,7 +39,7 @@ class LayerFolder:
 
     @classmethod
     def open_in_steps(cls, folder: Path | str) -> Steps[LayerFolder]:
-        """Open a folder as `open` does, some frames a step. Raises FrameError."""
+        """Open a folder as `open` does, in steps of FRAMES_PER_STEP frames. Raises FrameError."""
         folder = Path(folder).resolve()
         files = _find_sequence(folder)
         layers: dict[Path, frozenset[str]] = {}

@@ -38,7 +38,7 @@ MIN_CERTAINTY = 1e-3
 FLARE_ERROR, OUTSIDE_ERROR, PRIOR_ERROR = 0.1, 2.0, 0.25
 """Standard deviations of a brightness by the flare, at the least, of one by the flare of a light outside the frame, and
 of one in the lights' file: a plate that holds part of the flare biases the first, the second has only ghosts, and
-clipping and glare bias the third."""
+clipping and glow bias the third."""
 EDGE_SHARE = 0.03
 """Distance from the frame's edge, as a share of its width, within which a light counts as outside for its brightness:
 its core may be cut off."""

@@ -30,7 +30,7 @@ SHEETS, REPORT = "lights", "report.json"
 MAX_POINT_DISTANCE = 0.05
 """Distance from a detection, diagonals, up to which points give the depth of a light in a single view."""
 CLIPPED_VIEWS = 6
-"""Number of views with a large clipped area from which a light in it is searched."""
+"""Fewest views with a large clipped area for a search for a light in these areas."""
 MAX_STATIC_DISTANCE = 0.006
 """Median distance of a light from the projections of one place, diagonals, below which it is static."""
 
@@ -242,10 +242,10 @@ def _lights_from_one_view(capture: Capture, detections: Sequence[Detection]) -> 
 
 def _find_by_ghosts(capture: Capture, lights: Sequence[FoundLight], brightness_maps: Mapping[str, Mask],
                     progress: Progress, seed: int, messages: list[str]) -> list[FoundLight]:
-    """Return a light that no frame shows as such, from its ghosts, and append a sentence about it to `messages`.
+    """Return at most one light found by its ghosts, and append a sentence about it to `messages`.
 
-    Such a light stands in a clipped area that is too large for a light, as the sun in a bright sky, or, where no light
-    is known, out of frame. lights: those that are known. brightness_maps: by the view's name (`brightness_map`).
+    Such a light is in a clipped area larger than a light's disc (a sun in a bright sky); if no other light was found,
+    it may also be out of frame. lights: those found before. brightness_maps: by the view's name (`brightness_map`).
     """
     views = [(view.name, view.camera) for view in capture.views]
     areas = [clipped_area(brightness_maps[name], camera, lights) for name, camera in views]

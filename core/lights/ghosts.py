@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds a light whose own place no frame shows, from its ghosts: one out of frame, or a sun in a clipped sky.
+"""Finds a light from its ghosts if no frame shows where it is: out of frame, or a sun in a clipped sky.
 
 A ghost lies on the line through the principal point p and the light's projection l, and to first order at a fixed ratio
 mu of the way (paraxial optics: Lee and Eisemann 2013): g - p = mu (l - p). So a blob at g claims a light at p + (g - p)
 / mu, and where mu is right the claims of all views meet in one place. Values of mu are tried, and the claims
 triangulated like detections.
 
-Only ghosts on the far side of the principal point (mu < 0) are used: as the camera turns, they move against the scene.
-Where the camera hardly moves, blobs of the scene may agree on a light too. So the blobs of a light are triangulated as
-things of the scene as well: they are no ghosts if one place in the scene explains most of them.
+Only ghosts on the far side of the principal point (mu < 0) are used: when the camera turns, they move in the opposite
+direction to the scene. If the camera hardly moves, blobs of the scene may also agree on a light. Therefore the blobs
+of each candidate are also triangulated as points of the scene. If one point explains most of them, they are no ghosts.
 """
 from __future__ import annotations
 
@@ -51,12 +51,13 @@ MIN_CLIPPED_SHARE = 0.12
 """Lowest share of the views that must agree on a light in a clipped area: in the others its ghost may be hidden by the
 clipped area, or lie out of the frame."""
 MIN_CLIPPED_VIEWS = 4
-"""Number of these views whose frame must have the light in the clipped area; the others may have it out of frame."""
+"""Fewest views that agree on a light and have it inside their clipped area; in the others that agree, it may be out of
+frame."""
 MIN_CENTRE_DISTANCE = 0.06
-"""Smallest distance of a light in a clipped area from the principal point, diagonals: nearer by, all ghosts lie on the
-light."""
+"""Smallest distance of a light in a clipped area from the principal point, diagonals. At smaller distances all ghosts
+lie on the light."""
 MAX_SCENE_SHARE = 0.5
-"""Share of the blobs of a light that one place in the scene may explain."""
+"""Share of the blobs of a light that one point of the scene may explain."""
 BLOB_TOLERANCE = 0.01
 """Tolerance of a blob's place, diagonals."""
 
@@ -196,7 +197,7 @@ class _Search:
         return bool(area[min(row, area.shape[0] - 1), min(column, area.shape[1] - 1)])
 
     def _is_light_of_ghosts(self, light: FoundLight, ratio: float) -> bool:
-        """Return whether the blobs that claim a light at a ratio are neither dirt on the lens nor things of the scene,
+        """Return whether the blobs that claim a light at a ratio are neither dirt on the lens nor objects of the scene,
         and the light is out of frame where it has to be."""
         cameras = dict(self.views)
         centres = {name: np.array([cameras[name].cx, cameras[name].cy]) for name, _ in light.detections}
@@ -216,7 +217,10 @@ class _Search:
         return self._scene_support(ghosts) < MAX_SCENE_SHARE * len(ghosts)
 
     def _scene_support(self, pixels: Mapping[str, Floats]) -> int:
-        """Return the number of places (2,) in views, by the view's name, that one place in the scene explains best."""
+        """Return how many of the places one point of the scene explains, for the point that explains most.
+
+        pixels: a place (2,) in each view, by the view's name.
+        """
         views = [(name, camera) for name, camera in self.views if name in pixels]
         detections = [[_claim(pixels[name], 2 * BLOB_TOLERANCE * float(np.hypot(*camera.size)))]
                       for name, camera in views]

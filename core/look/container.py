@@ -56,7 +56,7 @@ def _parse_tensors(data: bytes) -> tuple[Arrays, dict[str, str]]:
         count = math.prod(shape)
         if min([0, *shape]) < 0 or not 0 <= begin <= end <= len(body) or end - begin != count * dtype.itemsize:
             raise ValueError(f"the tensor {name} does not fit the file")
-        # numpy is slow where numbers are not aligned, as after a header of any length.
+        # numpy is slow with unaligned numbers, and a header of arbitrary length may leave tensors unaligned.
         arrays[name] = np.require(np.frombuffer(body[begin:end], dtype).reshape(shape), requirements="A")
     return arrays, {str(key): str(value) for key, value in metadata.items()}
 

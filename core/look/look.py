@@ -267,7 +267,7 @@ class Look:
         edits: by the names of the placed lights; lights that mute and solo turn off are omitted.
         query: the view at which the network is evaluated: "target" the view itself; "trained" camera and light, clipped
         to the range of the training views; "source" the middle of the range of cameras, and the clipped light.
-        Placement always follows the view. budget: bounds the time for the network in an interactive drawing; lights
+        Placement always follows the view. budget: bounds the time for the network in an interactive redraw; lights
         with an extent are exact in any case. None for exact flares.
         """
         flares: dict[str, PlaneGaussians] = {}

@@ -55,10 +55,10 @@ _uses_blas = has_optimised_blas(vars(np)["__config__"])
 
 
 def multiply(weights: Floats, columns: Floats, out: Floats | None = None) -> Floats:
-    """Return the product of weights (k, c) and columns (c, n). out: where to write it.
+    """Return the product (k, n) of weights (k, c) and columns (c, n). out: where to write it.
 
-    Without an optimised BLAS numpy's matmul is slow. Its einsum needs none and is several times faster, if the
-    columns, which are many, lie side by side in memory.
+    Without an optimised BLAS numpy's matmul is slow. Its einsum is several times faster there, provided that each row
+    of `columns` is contiguous.
     """
     if _uses_blas:
         return np.asarray(np.matmul(weights, columns, out=out))
@@ -121,35 +121,35 @@ _cache = _OffsetsCache(MAX_CACHE_BYTES)
 
 
 class OffsetsBudget:
-    """Bounds the time that drawings of many lights spend in the network while the camera moves.
+    """Bounds the time that redraws of many lights spend in the network while the camera moves.
 
-    Lights whose features changed get new offsets in turn, those that have waited longest first, as many as the time
-    pays. Time that drawings of a moving view do not spend is kept for the next, so that a light that takes longer than
-    a drawing has is computed in some of the drawings, and the mean holds. The others are drawn with their last offsets,
-    at their exact places. Drawings at rest complete them, one light at least in each. A light that is drawn for the
-    first time is always computed. For one camera.
+    Each redraw computes new offsets for as many lights as its time allows, those that have waited longest first. It
+    draws the others with their last offsets, at their exact places. A redraw of a moving view passes unused time on to
+    the next one. A light that takes longer than the time of one redraw is therefore computed in only some redraws, and
+    the mean time stays within the limit. At rest, each redraw computes at least one light, until all offsets are
+    exact. A light that is drawn for the first time is always computed. For one camera.
     """
 
     def __init__(self, seconds: float, seconds_at_rest: float = 0.0,
                  clock: Callable[[], float] = time.perf_counter) -> None:
-        """Begin without offsets. seconds: for the network in one drawing. seconds_at_rest: the same while view and
-        lights are those of the last two drawings; the larger of both holds then. clock: returns seconds."""
+        """Begin without offsets. seconds: for the network in one redraw. seconds_at_rest: the same while view and
+        lights are those of the last two redraws; the larger of both holds then. clock: returns seconds."""
         self._seconds, self._seconds_at_rest, self._clock = seconds, max(seconds, seconds_at_rest), clock
         self._seconds_per_light = 0.0
-        self._kept_seconds = 0.0  # of earlier drawings
-        self._has_rested = True  # whether the next drawing is the first of a moving view; it has time for a light
+        self._unspent_seconds = 0.0  # of earlier redraws
+        self._was_at_rest = True  # the first redraw of a moving view has time for at least one light
         # Cache key and offsets of each light, by number of its network and its name; the longest waiting first.
         self._offsets: OrderedDict[tuple[int, str], tuple[tuple[int, bytes], Offsets]] = OrderedDict()
-        # Cache key of each light in the drawing since `begin`, and in the one before.
+        # Cache key of each light in the redraw since `begin`, and in the one before.
         self._drawn: dict[tuple[int, str], tuple[int, bytes]] = {}
         self._drawn_before: dict[tuple[int, str], tuple[int, bytes]] = {}
         self._due: set[tuple[int, str]] = set()
-        self._rested = False  # whether the last two drawings had the same view and lights
+        self._rested = False  # whether the last two redraws had the same view and lights
         self.is_complete = True
-        """Whether the drawing since `begin` has exact offsets."""
+        """Whether the redraw since `begin` has exact offsets."""
 
     def begin(self) -> None:
-        """Begin a drawing; forget the lights that the last one did not have."""
+        """Begin a redraw; forget the lights that the last one did not have."""
         for light in [light for light in self._offsets if light not in self._drawn]:
             del self._offsets[light]
         self._rested, self.is_complete = self._drawn == self._drawn_before, True
@@ -157,11 +157,11 @@ class OffsetsBudget:
 
     def get(self, light: tuple[int, str], key: tuple[int, bytes], compute: Callable[[], Offsets]) -> Offsets:
         """Return the offsets of a light: newly computed for `key` (features of the current view) if it is the light's
-        turn or its first drawing, else its last ones.
+        turn or its first redraw, else its last ones.
 
         light: number of its network, and its name. compute: computes the offsets for `key`.
         """
-        if not self._drawn:  # the first light of a drawing: now it is known whether the view rests
+        if not self._drawn:  # the first light of a redraw: now it is known whether the view rests
             self._choose_due(self._rested and self._drawn_before.get(light) == key)
         self._drawn[light] = key
         last_key, last_offsets = self._offsets.get(light, (None, None))
@@ -175,17 +175,17 @@ class OffsetsBudget:
         return last_offsets
 
     def _choose_due(self, is_at_rest: bool) -> None:
-        """Choose the lights that get exact offsets in this drawing: the longest waiting, as many as its time allows."""
+        """Choose the lights that get exact offsets in this redraw: the longest waiting, as many as its time allows."""
         cost = self._seconds_per_light
         if not cost:
             count = len(self._offsets)
         elif is_at_rest:
             count = max(int(self._seconds_at_rest / cost), 1)
         else:
-            seconds = max(self._seconds, cost) if self._has_rested else self._kept_seconds + self._seconds
+            seconds = max(self._seconds, cost) if self._was_at_rest else self._unspent_seconds + self._seconds
             count = int(seconds / cost)
-            self._kept_seconds = seconds - count * cost  # less than a light takes
-        self._has_rested = is_at_rest or not cost
+            self._unspent_seconds = seconds - count * cost  # less than a light takes
+        self._was_at_rest = is_at_rest or not cost
         self._due = set(itertools.islice(self._offsets, count))
 
     def _measure(self, compute: Callable[[], Offsets]) -> Offsets:

@@ -103,7 +103,10 @@ class Shot:
         finish(self.write_in_steps(path))
 
     def write_in_steps(self, path: Path | str) -> Steps[None]:
-        """Write the shot, some frames a step; the file appears, or replaces an earlier one, at the end."""
+        """Write the shot in steps of FRAMES_PER_STEP frames.
+
+        The file appears, or replaces an earlier one, at the end.
+        """
         head = {"version": VERSION, "flare": str(self.flare), "run": str(self.run) if self.run else None,
                 "query": self.query, "live": self.live, "apart": self.own_folder, "frames": []}
         with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as stream:
@@ -122,7 +125,10 @@ class Shot:
 
     @classmethod
     def read_in_steps(cls, path: Path | str) -> Steps[Shot]:
-        """Read a shot as `read` does, some frames a step where `write` wrote the file. Raises SettingsError."""
+        """Read a shot as `read` does, in steps of FRAMES_PER_STEP frames. Raises SettingsError.
+
+        A file that `write` did not write is parsed in one step.
+        """
         data = (yield from _parse_lines(Path(path), lambda entry: entry)) or read_json(path, SettingsError)
         try:
             if data["version"] != VERSION:
@@ -171,10 +177,10 @@ def camera_folders(names: Iterable[str], own_folder: bool) -> dict[str, str]:
 
 
 def read_folders_in_steps(path: Path) -> Steps[tuple[dict[str, str], bool]]:
-    """Read `Shot.folders` and `Shot.own_folder` of a file, some frames a step.
+    """Read `Shot.folders` and `Shot.own_folder` of a file in steps of FRAMES_PER_STEP frames.
 
-    No frame is kept: thousands of new objects would make Python collect garbage, which holds a window for longer than
-    the reading. Raises SettingsError for a missing or invalid file.
+    It stores no frames: thousands of new objects start Python's garbage collector, which blocks a window longer than
+    the reading does. Raises SettingsError for a missing or invalid file.
     """
     data = (yield from _parse_lines(path, _camera_name)) or read_json(path, SettingsError)
     try:
@@ -192,9 +198,9 @@ def _camera_name(entry: Mapping[str, Any]) -> str:
 
 
 def _parse_lines(path: Path, convert: Callable[[Any], Any]) -> Steps[dict[str, Any] | None]:
-    """Parse the lines of a file of `Shot.write`, some a step; return its data, None for a file of other lines.
+    """Parse a file of `Shot.write` line by line, in steps of FRAMES_PER_STEP frames.
 
-    convert: returns what is kept of a frame.
+    Return its data, or None for a file with another layout. convert: returns what to store for a frame.
     """
     try:
         head, *lines = read_text(path, encoding=UTF8_SIG).rstrip("\n").split("\n")

@@ -168,23 +168,24 @@ def with_supervision(capture: Capture, settings: FitSettings, progress: Progress
 
 def skip_absent_flare(args: argparse.Namespace, capture: Capture, settings: FitSettings, progress: Progress, *,
                       is_resumed: bool) -> tuple[Capture, FitSettings]:
-    """Return capture and settings as they are, or, where `remove` has found no flare in the frames, those of a fit that
-    takes the frames for exact clean frames and has one light; this is reported.
+    """Return capture and settings unchanged, or, if `remove` has found no flare in the frames, those of a fit that
+    uses the frames as exact clean frames and has one light; report the latter.
 
     A mode that the user or the resumed run has chosen stays.
     """
     from ...core.removal.jobs.provenance import has_exact_clean_frames, has_unchanged_clean_frames
 
-    is_free = args.mode is None and not is_resumed and settings.mode == "estimated"
-    if not (is_free or settings.mode == "default") or has_exact_clean_frames(capture):
+    may_change_mode = args.mode is None and not is_resumed and settings.mode == "estimated"
+    if not (may_change_mode or settings.mode == "default") or has_exact_clean_frames(capture):
         return capture, settings
     if not has_unchanged_clean_frames(capture):
         return capture, settings
     names = [light.name for light in capture.lights]
-    others = f", and of the {len(names)} lights only {names[0]} has one" if len(names) > 1 else ""
-    progress.say(f"`remove` has found no flare in the frames of {capture.folder}, so the fit takes them for clean "
-                 f"frames: its flare stays dark{others}. --mode split searches for a flare by parallax alone.")
-    if is_free:
+    others = f" Of the {len(names)} lights, the fit uses only {names[0]}." if len(names) > 1 else ""
+    progress.say(f"`remove` has found no flare in the frames of {capture.folder}, so the fit uses them as exact clean "
+                 f"frames, and its flare stays dark.{others} To search for a flare all the same, use --mode estimated "
+                 "or --mode split.")
+    if may_change_mode:
         args.mode = "default"
         settings = fit_settings(args, capture, progress)
     return capture.with_lights(capture.lights[:1]), settings

@@ -405,7 +405,7 @@ class TestSunInClippedSky:
     def test_a_clipped_sky_without_ghosts_is_no_light(self) -> None:
         assert not self.find(0.0).lights
 
-    def test_things_of_the_scene_are_no_ghosts(self) -> None:
+    def test_objects_of_the_scene_are_no_ghosts(self) -> None:
         """From cameras that look forward and hardly move, things opposite to a window agree on a light in it."""
         cameras = [Camera(*SIZE, 300, 300, 160, 120, shifted(x, y)) for x in np.linspace(-0.2, 0.2, 6)
                    for y in (-0.05, 0.05)]

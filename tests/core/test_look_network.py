@@ -97,9 +97,9 @@ def test_a_moving_camera_lets_no_light_wait_for_ever(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("cost", "exact"), [
     (3.0, [1, 0, 0, 1, 0, 0, 1, 0, 0]), (2.5, [1, 0, 0, 1, 0, 1, 0, 0, 1]), (1.0, [1] * 9), (0.1, [1] * 9)])
-def test_a_light_that_takes_longer_than_a_drawing_has_is_computed_in_some(tmp_path: Path, cost: float,
-                                                                          exact: list[int]) -> None:
-    """In a moving view the mean time is that of a drawing."""
+def test_a_light_that_takes_longer_than_the_time_of_a_redraw_is_computed_in_some(tmp_path: Path, cost: float,
+                                                                                 exact: list[int]) -> None:
+    """In a moving view the mean time stays within the limit of one redraw."""
     saved(tmp_path / "a.flare", lights=1)
     look, budget, counts = read_look(tmp_path / "a.flare"), budget_of(1.0, 60.0, cost), []
     poses = [camera.world_to_camera.copy() for camera in cameras(len(exact) + 1)]

@@ -97,7 +97,9 @@ class _BackgroundWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  traceback: TracebackType | None) -> None:
         self._thread.shutdown()
-        if self._unfinished is not None:  # an exception left the loop: the finished files are no one's edits
+        if self._unfinished is not None:
+            # An exception ended the loop. Record the finished files, so that the manifest does not take them for edits
+            # of a person.
             with contextlib.suppress(Exception):
                 self._record(*self._unfinished)
 
@@ -123,13 +125,16 @@ class _BackgroundWriter:
         self._progress.advance()
 
     def _record(self, frame: CleanFrame, writing: Future[None]) -> None:
+        """Wait until the results of a frame are written, then enter them in the manifest. Raises what `writing`
+        raised."""
         writing.result()
         self._manifest.record_results(frame.results)
         self.written += 1
 
     @contextlib.contextmanager
     def errors_of(self, frame: CleanFrame) -> Iterator[None]:
-        """Pass exceptions of the body to `on_error` as exceptions of this frame, after those of the frame before."""
+        """Pass an exception of the body to `on_error` as one of this frame, after the results of the previous frame
+        are finished."""
         try:
             yield
         except Exception as error:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Distinguishes the clean frames in a capture's removed/ that a person made from estimates that `remove` made.
 
-It uses the manifest there, which also shows whether the frames have changed since. It also tells whether the estimates
-differ from the frames at all.
+It uses the manifest there, which also shows whether the frames have changed since. It also checks whether the
+estimates differ from the frames.
 """
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def check_clean_frames_current(capture: Capture) -> None:
 
 
 def has_unchanged_clean_frames(capture: Capture) -> bool:
-    """Return whether the clean frames of a capture are its frames, to the last bit, but for MAX_CHANGED_SHARE of them:
-    then `remove` has found no flare."""
+    """Return whether at most MAX_CHANGED_SHARE of the clean frames of a capture differ from their frames; `remove` has
+    then found no flare."""
     changed = 0
     for view in capture.views:
         frame, clean = read_picture(capture.frame_path(view)), read_picture(capture.clean_frame_path(view))

@@ -176,8 +176,8 @@ def draw_glow(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def draw_veil(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Return veiling glare, (size, size, 3), at most about 1: light over the whole frame, more on the light's side,
-    without any edge. x, y: `canvas_grid`."""
+    """Return a veil, (size, size, 3), at most about 1: light over the whole frame, more on the light's side, without
+    any edge. x, y: `canvas_grid`."""
     distance = np.hypot(x - light[0], y - light[1])
     layer = 1 / (1 + (distance / log_uniform(random, 0.3, 2.5)) ** random.uniform(1, 3)) + random.uniform(0, 0.6)
     return (layer / layer.max())[..., None].astype(np.float32) * _radial_tint(random, distance)

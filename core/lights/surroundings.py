@@ -57,7 +57,8 @@ def clipped_area(bright: NDArray[np.bool_], camera: Camera, lights: Sequence[Fou
         pixels, depth = camera.project(np.stack([light.xyz for light in lights]))
         for pixel in pixels[camera.contains(pixels, depth)]:
             column, row = (pixel / camera.size * bright.shape[::-1]).astype(int)
-            large[labels[row, column]] = False
+            # A camera contains the right and the lower edge of its frame.
+            large[labels[min(row, bright.shape[0] - 1), min(column, bright.shape[1] - 1)]] = False
     return np.asarray(large[labels])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -100,8 +101,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
     capture = with_supervision(capture, settings, progress)
-    if not settings.uses_plates and not settings.scene.frozen:
-        capture, settings = skip_absent_flare(args, capture, settings, progress, is_resumed=is_resumed)
+    capture, settings = without_absent_flare(capture, settings, progress, is_resumed=is_resumed)
     result = fit(capture, settings, out, progress, resume=args.resume, device=args.device)
     progress.say(f"The run is in {result.folder}: look at preview.png there, then run `eval` and `bake`.")
     used = {view.name for part in capture.split(settings.holdout) for view in part}
@@ -166,29 +166,25 @@ def with_supervision(capture: Capture, settings: FitSettings, progress: Progress
     return with_clean_frames(capture, progress, is_flared=settings.uses_plates) if needs_clean_frames else capture
 
 
-def skip_absent_flare(args: argparse.Namespace, capture: Capture, settings: FitSettings, progress: Progress, *,
-                      is_resumed: bool) -> tuple[Capture, FitSettings]:
-    """Return capture and settings unchanged, or, if `remove` has found no flare in the frames, those of a fit that
+def without_absent_flare(capture: Capture, settings: FitSettings, progress: Progress, *,
+                         is_resumed: bool = False) -> tuple[Capture, FitSettings]:
+    """Return capture and settings unchanged, or, if `remove` has found no flare in any frame, those of a fit that
     uses the frames as exact clean frames and has one light; report the latter.
 
-    A mode that the user or the resumed run has chosen stays.
+    capture: with the clean frames that a fit with these settings needs. A resumed run keeps its mode.
     """
     from ...core.removal.jobs.provenance import has_exact_clean_frames, has_unchanged_clean_frames
 
-    may_change_mode = args.mode is None and not is_resumed and settings.mode == "estimated"
-    if not (may_change_mode or settings.mode == "default") or has_exact_clean_frames(capture):
+    modes = ("default",) if is_resumed else ("default", "estimated")
+    if settings.mode not in modes or settings.uses_plates or settings.scene.frozen or has_exact_clean_frames(capture):
         return capture, settings
-    if not has_unchanged_clean_frames(capture):
+    if not has_unchanged_clean_frames(capture, progress):
         return capture, settings
     names = [light.name for light in capture.lights]
     others = f" Of the {len(names)} lights, the fit uses only {names[0]}." if len(names) > 1 else ""
     progress.say(f"`remove` has found no flare in the frames of {capture.folder}, so the fit uses them as exact clean "
-                 f"frames, and its flare stays dark.{others} To search for a flare all the same, use --mode estimated "
-                 "or --mode split.")
-    if may_change_mode:
-        args.mode = "default"
-        settings = fit_settings(args, capture, progress)
-    return capture.with_lights(capture.lights[:1]), settings
+                 f"frames, and its flare stays dark.{others} To search for a flare all the same, use --mode split.")
+    return capture.with_lights(capture.lights[:1]), replace(settings, mode="default")
 
 
 def default_mode(capture: Capture, frozen: bool, progress: Progress) -> Mode:

@@ -115,14 +115,12 @@ def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, pr
     if scene.render.use_multiview:
         progress.say(f"The scene {scene.name!r} renders stereo; this flare is that of its camera, not of its views: "
                      "Bake Layers in Blender makes layers of each view.")
-    # Frames that are named are rendered whatever the scene's step.
-    step = 1 if options.frames or options.job_frames else scene.frame_step
-    all_numbers = range(scene.frame_start, scene.frame_end + 1, step)
+    all_numbers = range(scene.frame_start, scene.frame_end + 1)
     all_frames = [NumberedFrame(view="", number=number, file="") for number in all_numbers]
     selected = {frame.number for frame in select_task_frames(all_frames, options.frames, options.job_frames)}
     # Neighbours too: visibility is smoothed over them (`smooth_visibility`), and a part of the frames must give the
     # result of the whole range.
-    neighbour_offsets = range(-2 * options.smooth * step, 2 * options.smooth * step + 1, step)
+    neighbour_offsets = range(-2 * options.smooth, 2 * options.smooth + 1)
     numbers = [number for number in all_numbers if any(number + offset in selected for offset in neighbour_offsets)]
     if options.query == "source" or options.fall_off == 0 or not selected:
         # The middle frame selects the training view of --query source, and the first one the distance of --fall-off 0.

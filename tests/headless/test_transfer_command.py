@@ -207,17 +207,6 @@ def test_transfer_to_a_blend_whose_objects_hide_the_light(run: Run, made: Path, 
     assert (tmp_path / "part" / "layers.0004.exr").read_bytes() == (out / "layers.0004.exr").read_bytes()
 
 
-@pytest.mark.usefixtures("blend")
-def test_the_frame_step_of_a_blend_counts_where_no_frames_are_named(run: Run, made: Path, tmp_path: Path) -> None:
-    stepped = tmp_path / "stepped.blend"
-    subprocess.run([sys.executable, "-c", BLEND.replace("frame_end = 1, 9", "frame_end, scene.frame_step = 1, 9, 4"),
-                    str(stepped)], check=True, capture_output=True, timeout=120)
-    for name, more in (("all", []), ("named", ["--frames", "2-3"])):
-        run("transfer", made, "--to", stepped, "--out", tmp_path / name, *more)
-    assert [sorted(path.name for path in (tmp_path / name).glob("*.exr")) for name in ("all", "named")] == [
-        [f"layers.{number:04d}.exr" for number in (1, 5, 9)], [f"layers.{number:04d}.exr" for number in (2, 3)]]
-
-
 def test_a_range_of_frames_that_is_no_file_name_gets_one(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
     """Steps have a colon, and a long list is longer than a name may be."""
     names = set()

@@ -19,6 +19,7 @@ from ...colour import ColourSpace
 from ...colour.srgb import Pixels
 from ...errors import SettingsError
 from ...images.plates import Plate
+from ...images.views import split_views
 from ...images.write import MAX_HALF
 from ...system.reading import read_bytes
 from ..model.image_formation import flare_to_linear
@@ -191,6 +192,10 @@ class Remover:
         return FlarePrediction(display, merge_flare(prediction),
                                shot_confidence([(prediction, 1.0)], self.sensitivity.log_odds_bias),
                                prediction.glow_fraction)
+
+    def predict_other_views(self, plate: Plate) -> list[FlarePrediction]:
+        """Predict the flares of the views of a stereo plate after the first one; [] for a plate of one view."""
+        return [self.predict(self.to_network_input(view)) for _, view in split_views(plate)[1:]]
 
     def predict_with_tta(self, display: Pixels) -> TtaPrediction:
         """Predict the flare of display values 0..1 (h, w, 3), h and w multiples of SIZE_MULTIPLE."""

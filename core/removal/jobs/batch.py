@@ -147,15 +147,16 @@ class _PlateCleaner:
         matte = None
         if self._mattes:
             matte = self._mattes.read(frame.name, read_data_window(frame.source), read_exif(frame.source)[0])
-        return PreparedResults(lambda: self._write(frame, plate, prediction, matte),
+        predictions = [prediction, *self._remover.predict_other_views(plate)]
+        return PreparedResults(lambda: self._write(frame, plate, predictions, matte),
                                float(prediction.confidence) if matte is None else None)
 
-    def _write(self, frame: CleanFrame, plate: Plate, prediction: FlarePrediction, matte: Pixels | None) -> None:
-        """Write the clean plate, and its flare where the frame has a second result. matte: (height, width), 0..1."""
-        # A stereo picture has two views; `prediction` is for the first.
-        (_, first_view), *other_views = split_views(plate)
-        view_results = [self._remover.remove(first_view, matte, prediction),
-                        *(self._remover.remove(view, matte) for _, view in other_views)]
+    def _write(self, frame: CleanFrame, plate: Plate, predictions: Sequence[FlarePrediction],
+               matte: Pixels | None) -> None:
+        """Write the clean plate, and its flare where the frame has a second result. predictions: one for each view of
+        the plate. matte: (height, width), 0..1."""
+        view_results = [self._remover.remove(view, matte, prediction)
+                        for (_, view), prediction in zip(split_views(plate), predictions, strict=True)]
         write_view_results(frame.results, plate, view_results)
         if plate.warning:
             self._progress.say(plate.warning)

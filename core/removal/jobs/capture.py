@@ -47,10 +47,11 @@ class _FrameCleaner:
         plate, prediction = self._predictor.predict(frame.source)
         if frame.name in self._flared_names:
             prediction = prediction._replace(confidence=np.float32(1))
-        (_, first_view), *other_views = split_views(plate)
+        predictions = [prediction, *self._remover.predict_other_views(plate)]
         return PreparedResults(lambda: write_view_results(frame.results, plate, [
-            self._remover.remove(first_view, prediction=prediction),
-            *(self._remover.remove(view) for _, view in other_views)]), float(prediction.confidence))
+            self._remover.remove(view, prediction=view_prediction)
+            for (_, view), view_prediction in zip(split_views(plate), predictions, strict=True)]),
+            float(prediction.confidence))
 
 
 def clean_capture(capture: Capture, remover: Remover, progress: Progress,

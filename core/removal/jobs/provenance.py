@@ -13,10 +13,8 @@ import numpy as np
 from ...capture import REMOVED, Capture
 from ...errors import CaptureError
 from ...images.read import read_picture
+from ...system.progress import Progress
 from .manifest import Manifest
-
-MAX_CHANGED_SHARE = 0.02
-"""Share of the frames that `remove` may have changed in a capture without flares: single false detections."""
 
 
 def has_exact_clean_frames(capture: Capture) -> bool:
@@ -40,15 +38,17 @@ def check_clean_frames_current(capture: Capture) -> None:
                            "again.")
 
 
-def has_unchanged_clean_frames(capture: Capture) -> bool:
-    """Return whether at most MAX_CHANGED_SHARE of the clean frames of a capture differ from their frames; `remove` has
-    then found no flare."""
-    changed = 0
+def has_unchanged_clean_frames(capture: Capture, progress: Progress) -> bool:
+    """Return whether the clean frames of a capture are its frames to the last bit: `remove` has found no flare in any.
+
+    Raises Cancelled.
+    """
+    progress.stage("compare the clean frames", len(capture.views))
     for view in capture.views:
         frame, clean = read_picture(capture.frame_path(view)), read_picture(capture.clean_frame_path(view))
-        changed += not np.array_equal(frame.pixels, clean.pixels)
-        if changed > MAX_CHANGED_SHARE * len(capture.views):
+        if not np.array_equal(frame.pixels, clean.pixels):
             return False
+        progress.advance()
     return True
 
 

@@ -135,7 +135,8 @@ class OffsetsBudget:
         """Begin without offsets. seconds: for the network in one redraw. seconds_at_rest: the same while view and
         lights are those of the last two redraws; the larger of both holds then. clock: returns seconds."""
         self._seconds, self._seconds_at_rest, self._clock = seconds, max(seconds, seconds_at_rest), clock
-        self._seconds_per_light = 0.0
+        # Number of computations and mean time of one, by number of the network.
+        self._costs: dict[int, tuple[int, float]] = {}
         self._unspent_seconds = 0.0  # of earlier redraws
         self._was_at_rest = True  # the first redraw of a moving view has time for at least one light
         # Cache key and offsets of each light, by number of its network and its name; the longest waiting first.
@@ -166,7 +167,7 @@ class OffsetsBudget:
         self._drawn[light] = key
         last_key, last_offsets = self._offsets.get(light, (None, None))
         if last_offsets is None or (last_key != key and light in self._due):
-            last_key, last_offsets = key, _cache.get(key, lambda: self._measure(compute))
+            last_key, last_offsets = key, _cache.get(key, lambda: self._measure(light[0], compute))
             self._offsets[light] = last_key, last_offsets
         if last_key == key:
             self._offsets.move_to_end(light)  # it has exact offsets: behind all that wait
@@ -176,24 +177,31 @@ class OffsetsBudget:
 
     def _choose_due(self, is_at_rest: bool) -> None:
         """Choose the lights that get exact offsets in this redraw: the longest waiting, as many as its time allows."""
-        cost = self._seconds_per_light
-        if not cost:
-            count = len(self._offsets)
-        elif is_at_rest:
-            count = max(int(self._seconds_at_rest / cost), 1)
-        else:
-            seconds = max(self._seconds, cost) if self._was_at_rest else self._unspent_seconds + self._seconds
-            count = int(seconds / cost)
-            self._unspent_seconds = seconds - count * cost  # less than a light takes
-        self._was_at_rest = is_at_rest or not cost
-        self._due = set(itertools.islice(self._offsets, count))
+        seconds, has_one, cost = self._seconds_at_rest, is_at_rest or self._was_at_rest, 0.0
+        if not is_at_rest:
+            seconds = self._seconds if self._was_at_rest else self._unspent_seconds + self._seconds
+        self._was_at_rest = is_at_rest or not self._costs
+        self._due = set()
+        for light in self._offsets:
+            _, cost = self._costs.get(light[0], (0, 0.0))
+            if cost > seconds and (self._due or not has_one):
+                break
+            self._due.add(light)
+            seconds = max(seconds - cost, 0.0)
+        self._unspent_seconds = min(seconds, cost)  # no more than a light takes
 
-    def _measure(self, compute: Callable[[], Offsets]) -> Offsets:
-        """Compute offsets, and update the mean time of it."""
+    def _measure(self, network: int, compute: Callable[[], Offsets]) -> Offsets:
+        """Compute offsets, and update the mean time of it for the network of this number.
+
+        A network's first computation takes longer and counts only until the second. A slow one counts little once a
+        fast one follows.
+        """
         began = self._clock()
         offsets = compute()
         seconds = self._clock() - began
-        self._seconds_per_light = 0.9 * self._seconds_per_light + 0.1 * seconds if self._seconds_per_light else seconds
+        count, mean = self._costs.get(network, (0, 0.0))
+        weight = max(0.1, 1 / max(count, 1))
+        self._costs[network] = count + 1, min(mean + weight * (seconds - mean), 2 * seconds)
         return offsets
 
 

@@ -118,6 +118,42 @@ def test_a_light_that_takes_longer_than_the_time_of_a_redraw_is_computed_in_some
     assert draw(poses[0]), "at once, after a rest"
 
 
+@pytest.mark.parametrize(("first", "later", "exact"), [
+    (200.0, 8.0, [1] * 9), (200.0, 60.0, [1, 0, 0, 1, 0, 0, 1, 0, 0])])
+def test_one_slow_computation_does_not_hold_later_ones_up(tmp_path: Path, first: float, later: float,
+                                                          exact: list[int]) -> None:
+    """With 20 ms for a drawing and costs in ms. The first computation of a process takes longer."""
+    saved(tmp_path / "a.flare", lights=1)
+    look, ticks = read_look(tmp_path / "a.flare"), itertools.chain([0.0, first], itertools.count(first, later))
+    budget = OffsetsBudget(20.0, 60.0, lambda: next(ticks))
+    counts = []
+    for camera in cameras(len(exact) + 1):
+        budget.begin()
+        look.evaluate_lights(camera.world_to_camera, LIGHTS[:1], budget=budget)
+        counts.append(int(budget.is_complete))
+    assert counts == [1, *exact]
+
+
+def test_cheap_lights_do_not_hide_what_a_costly_one_takes() -> None:
+    """Four lights of 2 ms and one of 58 ms hold 20 ms for a drawing on average, and each has its turns."""
+    now, turns = 0.0, dict.fromkeys([(-1, "a"), (-1, "b"), (-1, "c"), (-1, "d"), (-2, "e")], 0)
+    budget = OffsetsBudget(20.0, clock=lambda: now)
+    for number in range(101):
+        budget.begin()
+        for light in turns:
+            def compute(light: tuple[int, str] = light) -> np.ndarray:
+                nonlocal now
+                now += 58 if light[0] == -2 else 2
+                turns[light] += 1
+                return np.zeros(1, np.float32)
+
+            budget.get(light, (light[0], f"{light[1]} {number}".encode()), compute)
+        if number == 0:
+            start = now
+    assert 0.9 * 20 * 100 < now - start <= 1.05 * 20 * 100
+    assert min(turns.values()) > 20
+
+
 def test_time_for_all_lights_is_an_exact_drawing(tmp_path: Path) -> None:
     """With a budget of time that suffices for all lights, every light is exact in every view."""
     saved(tmp_path / "a.flare", lights=1)

@@ -32,6 +32,7 @@ def test_edits_of_elements_that_a_look_lacks_show_nowhere(facts: Any) -> None:
     assert facts["leaks"] == facts["shot"] == facts["saved"] == facts["headings"] == []
     assert facts["neutral"]
     assert facts["listed"] == [True, ["glare"], True, True]
+    assert facts["listed, inverted by Blender"] == [True, True], "as a name is given, and without one"
     assert facts["highlight of a hidden one"] is None
 
 

@@ -95,6 +95,12 @@ present = [element.name for element in core_look.read_look(plain).lights[0].elem
 facts["listed"] = [sorted(listed()[0]) == sorted(present), listed(filter_name="GLA")[0],
                    "streak" in listed(use_filter_invert=True)[0], listed(filter_name="", use_filter_sort_alpha=True)[1]
                    == len(item.elements)]
+del stand_in.bitflag_item_never_show  # as before Blender 4.4, where Blender inverts the flags itself
+inverted = []
+for name in ("GLA", ""):
+    shown = set(listed(filter_name=name, use_filter_invert=True, use_filter_sort_alpha=False)[0])
+    inverted.append(sorted(element.name for element in item.elements if element.name not in shown))
+facts["listed, inverted by Blender"] = [inverted[0] == sorted({*present} - {"glare"}), inverted[1] == sorted(present)]
 highlight._current = None
 item.element = item.element
 facts["highlight of a hidden one"] = highlight.current_highlight(scene)

@@ -13,8 +13,8 @@ The reference of the power is the lamp's light in the first frame of the scene:
 
     keyed lamp     computed from its curves, so it follows them
     driven lamp    measured at the first frame when the flare gets the lamp. If the driver is added later, it is
-                   measured soon after the next redraw of the camera view, or before a bake, a transfer or a viewport
-                   render. A lamp with a keyed temperature counts as driven
+                   measured soon after a redraw of the camera view in that frame, or before a bake, a transfer or a
+                   viewport render. A lamp with a keyed temperature counts as driven
     other lamp     measured when the flare gets the lamp, so that a change by hand dims the flare
 
 An empty or a mesh has no power; its factor is 1. The reference distance is the one from the camera to the object when
@@ -275,12 +275,28 @@ def measure_driven(scene: Any) -> None:
         _measure_power(scene, item)
 
 
+def reference_note(scene: Any, item: Any) -> str:
+    """Return where a flare gets the reference of its driven lamp, and how; "" for a flare that has it."""
+    if item not in outdated_references(scene):
+        return ""
+    return (f"The driven power of {item.target.name} gets its reference in frame {scene.frame_start}: go to that "
+            "frame, or bake.")
+
+
+def _is_measurable(scene: Any) -> bool:
+    """Return whether a reference is outdated and the scene is at its first frame.
+
+    To move the timeline there would discard a pose that is not keyed yet.
+    """
+    return scene.frame_current == scene.frame_start and not scene.frame_subframe and bool(outdated_references(scene))
+
+
 def measure_soon(scene: Any) -> None:
-    """Start a timer that calls `measure_driven`, if a reference is outdated.
+    """Start a timer that calls `measure_driven`, if a reference is outdated and the scene is at its first frame.
 
     A redraw itself must not change the scene.
     """
-    if outdated_references(scene) and not bpy.app.timers.is_registered(measure_in_windows):
+    if _is_measurable(scene) and not bpy.app.timers.is_registered(measure_in_windows):
         bpy.app.timers.register(measure_in_windows, first_interval=0.0)
 
 
@@ -289,7 +305,7 @@ def measure_in_windows() -> float | None:
     if bpy.app.is_job_running("RENDER"):
         return RENDER_WAIT_S
     for scene in {window.scene for window in bpy.context.window_manager.windows}:
-        if outdated_references(scene):
+        if _is_measurable(scene):
             measure_driven(scene)
             scene.update_tag()  # so that the flares are drawn anew
     redraw_viewports()

@@ -20,6 +20,8 @@ def draw_switches(column: Any, scene: Any, item: Any) -> None:
         return
     if lamp_drive.is_lamp(item.target):
         column.prop(item, "follow_power")
+        if note := lamp_drive.reference_note(scene, item):
+            label_lines(column, note, "INFO")
     column.prop(item, "follow_visibility")
     if lamp_drive.has_direction(item):
         column.prop(item, "follow_direction")

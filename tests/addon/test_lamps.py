@@ -44,6 +44,15 @@ def test_a_lamp_that_is_animated_later_is_the_same_in_view_bake_and_transfer(fac
             assert np.ravel(factors) == pytest.approx(np.ravel(exact[name]), abs=2e-3), (name, route)
 
 
+def test_a_drawing_of_the_camera_view_keeps_a_pose_without_keys(facts: Any) -> None:
+    """The view measures a driven lamp in the first frame only, and the panel names it until then.
+
+    Block of lamps.py: "lamps that are driven later, and other keys of their power".
+    """
+    assert facts["posed by hand"] == [[7, 8, 9], False, True]
+    assert facts["posed, first frame"] == [True, [20, 20, 20], False]
+
+
 def test_a_flare_follows_all_of_its_lamp_but_nothing_of_a_light_of_the_capture(facts: Any) -> None:
     """Block of lamps.py: "lamps switch their flares"."""
     assert facts["switches"] == [[True] * 4, pytest.approx(8.016, abs=1e-3)]

@@ -263,6 +263,7 @@ def seen_baked_sent(change):
         scene.frame_set(4)
         change(lamp.data)
         if route == "view":
+            scene.frame_set(1)
             draw_once(scene)
             routes[route] = [factor(scene, number)[:2] for number in (1, 9)]
         elif route == "bake":
@@ -291,7 +292,8 @@ def draw_once(scene):
     if bpy.app.timers.is_registered(lamp_drive.measure_in_windows):
         bpy.app.timers.unregister(lamp_drive.measure_in_windows)
         changes = part("flare_addon.scene_changes").change_count()
-        assert lamp_drive.measure_in_windows() is None and scene.frame_current == 4
+        frame = scene.frame_current
+        assert lamp_drive.measure_in_windows() is None and scene.frame_current == frame
         bpy.context.view_layer.update()
         assert part("flare_addon.scene_changes").change_count() > changes, "the view is drawn anew"
 
@@ -318,6 +320,30 @@ if "exposure" in bpy.types.Light.bl_rna.properties:
     animations["keyed exposure"] = lambda data: keyed(data, "exposure", (1, 0.0), (9, 2.0))
     animations["driven exposure"] = lambda data: drive(data, "exposure", "(frame - 1) / 4")
 facts["animated later"] = {name: seen_baked_sent(change) for name, change in animations.items()}
+
+scene, lamp, item = lit_scene()
+posed = object_in(scene, "Posed", None, (0, 0, 0))
+keyed(posed, "location", (1, (0, 0, 0)), (9, (1, 0, 0)))
+scene.frame_set(4)
+drive(lamp.data, "energy", "10 * (frame + 1)")
+posed.location = 7, 8, 9  # and no key yet
+
+
+def power_notes():
+    """The labels about the lamp's power that the panel shows."""
+    layout = MagicMock()
+    panels.FITFLARE_PT_look.draw(SimpleNamespace(layout=layout), bpy.context)
+    text = " ".join(str(call.kwargs.get("text", "")) for call in layout.mock_calls
+                    if call[0].rpartition(".")[2] == "label")
+    return "reference in frame 1" in text
+
+
+draw_once(scene)
+lamp_drive.measure_in_windows()  # as if the timeline had moved on before the timer
+facts["posed by hand"] = [list(posed.location), item.reference_is_driven, power_notes()]
+scene.frame_set(1)
+draw_once(scene)
+facts["posed, first frame"] = [item.reference_is_driven, list(item.reference_light), power_notes()]
 
 # ---- many lamps among walls -----------------------------------------------------------------------------
 occlusion = part("flare_addon.occlusion")

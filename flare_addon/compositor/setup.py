@@ -185,9 +185,14 @@ def _connect_scene_picture(tree: Any, node: Any, socket: Any, with_objects: bool
             socket.node.name in (LAYERS, PLATE) or _is_crop(socket.node) or is_view_node(socket.node)):
         socket = _picture_at_size(tree, socket, with_objects)
     tree.links.new(socket, node.inputs["Scene"])
+    _remove_unused_render(tree)
+
+
+def _remove_unused_render(tree: Any) -> None:
+    """Remove our node of the render if nothing uses its output; Blender renders the scene for it all the same."""
     render = tree.nodes.get(RENDER)
     if render is not None and not any(output.is_linked for output in render.outputs):
-        tree.nodes.remove(render)  # Blender renders the scene for this node even if nothing uses its output
+        tree.nodes.remove(render)
 
 
 def _picture_at_size(tree: Any, socket: Any, with_objects: bool) -> Any:
@@ -262,9 +267,15 @@ def show_plate(scene: Any) -> bool:
         tree = _new_tree(scene, keep_image=False)
         scene[STATE_PROPERTY] = {**state, **_tree_state(tree)}
     footage = _footage_node(tree, plate)
-    if find_node(scene) is None and SIZE not in tree.nodes:
-        picture = _picture_at_size(tree, footage.outputs["Image"], scene.render.film_transparent)
-        tree.links.new(picture, _final_input(tree))
+    ours, objects = [tree.nodes[name] for name in (OBJECTS, SIZE) if name in tree.nodes], scene.render.film_transparent
+    if find_node(scene) is None and (not ours or (ours[0].name == OBJECTS) != objects):
+        fed_inputs = [link.to_socket for link in ours[0].outputs[0].links] if ours else [_final_input(tree)]
+        for node in ours:
+            tree.nodes.remove(node)
+        picture = _picture_at_size(tree, footage.outputs["Image"], objects)
+        for fed_input in fed_inputs:
+            tree.links.new(picture, fed_input)
+        _remove_unused_render(tree)
     return True
 
 

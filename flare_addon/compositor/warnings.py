@@ -68,12 +68,30 @@ def footage_note(scene: Any) -> str:
     if scene.fit_flare.over == "plate" and not is_transparent:
         return ("The film is opaque, so renders over footage show no objects of the scene. To show them, switch "
                 "Transparent on in the render properties, under Film, then set the compositor up.")
+    if is_transparent and _lacks_objects(scene):
+        how = ("bake, or import the footage again" if setup.shows_plate_alone(scene)
+               else "press Set Up Compositor again")
+        return f"Renders show the footage without the objects of the scene; {how}."
     for node in setup.footage_nodes(scene):
         with contextlib.suppress(FrameError):
             if setup.footage_behind_camera(scene)[0] != node.image:
                 return ("Renders show the footage of another camera. To show that of the scene's camera, bake, or "
                         "press Set Up Compositor again.")
     return ""
+
+
+def _lacks_objects(scene: Any) -> bool:
+    """Return whether the compositor shows footage in place of the render, and a new set-up would show both."""
+    tree = trees.tree_of(scene)
+    if tree is None or setup.PLATE not in tree.nodes or setup.STATE_PROPERTY not in scene:
+        return False
+    artists_node = tree.nodes.get(scene[setup.STATE_PROPERTY]["from"])
+    if artists_node is not None and artists_node.bl_idname != "CompositorNodeRLayers":
+        return False  # a set-up leaves the render to the artist's nodes
+    ends = [node for node in tree.nodes if node.bl_idname == trees.OUTPUT_TYPE]
+    renders = [node for node in tree.nodes if node.bl_idname in ("CompositorNodeRLayers", "NodeGroupInput")]
+    return any(trees.depends_on(end, tree.nodes[setup.PLATE]) for end in ends) and not any(
+        trees.depends_on(end, render) for end in ends for render in renders)
 
 
 def stereo_warnings(scene: Any) -> Iterator[str]:

@@ -80,6 +80,22 @@ def test_objects_lie_over_the_footage_and_the_flare_over_both(facts: Any) -> Non
     assert facts["objects removed"]
 
 
+def test_a_film_that_is_made_transparent_later_shows_the_objects_after_an_import(facts: Any) -> None:
+    """Block of views.py: "a film that is made transparent after an import"."""
+    film = facts["film"]
+    note, difference = film["opaque"]
+    assert "no objects of the scene" in note and difference < 2e-3
+    note, note_after, off, _, has_artists_node, has_render = film["transparent"]
+    assert "without the objects of the scene" in note and "import" in note and note_after == ""
+    assert max(off) < 2e-3 and has_artists_node and has_render
+    _, note_after, _, difference, has_artists_node, has_render = film["opaque again"]
+    assert "no objects of the scene" in note_after and difference < 2e-3
+    assert has_artists_node and not has_render, "Blender does not render what nothing shows"
+    assert "without the objects of the scene; press Set Up Compositor again" in film["set up, transparent later"]
+    assert film["set up again"] == ""
+    assert film["over an artist's picture"] == [True, ""], "the artist's nodes decide what there is of the render"
+
+
 def test_single_picture_and_import_turn_the_largest_view_to_the_camera(facts: Any) -> None:
     """Block of views.py: "views that turn to the camera"."""
     assert facts["turned"] == ["0001", "Camera"]

@@ -216,6 +216,58 @@ ops.set_up_baked()
 ops.remove_compositor()
 facts["objects removed"] = trees.tree_of(scene) is None
 
+# ---- a film that is made transparent after an import ----------------------------------------------------
+scene = imported(match_scene=False)
+scene.frame_set(0)
+scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = WIDTH, HEIGHT, 100
+board = object_in(scene, "Board", bpy.data.meshes.new("Board"), (0, 0, 0))
+board.data.from_pydata([(-9, -9, -1), (0, -9, -1), (0, 9, -1), (-9, 9, -1)], [], [(0, 1, 2, 3)])
+board.parent, board.color = scene.camera, (0.5, 0.25, 0.125, 1)
+tree = trees.tree_of(scene)
+end = next(node for node in tree.nodes if node.bl_idname == trees.OUTPUT_TYPE)
+reroute = tree.nodes.new("NodeReroute")  # of the artist, after the footage
+tree.links.new(tree.nodes[setup.SIZE].outputs[0], reroute.inputs[0])
+tree.links.new(reroute.outputs[0], end.inputs[0])
+facts["film"] = {"opaque": [warnings.footage_note(scene), float(np.abs(rendered(scene, ".exr") - plain).max())]}
+
+
+def film(name, is_transparent):
+    """Note and render after a switch of the film, then of an import of the capture again."""
+    scene.render.film_transparent = is_transparent
+    note = warnings.footage_note(scene)
+    ops.import_capture(directory=capture, match_scene=False)
+    board.parent = scene.camera
+    picture = rendered(scene, ".exr")
+    facts["film"][name] = [note, warnings.footage_note(scene), halves(picture), float(np.abs(picture - plain).max()),
+                           trees.depends_on(end, reroute), setup.RENDER in tree.nodes]
+
+
+film("transparent", True)
+film("opaque again", False)
+tree.links.new(reroute.inputs[0].links[0].from_socket, end.inputs[0])
+tree.nodes.remove(reroute)
+ops.open_flare(filepath=flare)
+scene.frame_end = scene.frame_start
+ops.bake()
+ops.set_up_baked()
+scene.render.film_transparent = True
+facts["film"]["set up, transparent later"] = warnings.footage_note(scene)
+ops.set_up_baked()
+facts["film"]["set up again"] = warnings.footage_note(scene)
+scene = imported(frames=False, match_scene=False)
+tree = artists_tree(scene)
+scene.render.film_transparent = True
+mine = tree.nodes.new("CompositorNodeImage")
+mine.image = bpy.data.images.new("mine", 8, 4)
+output = tree.nodes.new(trees.OUTPUT_TYPE)
+tree.links.new(mine.outputs[0], output.inputs[0])
+ops.import_capture(directory=capture)
+ops.open_flare(filepath=flare)
+ops.bake()
+scene.fit_flare.over = "plate"
+ops.set_up_baked()
+facts["film"]["over an artist's picture"] = [setup.PLATE in tree.nodes, warnings.footage_note(scene)]
+
 # ---- views that turn to the camera ----------------------------------------------------------------------
 turned = []
 for name in ("library", "capture"):

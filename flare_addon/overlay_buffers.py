@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import bpy
 import numpy as np
 
 from .overlay_quads import DrawnRegion, Quads
@@ -62,6 +63,13 @@ def create_offscreen(width: int, height: int) -> Any:
     return gpu.types.GPUOffScreen(width, height, format="RGBA32F")
 
 
+def open_regions() -> set[int]:
+    """Return the addresses of the regions of all 3D views that windows show."""
+    manager = bpy.context.window_manager
+    return {region.as_pointer() for window in manager.windows for area in window.screen.areas if area.type == "VIEW_3D"
+            for region in area.regions} if manager is not None else set()
+
+
 class CanvasBuffers:
     """The offscreen buffers of a canvas, one for each level that it needed."""
 
@@ -97,7 +105,13 @@ class BuffersByCanvas:
         self._canvases: OrderedDict[Canvas, CanvasBuffers] = OrderedDict()
 
     def of(self, canvas: Canvas) -> CanvasBuffers:
-        """Return the buffers of a canvas. With too many canvases, those of the one drawn longest ago are freed."""
+        """Return the buffers of a canvas. With too many canvases, those of the one drawn longest ago are freed.
+
+        Those of regions that no window shows are freed too.
+        """
+        kept_regions = {PICTURE[0], canvas[0]} | open_regions()
+        for closed in [key for key in self._canvases if key[0] not in kept_regions]:
+            self.free(closed)
         buffers = self._canvases.setdefault(canvas, CanvasBuffers())
         self._canvases.move_to_end(canvas)
         while len(self._canvases) > MAX_CANVASES:

@@ -118,7 +118,7 @@ def test_views_and_eyes_do_not_redraw_each_other(facts: Any) -> None:
     """Block of lamps.py: "a camera view that is drawn again". The buffers of few views are kept, of others freed."""
     assert facts["in turns"] == {"two regions": 2, "two eyes": 2}
     assert facts["buffers"] == {"sizes": [[26, 13]], "freed": 1, "kept": [1, 3, 4, 5], "another size": 2,
-                                "all": 6}
+                                "all": 6, "of closed regions": [1, [0, 2, 3]]}
 
 
 def test_the_sum_is_drawn_where_the_flare_is(facts: Any) -> None:

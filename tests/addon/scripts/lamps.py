@@ -427,9 +427,10 @@ def renderings(*views):
     return len(rendered) - before
 
 
+buffers, freed = part("flare_addon.overlay_buffers"), []
+buffers.open_regions = lambda: set(range(1, 6))
 facts["in turns"] = {"two regions": renderings(*[(1, ""), (2, "")] * 3),
                      "two eyes": renderings(*[(3, "left"), (3, "right")] * 3)}
-buffers, freed = part("flare_addon.overlay_buffers"), []
 buffers.create_offscreen = lambda *key: SimpleNamespace(key=key, free=lambda: freed.append(key))
 by_canvas = buffers.BuffersByCanvas()
 sizes = [by_canvas.of((number, "")).offscreen(4, 101, 50).key for number in (1, 1, 2, 3, 4, 1, 5)]
@@ -439,6 +440,12 @@ by_canvas.of((1, "")).offscreen(4, 99, 50)
 facts["buffers"] |= {"kept": kept, "another size": len(freed)}
 by_canvas.free()
 facts["buffers"]["all"] = len(freed)
+for number in (0, 1, 2, 3):
+    by_canvas.of((number, "")).offscreen(4, 101, 50)
+buffers.open_regions = lambda: {2}
+count = len(freed)
+by_canvas.of((3, ""))  # a region that Blender draws is open, wherever it is
+facts["buffers"]["of closed regions"] = [len(freed) - count, [number for number, _ in by_canvas._canvases]]
 
 # ---- the part of a region that the sum is drawn in ------------------------------------------------------
 scene, lamp, item = lit_scene()

@@ -66,7 +66,7 @@ facts["up"] = {name: list(np.array(Euler(axes[name]).to_matrix()) @ up)
 
 # ---- frames ---------------------------------------------------------------------------------------
 custom = SimpleNamespace(bake_range="custom", bake_first=3, bake_last=5)
-facts["custom"] = list(shots.frames_to_bake(SimpleNamespace(fit_flare=custom)))
+facts["custom"] = list(shots.frames_to_bake(SimpleNamespace(fit_flare=custom, frame_step=1)))
 sequence = SimpleNamespace(source="SEQUENCE", library=None, filepath="/s/plate.1001.exr")
 behind = SimpleNamespace(source="IMAGE", image=sequence,
                          image_user=SimpleNamespace(frame_start=1, frame_offset=1004))

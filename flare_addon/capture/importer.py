@@ -10,7 +10,7 @@ import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -128,12 +128,24 @@ def find_capture(path: Path | str) -> Path:
 
 
 def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | None = None) -> Imported:
-    """Import the capture in `folder` into `scene`. Raises CaptureError and FrameError."""
-    return finish(import_in_steps(scene, folder, settings or ImportSettings()))
+    """Import the capture in `folder` into `scene`, and show its frames in renders. Raises CaptureError and
+    FrameError."""
+    settings = settings or ImportSettings()
+    imported = finish(import_in_steps(scene, folder, settings))
+    return replace(imported, notes=(*imported.notes, *show_frames_in_renders(scene, settings)))
+
+
+def show_frames_in_renders(scene: Any, settings: ImportSettings) -> list[str]:
+    """Make renders show the frames of a capture that was imported with these settings; return notes for the user.
+
+    A step of its own after the import: Blender evaluates the new compositor.
+    """
+    return [ARTISTS_COMPOSITOR] if settings.frames and not show_plate(scene) else []
 
 
 def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) -> Steps[Imported]:
-    """Import a capture as `import_capture` does, as a generator that pauses between short steps.
+    """Import a capture as `import_capture` does, as a generator that pauses between short steps; without
+    `show_frames_in_renders`.
 
     If the generator fails or is closed early, all that it added is removed.
     """
@@ -190,8 +202,6 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
         notes += [note for note in [show_as_filmed(scene)] if note]
         if settings.frames:
             scene.render.film_transparent = True  # else the world hides the frames
-    if settings.frames and not show_plate(scene):
-        notes.append(ARTISTS_COMPOSITOR)
     if not lights:
         notes.append("The capture has no lights yet; find or add them in the panel Lights.")
     if any(view.lens for view in capture.views) and settings.frames:

@@ -12,7 +12,7 @@ import bpy
 from ...core.system.steps import PAUSE, Steps, finish
 from .. import fits
 from ..capture import exporter
-from ..capture.importer import ImportSettings, import_in_steps
+from ..capture.importer import ImportSettings, import_in_steps, show_frames_in_renders
 from ..reports import NO_CAMERA, GuardedOperator, report_errors
 from ..views import look_through_camera
 
@@ -148,7 +148,8 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         self._is_complete = True
         fits.clear_other_run(context.scene)
         fits.expose_cameras(context.scene, fits.run_folder(context.scene))
-        for note in imported.notes:
+        yield PAUSE
+        for note in (*imported.notes, *show_frames_in_renders(context.scene, settings)):
             self.report({"WARNING"}, note)
         self.report({"INFO"}, f"{self._name}: cameras {len(imported.cameras)}, lights {len(imported.lights)}")
         yield PAUSE

@@ -152,6 +152,7 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         for note in (*imported.notes, *show_frames_in_renders(context.scene, settings)):
             self.report({"WARNING"}, note)
         self.report({"INFO"}, f"{self._name}: cameras {len(imported.cameras)}, lights {len(imported.lights)}")
+        yield PAUSE  # Blender evaluates the new compositor
         yield PAUSE
         if self._in_steps:
             _load_footage(context.scene)

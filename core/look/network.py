@@ -138,14 +138,14 @@ class OffsetsBudget:
         # Number of computations and mean time of one, by number of the network.
         self._costs: dict[int, tuple[int, float]] = {}
         self._unspent_seconds = 0.0  # of earlier redraws
-        self._was_at_rest = True  # the first redraw of a moving view has time for at least one light
+        self._was_at_rest = True  # in the redraw before; the first redraw of a moving view has time for one light
         # Cache key and offsets of each light, by number of its network and its name; the longest waiting first.
         self._offsets: OrderedDict[tuple[int, str], tuple[tuple[int, bytes], Offsets]] = OrderedDict()
         # Cache key of each light in the redraw since `begin`, and in the one before.
         self._drawn: dict[tuple[int, str], tuple[int, bytes]] = {}
         self._drawn_before: dict[tuple[int, str], tuple[int, bytes]] = {}
         self._due: set[tuple[int, str]] = set()
-        self._rested = False  # whether the last two redraws had the same view and lights
+        self._has_repeated = False  # whether the last two redraws had the same view and lights
         self.is_complete = True
         """Whether the redraw since `begin` has exact offsets."""
 
@@ -153,7 +153,7 @@ class OffsetsBudget:
         """Begin a redraw; forget the lights that the last one did not have."""
         for light in [light for light in self._offsets if light not in self._drawn]:
             del self._offsets[light]
-        self._rested, self.is_complete = self._drawn == self._drawn_before, True
+        self._has_repeated, self.is_complete = self._drawn == self._drawn_before, True
         self._drawn, self._drawn_before = {}, self._drawn
 
     def get(self, light: tuple[int, str], key: tuple[int, bytes], compute: Callable[[], Offsets]) -> Offsets:
@@ -163,7 +163,7 @@ class OffsetsBudget:
         light: number of its network, and its name. compute: computes the offsets for `key`.
         """
         if not self._drawn:  # the first light of a redraw: now it is known whether the view rests
-            self._choose_due(self._rested and self._drawn_before.get(light) == key)
+            self._choose_due(self._has_repeated and self._drawn_before.get(light) == key)
         self._drawn[light] = key
         last_key, last_offsets = self._offsets.get(light, (None, None))
         if last_offsets is None or (last_key != key and light in self._due):
@@ -177,9 +177,8 @@ class OffsetsBudget:
 
     def _choose_due(self, is_at_rest: bool) -> None:
         """Choose the lights that get exact offsets in this redraw: the longest waiting, as many as its time allows."""
-        seconds, has_one, cost = self._seconds_at_rest, is_at_rest or self._was_at_rest, 0.0
-        if not is_at_rest:
-            seconds = self._seconds if self._was_at_rest else self._unspent_seconds + self._seconds
+        seconds = self._seconds_at_rest if is_at_rest else self._seconds + self._unspent_seconds
+        has_one, cost = is_at_rest or self._was_at_rest, 0.0
         self._was_at_rest = is_at_rest or not self._costs
         self._due = set()
         for light in self._offsets:
@@ -188,10 +187,10 @@ class OffsetsBudget:
                 break
             self._due.add(light)
             seconds = max(seconds - cost, 0.0)
-        self._unspent_seconds = min(seconds, cost)  # no more than a light takes
+        self._unspent_seconds = 0.0 if is_at_rest else min(seconds, cost)  # no more than a light takes
 
     def _measure(self, network: int, compute: Callable[[], Offsets]) -> Offsets:
-        """Compute offsets, and update the mean time of it for the network of this number.
+        """Compute offsets, and update the mean time of a computation for the network of this number.
 
         A network's first computation takes longer and counts only until the second. A slow one counts little once a
         fast one follows.

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from ..errors import FrameError
 from ..images.exr import exr_pixel_aspect
@@ -42,22 +42,21 @@ class LayerFolder:
         """Open a folder as `open` does, in steps of FRAMES_PER_STEP frames. Raises FrameError."""
         folder = Path(folder).resolve()
         files = _find_sequence(folder)
-        layers: dict[Path, frozenset[str]] = {}
-        windows: dict[Path, DataWindow] = {}
-        headers: dict[tuple[frozenset[str], DataWindow], tuple[frozenset[str], DataWindow]] = {}
+        headers: dict[Path, _Header] = {}
+        distinct_headers: dict[_Header, _Header] = {}
         for path in files.values():
             header = _read_header(path)
-            layers[path], windows[path] = headers.setdefault(header, header)  # frames of a bake share one
-            if len(layers) % FRAMES_PER_STEP == 0:
+            headers[path] = distinct_headers.setdefault(header, header)  # frames of a bake share one
+            if len(headers) % FRAMES_PER_STEP == 0:
                 yield
         first, *others = files.values()
         for path in others:
-            if layers[path] != layers[first]:
-                only_first, only_other = (" and ".join(sorted(layers[a] - layers[b])) or "no others"
+            if headers[path].layers != headers[first].layers:
+                only_first, only_other = (" and ".join(sorted(headers[a].layers - headers[b].layers)) or "no others"
                                           for a, b in ((first, path), (path, first)))
                 raise FrameError(f"{folder} holds frames of two bakes: beside the layers that both have, {first.name} "
                                  f"has {only_first}, {path.name} has {only_other}; bake each into its own folder.")
-        _check_windows(folder, windows)
+        _check_windows(folder, {path: header.window for path, header in headers.items()})
         return cls(folder, files)
 
     def window(self, number: int | None = None) -> DataWindow:
@@ -102,9 +101,15 @@ def _find_sequence(folder: Path) -> dict[int, Path]:
     return dict(sorted(next(iter(sequences.values())).items()))
 
 
-def _read_header(path: Path) -> tuple[frozenset[str], DataWindow]:
-    """Return the names of the layers in a file, of which the composite has none, and its data window. Raises FrameError
-    where it is missing, truncated or no EXR."""
+class _Header(NamedTuple):
+    """The names of the layers in a file, of which the composite has none, and its data window."""
+
+    layers: frozenset[str]
+    window: DataWindow
+
+
+def _read_header(path: Path) -> _Header:
+    """Read the header of a file, which is opened once. Raises FrameError where it is missing, truncated or no EXR."""
     try:
         with open_regular(path) as stream:
             if stream.read(4) != exr_header.MAGIC:
@@ -114,8 +119,7 @@ def _read_header(path: Path) -> tuple[frozenset[str], DataWindow]:
             names = exr_header.channel_kinds(stream)
             if not names:
                 raise FrameError(f"{path} has a damaged header; bake it again.")
-            layers = frozenset(name.rpartition(".")[0] for name in names) - {""}
-            return layers, _read_window(path, stream)
+            return _Header(frozenset(name.rpartition(".")[0] for name in names) - {""}, _read_window(path, stream))
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
 

@@ -123,7 +123,7 @@ def _triangulate(observations: Observations, first: NDArray[np.int64], second: N
     """
     origins, other_origins = (observations.position[observations.view[index]] for index in (first, second))
     midpoints, cosines, is_in_front = triangulate_midpoints(origins, observations.ray[first],
-                                                          other_origins, observations.ray[second])
+                                                            other_origins, observations.ray[second])
     valid = is_in_front & (1 - cosines ** 2 > MIN_SQUARED_SINE)
     return np.concatenate([np.where(valid[:, None], midpoints, 0.0), valid[:, None].astype(float)], axis=1)
 

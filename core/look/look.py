@@ -199,9 +199,10 @@ class LightLook:
             ellipse_arcs = rows["arcs"] + offsets["arcs"]
             opacities = opacities * opacity_gain(ellipse_arcs, rings)
             arcs = arcs_of_ellipse(ellipse_arcs, scales, rotations)
-        return _DeformedGaussians(positions, shift, scales, rotations,
-                         None if form.solid else covariance_of_ellipse(scales, rotations), opacities, sh,
-                         None if form.sh_degree else colours(np.zeros((len(sh), 3), np.float32), sh, 0), rings, arcs)
+        covariances = None if form.solid else covariance_of_ellipse(scales, rotations)
+        sh_colours = None if form.sh_degree else colours(np.zeros((len(sh), 3), np.float32), sh, 0)
+        return _DeformedGaussians(positions, shift, scales, rotations, covariances, opacities, sh, sh_colours, rings,
+                                  arcs)
 
 
 class Look:

@@ -29,7 +29,7 @@ from .triangulation import TriangulationSettings, triangulate_lights
 SHEETS, REPORT = "lights", "report.json"
 MAX_POINT_DISTANCE = 0.05
 """Distance from a detection, diagonals, up to which points give the depth of a light in a single view."""
-CLIPPED_VIEWS = 6
+MIN_VIEWS_WITH_AREA = 6
 """Fewest views with a large clipped area for a search for a light in these areas."""
 MAX_STATIC_DISTANCE = 0.006
 """Median distance of a light from the projections of one place, diagonals, below which it is static."""
@@ -54,8 +54,8 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
     """Find the lights of a capture in its frames.
 
     With `gaussians`, the means (n, 3) and opacities (n,) of a fitted scene, detections are lifted on to its Gaussians,
-    as in the paper; else their rays are triangulated. Where no frame shows a light, one out of frame is searched by its
-    ghosts. Raises SettingsError for settings.min_views below 1.
+    as in the paper; else their rays are triangulated. A light in a clipped sky is searched by its ghosts, as is one
+    out of frame where no frame shows a light. Raises SettingsError for settings.min_views below 1.
     """
     progress, settings = progress or Progress(), settings or TriangulationSettings()
     if settings.min_views < 1:
@@ -81,7 +81,9 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
             messages.append(f"{len(gaps)} places are no lights but gaps through which a bright far surrounding shows; "
                             "`lights/report.json` lists them as doubtful.")
     if len(views) > 1:
-        lights += _find_by_ghosts(capture, lights, brightness_maps, progress, settings.seed, messages)
+        lights_by_ghosts, message = _find_by_ghosts(capture, lights, brightness_maps, progress, settings.seed)
+        lights += lights_by_ghosts
+        messages += [message] if message else []
     if not lights and not doubtful:
         messages.append("No light was found: none is in frame in enough views, or none is over-exposed.")
     return Findings(lights, doubtful, detections, messages)
@@ -241,33 +243,32 @@ def _lights_from_one_view(capture: Capture, detections: Sequence[Detection]) -> 
 
 
 def _find_by_ghosts(capture: Capture, lights: Sequence[FoundLight], brightness_maps: Mapping[str, Mask],
-                    progress: Progress, seed: int, messages: list[str]) -> list[FoundLight]:
-    """Return at most one light found by its ghosts, and append a sentence about it to `messages`.
+                    progress: Progress, seed: int) -> tuple[list[FoundLight], str]:
+    """Return at most one light found by its ghosts, and a sentence about it for the user, "" for none.
 
     Such a light is in a clipped area larger than a light's disc (a sun in a bright sky); if no other light was found,
     it may also be out of frame. lights: those found before. brightness_maps: by the view's name (`brightness_map`).
     """
     views = [(view.name, view.camera) for view in capture.views]
     areas = [clipped_area(brightness_maps[name], camera, lights) for name, camera in views]
-    search_clipped = sum(bool(area.any()) for area in areas) >= CLIPPED_VIEWS
+    search_clipped = sum(bool(area.any()) for area in areas) >= MIN_VIEWS_WITH_AREA
     if lights and not search_clipped:
-        return []
+        return [], ""
     progress.stage("follow ghosts", len(capture.views))
     blobs = []
     for view in capture.views:
         blobs.append(find_blobs(capture.frame(view), capture.clean_frame(view)))
         progress.advance()
-    found: list[FoundLight] = []
     if search_clipped:
-        found = locate_by_ghosts(views, blobs, capture.extent, seed, progress, areas)
-        if found:
-            messages.append("One light stands in a clipped area, such as a bright sky; its ghosts give its direction.")
-    if not lights and not found:
-        found = locate_by_ghosts(views, blobs, capture.extent, seed, progress)
-        if found:
-            messages.append("No frame shows a light; one out of frame was found by its ghosts, its direction more "
-                            "exactly than its distance.")
-    return found
+        in_area = locate_by_ghosts(views, blobs, capture.extent, seed, progress, areas)
+        if in_area:
+            return in_area, "One light lies in a clipped area, such as a bright sky; its ghosts give its direction."
+    if not lights:
+        out_of_frame = locate_by_ghosts(views, blobs, capture.extent, seed, progress)
+        if out_of_frame:
+            return out_of_frame, ("No frame shows a light; one out of frame was found by its ghosts, its direction "
+                                  "more exactly than its distance.")
+    return [], ""
 
 
 def make_detector(method: str, threshold: float | None = None, boxes: str | Path | None = None,

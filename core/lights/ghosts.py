@@ -23,6 +23,7 @@ from ..images.picture import Picture
 from ..system.progress import Progress
 from .detection import Detection, Mask
 from .found_light import FoundLight
+from .surroundings import map_index
 from .triangulation import TriangulationSettings, triangulate_lights
 
 GHOST_RATIOS = -np.exp(np.linspace(np.log(0.12), np.log(2.5), 28))
@@ -47,10 +48,10 @@ MIN_STRENGTH = 0.004
 """Strength of a blob, see `Blob`, up to which it is noise."""
 MAX_VISIBLE_SHARE = 0.2
 """Share of the views with a light well inside the frame from which it is not out of frame."""
-MIN_CLIPPED_SHARE = 0.12
+MIN_SHARE_IN_AREA = 0.12
 """Lowest share of the views that must agree on a light in a clipped area: in the others its ghost may be hidden by the
 clipped area, or lie out of the frame."""
-MIN_CLIPPED_VIEWS = 4
+MIN_VIEWS_IN_AREA = 4
 """Fewest views that agree on a light and have it inside their clipped area; in the others that agree, it may be out of
 frame."""
 MIN_CENTRE_DISTANCE = 0.06
@@ -117,7 +118,7 @@ def locate_by_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequen
     """Return at most one light, from the blobs of each view; none where too few views agree.
 
     The ratio of ghost to light is searched over GHOST_RATIOS, then refined. extent: size of the cameras' path, world
-    units. clipped_areas: for each view a mask (height, width) of any size, true where the light may stand in the frame;
+    units. clipped_areas: for each view a mask (height, width) of any size, true where the light may lie in the frame;
     None for a light that hardly any frame has inside. Raises Cancelled on a stop request.
     """
     progress = progress or Progress()
@@ -149,7 +150,7 @@ def _rank(light: FoundLight, ratio: float) -> tuple[int, float]:
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The blobs of all views, and where a light may stand; see `locate_by_ghosts`."""
+    """The blobs of all views, and where a light may lie; see `locate_by_ghosts`."""
 
     views: Sequence[tuple[str, Camera]]
     blobs: Sequence[Sequence[Blob]]
@@ -170,16 +171,16 @@ class _Search:
             # much at the light.
             radius = 2 * BLOB_TOLERANCE * float(np.hypot(*camera.size)) / abs(ratio)
             places = [centre + (blob.xy - centre) / ratio for blob in in_view]
-            claims.append([_claim(place, radius) for place in places if self._may_stand_at(place, index)])
-        min_share = MIN_SHARE if self.clipped_areas is None else MIN_CLIPPED_SHARE
+            claims.append([_claim(place, radius) for place in places if self._may_lie_at(place, index)])
+        min_share = MIN_SHARE if self.clipped_areas is None else MIN_SHARE_IN_AREA
         settings = TriangulationSettings(tolerance=0.0, min_views=MIN_VIEWS, max_nfa=MAX_NFA / len(GHOST_RATIOS),
                                          min_share=min_share, allow_out_of_frame=True, max_lights=2,
                                          max_candidates=1000, seed=self.seed)
         return next((light for light in triangulate_lights(self.views, claims, self.extent, settings)
                      if self._is_light_of_ghosts(light, ratio)), None)
 
-    def _may_stand_at(self, place: Floats, view: int) -> bool:
-        """Return whether a light may stand at a place (2,), pixels, of the view of this index."""
+    def _may_lie_at(self, place: Floats, view: int) -> bool:
+        """Return whether a light may lie at a place (2,), pixels, of the view of this index."""
         camera = self.views[view][1]
         if not camera.contains([place])[0]:
             return True
@@ -193,15 +194,14 @@ class _Search:
         if np.linalg.norm(place - (camera.cx, camera.cy)) < MIN_CENTRE_DISTANCE * np.hypot(*camera.size):
             return False
         area = self.clipped_areas[view]
-        column, row = (place / camera.size * area.shape[::-1]).astype(int)
-        return bool(area[min(row, area.shape[0] - 1), min(column, area.shape[1] - 1)])
+        return bool(area[map_index(area, place, camera)])
 
     def _is_light_of_ghosts(self, light: FoundLight, ratio: float) -> bool:
         """Return whether the blobs that claim a light at a ratio are neither dirt on the lens nor objects of the scene,
         and the light is out of frame where it has to be."""
-        cameras = dict(self.views)
-        centres = {name: np.array([cameras[name].cx, cameras[name].cy]) for name, _ in light.detections}
-        ghosts = {name: centres[name] + (detection.xy - centres[name]) * ratio for name, detection in light.detections}
+        cameras, places = dict(self.views), {name: detection.xy for name, detection in light.detections}
+        centres = {name: np.array([cameras[name].cx, cameras[name].cy]) for name in places}
+        ghosts = {name: centres[name] + (place - centres[name]) * ratio for name, place in places.items()}
         first_diagonal = float(np.hypot(*self.views[0][1].size))
         if np.ptp(list(ghosts.values()), axis=0).max() <= MIN_MOTION * first_diagonal:  # dirt stays in place
             return False
@@ -210,9 +210,9 @@ class _Search:
             if visible >= MAX_VISIBLE_SHARE * len(self.views):
                 return False
         else:
-            places = dict(light.detections)
-            clipped = sum(camera.contains([places[name].xy])[0] for name, camera in self.views if name in places)
-            if clipped < MIN_CLIPPED_VIEWS:
+            # A place in the frame lies in the clipped area (`_may_lie_at`).
+            in_area = sum(cameras[name].contains([place])[0] for name, place in places.items())
+            if in_area < MIN_VIEWS_IN_AREA:
                 return False
         return self._scene_support(ghosts) < MAX_SCENE_SHARE * len(ghosts)
 
@@ -226,8 +226,8 @@ class _Search:
                       for name, camera in views]
         settings = TriangulationSettings(tolerance=0.0, min_views=2, max_nfa=np.inf, min_share=0.0,
                                          allow_out_of_frame=True, max_lights=1, seed=self.seed)
-        places = triangulate_lights(views, detections, self.extent, settings)
-        return max((len(place.support) for place in places), default=0)
+        points = triangulate_lights(views, detections, self.extent, settings)
+        return max((len(point.support) for point in points), default=0)
 
 
 def _claim(place: NDArray[np.float64], radius: float) -> Detection:

@@ -44,7 +44,7 @@ def brightness_map(picture: Picture) -> NDArray[np.bool_]:
 
 
 def clipped_area(bright: NDArray[np.bool_], camera: Camera, lights: Sequence[FoundLight]) -> NDArray[np.bool_]:
-    """Return the mask (height, width) of the large bright areas of a view in which none of the lights stands.
+    """Return the mask (height, width) of the large bright areas of a view in which none of the lights lies.
 
     bright: the view's map (`brightness_map`). An area is large from MIN_AREA_SHARE of the frame.
     """
@@ -56,10 +56,15 @@ def clipped_area(bright: NDArray[np.bool_], camera: Camera, lights: Sequence[Fou
     if lights and count > 1:
         pixels, depth = camera.project(np.stack([light.xyz for light in lights]))
         for pixel in pixels[camera.contains(pixels, depth)]:
-            column, row = (pixel / camera.size * bright.shape[::-1]).astype(int)
-            # A camera contains the right and the lower edge of its frame.
-            large[labels[min(row, bright.shape[0] - 1), min(column, bright.shape[1] - 1)]] = False
+            large[labels[map_index(bright, pixel, camera)]] = False
     return np.asarray(large[labels])
+
+
+def map_index(mask: NDArray[np.bool_], pixel: Floats, camera: Camera) -> tuple[int, int]:
+    """Return the row and the column, in a map (height, width) of a view, of a pixel (2,) that its camera contains."""
+    height, width = mask.shape
+    column, row = (pixel / camera.size * (width, height)).astype(int)
+    return min(row, height - 1), min(column, width - 1)  # a camera contains the right and the lower edge of its frame
 
 
 def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
@@ -87,9 +92,8 @@ def explained_share(light: FoundLight, cameras: Mapping[str, Camera],
             # The light and the direction fall on one spot here, so the test could not tell a lamp from the surrounding.
             if depth[0] > 0 and np.linalg.norm(place[0] - pixel) < clearance:
                 continue
-            height, width = maps[other_name].shape
-            x, y = (pixel / camera.size * (width, height)).astype(int)
-            is_bright.append(bool(maps[other_name][min(y, height - 1), min(x, width - 1)]))
+            bright = maps[other_name]
+            is_bright.append(bool(bright[map_index(bright, pixel, camera)]))
     return float(np.mean(is_bright)) if len(is_bright) >= MIN_TESTS else None
 
 

@@ -8,6 +8,7 @@ Light discs stay (`light_discs`). `jobs` runs it on folders and captures, `evalu
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -196,6 +197,13 @@ class Remover:
     def predict_other_views(self, plate: Plate) -> list[FlarePrediction]:
         """Predict the flares of the views of a stereo plate after the first one; [] for a plate of one view."""
         return [self.predict(self.to_network_input(view)) for _, view in split_views(plate)[1:]]
+
+    def remove_views(self, plate: Plate, predictions: Sequence[FlarePrediction], matte: Pixels | None = None
+                     ) -> list[tuple[NDArray[Any], NDArray[np.float16]]]:
+        """Return the result of `remove` for each view of a plate, in the order of `split_views`. predictions: of the
+        views, in the same order. matte: as in `remove`, for all views."""
+        return [self.remove(view, matte, prediction)
+                for (_, view), prediction in zip(split_views(plate), predictions, strict=True)]
 
     def predict_with_tta(self, display: Pixels) -> TtaPrediction:
         """Predict the flare of display values 0..1 (h, w, 3), h and w multiples of SIZE_MULTIPLE."""

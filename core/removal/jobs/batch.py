@@ -19,7 +19,7 @@ from ...images.exr import read_data_window
 from ...images.formats.exif import read_exif
 from ...images.listing import pictures_below, pictures_in, unlisted_entries
 from ...images.plates import Plate, clean_name, is_plate_error
-from ...images.views import split_views, write_view_results
+from ...images.views import write_view_results
 from ...system.files import check_no_overwrite, real_path
 from ...system.progress import Progress
 from ...system.tally import Tally, list_first
@@ -155,9 +155,7 @@ class _PlateCleaner:
                matte: Pixels | None) -> None:
         """Write the clean plate, and its flare where the frame has a second result. predictions: one for each view of
         the plate. matte: (height, width), 0..1."""
-        view_results = [self._remover.remove(view, matte, prediction)
-                        for (_, view), prediction in zip(split_views(plate), predictions, strict=True)]
-        write_view_results(frame.results, plate, view_results)
+        write_view_results(frame.results, plate, self._remover.remove_views(plate, predictions, matte))
         if plate.warning:
             self._progress.say(plate.warning)
 

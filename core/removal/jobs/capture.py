@@ -15,7 +15,7 @@ from ...capture import REMOVED, Capture
 from ...errors import CaptureError
 from ...images.formats.kinds import JPEG_SUFFIXES
 from ...images.plates import clean_name
-from ...images.views import split_views, write_view_results
+from ...images.views import write_view_results
 from ...system.files import retry_while_locked, safe_join
 from ...system.progress import Progress
 from ..inference.neighbours import ShotPredictor, shot_sort_key
@@ -48,9 +48,8 @@ class _FrameCleaner:
         if frame.name in self._flared_names:
             prediction = prediction._replace(confidence=np.float32(1))
         predictions = [prediction, *self._remover.predict_other_views(plate)]
-        return PreparedResults(lambda: write_view_results(frame.results, plate, [
-            self._remover.remove(view, prediction=view_prediction)
-            for (_, view), view_prediction in zip(split_views(plate), predictions, strict=True)]),
+        return PreparedResults(
+            lambda: write_view_results(frame.results, plate, self._remover.remove_views(plate, predictions)),
             float(prediction.confidence))
 
 

@@ -104,7 +104,7 @@ class _BackgroundWriter:
                 self._record(*self._unfinished)
 
     def start(self, frame: CleanFrame, digest: str, prepared: PreparedResults, *, overwrite: bool) -> None:
-        """Finish the frame before, and begin to write the results of this one.
+        """Finish the previous frame, and begin to write the results of this one.
 
         digest, overwrite: as in `Manifest.begin_frame`.
         """

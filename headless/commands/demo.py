@@ -68,7 +68,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     overrides = {"model": args.model} if args.model else {}
     settings = preset(args.preset, mode=mode, iterations=args.iterations, **overrides)
     capture = fit.with_supervision(capture, settings, progress)
-    capture, settings = fit.without_absent_flare(capture, settings, progress)
+    capture, settings = fit.adapt_to_absent_flare(capture, settings, progress)
     progress.say(f"{source.name}: {len(capture.views)} frames, {len(capture.lights)} lights. "
                  f"{_describe_supervision(capture, settings.mode)}")
     _check_resumable(out / "run", settings, capture)

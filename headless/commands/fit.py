@@ -101,7 +101,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
     capture = with_supervision(capture, settings, progress)
-    capture, settings = without_absent_flare(capture, settings, progress, is_resumed=is_resumed)
+    capture, settings = adapt_to_absent_flare(capture, settings, progress, is_resumed=is_resumed)
     result = fit(capture, settings, out, progress, resume=args.resume, device=args.device)
     progress.say(f"The run is in {result.folder}: look at preview.png there, then run `eval` and `bake`.")
     used = {view.name for part in capture.split(settings.holdout) for view in part}
@@ -166,8 +166,8 @@ def with_supervision(capture: Capture, settings: FitSettings, progress: Progress
     return with_clean_frames(capture, progress, is_flared=settings.uses_plates) if needs_clean_frames else capture
 
 
-def without_absent_flare(capture: Capture, settings: FitSettings, progress: Progress, *,
-                         is_resumed: bool = False) -> tuple[Capture, FitSettings]:
+def adapt_to_absent_flare(capture: Capture, settings: FitSettings, progress: Progress, *,
+                          is_resumed: bool = False) -> tuple[Capture, FitSettings]:
     """Return capture and settings unchanged, or, if `remove` has found no flare in any frame, those of a fit that
     uses the frames as exact clean frames and has one light; report the latter.
 

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture, kind = _open_capture(args, progress)
     settings = _fit_settings(args, kind, capture, progress)
     capture = fit.with_supervision(capture, settings, progress)
-    capture, settings = fit.without_absent_flare(capture, settings, progress)
+    capture, settings = fit.adapt_to_absent_flare(capture, settings, progress)
     run_ = fit_capture(capture, settings, out / RUN, progress, resume=True)
     scores = _score_held_out(run_, progress)
     capture = run_.open_capture()

@@ -20,7 +20,6 @@ from ..capture.renderer import RenderedLayers
 from ..colour import ColourSpace, colour_space
 from ..conventions.frame_numbers import NumberedFrame
 from ..errors import FrameError, RunError
-from ..images.exr import is_exr_truncated
 from ..images.formats import exr_header
 from ..look import KeyedEdits, LookEdits
 from ..system.files import check_names, file_lock, read_json, remove_file, write_json
@@ -290,10 +289,8 @@ def _is_up_to_date(path: Path, expected: Mapping[str, Any]) -> bool:
 
     bake.json does not show it, since other tasks of a farm write here too."""
     try:
-        if is_exr_truncated(path):
-            return False
         notes = read_description(path)
-    except (FrameError, OSError):
+    except FrameError:
         return False
     return all(notes.get(name) == value for name, value in expected.items())
 

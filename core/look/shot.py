@@ -248,8 +248,8 @@ def _read_frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
     frame_number = _to_int(entry["frame"])
     if not 0 <= frame_number < MAX_FRAME:
         raise ValueError(f"the frame {frame_number} is no number of a file")
-    return ShotFrame(frame_number, str(entry.get("name", "Camera")),
-                     Camera(width, height, fx, fy, cx, cy, pose, exposure), lights, tuple(entry.get("edits", [])))
+    camera = Camera(width, height, fx, fy, cx, cy, pose, exposure)
+    return ShotFrame(frame_number, _camera_name(entry), camera, lights, tuple(entry.get("edits", [])))
 
 
 def _light_entry(light: PlacedLight) -> dict[str, Any]:

@@ -51,14 +51,12 @@ from tests.core.flared import flared_capture
 from tests.core.recording_progress import RecordingProgress, StopAfter
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return Capture.open(flared_capture(tmp_path_factory.mktemp("capture")))
-
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def quick(iterations: int = 40, **changes: Any) -> FitSettings:

@@ -29,14 +29,12 @@ from tests.core.recording_progress import StopAfter
 from tests.core.simulated_gpu import GPU, SimulatedGpu, simulate
 
 MAX_DIFFERENCE_DB = 0.2
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return Capture.open(flared_capture(tmp_path_factory.mktemp("capture")))
-
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture

@@ -18,6 +18,8 @@ from core.gaussians import SceneGaussians
 from core.gaussians.ply import read_ply, write_ply
 from tests.core.flared import flared_capture
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
@@ -36,9 +38,6 @@ def scene(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
         made.opacity_logits += 3
     write_ply(path, made)
     return path
-
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def settings(scene: Path, **changes: Any) -> FitSettings:

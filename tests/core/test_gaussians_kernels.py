@@ -14,8 +14,6 @@ from tests.core.gaussian_cases import differences, scene_case, splat_case
 SETS = [name for name in ("tiles", "cpu") if is_available(name)]
 SCENES = 200
 SPLATS = 100
-
-
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 

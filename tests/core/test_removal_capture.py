@@ -21,6 +21,7 @@ from core.removal.jobs.capture import UNFINISHED_FOLDER, _clean_names, clean_cap
 from core.removal.jobs.provenance import check_clean_frames_current, has_exact_clean_frames
 from core.system.progress import Progress
 from tests.core.captures import make_capture
+from tests.core.recording_progress import StopAfter
 from tests.core.removal_cases import lit_street
 from tests.core.test_capture_neighbours import turned_capture
 
@@ -129,14 +130,8 @@ def test_a_stopped_cleaning_of_a_capture_resumes(tmp_path: Path, flare_everywher
     capture = Capture.open(make_capture(tmp_path / "capture", views=3))
     remover = Remover(flare_everywhere, working_size=64)
     shutil.rmtree(capture.folder / "removed", ignore_errors=True)
-
-    class Stopped(Progress):
-        def advance(self, steps: int = 1, **figures: float) -> None:
-            self.request_stop()
-            super().advance(steps, **figures)
-
     with pytest.raises(Cancelled):
-        clean_capture(capture, remover, Stopped())
+        clean_capture(capture, remover, StopAfter(1))
     first = next((capture.folder / UNFINISHED_FOLDER).rglob("*.png"))
     begun = first.stat().st_mtime_ns
     made = clean_capture(capture, remover, Progress())

@@ -19,6 +19,7 @@ from core.optics.lenses import find_lens, lens_names
 from core.optics.prescription import parse_prescription
 from core.optics.starburst import starburst_texture
 from core.system.progress import Progress
+from tests.core.recording_progress import StopAfter
 
 SMALL = {"lens": "US4099850", "tracing.width": 64, "tracing.positions": 8, "tracing.bands": 2, "ghosts.count": 4,
          "fit.iterations": 80, "fit.gaussians": 150, "fit.max_gaussians": 200}
@@ -75,13 +76,8 @@ def test_the_same_settings_make_the_same_file(made: tuple[Path, traced_flare.Tra
 
 
 def test_a_stopped_fit_leaves_no_file(tmp_path: Path) -> None:
-    class Stopping(Progress):
-        def _show_progress(self, _figures: dict[str, float]) -> None:
-            if self._stage == "fit":
-                self.request_stop()
-
     with pytest.raises(Cancelled):
-        make_flare(TracedFlareSettings().override(SMALL), tmp_path / "a.flare", Stopping())
+        make_flare(TracedFlareSettings().override(SMALL), tmp_path / "a.flare", StopAfter(1, "fit"))
     assert list(tmp_path.iterdir()) == []
 
 

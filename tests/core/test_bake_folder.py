@@ -78,7 +78,7 @@ def test_a_damaged_frame_is_named(tmp_path: Path) -> None:
         LayerFolder.open(tmp_path)
 
 
-def test_a_folder_is_opened_some_frames_a_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_is_opened_in_steps_of_some_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("core.bake.folder.FRAMES_PER_STEP", 2)
     files = {number: frame(tmp_path, number, ["sun"]) for number in range(1, 6)}
     assert sum(1 for _ in LayerFolder.open_in_steps(tmp_path)) == 2

@@ -241,7 +241,7 @@ def test_links_that_leave_the_folder_are_refused(tmp_path: Path) -> None:
     assert safe_join(folder, "sub/c.png", CaptureError) == folder / "sub/c.png"
 
 
-def test_many_names_are_checked_as_single_ones(tmp_path: Path) -> None:
+def test_check_names_agrees_with_safe_join(tmp_path: Path) -> None:
     folder = tmp_path / "layers"
     (folder / "sub").mkdir(parents=True)
     (tmp_path / "out").mkdir()

@@ -310,11 +310,11 @@ def test_the_binomial_tail_is_exact() -> None:
     assert edges == [1, 0, 1, 0]
 
 
-def turning(number: int, most: float = 0.12) -> list[Camera]:
-    """Cameras that travel and turn, the light of `TestGhosts` above all their frames. most: largest turn, radians."""
-    rng = np.random.default_rng(4)
-    return [Camera(*SIZE, 300, 300, 160, 120, rotated @ camera.world_to_camera) for camera, rotated in
-            zip(orbit(number, size=SIZE), (tilt(x, y) for x, y in rng.uniform(-most, most, (number, 2))), strict=True)]
+def turning(number: int, max_turn: float = 0.12) -> list[Camera]:
+    """Cameras that travel and turn, the light of `TestGhosts` above all their frames. max_turn: radians."""
+    turns = np.random.default_rng(4).uniform(-max_turn, max_turn, (number, 2))
+    return [Camera(*SIZE, 300, 300, 160, 120, tilt(x, y) @ camera.world_to_camera)
+            for camera, (x, y) in zip(orbit(number, size=SIZE), turns, strict=True)]
 
 
 def tilt(x: float, y: float) -> NDArray[np.float64]:
@@ -382,8 +382,8 @@ class TestSunInClippedSky:
             light = np.full((SIZE[1], SIZE[0], 3), 0.1)
             v, u = np.mgrid[:SIZE[1], :SIZE[0]] + 0.5
             sun, centre = camera.project(self.sun[None])[0][0], np.array([camera.cx, camera.cy])
-            away = np.hypot(u - sun[0] - 6, v - sun[1])  # the sun is not in the middle of the clipped sky
-            light += np.clip(1 + (self.sky_radius - away) / 120, 0, 1.2)[..., None]
+            distance = np.hypot(u - sun[0] - 6, v - sun[1])  # the sun is not in the middle of the clipped sky
+            light += np.clip(1 + (self.sky_radius - distance) / 120, 0, 1.2)[..., None]
             for pixel in camera.project(static)[0]:
                 light[np.hypot(u - pixel[0], v - pixel[1]) < 4] = 0.4
             if share:
@@ -394,7 +394,7 @@ class TestSunInClippedSky:
         return find_lights(SimpleNamespace(views=views, frame=lambda view: frames[view.name], extent=EXTENT,
                                            clean_frame=lambda _: None), ExposureDetector(0.3))
 
-    def test_the_sun_is_found_by_its_ghost(self) -> None:
+    def test_a_ghost_gives_the_direction_of_the_sun(self) -> None:
         findings = self.find(-0.5)
         (found,) = findings.lights
         middle = np.mean([camera.position for camera in turning(14, 0.2)], axis=0)
@@ -406,11 +406,11 @@ class TestSunInClippedSky:
         assert not self.find(0.0).lights
 
     def test_objects_of_the_scene_are_no_ghosts(self) -> None:
-        """From cameras that look forward and hardly move, things opposite to a window agree on a light in it."""
+        """From cameras that look forward and hardly move, objects opposite to a window agree on a light in it."""
         cameras = [Camera(*SIZE, 300, 300, 160, 120, shifted(x, y)) for x in np.linspace(-0.2, 0.2, 6)
                    for y in (-0.05, 0.05)]
-        things = np.random.default_rng(1).uniform((-4, 0.5, 8), (4, 3, 12), (10, 3))
-        blobs = [[Blob(pixel, 5.0, 0.1) for pixel in camera.project(things)[0] if camera.contains([pixel])[0]]
+        objects = np.random.default_rng(1).uniform((-4, 0.5, 8), (4, 3, 12), (10, 3))
+        blobs = [[Blob(pixel, 5.0, 0.1) for pixel in camera.project(objects)[0] if camera.contains([pixel])[0]]
                  for camera in cameras]
         window = np.zeros((60, 80), bool)
         window[2:25] = True

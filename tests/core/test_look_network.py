@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The deformation network in numpy: its store of computed offsets, products of matrices without a BLAS, and drawings in
+"""The deformation network in numpy: its store of computed offsets, products of matrices without a BLAS, and redraws in
 which lights take turns."""
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ LIGHTS = [PlacedLight(f"lamp {number}", "lamp 0", np.array(LIGHT) + np.array([0.
           for number in range(5)]
 
 
-def drawn(look: Look, view: int, budget: OffsetsBudget | None) -> dict[str, PlaneGaussians]:
-    """The flares of LIGHTS in a view, as one drawing evaluates them."""
+def redraw(look: Look, view: int, budget: OffsetsBudget | None) -> dict[str, PlaneGaussians]:
+    """The flares of LIGHTS in a view, as one redraw evaluates them."""
     if budget is not None:
         budget.begin()
     return look.evaluate_lights(cameras(3)[view].world_to_camera, LIGHTS, budget=budget)
@@ -58,21 +58,21 @@ def budget_of(seconds: float, seconds_at_rest: float = 0.0, cost: float = 1.0) -
 
 
 def exact_lights(look: Look, view: int, flares: dict[str, PlaneGaussians]) -> list[str]:
-    return [name for name, expected in drawn(look, view, None).items()
+    return [name for name, expected in redraw(look, view, None).items()
             if np.array_equal(flares[name].colours, expected.colours)]
 
 
 def test_lights_take_turns_until_all_are_exact(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
     look, budget = read_look(tmp_path / "a.flare"), budget_of(1.0)
-    assert len(exact_lights(look, 0, drawn(look, 0, budget))) == len(LIGHTS) and budget.is_complete
+    assert len(exact_lights(look, 0, redraw(look, 0, budget))) == len(LIGHTS) and budget.is_complete
     counts = []
     for _ in LIGHTS:
-        flares = drawn(look, 1, budget)
+        flares = redraw(look, 1, budget)
         exact = exact_lights(look, 1, flares)
         counts.append(len(exact))
         assert budget.is_complete == (len(exact) == len(LIGHTS))
-        for name, expected in drawn(look, 1, None).items():  # near their exact places, whosever turn it is
+        for name, expected in redraw(look, 1, None).items():  # near their exact places, whosever turn it is
             assert np.abs(flares[name].means - expected.means).max() < 0.05
     assert counts == [1, 2, 3, 4, 5]
 
@@ -80,24 +80,24 @@ def test_lights_take_turns_until_all_are_exact(tmp_path: Path) -> None:
 def test_lights_are_completed_faster_at_rest(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
     look, budget = read_look(tmp_path / "a.flare"), budget_of(1.0, 60.0)
-    drawn(look, 0, budget)
-    counts = [len(exact_lights(look, view, drawn(look, view, budget))) for view in (1, 2, 2, 2, 1)]
+    redraw(look, 0, budget)
+    counts = [len(exact_lights(look, view, redraw(look, view, budget))) for view in (1, 2, 2, 2, 1)]
     assert counts == [1, 1, 2, 5, 1]
 
 
 def test_a_moving_camera_lets_no_light_wait_for_ever(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
     look, budget = read_look(tmp_path / "a.flare"), budget_of(1.0)
-    drawn(look, 0, budget)
+    redraw(look, 0, budget)
     turns = set()
     for number in range(2 * len(LIGHTS)):
-        turns |= set(exact_lights(look, 1 + number % 2, drawn(look, 1 + number % 2, budget)))
+        turns |= set(exact_lights(look, 1 + number % 2, redraw(look, 1 + number % 2, budget)))
     assert turns == {light.name for light in LIGHTS}
 
 
 @pytest.mark.parametrize(("cost", "exact"), [
     (3.0, [1, 0, 0, 1, 0, 0, 1, 0, 0]), (2.5, [1, 0, 0, 1, 0, 1, 0, 0, 1]), (1.0, [1] * 9), (0.1, [1] * 9)])
-def test_a_light_that_takes_longer_than_the_time_of_a_redraw_is_computed_in_some(tmp_path: Path, cost: float,
+def test_a_light_that_takes_longer_than_a_redraw_has_is_computed_in_some_redraws(tmp_path: Path, cost: float,
                                                                                  exact: list[int]) -> None:
     """In a moving view the mean time stays within the limit of one redraw."""
     saved(tmp_path / "a.flare", lights=1)
@@ -120,9 +120,9 @@ def test_a_light_that_takes_longer_than_the_time_of_a_redraw_is_computed_in_some
 
 @pytest.mark.parametrize(("first", "later", "exact"), [
     (200.0, 8.0, [1] * 9), (200.0, 60.0, [1, 0, 0, 1, 0, 0, 1, 0, 0])])
-def test_one_slow_computation_does_not_hold_later_ones_up(tmp_path: Path, first: float, later: float,
-                                                          exact: list[int]) -> None:
-    """With 20 ms for a drawing and costs in ms. The first computation of a process takes longer."""
+def test_one_slow_computation_does_not_delay_later_ones(tmp_path: Path, first: float, later: float,
+                                                        exact: list[int]) -> None:
+    """With 20 ms for a redraw and costs in ms. The first computation of a process takes longer."""
     saved(tmp_path / "a.flare", lights=1)
     look, ticks = read_look(tmp_path / "a.flare"), itertools.chain([0.0, first], itertools.count(first, later))
     budget = OffsetsBudget(20.0, 60.0, lambda: next(ticks))
@@ -134,8 +134,8 @@ def test_one_slow_computation_does_not_hold_later_ones_up(tmp_path: Path, first:
     assert counts == [1, *exact]
 
 
-def test_cheap_lights_do_not_hide_what_a_costly_one_takes() -> None:
-    """Four lights of 2 ms and one of 58 ms hold 20 ms for a drawing on average, and each has its turns."""
+def test_the_mean_time_of_lights_with_different_costs_stays_within_the_limit() -> None:
+    """Four lights of 2 ms and one of 58 ms need 20 ms for a redraw on average, and each has its turns."""
     now, turns = 0.0, dict.fromkeys([(-1, "a"), (-1, "b"), (-1, "c"), (-1, "d"), (-2, "e")], 0)
     budget = OffsetsBudget(20.0, clock=lambda: now)
     for number in range(101):
@@ -154,12 +154,12 @@ def test_cheap_lights_do_not_hide_what_a_costly_one_takes() -> None:
     assert min(turns.values()) > 20
 
 
-def test_time_for_all_lights_is_an_exact_drawing(tmp_path: Path) -> None:
+def test_a_redraw_with_time_for_all_lights_is_exact(tmp_path: Path) -> None:
     """With a budget of time that suffices for all lights, every light is exact in every view."""
     saved(tmp_path / "a.flare", lights=1)
     look, budget = read_look(tmp_path / "a.flare"), budget_of(60.0)
     for view in (0, 1, 2):
-        assert len(exact_lights(look, view, drawn(look, view, budget))) == len(LIGHTS) and budget.is_complete
+        assert len(exact_lights(look, view, redraw(look, view, budget))) == len(LIGHTS) and budget.is_complete
 
 
 def offsets(network: Network, size: int) -> np.ndarray:

@@ -204,12 +204,13 @@ def test_a_fit_of_frames_without_flare_stays_dark(capture: Path, tmp_path: Path,
     (bare / "lights.json").write_text(json.dumps({"lights": [lights[0], other]}), encoding="utf-8")
     fit_args = ["fit", str(bare), "--out", str(run), "--iterations", "2"]
     assert cli.main(fit_args) == 0
-    said = capsys.readouterr().err
-    assert "found no flare in the frames" in said and f"Of the 2 lights, the fit uses only {lights[0]['name']}." in said
+    messages = capsys.readouterr().err
+    assert "found no flare in the frames" in messages
+    assert f"Of the 2 lights, the fit uses only {lights[0]['name']}." in messages
     assert 'mode = "default"' in (run / "config.toml").read_text(encoding="utf-8")
     assert cli.main([*fit_args, "--resume"]) == 0
-    assert cli.main([*fit_args[:3], str(tmp_path / "panel"), *fit_args[4:], "--mode", "estimated"]) == 0
-    assert 'mode = "default"' in (tmp_path / "panel" / "config.toml").read_text(encoding="utf-8")
+    assert cli.main([*fit_args[:3], str(tmp_path / "estimated"), *fit_args[4:], "--mode", "estimated"]) == 0
+    assert 'mode = "default"' in (tmp_path / "estimated" / "config.toml").read_text(encoding="utf-8")
 
 
 def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],

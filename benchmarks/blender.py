@@ -3,7 +3,7 @@
 
     python benchmarks/blender.py                             in a Python that has bpy; prints a table
     python benchmarks/blender.py --shares [--against TREE]   prints the parts of a redraw
-    blender [-b] --python benchmarks/blender.py -- WORDS     the same in Blender
+    blender [-b] --python benchmarks/blender.py -- ARGUMENTS the same in Blender
 
 Import: 400 cameras, 100,000 points. Events: polled in the window's thread, with 400 cameras in the scene. Overlay: one
 light of 2,000 Gaussians at 1920 x 1080, without the drawing on the GPU. Parts of a redraw: see `overlay_shares.py`.
@@ -74,7 +74,7 @@ def make_capture(folder: Path, cameras: int = CAMERAS) -> Path:
 def make_flare(path: Path, count: int = GAUSSIANS, smallest: float = 0.01) -> Path:
     """Write a .flare of one light with numpy alone: random weights, hash tables with their coarsest level alone.
 
-    count: number of Gaussians. smallest: least standard deviation, normalised coordinates; the largest is 0.06."""
+    count: number of Gaussians. smallest, 0.06: bounds of their standard deviations, normalised coordinates."""
     random = np.random.default_rng(1)
     widths = {"positions": 1, "log_scales": 2, "rotations": 2, "opacity_logits": 1, "sh": 3, "rings": 2}
     arrays = {f"0.gaussians.{name}": random.normal(size=(count, width)) for name, width in widths.items()}
@@ -223,12 +223,12 @@ def main() -> None:
     """Time the import of a capture, the reading of events, and the overlay, inside Blender."""
     import bpy
 
-    words = sys.argv[sys.argv.index("--") + 1:] if "--" in sys.argv else sys.argv[1:]
-    if "--shares" in words:
+    arguments = sys.argv[sys.argv.index("--") + 1:] if "--" in sys.argv else sys.argv[1:]
+    if "--shares" in arguments:
         sys.path.insert(0, str(Path(__file__).parent))
         import overlay_shares
 
-        overlay_shares.main([word for word in words if word != "--shares"])
+        overlay_shares.main([argument for argument in arguments if argument != "--shares"])
         return
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     load_module("flare_addon").register()

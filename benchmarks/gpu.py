@@ -140,8 +140,7 @@ def _time_fit(capture: Path, width: int, run: Path, deadline: Deadline) -> tuple
                         "--device", "cuda"], check=True, timeout=max(deadline.seconds_left, 1), capture_output=True)
         seconds = time.monotonic() - start
         subprocess.run([*command, "eval", str(run), "--device", "cuda"], check=True,
-                       timeout=max(deadline.seconds_left, 1),
-                       capture_output=True)
+                       timeout=max(deadline.seconds_left, 1), capture_output=True)
     except subprocess.CalledProcessError as problem:
         return f"failed: {problem.stderr.decode(errors='replace').strip().splitlines()[-1:]}", "–", "–"
     except subprocess.TimeoutExpired:

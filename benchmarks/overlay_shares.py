@@ -195,7 +195,7 @@ def table(columns: dict[str, Times]) -> str:
     return "\n".join(lines)
 
 
-def measure(words: Sequence[str]) -> None:
+def measure(arguments: Sequence[str]) -> None:
     """Measure the trees in turns, and print the table."""
     import bpy
 
@@ -204,7 +204,7 @@ def measure(words: Sequence[str]) -> None:
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--redraws", type=int, default=8, help="redraws of a tree in a round")
     parser.add_argument("--no-gpu", action="store_true", help="measure the parts in numpy alone")
-    options = parser.parse_args(words)
+    options = parser.parse_args(arguments)
     trees = {} if options.against is None else {"earlier tree": options.against.resolve()}
     trees["this tree"] = ROOT
     columns: dict[str, Times] = {}
@@ -214,8 +214,8 @@ def measure(words: Sequence[str]) -> None:
         for _ in range(options.rounds):
             for name, tree in trees.items():
                 times = measure_tree(tree, flare, options.redraws, has_gpu)
-                known = columns.setdefault(name, {})
-                known.update({part: min(seconds, known.get(part, seconds)) for part, seconds in times.items()})
+                fastest = columns.setdefault(name, {})
+                fastest.update({part: min(seconds, fastest.get(part, seconds)) for part, seconds in times.items()})
     if has_gpu:
         import gpu
 
@@ -226,14 +226,14 @@ def measure(words: Sequence[str]) -> None:
     sys.stdout.flush()
 
 
-def main(words: Sequence[str]) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Measure in this process, in a window once Blender has opened it, and end the process."""
     import bpy
 
     def measure_and_leave() -> None:
         status = 1
         try:
-            measure(words)
+            measure(arguments)
             status = 0
         finally:
             if status:

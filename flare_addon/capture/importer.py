@@ -25,7 +25,8 @@ from ...core.removal.jobs.provenance import has_exact_clean_frames
 from ...core.system.steps import PAUSE, Steps, finish
 from .. import cameras, fcurves, light_paths
 from ..cameras import FLIP_YZ
-from ..compositor.setup import ARTISTS_COMPOSITOR, footage_nodes, show_plate
+from ..compositor.footage import footage_nodes
+from ..compositor.setup import ARTISTS_COMPOSITOR, show_plate
 from ..images import load_image
 from ..paths import absolute, blend_relative
 from ..plate_space import show_recorded

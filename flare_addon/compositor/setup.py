@@ -23,9 +23,20 @@ from .flare_node import (
     layer_of_gain,
     new_node,
     node_group,
-    over,
-    scale_to_render_size,
     set_name,
+)
+from .footage import (
+    OBJECTS,
+    PLATE,
+    RENDER,
+    SIZE,
+    footage_behind_camera,
+    footage_node,
+    is_artists_picture,
+    picture_at_size,
+    remove_unused_render,
+    render_picture,
+    shows_render,
 )
 from .layer_nodes import (
     LAYERS,
@@ -38,12 +49,7 @@ from .layer_nodes import (
 )
 from .trees import GROUPS_ARE_TREES, tree_of
 
-PLATE = "Fit Flare Footage"
 VIEWER = "Fit Flare Viewer"
-RENDER = "Fit Flare Render"
-SIZE = "Fit Flare Size"
-OBJECTS = "Fit Flare Objects"
-"""Name of the node that composites the render over footage."""
 CROP = "Fit Flare Crop"
 """Start of the names of the nodes that cut the overscan of the layers off, one for each layer."""
 _OUR_NODES = (GROUP, LAYERS, PLATE, SIZE, OBJECTS, VIEWER, RENDER)
@@ -108,7 +114,7 @@ def set_up_nodes(scene: Any, layers: LayerFolder, *, keep_image: bool = False, p
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
     if plate is not None:
-        scene_picture = _footage_node(tree, plate).outputs["Image"]
+        scene_picture = footage_node(tree, plate).outputs["Image"]
     else:
         scene_picture = None if keep_image else sockets["scene"]
     _insert_node(scene, tree, node, scene_picture, with_objects=plate is not None and scene.render.film_transparent)
@@ -133,9 +139,8 @@ def _insert_node(scene: Any, tree: Any, node: Any, scene_picture: Any, with_obje
         artists_picture = _image_under_flare(tree, node, scene[STATE_PROPERTY])
     if artists_picture is not None:
         scene[STATE_PROPERTY].update({"from": artists_picture.node.name, "socket": artists_picture.identifier})
-    with_objects = with_objects and (
-        artists_picture is None or artists_picture.node.bl_idname == "CompositorNodeRLayers")
-    _connect_scene_picture(tree, node, scene_picture or artists_picture or _render_picture(tree), with_objects)
+    with_objects = with_objects and not (artists_picture is not None and is_artists_picture(artists_picture.node))
+    _connect_scene_picture(tree, node, scene_picture or artists_picture or render_picture(tree), with_objects)
     if not is_set_up or end.links[0].from_node == node:  # else the artist has nodes between ours and the output
         tree.links.new(node.outputs["Image"], end)
 
@@ -183,25 +188,9 @@ def _connect_scene_picture(tree: Any, node: Any, socket: Any, with_objects: bool
             tree.nodes.remove(previous)
     if socket is not None and (
             socket.node.name in (LAYERS, PLATE) or _is_crop(socket.node) or is_view_node(socket.node)):
-        socket = _picture_at_size(tree, socket, with_objects)
+        socket = picture_at_size(tree, socket, with_objects)
     tree.links.new(socket, node.inputs["Scene"])
-    _remove_unused_render(tree)
-
-
-def _remove_unused_render(tree: Any) -> None:
-    """Remove our node of the render if nothing uses its output; Blender renders the scene for it all the same."""
-    render = tree.nodes.get(RENDER)
-    if render is not None and not any(output.is_linked for output in render.outputs):
-        tree.nodes.remove(render)
-
-
-def _picture_at_size(tree: Any, socket: Any, with_objects: bool) -> Any:
-    """Add nodes that scale a picture of a file to the size of the render and, with `with_objects`, put the render over
-    it; return their output socket. socket: output socket of the picture."""
-    picture = set_name(scale_to_render_size(tree, socket, -3, 1), SIZE).outputs[0]
-    if with_objects:
-        picture = set_name(over(tree, picture, _render_picture(tree), -2.5, 2), OBJECTS).outputs[0]
-    return picture
+    remove_unused_render(tree)
 
 
 def _is_crop(node: Any) -> bool:
@@ -232,26 +221,6 @@ def _own_tree(scene: Any) -> Any:
     return tree
 
 
-def footage_nodes(scene: Any) -> list[Any]:
-    """Return the node that shows footage under the flare, as a list; [] without one."""
-    tree = tree_of(scene)
-    node = tree.nodes.get(PLATE) if tree is not None else None
-    return [node] if getattr(node, "image", None) is not None else []
-
-
-def footage_behind_camera(scene: Any) -> tuple[Any, int, int, int]:
-    """Return the footage behind the scene's camera: image, frame_start, frame_offset, frame_duration.
-
-    Raises FrameError where there is none.
-    """
-    camera = scene.camera
-    for background in camera.data.background_images if camera is not None and camera.type == "CAMERA" else ():
-        if background.source == "IMAGE" and background.image is not None:
-            user = background.image_user
-            return background.image, user.frame_start, user.frame_offset, user.frame_duration
-    raise FrameError("The camera has no footage behind it; choose Render under Over instead.")
-
-
 def show_plate(scene: Any) -> bool:
     """Make renders show the footage behind the scene's camera, until layers are set up over it.
 
@@ -266,16 +235,19 @@ def show_plate(scene: Any) -> bool:
     if tree is None:
         tree = _new_tree(scene, keep_image=False)
         scene[STATE_PROPERTY] = {**state, **_tree_state(tree)}
-    footage = _footage_node(tree, plate)
-    ours, objects = [tree.nodes[name] for name in (OBJECTS, SIZE) if name in tree.nodes], scene.render.film_transparent
-    if find_node(scene) is None and (not ours or (ours[0].name == OBJECTS) != objects):
-        fed_inputs = [link.to_socket for link in ours[0].outputs[0].links] if ours else [_final_input(tree)]
-        for node in ours:
+    footage = footage_node(tree, plate)
+    with_objects = scene.render.film_transparent
+    # The node of the two that ends the picture comes first.
+    previous = [tree.nodes[name] for name in (OBJECTS, SIZE) if name in tree.nodes]
+    is_up_to_date = bool(previous) and (previous[0].name == OBJECTS) == with_objects
+    if find_node(scene) is None and not is_up_to_date:
+        fed_inputs = [link.to_socket for link in previous[0].outputs[0].links] if previous else [_final_input(tree)]
+        for node in previous:
             tree.nodes.remove(node)
-        picture = _picture_at_size(tree, footage.outputs["Image"], objects)
+        picture = picture_at_size(tree, footage.outputs["Image"], with_objects)
         for fed_input in fed_inputs:
             tree.links.new(picture, fed_input)
-        _remove_unused_render(tree)
+        remove_unused_render(tree)
     return True
 
 
@@ -318,28 +290,6 @@ def _undo_set_up(scene: Any, tree: Any, source: Any, node_settings: dict[str, An
         elif not GROUPS_ARE_TREES:
             scene.use_nodes = bool(state["use_nodes"])
     _remove_unused([image], state)
-
-
-def _render_picture(tree: Any) -> Any:
-    """Return the socket of the render; a node for it is added where there is none.
-
-    In a stack of effects it is the picture that comes into the effect.
-    """
-    render = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
-    if render is None and (incoming := trees.incoming_picture(tree, RENDER)) is not None:
-        return incoming
-    return (render or set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)).outputs["Image"]
-
-
-def _footage_node(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
-    """Return the node that shows footage. plate: image, frame_start, frame_offset, frame_duration."""
-    node = tree.nodes.get(PLATE) or set_name(new_node(tree, "CompositorNodeImage", -4, 2.5), PLATE)
-    image, start, offset, duration = plate
-    node.image = image
-    if image.source == "SEQUENCE":
-        node.frame_start, node.frame_offset, node.frame_duration = start, offset, duration
-        node.use_auto_refresh = True
-    return node
 
 
 # ---- removal -------------------------------------------------------------------------------
@@ -421,7 +371,7 @@ def _bypass_node(tree: Any, node: Any, state: dict[str, Any]) -> None:
     """
     picture_below = _image_under_flare(tree, node, state)
     if picture_below is None and not state["tree"]:
-        picture_below = _render_picture(tree)
+        picture_below = render_picture(tree)
     for fed_input in [link.to_socket for link in tree.links if link.from_node == node
                       and (link.from_socket.name == "Image" or link.to_node.bl_idname == trees.OUTPUT_TYPE)]:
         if picture_below is not None:
@@ -472,7 +422,7 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
     """
     tree = trees.new_tree(scene)
     if keep_image and not tree.nodes:
-        tree.links.new(_render_picture(tree), _final_input(tree))
+        tree.links.new(render_picture(tree), _final_input(tree))
     return tree
 
 
@@ -494,7 +444,4 @@ def _final_input(tree: Any, add: bool = True) -> Any:
 def is_over_render(scene: Any) -> bool:
     """Return whether the flare lies over the render, without footage under it."""
     node = find_node(scene)
-    if node is None or OBJECTS in tree_of(scene).nodes:
-        return False
-    return any(trees.depends_on(node, candidate) for candidate in tree_of(scene).nodes
-               if candidate.bl_idname in ("CompositorNodeRLayers", "NodeGroupInput"))
+    return node is not None and OBJECTS not in tree_of(scene).nodes and shows_render(tree_of(scene), node)

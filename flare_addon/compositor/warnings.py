@@ -11,7 +11,7 @@ from ...core.conventions.frame_numbers import NumberedFrame, missing_numbers
 from ...core.errors import FrameError
 from ...core.images.picture import same_aspect
 from .. import stereo
-from . import drivers, flare_node, layer_nodes, setup, trees
+from . import drivers, flare_node, footage, layer_nodes, setup, trees
 
 _SPHERICAL = ("The camera has Spherical Stereo, with which the flares do not lie on the lights; switch it off in the "
               "camera's Stereoscopy settings.")
@@ -30,7 +30,7 @@ def warnings(scene: Any, layer_folders: Sequence[LayerFolder], live: bool) -> It
         yield ("The compositor effect with the flare is switched off for renders, so they have no flare; switch it on "
                "in the list of effects.")
     yield from stereo_warnings(scene)
-    if setup.OBJECTS in trees.tree_of(scene).nodes and (note := footage_note(scene)):
+    if footage.OBJECTS in trees.tree_of(scene).nodes and (note := footage_note(scene)):
         yield note
     if strips := _active_strips(scene):
         yield (f"Renders show the video sequencer, which has {strips[0].name!r}, in place of the compositor, without "
@@ -62,7 +62,7 @@ def footage_note(scene: Any) -> str:
     """Return how a render over footage differs from the camera view, and what to do; "" where it does not."""
     tree, is_transparent = trees.tree_of(scene), scene.render.film_transparent
     nodes = () if tree is None else tree.nodes
-    if setup.OBJECTS in nodes and not is_transparent:
+    if footage.OBJECTS in nodes and not is_transparent:
         return ("The film is opaque, so the world hides the footage in renders; switch Transparent on in the render "
                 "properties, under Film.")
     if scene.fit_flare.over == "plate" and not is_transparent:
@@ -72,9 +72,9 @@ def footage_note(scene: Any) -> str:
         how = ("bake, or import the footage again" if setup.shows_plate_alone(scene)
                else "press Set Up Compositor again")
         return f"Renders show the footage without the objects of the scene; {how}."
-    for node in setup.footage_nodes(scene):
+    for node in footage.footage_nodes(scene):
         with contextlib.suppress(FrameError):
-            if setup.footage_behind_camera(scene)[0] != node.image:
+            if footage.footage_behind_camera(scene)[0] != node.image:
                 return ("Renders show the footage of another camera. To show that of the scene's camera, bake, or "
                         "press Set Up Compositor again.")
     return ""
@@ -83,15 +83,13 @@ def footage_note(scene: Any) -> str:
 def _lacks_objects(scene: Any) -> bool:
     """Return whether the compositor shows footage in place of the render, and a new set-up would show both."""
     tree = trees.tree_of(scene)
-    if tree is None or setup.PLATE not in tree.nodes or setup.STATE_PROPERTY not in scene:
+    if tree is None or footage.PLATE not in tree.nodes or setup.STATE_PROPERTY not in scene:
         return False
-    artists_node = tree.nodes.get(scene[setup.STATE_PROPERTY]["from"])
-    if artists_node is not None and artists_node.bl_idname != "CompositorNodeRLayers":
+    if footage.is_artists_picture(tree.nodes.get(scene[setup.STATE_PROPERTY]["from"])):
         return False  # a set-up leaves the render to the artist's nodes
     ends = [node for node in tree.nodes if node.bl_idname == trees.OUTPUT_TYPE]
-    renders = [node for node in tree.nodes if node.bl_idname in ("CompositorNodeRLayers", "NodeGroupInput")]
-    return any(trees.depends_on(end, tree.nodes[setup.PLATE]) for end in ends) and not any(
-        trees.depends_on(end, render) for end in ends for render in renders)
+    return any(trees.depends_on(end, tree.nodes[footage.PLATE]) for end in ends) and not any(
+        footage.shows_render(tree, end) for end in ends)
 
 
 def stereo_warnings(scene: Any) -> Iterator[str]:

@@ -15,6 +15,7 @@ from ...core.errors import CaptureError, FitFlareError, RunError
 from ...core.system.steps import PAUSE, Steps, finish
 from .. import baking, jobs, render_settings, shots
 from ..compositor import drivers, flare_node, setup, warnings
+from ..compositor.footage import footage_behind_camera
 from ..paths import absolute, is_folder
 from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator, report_errors
 
@@ -114,7 +115,7 @@ def _set_up_in_steps(operator: Any, scene_now: Callable[[], Any], folder: str, *
         views[view] = yield from LayerFolder.open_in_steps(path)
     yield PAUSE
     scene, layers = scene_now(), next(iter(views.values()))
-    footage = setup.footage_behind_camera(scene) if plate else None
+    footage = footage_behind_camera(scene) if plate else None
     setup.set_up_nodes(scene, layers, keep_image=keep_image, plate=footage, views=views if len(views) > 1 else None)
     yield PAUSE
     scene = scene_now()

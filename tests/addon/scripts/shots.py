@@ -179,7 +179,7 @@ backs = [one.camera.data.background_images[0] for one in (scene, other)]
 tree = artists_tree(scene)
 own, under = (tree.nodes.new("CompositorNodeImage") for _ in range(2))
 own.image = under.image = backs[0].image
-under.name = part("flare_addon.compositor.setup").PLATE
+under.name = part("flare_addon.compositor.footage").PLATE
 facts["shared footage"] = []
 for which, one in (("removed", scene), ("removed", other), ("images", scene), ("images", other)):
     one.fit_flare.footage = which

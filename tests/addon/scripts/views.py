@@ -18,9 +18,9 @@ package, capture, flare, out = sys.argv[1:5]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-overlay, panels, trees, views, setup, render_settings = (
+overlay, panels, trees, views, setup, footage, render_settings = (
     part(f"flare_addon.{name}") for name in ("overlay", "panels", "compositor.trees", "views", "compositor.setup",
-                                             "render_settings"))
+                                             "compositor.footage", "render_settings"))
 facts: dict[str, object] = {}
 
 # ---- views that show the compositor's result ------------------------------------------------------------
@@ -173,12 +173,20 @@ cancelled.close()
 facts["cancelled"] = [trees.tree_of(scene) is None, scene.render.film_transparent, setup.STATE_PROPERTY in scene]
 
 # ---- objects before the footage -------------------------------------------------------------------------
+LEFT, RIGHT = slice(0, 31), slice(36, None)  # the board ends at column 33
+
+
+def add_board(scene):
+    """Add a coloured board before the left half of the scene's camera; return it."""
+    board = object_in(scene, "Board", bpy.data.meshes.new("Board"), (0, 0, 0))
+    board.data.from_pydata([(-9, -9, -1), (0, -9, -1), (0, 9, -1), (-9, 9, -1)], [], [(0, 1, 2, 3)])
+    board.parent, board.color = scene.camera, (0.5, 0.25, 0.125, 1)
+    return board
+
+
 scene = imported()
 plain = rendered(scene, ".exr")
-board = object_in(scene, "Board", bpy.data.meshes.new("Board"), (0, 0, 0))
-board.data.from_pydata([(-9, -9, -1), (0, -9, -1), (0, 9, -1), (-9, 9, -1)], [], [(0, 1, 2, 3)])
-board.parent, board.color = scene.camera, (0.5, 0.25, 0.125, 1)
-LEFT, RIGHT = slice(0, 31), slice(36, None)  # the board ends at column 33
+board = add_board(scene)
 
 
 def halves(picture):
@@ -210,7 +218,7 @@ facts["set up, transparent again"] = halves(rendered(scene, ".exr") - light)
 scene.fit_flare.over = "scene"
 ops.set_up_baked()
 facts["over the baked scene"] = sorted(node.name for node in trees.tree_of(scene).nodes
-                                       if node.name in (setup.RENDER, setup.OBJECTS))
+                                       if node.name in (footage.RENDER, footage.OBJECTS))
 scene.fit_flare.over = "plate"
 ops.set_up_baked()
 ops.remove_compositor()
@@ -220,13 +228,11 @@ facts["objects removed"] = trees.tree_of(scene) is None
 scene = imported(match_scene=False)
 scene.frame_set(0)
 scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = WIDTH, HEIGHT, 100
-board = object_in(scene, "Board", bpy.data.meshes.new("Board"), (0, 0, 0))
-board.data.from_pydata([(-9, -9, -1), (0, -9, -1), (0, 9, -1), (-9, 9, -1)], [], [(0, 1, 2, 3)])
-board.parent, board.color = scene.camera, (0.5, 0.25, 0.125, 1)
+board = add_board(scene)
 tree = trees.tree_of(scene)
 end = next(node for node in tree.nodes if node.bl_idname == trees.OUTPUT_TYPE)
 reroute = tree.nodes.new("NodeReroute")  # of the artist, after the footage
-tree.links.new(tree.nodes[setup.SIZE].outputs[0], reroute.inputs[0])
+tree.links.new(tree.nodes[footage.SIZE].outputs[0], reroute.inputs[0])
 tree.links.new(reroute.outputs[0], end.inputs[0])
 facts["film"] = {"opaque": [warnings.footage_note(scene), float(np.abs(rendered(scene, ".exr") - plain).max())]}
 
@@ -239,7 +245,7 @@ def film(name, is_transparent):
     board.parent = scene.camera
     picture = rendered(scene, ".exr")
     facts["film"][name] = [note, warnings.footage_note(scene), halves(picture), float(np.abs(picture - plain).max()),
-                           trees.depends_on(end, reroute), setup.RENDER in tree.nodes]
+                           trees.depends_on(end, reroute), footage.RENDER in tree.nodes]
 
 
 film("transparent", True)
@@ -266,7 +272,7 @@ ops.open_flare(filepath=flare)
 ops.bake()
 scene.fit_flare.over = "plate"
 ops.set_up_baked()
-facts["film"]["over an artist's picture"] = [setup.PLATE in tree.nodes, warnings.footage_note(scene)]
+facts["film"]["over an artist's picture"] = [footage.PLATE in tree.nodes, warnings.footage_note(scene)]
 
 # ---- views that turn to the camera ----------------------------------------------------------------------
 turned = []

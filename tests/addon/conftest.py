@@ -60,3 +60,20 @@ def run_script(blender: Blender, package: Path, tmp_path_factory: pytest.TempPat
                            user=base / "user")
 
     return run
+
+
+@pytest.fixture(scope="session")
+def run_look_script(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Any]:
+    """Return a function that runs a script of `scripts`, given by its name, in Blender and returns its facts.
+
+    The script gets the package, a .flare of one light, one of the two lights "sun" and "moon", and a folder for its
+    output.
+    """
+    from test_work import a_flare
+
+    def run(name: str) -> Any:
+        base = tmp_path_factory.mktemp(name)
+        return blender.run(Path(__file__).parent / "scripts" / f"{name}.py", package, a_flare(base / "lamp.flare"),
+                           a_flare(base / "two.flare", "sun", "moon"), base, user=base / "user")
+
+    return run

@@ -2,21 +2,15 @@
 """An artist's first minutes with the library, without a capture and without an engine."""
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
-from blenders import Blender
-from test_work import a_flare
-
-SCRIPT = Path(__file__).parent / "scripts" / "first_minute.py"
 
 
 @pytest.fixture(scope="session")
-def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    base = tmp_path_factory.mktemp("first_minute")
-    return blender.run(SCRIPT, package, a_flare(base / "lamp.flare"), a_flare(base / "two.flare", "sun", "moon"), base,
-                       user=base / "user")
+def facts(run_look_script: Callable[[str], Any]) -> Any:
+    return run_look_script("first_minute")
 
 
 def test_one_button_shows_a_look_of_the_library(facts: Any) -> None:

@@ -2,21 +2,15 @@
 """Other looks are tried on flares that an artist has edited: every choice stays, and nothing is left out silently."""
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
-from blenders import Blender
-from test_work import a_flare
-
-SCRIPT = Path(__file__).parent / "scripts" / "looks.py"
 
 
 @pytest.fixture(scope="session")
-def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    base = tmp_path_factory.mktemp("looks")
-    return blender.run(SCRIPT, package, a_flare(base / "lamp.flare"), a_flare(base / "two.flare", "sun", "moon"), base,
-                       user=base / "user")
+def facts(run_look_script: Callable[[str], Any]) -> Any:
+    return run_look_script("looks")
 
 
 def test_edits_keys_and_drivers_of_elements_outlast_a_look_without_them(facts: Any) -> None:
@@ -42,7 +36,7 @@ def test_a_choice_against_the_file_stays(facts: Any) -> None:
     assert facts["as fitted again"] == [False]
 
 
-def test_each_flare_gets_the_light_back_that_it_had(facts: Any) -> None:
+def test_each_flare_returns_to_the_light_of_its_first_look(facts: Any) -> None:
     """Block of looks.py: "two lights, one light, two lights"."""
     assert facts["each its own look"] == [True, ["light", "light"], ["sun", "moon"]]
     assert facts["without a light object"] == [[["sun", "sun", "Lamp 1"], ["moon", "moon", ""]], 0.25]
@@ -102,7 +96,7 @@ def test_a_look_is_undone(facts: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", ["linked copy", "full copy"])
-def test_a_copied_scene_has_a_look_of_its_own(facts: Any, kind: str) -> None:
+def test_a_change_in_a_copied_scene_leaves_the_original_alone(facts: Any, kind: str) -> None:
     """Block of looks.py: "copies of a scene"."""
     placed, other, count, intensities = facts[kind]
     assert placed == [True, True]

@@ -233,7 +233,7 @@ def compare(scene, engine: str, over: str, results) -> None:
             path = str(flow.out / name.replace(" ", "_"))
             bpy.ops.render.render(scene=scene.name)
             rendered = saved(scene, Path(f"{path}_render.png"))
-            view = yield from settled_view(scene, Path(f"{path}_view.png"), rendered)
+            view = yield from view_at_rest(scene, Path(f"{path}_view.png"), rendered)
             results[name] = differences(rendered, view)
             placed = module("looks").place_lights(scene, bpy.context.evaluated_depsgraph_get(), scene.camera)[1]
             results[name]["share"] = round(float(placed[0].visibility), 3)
@@ -242,7 +242,7 @@ def compare(scene, engine: str, over: str, results) -> None:
             print(name, results[name], flush=True)
 
 
-def settled_view(scene, path: Path, rendered):
+def view_at_rest(scene, path: Path, rendered):
     """Take screenshots into `path` until the view no longer changes; return the camera's frame in it, a generator of
     steps.
 

@@ -253,7 +253,7 @@ def red_green(shot):
     return [[round(value, 4) for value in frame.lights[0].factor[:2]] for frame in shot.frames]
 
 
-def seen_baked_sent(change):
+def factors_by_route(change):
     """Light a scene whose lamp `change` animates after it got its flare; return the factors on red and green in frames
     1 and 9, in a camera view, in a bake and in a transfer, each of a new scene at frame 4."""
     routes = {}
@@ -319,7 +319,7 @@ animations = {"driven power": lambda data: drive(data, "energy", "10 * (frame + 
 if "exposure" in bpy.types.Light.bl_rna.properties:
     animations["keyed exposure"] = lambda data: keyed(data, "exposure", (1, 0.0), (9, 2.0))
     animations["driven exposure"] = lambda data: drive(data, "exposure", "(frame - 1) / 4")
-facts["animated later"] = {name: seen_baked_sent(change) for name, change in animations.items()}
+facts["animated later"] = {name: factors_by_route(change) for name, change in animations.items()}
 
 scene, lamp, item = lit_scene()
 posed = object_in(scene, "Posed", None, (0, 0, 0))
@@ -435,9 +435,9 @@ buffers.create_offscreen = lambda *key: SimpleNamespace(key=key, free=lambda: fr
 by_canvas = buffers.BuffersByCanvas()
 sizes = [by_canvas.of((number, "")).offscreen(4, 101, 50).key for number in (1, 1, 2, 3, 4, 1, 5)]
 facts["buffers"] = {"sizes": list(map(list, set(sizes))), "freed": len(freed)}
-kept = [number for number in range(1, 6) if (number, "") in by_canvas._canvases]
+remaining = [number for number in range(1, 6) if (number, "") in by_canvas._canvases]
 by_canvas.of((1, "")).offscreen(4, 99, 50)
-facts["buffers"] |= {"kept": kept, "another size": len(freed)}
+facts["buffers"] |= {"kept": remaining, "another size": len(freed)}
 by_canvas.free()
 facts["buffers"]["all"] = len(freed)
 for number in (0, 1, 2, 3):

@@ -98,8 +98,8 @@ facts["listed"] = [sorted(listed()[0]) == sorted(present), listed(filter_name="G
 del stand_in.bitflag_item_never_show  # as before Blender 4.4, where Blender inverts the flags itself
 inverted = []
 for name in ("GLA", ""):
-    shown = set(listed(filter_name=name, use_filter_invert=True, use_filter_sort_alpha=False)[0])
-    inverted.append(sorted(element.name for element in item.elements if element.name not in shown))
+    flagged = set(listed(filter_name=name, use_filter_invert=True, use_filter_sort_alpha=False)[0])
+    inverted.append(sorted(element.name for element in item.elements if element.name not in flagged))
 facts["listed, inverted by Blender"] = [inverted[0] == sorted({*present} - {"glare"}), inverted[1] == sorted(present)]
 highlight._current = None
 item.element = item.element

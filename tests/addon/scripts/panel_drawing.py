@@ -15,7 +15,7 @@ _ICONS = frozenset(_FUNCTIONS["label"].parameters["icon"].enum_items.keys())
 class Layout:
     """Stands in for Blender's UILayout. Raises where Blender has no such operator, property, icon, parameter or list.
 
-    drawn: what was drawn, in order: (function, text, operator, property or list).
+    drawn: what was drawn, in order: pairs of the layout's function and its operator, menu, property, list or text.
     """
 
     def __init__(self, drawn: list[tuple[str, str]] | None = None) -> None:
@@ -32,9 +32,9 @@ class Layout:
             assert not unknown, f"{name} has no parameters {unknown}"
             assert settings.get("icon", "NONE") in _ICONS, settings["icon"]
             self.drawn.append((name, _subject(name, args, settings)))
-            if name in ("operator", "menu"):
-                return _operator_settings(args[0]) if name == "operator" else None
-            return Layout(self.drawn)
+            if name == "operator":
+                return _operator_settings(args[0])
+            return None if name == "menu" else Layout(self.drawn)
 
         return draw
 

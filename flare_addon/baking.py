@@ -7,7 +7,6 @@ starts a bake; the panel Bake shows it.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -19,17 +18,14 @@ import bpy
 from ..core.errors import FitFlareError, RunError, os_error_message
 from ..core.system.files import remove_file, write_json
 from ..core.system.processes import available_cores
-from ..core.system.steps import PAUSE, Steps, finish
+from ..core.system.steps import Steps, finish
 from . import engine, jobs, lamp_drive, looks, shots
 from .compositor.flare_node import find_node
 from .compositor.trees import forget_composited_frames
 from .properties import redraw_viewports
 from .shots import ShotReading
+from .turns import INTERVAL_S, run_turn
 
-STEP_S = 0.02
-"""Seconds for which a bake may block the window at a time; a longer step is not interrupted."""
-INTERVAL_S = 0.005
-"""Seconds between two such turns."""
 MAX_PROCESSES = 8
 """Most processes that draw without an engine; each needs about a gigabyte for frames of 4K."""
 
@@ -38,40 +34,29 @@ class Preparation:
     """A scene that is being read for a bake."""
 
     def __init__(self, reading: ShotReading, own_folder: bool, folder: Path) -> None:
-        """Prepare the bake of a scene; `step` reads its frames.
+        """Prepare the bake of a scene.
 
         own_folder: the layers of a single camera have a subfolder too. folder: where the layers are written.
         """
-        self.reading, self.error = reading, ""
+        self.reading = reading
         self._own_folder, self._folder = own_folder, folder
-        self._start: Steps[None] | None = None
+        self.steps = self._read_and_start()
 
     @property
     def fraction_done(self) -> float:
         """The part of the frames that is read, 0..1."""
         return self.reading.done / max(self.reading.total, 1)
 
-    def step(self) -> bool:
-        """Read one frame of the scene; after the last one, write some frames of the shot file; after all, start the
-        bake. Return whether steps remain."""
-        if self.reading.done < self.reading.total:
-            self.reading.step()
-            return True
-        self._start = self._start or self._start_in_steps()
-        try:
-            next(self._start)
-        except StopIteration:
-            return False
-        return True
-
     def end(self) -> None:
         """Restore the timeline; leave no half-written shot."""
-        if self._start is not None:
-            self._start.close()
+        self.steps.close()
         self.reading.restore()
 
-    def _start_in_steps(self) -> Steps[None]:
-        """Write the shot that was read, and start the process that bakes it."""
+    def _read_and_start(self) -> Steps[None]:
+        """Read the scene frame by frame, write the shot file, and start the process that bakes it."""
+        while self.reading.done < self.reading.total:
+            self.reading.step()
+            yield
         self.reading.restore()
         yield
         scene = self.reading.scene
@@ -141,8 +126,7 @@ def start_bake(scene: Any, camera_objects: Sequence[Any], *, replace_others: boo
     _last_error, _last_scene = "", scene.name
     if bpy.app.background:
         try:
-            while new_preparation.step():
-                pass
+            finish(new_preparation.steps)
         finally:
             new_preparation.end()
         return
@@ -157,15 +141,13 @@ def cancel() -> None:
 
 
 def _read_scene() -> float | None:
-    """Read frames for `STEP_S`; return the seconds to the next call, None to stop the timer."""
+    """Run a turn of the reading; return the seconds to the next turn, None to stop the timer."""
     if _preparation is None:
         return None
-    start = time.perf_counter()
     try:
-        while _preparation.step():
-            if time.perf_counter() - start > STEP_S:
-                jobs.redraw_bars()
-                return INTERVAL_S
+        if run_turn(_preparation.steps):
+            jobs.redraw_bars()
+            return INTERVAL_S
         _end_reading("")
     except FitFlareError as problem:
         _end_reading(str(problem))
@@ -223,17 +205,13 @@ def _on_finished(job: jobs.Job) -> None:
 
 
 def _run_steps(steps: Steps[None], job: jobs.Job) -> float | None:
-    """Run steps that follow a bake for `STEP_S`; return the seconds to the next call, None to stop the timer.
+    """Run a turn of the steps that follow a bake; return the seconds to the next turn, None to stop the timer.
 
     An unexpected exception is shown in the panel and the console, as one of the job.
     """
-    start = time.perf_counter()
     try:
-        while next(steps) != PAUSE and time.perf_counter() - start <= STEP_S:
-            pass
-        return INTERVAL_S
-    except StopIteration:
-        pass
+        if run_turn(steps):
+            return INTERVAL_S
     except Exception as problem:
         jobs.report_exception(job, problem)
     jobs.redraw_bars()

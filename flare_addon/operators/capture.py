@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,8 @@ from .. import fits
 from ..capture import exporter
 from ..capture.importer import ImportSettings, import_in_steps, show_frames_in_renders
 from ..reports import NO_CAMERA, GuardedOperator, report_errors
+from ..turns import INTERVAL_S, run_turn
 from ..views import look_through_camera
-
-STEP_S = 0.02
-"""Seconds for which an import may block the window at a time; a longer step is not interrupted."""
-INTERVAL_S = 0.005
-"""Seconds between two such turns."""
 
 
 class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
@@ -112,14 +107,10 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         self._is_window_turn = not self._is_window_turn
         if self._is_window_turn:
             return {"RUNNING_MODAL"}
-        start = time.perf_counter()
         with report_errors(self) as outcome:
             try:
-                while next(self._steps) != PAUSE and time.perf_counter() - start < STEP_S:
-                    pass
-                return {"RUNNING_MODAL"}
-            except StopIteration:
-                pass
+                if run_turn(self._steps):
+                    return {"RUNNING_MODAL"}
             except (ReferenceError, RuntimeError):
                 self.cancel(context)
                 raise

@@ -295,8 +295,9 @@ def prepare():
     baking._last_error, baking._last_scene = "", scene.name
 
 
-started, start_process, step_s = [], baking._start_process, baking.STEP_S
-baking._start_process, baking.STEP_S = lambda _folder, count: started.append(count), 0.0
+started, start_process, turns = [], baking._start_process, part("flare_addon.turns")
+turn_s, turns.TURN_S = turns.TURN_S, 0.0
+baking._start_process = lambda _folder, count: started.append(count)
 prepare()
 shot_before = (folder / shots.SHOT_FILE).read_text()
 calls = [[baking._read_scene(), baking.preparation().reading.done, scene.frame_current] for _ in range(3)]
@@ -326,7 +327,7 @@ baking._read_scene()
 lens, scene.camera = scene.camera, None
 facts["camera deleted between calls"] = [baking._read_scene(), baking.preparation() is None, scene.frame_current,
                                          "was deleted while" in baking.last_error(scene)]
-scene.camera, baking._start_process, baking.STEP_S = lens, start_process, step_s
+scene.camera, baking._start_process, turns.TURN_S = lens, start_process, turn_s
 baking._preparation = baking.Preparation(reading, False, folder)
 during = refusal(ops.bake)
 bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)

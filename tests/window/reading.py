@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import driver as ui
 import flow
 from flow import done, wait
-from measure import NAME, Gaps, Times, milliseconds, module, noted
+from measure import NAME, Gaps, Times, milliseconds, module, timed
 
 FRAMES = int(os.environ.get("FIT_FLARE_FRAMES", "1000"))
 LIMIT_MS = 50.0
@@ -46,8 +46,8 @@ def steps():
     yield from ui.open_tab("Fit Flare")
     yield 1
     record = {"read": [], "follow": []}
-    time_calls(module("baking"), "_read_scene", record["read"])
-    time_calls(module("baking"), "_run_steps", record["follow"])
+    timed(module("baking"), "_read_scene", record["read"])
+    timed(module("baking"), "_run_steps", record["follow"])
     for name in ("bake", "bake again"):
         yield from bake(scene, name, record)
     longest = {name: facts["longest_work_ms"] for name, facts in measured.items()}
@@ -93,17 +93,6 @@ def bake(scene, name: str, record: dict[str, Times]):
 def is_set_up(scene) -> bool:
     """Return whether the compositor shows layers."""
     return module("compositor.flare_node").find_node(scene) is not None
-
-
-def time_calls(target, name: str, times: Times) -> None:
-    """Note the time of each call of a timer of the add-on."""
-    inner = getattr(target, name)
-
-    def timed(*words):
-        with noted(times):
-            return inner(*words)
-
-    setattr(target, name, timed)
 
 
 if __name__ == "__main__":

@@ -260,10 +260,9 @@ def _camera_distance(scene: Any, target: Any) -> float:
     return float((light - camera).length)
 
 
-def outdated_references(scene: Any) -> list[Any]:
-    """Return the flares of driven lamps whose reference was measured before the lamp was driven."""
-    return [item for item in scene.fit_flare.lights if item.follow_power and not item.reference_is_driven
-            and is_driven(item.target)]
+def _is_outdated(item: Any) -> bool:
+    """Return whether the lamp of a flare is driven, and its power was measured before it was driven."""
+    return bool(item.follow_power and not item.reference_is_driven and is_driven(item.target))
 
 
 def measure_driven(scene: Any) -> None:
@@ -271,13 +270,14 @@ def measure_driven(scene: Any) -> None:
 
     Bakes, transfers and viewport renders call it first.
     """
-    for item in outdated_references(scene):
-        _measure_power(scene, item)
+    for item in scene.fit_flare.lights:
+        if _is_outdated(item):
+            _measure_power(scene, item)
 
 
 def reference_note(scene: Any, item: Any) -> str:
     """Return where a flare gets the reference of its driven lamp, and how; "" for a flare that has it."""
-    if item not in outdated_references(scene):
+    if not _is_outdated(item):
         return ""
     return (f"The driven power of {item.target.name} gets its reference in frame {scene.frame_start}: go to that "
             "frame, or bake.")
@@ -288,7 +288,8 @@ def _is_measurable(scene: Any) -> bool:
 
     To move the timeline there would discard a pose that is not keyed yet.
     """
-    return scene.frame_current == scene.frame_start and not scene.frame_subframe and bool(outdated_references(scene))
+    return (scene.frame_current == scene.frame_start and not scene.frame_subframe
+            and any(map(_is_outdated, scene.fit_flare.lights)))
 
 
 def measure_soon(scene: Any) -> None:

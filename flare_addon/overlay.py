@@ -123,21 +123,21 @@ def _upload_quads(vertices: Quads) -> Any:
 
 
 def render_levels(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look,
-                  canvas: CanvasBuffers | None = None) -> DrawnLevels:
-    """Draw Gaussians of a look into the offscreen buffers of a canvas, by default that of pictures; return the levels.
+                  buffers: CanvasBuffers | None = None) -> DrawnLevels:
+    """Draw Gaussians of a look into the offscreen buffers of a canvas, by default those of pictures; return the levels.
 
     A level without Gaussians is neither cleared nor drawn. Needs a GPU context.
     """
     import gpu
 
-    canvas = canvas or _buffers.of(PICTURE)
-    canvas.content = None  # the buffers get another content
+    buffers = buffers or _buffers.of(PICTURE)
+    buffers.content = None  # they get another content
     if gaussians is None:
         return DrawnLevels({}, (0, 0, 0, 0))
     by_level = quads_by_level(gaussians, window, look, _memory)
     offscreens = {}
     for divisor, quads in by_level.items():
-        offscreen = offscreens[divisor] = canvas.offscreen(divisor, window.width, window.height)
+        offscreen = offscreens[divisor] = buffers.offscreen(divisor, window.width, window.height)
         with offscreen.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
             gpu.state.blend_set("ADDITIVE" if look.blend == "add" else "ALPHA_PREMULT")

@@ -81,7 +81,8 @@ class CanvasBuffers:
     def offscreen(self, divisor: int, width: int, height: int) -> Any:
         """Return the buffer of a level, whose size is that of the region (pixels) divided by `divisor`, rounded up.
 
-        A buffer of this level with another size is freed."""
+        A buffer of this level with another size is freed.
+        """
         key = max(-(-width // divisor), 1), max(-(-height // divisor), 1)
         known = self._offscreens.get(divisor)
         if known is None or known[0] != key:
@@ -109,8 +110,8 @@ class BuffersByCanvas:
 
         Those of regions that no window shows are freed too.
         """
-        kept_regions = {PICTURE[0], canvas[0]} | open_regions()
-        for closed in [key for key in self._canvases if key[0] not in kept_regions]:
+        drawable_regions = {PICTURE[0], canvas[0]} | open_regions()
+        for closed in [key for key in self._canvases if key[0] not in drawable_regions]:
             self.free(closed)
         buffers = self._canvases.setdefault(canvas, CanvasBuffers())
         self._canvases.move_to_end(canvas)

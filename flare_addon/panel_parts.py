@@ -71,7 +71,7 @@ def draw_motion_note(layout: Any, scene: Any, objects: Sequence[Any]) -> None:
                             f"images: {', '.join(names)}.", "INFO")
 
 
-def draw_footage_note(layout: Any, scene: Any, footage: Sequence[Any]) -> None:
+def draw_view_transform_note(layout: Any, scene: Any, footage: Sequence[Any]) -> None:
     """Draw why a render differs from a camera view whose footage bypasses the view transform, with switches of the
     images.
 

@@ -20,7 +20,7 @@ from .compositor.warnings import footage_note
 from .layouts import draw_progress, label_lines, settings_column
 from .operators import make_flare
 from .paths import is_folder
-from .render_settings import is_shown_as_filmed
+from .render_settings import has_plain_view
 from .user_settings import PACKAGE
 from .views import camera_of, display_footage
 
@@ -311,8 +311,8 @@ def _draw_view_hint(layout: Any, context: bpy.types.Context) -> None:
         label_lines(layout, "Overlays are switched off in this view, and the flare with them.", "INFO")
     elif view is not None and overlay.is_composited(view, scene):
         label_lines(layout, "This view is composited: it shows the flare as it was baked.", "INFO")
-    elif view is not None and not is_shown_as_filmed(scene) and (footage := display_footage(camera_of(view, scene))):
-        panel_parts.draw_footage_note(layout, scene, footage)
+    elif view is not None and not has_plain_view(scene) and (footage := display_footage(camera_of(view, scene))):
+        panel_parts.draw_view_transform_note(layout, scene, footage)
     elif state.show and state.native and state.footage == "images" and fits.has_clean_frames(scene):
         label_lines(layout, "The frames behind the camera contain their own flare, and this one is drawn over it: "
                     "choose Clean under Capture to see this one alone.", "INFO")

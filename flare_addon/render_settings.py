@@ -32,14 +32,14 @@ def match_scene(scene: Any, layers: LayerFolder, size: tuple[int, int]) -> None:
     render.resolution_percentage = 100
 
 
-def set_plain_view(scene: Any) -> str:
-    """Switch look and dithering off, and show pictures as filmed. Returns what `show_as_filmed` does."""
+def set_plain_output(scene: Any) -> str:
+    """Switch dithering off, and the view transform to the plain one. Returns what `set_plain_view` does."""
     scene.render.dither_intensity = 0.0
-    return show_as_filmed(scene)
+    return set_plain_view(scene)
 
 
-def show_as_filmed(scene: Any) -> str:
-    """Choose the view transform that shows pictures unchanged, in place of Blender's default AgX.
+def set_plain_view(scene: Any) -> str:
+    """Choose the plain view transform, which shows pictures unchanged, in place of Blender's default AgX.
 
     Returns a sentence where the colour configuration has no such view, "" where it has.
     """
@@ -53,8 +53,8 @@ def show_as_filmed(scene: Any) -> str:
             f"shown by {view.view_transform}: choose another in the scene's colour management.")
 
 
-def is_shown_as_filmed(scene: Any) -> bool:
-    """Return whether the view transform shows pictures unchanged, as `show_as_filmed` sets it."""
+def has_plain_view(scene: Any) -> bool:
+    """Return whether the view transform shows pictures unchanged, as `set_plain_view` sets it."""
     view = scene.view_settings
     return (view.view_transform in PLAIN_VIEWS and view.look == "None" and (view.exposure, view.gamma) == (0.0, 1.0)
             and not view.use_curve_mapping)

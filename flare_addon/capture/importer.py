@@ -30,7 +30,7 @@ from ..compositor.setup import ARTISTS_COMPOSITOR, show_plate
 from ..images import load_image
 from ..paths import absolute, blend_relative
 from ..plate_space import show_recorded
-from ..render_settings import show_as_filmed
+from ..render_settings import set_plain_view
 
 SENSOR = 36.0  # mm
 UP_ROTATIONS = {"Z": (0.0, 0.0, 0.0), "-Y": (-math.pi / 2, 0.0, 0.0), "Y": (math.pi / 2, 0.0, 0.0)}
@@ -141,7 +141,9 @@ def show_frames_in_renders(scene: Any, settings: ImportSettings) -> list[str]:
 
     A step of its own after the import: Blender evaluates the new compositor.
     """
-    return [ARTISTS_COMPOSITOR] if settings.frames and not show_plate(scene) else []
+    if not settings.frames or show_plate(scene):
+        return []
+    return [ARTISTS_COMPOSITOR]
 
 
 def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) -> Steps[Imported]:
@@ -200,7 +202,7 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
     _assign_to_scene(scene, folder, settings, capture, root)
     scene.camera = camera_objects[0]
     if settings.match_scene:
-        notes += [note for note in [show_as_filmed(scene)] if note]
+        notes += [note for note in [set_plain_view(scene)] if note]
         if settings.frames:
             scene.render.film_transparent = True  # else the world hides the frames
     if not lights:

@@ -133,7 +133,7 @@ def scale_to_render_size(tree: Any, socket: Any, column: float, row: float) -> A
     return node
 
 
-def over(tree: Any, background: Any, foreground: Any, column: float, row: float) -> Any:
+def alpha_over(tree: Any, background: Any, foreground: Any, column: float, row: float) -> Any:
     """Add a node that composites a picture of premultiplied alpha over another; return it.
 
     background, foreground: output sockets.

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from ...core.errors import FrameError
-from .flare_node import new_node, over, scale_to_render_size, set_name
+from .flare_node import alpha_over, new_node, scale_to_render_size, set_name
 from .trees import depends_on, incoming_picture, tree_of
 
 PLATE = "Fit Flare Footage"
@@ -77,7 +77,7 @@ def picture_at_size(tree: Any, socket: Any, with_objects: bool) -> Any:
     """
     picture = set_name(scale_to_render_size(tree, socket, -3, 1), SIZE).outputs[0]
     if with_objects:
-        picture = set_name(over(tree, picture, render_picture(tree), -2.5, 2), OBJECTS).outputs[0]
+        picture = set_name(alpha_over(tree, picture, render_picture(tree), -2.5, 2), OBJECTS).outputs[0]
     return picture
 
 

@@ -270,7 +270,7 @@ class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):
         scene.frame_start = scene.frame_end = scene.frame_current
         scene.fit_flare.over = "plate"
         scene.render.film_transparent = True  # else the world hides the picture in a rendered view
-        if note := render_settings.show_as_filmed(scene):
+        if note := render_settings.set_plain_view(scene):
             self.report({"WARNING"}, note)
         if not setup.show_plate(scene):
             self.report({"WARNING"}, setup.ARTISTS_COMPOSITOR)

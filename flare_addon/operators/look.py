@@ -190,10 +190,10 @@ class FITFLARE_UL_elements(bpy.types.UIList):
         flags = helpers.filter_items_by_name(self.filter_name, self.bitflag_filter_item, elements, "name",
                                              reverse=bool(hide_flag and self.use_filter_invert))
         is_inverted_later = not hide_flag and self.use_filter_invert
-        hidden, shown = (self.bitflag_filter_item, 0) if is_inverted_later else (hide_flag, self.bitflag_filter_item)
-        flags = flags or [shown] * len(elements)
+        hide, show = (self.bitflag_filter_item, 0) if is_inverted_later else (hide_flag, self.bitflag_filter_item)
+        flags = flags or [show] * len(elements)
         order = helpers.sort_items_by_name(elements, "name") if self.use_filter_sort_alpha else []
-        return [hidden if element.is_absent else flag for element, flag in zip(elements, flags, strict=True)], order
+        return [hide if element.is_absent else flag for element, flag in zip(elements, flags, strict=True)], order
 
     def draw_item(self, _context: Any, layout: Any, _data: Any, item: Any, _icon: Any, _active: Any, _property: Any,
                   _index: int = 0) -> None:

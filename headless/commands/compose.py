@@ -79,7 +79,7 @@ def compose_frames(layers: LayerFolder, out: Path, progress: Progress, *, number
     if not (window := layers.window()).is_frame:
         progress.say(f"The layers have overscan ({window.size[0]} x {window.size[1]} pixels for a frame of "
                      f"{window.frame[0]} x {window.frame[1]}), which Blender cannot show; its nodes cut it off.")
-    for warning in (render_settings.set_plain_view(scene), layer_nodes.colour_space_warning(scene)):
+    for warning in (render_settings.set_plain_output(scene), layer_nodes.colour_space_warning(scene)):
         if warning:
             progress.say(warning)
     node.inputs["Intensity"].default_value = intensity

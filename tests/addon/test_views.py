@@ -45,7 +45,7 @@ def test_the_panel_offers_to_view_footage_as_a_render(facts: Any) -> None:
     assert switches == [["photo", "use_view_as_render"]]
     text, switches = facts["hint of a clip"]
     assert "A movie clip always bypasses the view transform" in text and switches == []
-    assert facts["hint after the switch"] == facts["hint, shown as filmed"] == ["", []]
+    assert facts["hint after the switch"] == facts["hint, plain view transform"] == ["", []]
     assert facts["hint, exposed"] == 1
 
 

@@ -36,7 +36,7 @@ def empty() -> bpy.types.Scene:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
     render_settings.match_scene(scene, layers, layers.size())
-    render_settings.set_plain_view(scene)
+    render_settings.set_plain_output(scene)
     scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.collection.objects.link(scene.camera)
     return scene

@@ -35,7 +35,7 @@ def empty() -> bpy.types.Scene:
     scene = bpy.context.scene
     scene.frame_set(layers.last + 1)
     render_settings.match_scene(scene, layers, layers.size())
-    render_settings.set_plain_view(scene)
+    render_settings.set_plain_output(scene)
     return scene
 
 

@@ -35,7 +35,7 @@ def shot(lamps, *, over="scene"):
     scene.render.resolution_x, scene.render.resolution_y = 16, 8
     if hasattr(scene.render, "compositor_device"):
         scene.render.compositor_device = "CPU"
-    render_settings.set_plain_view(scene)
+    render_settings.set_plain_output(scene)
     for name in lamps:
         lamp = bpy.data.objects.new(name, None)
         scene.collection.objects.link(lamp)

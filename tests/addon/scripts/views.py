@@ -100,8 +100,8 @@ facts["hint of a clip"] = hints(scene, filming)
 image.use_view_as_render = True
 facts["hint after the switch"] = hints(scene, camera)
 image.use_view_as_render = False
-render_settings.show_as_filmed(scene)
-facts["hint, shown as filmed"] = hints(scene, camera)
+render_settings.set_plain_view(scene)
+facts["hint, plain view transform"] = hints(scene, camera)
 scene.view_settings.exposure = 1.0
 facts["hint, exposed"] = len(hints(scene, camera)[1])
 

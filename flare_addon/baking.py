@@ -22,9 +22,9 @@ from ..core.system.steps import Steps, finish
 from . import engine, jobs, lamp_drive, looks, shots
 from .compositor.flare_node import find_node
 from .compositor.trees import forget_composited_frames
-from .properties import redraw_viewports
 from .shots import ShotReading
 from .turns import INTERVAL_S, run_turn
+from .views import redraw_viewports
 
 MAX_PROCESSES = 8
 """Most processes that draw without an engine; each needs about a gigabyte for frames of 4K."""

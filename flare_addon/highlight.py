@@ -15,6 +15,7 @@ import bpy
 import numpy as np
 
 from ..core.look import Edit, LookEdits, PlaneGaussians
+from .views import redraw_viewports
 
 DURATION_S = 1.2
 DIMMED = 0.15
@@ -48,7 +49,7 @@ def start_highlight(item: Any) -> None:
         if bpy.app.timers.is_registered(_end_highlight):
             bpy.app.timers.unregister(_end_highlight)
         bpy.app.timers.register(_end_highlight, first_interval=DURATION_S)
-    _redraw()
+    redraw_viewports()
 
 
 def current_highlight(scene: Any) -> Highlight | None:
@@ -106,12 +107,6 @@ def _end_highlight() -> None:
     """End the highlight."""
     global _current
     _current = None
-    _redraw()
-
-
-def _redraw() -> None:
-    from .properties import redraw_viewports
-
     redraw_viewports()
 
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from . import fcurves
 from .objects import depsgraph_of, enabled_collections
-from .properties import redraw_viewports
+from .views import redraw_viewports
 
 Gain = tuple[float, float, float]
 

@@ -31,9 +31,8 @@ from .compositor.trees import is_off_in_preview
 from .overlay_buffers import PICTURE, BuffersByCanvas, CanvasBuffers, DrawnLevels, part_of_quads
 from .overlay_quads import LEVELS, DrawnRegion, QuadMemory, Quads, quads_by_level
 from .overlay_shaders import gaussian_shader, sum_shader
-from .properties import redraw_viewports, schedule_redraw
 from .scene_changes import change_count
-from .views import camera_of, has_display_footage
+from .views import camera_of, has_display_footage, redraw_viewports, schedule_redraw
 from .working_space import working_space
 
 NETWORK_S, NETWORK_AT_REST_S = 0.02, 0.25

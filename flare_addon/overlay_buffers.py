@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import bpy
 import numpy as np
 
 from .overlay_quads import DrawnRegion, Quads
 from .stereo import Eye
+from .views import view_areas
 
 MAX_CANVASES = 4
 """Most canvases with buffers. Beyond it, the canvas that was drawn longest ago loses its buffers."""
@@ -65,9 +65,7 @@ def create_offscreen(width: int, height: int) -> Any:
 
 def open_regions() -> set[int]:
     """Return the addresses of the regions of all 3D views that windows show."""
-    manager = bpy.context.window_manager
-    return {region.as_pointer() for window in manager.windows for area in window.screen.areas if area.type == "VIEW_3D"
-            for region in area.regions} if manager is not None else set()
+    return {region.as_pointer() for area in view_areas() for region in area.regions}
 
 
 class CanvasBuffers:

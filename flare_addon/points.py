@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .properties import schedule_redraw
+from .views import schedule_redraw
 
 ATTRIBUTE = "Col"
 MAX_VERTICES = 400_000  # that are drawn; larger clouds are thinned to every second, third, ... vertex

@@ -26,6 +26,7 @@ from ..core.choices import ITERATIONS, Mode, Preset
 from ..core.conventions.exposures import MIN_EXPOSURE
 from ..core.look import Edit
 from .plate_space import clear_recorded_space, search_names
+from .views import redraw_viewports
 from .working_space import picked_from_tint, tint_from_picked
 
 # From 4.5 on this option permits paths relative to the .blend; earlier versions do not know it.
@@ -33,9 +34,6 @@ PATH_OPTIONS = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) 
 
 OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
 """Option for properties of linked objects, whose values would otherwise not be saved."""
-
-REFINE_S = 0.02
-"""Time after which a drawing that is not complete is followed by another."""
 
 PRESETS: tuple[tuple[Preset, str, str], ...] = (
     ("draft", "Draft", f"A first result in minutes: {ITERATIONS['draft']:,} iterations"),
@@ -49,21 +47,6 @@ MODES: tuple[tuple[Mode, str, str, int], ...] = (  # a .blend stores the numbers
      "removal network makes when the fit starts. Parallax separates their remaining flare. The fit takes longer", 2),
     ("split", "No Clean Frames", "Separate scene and flare by parallax alone. The fit takes longer", 1),
 )
-
-
-def redraw_viewports(_self: Any = None, _context: Any = None) -> None:
-    """Redraw every 3D view, since a change affects the overlay."""
-    manager = getattr(bpy.context, "window_manager", None)
-    for window in manager.windows if manager else ():
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
-
-
-def schedule_redraw() -> None:
-    """Redraw every 3D view after REFINE_S."""
-    if not bpy.app.timers.is_registered(redraw_viewports):
-        bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
 
 
 def _update_target(self: Any, context: Any) -> None:

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import bpy
+
+REFINE_S = 0.02
+"""Seconds after which a drawing that is not complete is followed by another."""
+
 
 def look_through_camera(context: Any) -> bool:
     """Turn the largest 3D view of the screen to the scene's camera; return whether there is one.
@@ -26,6 +31,25 @@ def largest_view(context: Any) -> tuple[Any, Any, Any] | None:
         return None
     area = max(areas, key=lambda area: area.width * area.height)
     return area, next(region for region in area.regions if region.type == "WINDOW"), area.spaces.active
+
+
+def view_areas() -> list[Any]:
+    """Return the areas of the 3D views of all windows."""
+    manager = getattr(bpy.context, "window_manager", None)
+    return [area for window in (manager.windows if manager else ()) for area in window.screen.areas
+            if area.type == "VIEW_3D"]
+
+
+def redraw_viewports(_self: Any = None, _context: Any = None) -> None:
+    """Redraw every 3D view, since a change affects the overlay."""
+    for area in view_areas():
+        area.tag_redraw()
+
+
+def schedule_redraw() -> None:
+    """Redraw every 3D view after `REFINE_S`."""
+    if not bpy.app.timers.is_registered(redraw_viewports):
+        bpy.app.timers.register(redraw_viewports, first_interval=REFINE_S)
 
 
 def camera_of(space: Any, scene: Any) -> Any:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -45,7 +45,7 @@ PIXEL_ASPECT_TOLERANCE = 2e-3
 CAMERAS_PER_STEP = 10
 """Cameras with a picture each that one step adds."""
 
-OBJECTS_PER_LINK = 100
+OBJECTS_PER_LINK = 50
 """Objects that the scene gets in one step."""
 
 CameraLayout = Literal["animated", "each"]
@@ -67,12 +67,17 @@ class ImportSettings:
 
 @dataclass(frozen=True)
 class Imported:
-    """The objects that an import made. notes: warnings."""
+    """The objects that an import made. notes: warnings.
+
+    collection: the collection in the scene. unlinked: the collection of the objects that the scene does not have yet.
+    """
 
     root: Any
     cameras: tuple[Any, ...]
     lights: tuple[Any, ...]
     notes: tuple[str, ...]
+    collection: Any
+    unlinked: Any
 
 
 class _SceneState:
@@ -133,7 +138,9 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     FrameError."""
     settings = settings or ImportSettings()
     imported = finish(import_in_steps(scene, folder, settings))
-    return replace(imported, notes=(*imported.notes, *show_frames_in_renders(scene, settings)))
+    notes = show_frames_in_renders(scene, settings)
+    finish(link_objects_in_steps(imported))
+    return replace(imported, notes=(*imported.notes, *notes))
 
 
 def show_frames_in_renders(scene: Any, settings: ImportSettings) -> list[str]:
@@ -147,10 +154,12 @@ def show_frames_in_renders(scene: Any, settings: ImportSettings) -> list[str]:
 
 
 def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) -> Steps[Imported]:
-    """Import a capture as `import_capture` does, as a generator that pauses between short steps; without
-    `show_frames_in_renders`.
+    """Import a capture as a generator that pauses between short steps, without `show_frames_in_renders`.
 
-    If the generator fails or is closed early, all that it added is removed.
+    After each step in which the scene gets objects, Blender builds its dependency graph and draws anew, which takes
+    longer the more objects there are. The scene therefore gets only the root, its camera and the lights;
+    `link_objects_in_steps` links the others, after all else that makes Blender evaluate the scene. If the generator
+    fails or is closed early, all that it added is removed.
     """
     folder = find_capture(folder)
     capture = yield from Capture.open_in_steps(folder, need_frames=settings.frames)
@@ -158,22 +167,31 @@ def import_in_steps(scene: Any, folder: Path | str, settings: ImportSettings) ->
     unlinked = bpy.data.collections.new("Imported Objects")
     previous_state = _SceneState(scene)
     try:
-        imported = yield from _add_capture(scene, folder, settings, capture, collection, unlinked)
+        return (yield from _add_capture(scene, folder, settings, capture, collection, unlinked))
     except BaseException:  # GeneratorExit too
         previous_state.restore(collection, unlinked)
         raise
-    bpy.data.collections.remove(unlinked)
-    return imported
+
+
+def link_objects_in_steps(imported: Imported) -> Steps[None]:
+    """Link the objects of an import that the scene does not have yet, in steps; one that was deleted is left out."""
+    while objects_left := imported.unlinked.objects[:OBJECTS_PER_LINK]:
+        _move_objects(objects_left, imported.unlinked, imported.collection)
+        yield PAUSE
+    bpy.data.collections.remove(imported.unlinked)
+
+
+def _move_objects(objects: Iterable[Any], source: Any, target: Any) -> None:
+    """Move objects from one collection to another."""
+    for item in objects:
+        target.objects.link(item)
+        source.objects.unlink(item)
 
 
 def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Capture, collection: Any, unlinked: Any
                  ) -> Steps[Imported]:
-    """Add the objects of a capture, in steps, to a new collection.
-
-    After each step in which the scene gets objects, Blender builds its dependency graph and draws anew, which takes
-    longer the more objects there are. All objects are therefore made in the collection `unlinked`, which no scene has,
-    and moved over OBJECTS_PER_LINK at a time; the last ones in most cases in the turn that sets the scene's camera.
-    """
+    """Add the objects of a capture to the collection `unlinked`, which no scene has, in steps; then link the root, the
+    first camera and the lights to a new collection of the scene, and make these the scene's own."""
     notes: list[str] = []
     extent = capture.extent
     root = _add_object(unlinked, f"{collection.name} Root", None, None)
@@ -188,17 +206,12 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
     for item, light in zip(lights, capture.lights, strict=True):
         if light.moves:
             yield from light_paths.key_light_path(item, light, capture, frame_numbers)
-    points = []
     if settings.points and len(capture.points):
         mesh = yield from _make_points_mesh(capture.points)
-        points.append(_add_points(unlinked, root, mesh))
+        _add_points(unlinked, root, mesh)
     scene.collection.children.link(collection)
-    for number, item in enumerate((root, *camera_objects, *lights, *points), 1):
-        collection.objects.link(item)
-        unlinked.objects.unlink(item)
-        if number % OBJECTS_PER_LINK == 0:
-            yield PAUSE
-    yield  # the last place at which a cancel finds the scene's own state unchanged
+    _move_objects((root, camera_objects[0], *lights), unlinked, collection)
+    yield PAUSE  # the last place at which a cancel finds the scene's own state unchanged
     _assign_to_scene(scene, folder, settings, capture, root)
     scene.camera = camera_objects[0]
     if settings.match_scene:
@@ -209,7 +222,7 @@ def _add_capture(scene: Any, folder: Path, settings: ImportSettings, capture: Ca
         notes.append("The capture has no lights yet; find or add them in the panel Lights.")
     if any(view.lens for view in capture.views) and settings.frames:
         notes.append("The frames behind the camera show the lens's distortion; the cameras have none.")
-    return Imported(root, camera_objects, lights, tuple(notes))
+    return Imported(root, camera_objects, lights, tuple(notes), collection, unlinked)
 
 
 def _assign_to_scene(scene: Any, folder: Path, settings: ImportSettings, capture: Capture, root: Any) -> None:
@@ -456,12 +469,11 @@ def _make_points_mesh(cloud: PointCloud) -> Steps[Any]:
     return mesh
 
 
-def _add_points(collection: Any, root: Any, mesh: Any) -> Any:
+def _add_points(collection: Any, root: Any, mesh: Any) -> None:
     """Add the object of a point cloud, which is not rendered."""
     points = _add_object(collection, "Points", mesh, root)
     points.hide_render = points.hide_select = True
     points.display_type, points.fit_flare.is_points = "BOUNDS", True  # points.py draws them in their colours
-    return points
 
 
 def _add_object(collection: Any, name: str, data: Any, parent: Any) -> Any:

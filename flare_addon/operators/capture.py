@@ -11,7 +11,12 @@ import bpy
 from ...core.system.steps import PAUSE, Steps, finish
 from .. import fits
 from ..capture import exporter
-from ..capture.importer import ImportSettings, import_in_steps, show_frames_in_renders
+from ..capture.importer import (
+    ImportSettings,
+    import_in_steps,
+    link_objects_in_steps,
+    show_frames_in_renders,
+)
 from ..reports import NO_CAMERA, GuardedOperator, report_errors
 from ..turns import INTERVAL_S, run_turn
 from ..views import look_through_camera
@@ -132,24 +137,30 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
     def _import_and_show(self, context: bpy.types.Context, path: Path, settings: ImportSettings) -> Steps[None]:
         """Import the capture at `path`, report it, and turn the view to its camera, in steps. Raises FitFlareError.
 
-        Blender builds its dependency graph for the new camera, loads the first picture, draws it, and stores an undo
-        step at the end: each in a turn of its own.
+        Blender builds its dependency graph for the new camera, evaluates the compositor, loads the first picture, draws
+        it, and stores an undo step at the end: each in a turn of its own. The scene gets most of the objects last.
         """
         imported = yield from import_in_steps(context.scene, path, settings)
         self._is_complete = True
-        fits.clear_other_run(context.scene)
-        fits.expose_cameras(context.scene, fits.run_folder(context.scene))
-        yield PAUSE
-        for note in (*imported.notes, *show_frames_in_renders(context.scene, settings)):
-            self.report({"WARNING"}, note)
-        self.report({"INFO"}, f"{self._name}: cameras {len(imported.cameras)}, lights {len(imported.lights)}")
-        yield PAUSE  # Blender evaluates the new compositor
-        yield PAUSE
-        if self._in_steps:
-            _load_footage(context.scene)
+        try:
+            fits.clear_other_run(context.scene)
+            fits.expose_cameras(context.scene, fits.run_folder(context.scene))
             yield PAUSE
-        look_through_camera(context)
-        yield PAUSE
+            for note in (*imported.notes, *show_frames_in_renders(context.scene, settings)):
+                self.report({"WARNING"}, note)
+            self.report({"INFO"}, f"{self._name}: cameras {len(imported.cameras)}, lights {len(imported.lights)}")
+            yield PAUSE  # Blender evaluates the new compositor
+            yield PAUSE
+            if self._in_steps:
+                _load_footage(context.scene)
+                yield PAUSE
+            look_through_camera(context)
+            yield PAUSE
+            yield from link_objects_in_steps(imported)
+        except BaseException:  # GeneratorExit too: what is imported stays
+            with contextlib.suppress(ReferenceError):
+                finish(link_objects_in_steps(imported))
+            raise
 
 
 def _load_footage(scene: bpy.types.Scene) -> None:

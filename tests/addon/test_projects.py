@@ -84,8 +84,16 @@ def test_a_cancelled_import_leaves_nothing(facts: Any) -> None:
 
 def test_the_scene_gets_the_objects_of_a_capture_in_portions(facts: Any) -> None:
     """Block of projects.py: "the objects of an import, in portions"."""
-    portions, count, unused_collections = facts["portions of objects"]
-    assert count > 4 and portions == list(range(2, count + 1, 2))
+    first, portions, count, has_root, unused_collections = facts["portions of objects"]
+    assert count > first + 4 and has_root, "the root, the scene's camera and the lights come first"
+    assert portions == [min(number, count) for number in range(first + 2, count + 2, 2)]
+    assert unused_collections == []
+
+
+def test_an_import_that_is_closed_late_is_completed(facts: Any) -> None:
+    """Block of projects.py: "an import whose window is closed after the scene has its camera"."""
+    few, count, unused_collections = facts["closed after the scene has its camera"]
+    assert few < count == facts["portions of objects"][2]
     assert unused_collections == []
 
 

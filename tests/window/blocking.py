@@ -44,7 +44,8 @@ def steps():
     scene = bpy.context.scene
     figures: dict[str, object] = {"blender": bpy.app.version_string, "cameras": CAMERAS}
     steps: Times = []
-    time_steps(module("operators.capture"), steps)
+    for name in ("import_in_steps", "link_objects_in_steps"):
+        time_steps(module("operators.capture"), name, steps)
     for layout in ("each", "animated"):
         for item in list(bpy.data.objects):
             bpy.data.objects.remove(item)
@@ -53,7 +54,7 @@ def steps():
         gaps = Gaps()
         with ui.override():
             bpy.ops.fit_flare.import_capture("INVOKE_DEFAULT", directory=str(capture), cameras=layout)
-        while not scene.fit_flare.capture:
+        while sum(item.type == "CAMERA" for item in scene.objects) < (CAMERAS if layout == "each" else 1):
             yield 0.1
         yield 1
         figures[f"import, {layout}"] = {**gaps.stop(), "longest_step_at_work_ms": milliseconds(
@@ -93,12 +94,12 @@ def steps():
     save(figures)
 
 
-def time_steps(target, record: Times) -> None:
-    """Replace `import_in_steps` of the module `target`, so that `record` gets the time of each step of an import."""
-    inner = target.import_in_steps
+def time_steps(target, name: str, record: Times) -> None:
+    """Replace a function in steps of the module `target`, so that `record` gets the time of each of its steps."""
+    inner = getattr(target, name)
 
-    def import_in_steps(*words):
-        """Walk through the steps of an import and note the time of each."""
+    def in_steps(*words):
+        """Run the steps and note the time of each."""
         walk = inner(*words)
         while True:
             with noted(record):
@@ -108,7 +109,7 @@ def time_steps(target, record: Times) -> None:
                     return end.value
             yield pause
 
-    target.import_in_steps = import_in_steps
+    setattr(target, name, in_steps)
 
 
 def save(figures: dict[str, object]) -> None:

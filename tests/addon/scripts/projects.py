@@ -179,20 +179,33 @@ steps.close()
 facts["cancelled import"] = [before == all_of_it(), grown != before, steps_before_cameras > 5]
 for kind in ("each", "animated"):
     for _ in (steps := importer.import_in_steps(scene, capture, importer.ImportSettings(kind))):
-        if any(item.type == "MESH" for item in scene.objects):  # all objects are in the scene
+        if len(scene.objects):
             break
     steps.close()
     facts["cancelled import"].append(before == all_of_it())
 
 # ---- the objects of an import, in portions --------------------------------------------------------------
 importer.OBJECTS_PER_LINK = 2
-portions = [len(scene.objects) for pause in importer.import_in_steps(scene, capture, importer.ImportSettings("each"))
-            if pause is not None]
-facts["portions of objects"] = [portions, len(scene.objects),
+imported = importer.finish(importer.import_in_steps(scene, capture, importer.ImportSettings("each")))
+first = len(scene.objects)
+portions = [len(scene.objects) for _ in importer.link_objects_in_steps(imported)]
+facts["portions of objects"] = [first, portions, len(scene.objects), imported.root.name in scene.objects,
                                 [item.name for item in bpy.data.collections if not item.users]]
 
-# ---- an import that leaves every other turn to the window -----------------------------------------------
+# ---- an import whose window is closed after the scene has its camera ------------------------------------
 operators = part("flare_addon.operators.capture")
+scene = empty()
+operator = SimpleNamespace(_in_steps=False, _is_complete=False, _name="desk", report=lambda *_words: None)
+steps = operators.FITFLARE_OT_import_capture._import_and_show(
+    operator, bpy.context, Path(capture), importer.ImportSettings("each"))
+while not operator._is_complete:
+    next(steps)
+few = len(scene.objects)
+steps.close()
+facts["closed after the scene has its camera"] = [few, len(scene.objects),
+                                                  [item.name for item in bpy.data.collections if not item.users]]
+
+# ---- an import that leaves every other turn to the window -----------------------------------------------
 done = []
 
 

@@ -178,7 +178,8 @@ def link_objects_in_steps(imported: Imported) -> Steps[None]:
     while objects_left := imported.unlinked.objects[:OBJECTS_PER_LINK]:
         _move_objects(objects_left, imported.unlinked, imported.collection)
         yield PAUSE
-    bpy.data.collections.remove(imported.unlinked)
+    bpy.data.collections.remove(imported.unlinked)  # Blender builds its dependency graph once more
+    yield PAUSE
 
 
 def _move_objects(objects: Iterable[Any], source: Any, target: Any) -> None:

@@ -86,7 +86,7 @@ def test_the_scene_gets_the_objects_of_a_capture_in_portions(facts: Any) -> None
     """Block of projects.py: "the objects of an import, in portions"."""
     first, portions, count, has_root, unused_collections = facts["portions of objects"]
     assert count > first + 4 and has_root, "the root, the scene's camera and the lights come first"
-    assert portions == [min(number, count) for number in range(first + 2, count + 2, 2)]
+    assert portions == [*(min(number, count) for number in range(first + 2, count + 2, 2)), count]
     assert unused_collections == []
 
 

@@ -40,6 +40,9 @@ TYPICAL = 9
 """Number of sources at the end of a track whose median size is compared."""
 DISTANCE_SCALE = 0.1
 """Distance, diagonals, that costs as much as the whole gate when tracks are joined: gates of fast lights are wide."""
+JOIN_DISTANCE, JOIN_SPEED = 0.08, 0.75
+"""Largest distance of the places that two joined tracks predict in the middle of the gap: diagonals, plus a share of
+the way through the gap at the larger speed, at the gap or median."""
 MAX_SINGLE_GAP = 6
 """Largest gap, frames, to a track of one frame."""
 MAX_DIFFERENCE = 1.0
@@ -78,6 +81,12 @@ class Chain:
         step = self.frames[later] - self.frames[earlier]
         places = self.places
         return np.asarray((places[later] - places[earlier]) / step)
+
+    def median_speed(self) -> float:
+        """Return the median speed, pixels per frame; 0 for a single frame."""
+        if len(self.frames) < 2:
+            return 0.0
+        return float(np.median(np.linalg.norm(np.diff(self.places, axis=0), axis=1) / np.diff(self.frames)))
 
     def predict(self, frame: int) -> Floats:
         """Return the place (2,) in a frame after the chain's last or before its first one, at constant velocity."""
@@ -220,6 +229,8 @@ def _join_cost(first: Chain, second: Chain, diagonal: float) -> float | None:
     speeds = [float(np.linalg.norm(chain.velocity(at_end))) for chain, at_end in ((first, True), (second, False))]
     if is_single:  # a single frame has no velocity; it may have the other's
         gate += 0.5 * gap * max(speeds)
+    speed = max(*speeds, first.median_speed(), second.median_speed())
+    gate = min(gate, JOIN_DISTANCE * diagonal + JOIN_SPEED * gap * speed)
     # Each is extrapolated over half the gap: the velocities need not agree, only the places in its middle.
     middle = first.frames[-1] + gap / 2
     middle_by_first = first.places[-1] + first.velocity(at_end=True) * (middle - first.frames[-1])

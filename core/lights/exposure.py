@@ -2,7 +2,7 @@
 """Detects lights as over-exposed spots; needs no weights.
 
 A light is far brighter than what it lights. In the picture it is a clipped region that is compact (solid, not long,
-small against the frame), white to the core (all channels clip, where a bright coloured surface clips one), brighter
+small against the frame), white at its core (all channels clip, where a bright coloured surface clips one), brighter
 than its surroundings (a clipped patch of sky or wall continues into pixels nearly as bright), and isolated (the panes
 of a window are close together). Each of these is a smooth step; their product is the score.
 """
@@ -27,6 +27,9 @@ MAX_MORPHOLOGY_COST = 1e10
 """Largest region times structuring element, px², for morphology: a quarter of a second."""
 MAX_AREA_SHARE = 0.025
 """Share of the frame from which a clipped region is no light."""
+CORE_SHARE = 0.25
+"""Share of a region that is its core, its whitest pixels. The glow about a coloured lamp or a low sun clips too, but in
+one channel only."""
 GROUP_DISTANCE = 0.015
 """Distance, frame diagonals, below which clipped regions are one group."""
 ATTACHED_SHARES, GROUP_EXCESSES = (0.4, 0.1), (5.0, 1.5)
@@ -147,12 +150,14 @@ def _attached_share(core: NDArray[np.bool_], region: NDArray[np.bool_]) -> float
     return float(np.pad(region, room)[ring].mean())
 
 
-def shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:
+def shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32],
+                area_shares: tuple[float, float] = AREA_SHARES) -> float:
     """Return the score, 0..1, of a mask's shape, size, whiteness and surroundings.
 
     The score is 1 for a region that is solid (its share of its convex hull), compact (the ratio of its sides), small
-    (its share of the frame), white (its mean least channel) and in darker surroundings. mask: (h, w), whose top left
-    pixel is `corner` (x, y) of the picture. display: the picture's display values (height, width, 3).
+    (its share of the frame), white (the mean least channel of its core) and in darker surroundings. mask: (h, w), whose
+    top left pixel is `corner` (x, y) of the picture. display: the picture's display values (height, width, 3).
+    area_shares: shares of the frame at which the factor for the size is 0 and 1.
     """
     import cv2
 
@@ -165,9 +170,15 @@ def shape_score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArr
     sides = np.sort(np.asarray(cv2.minAreaRect(hull)[1]) + 1.0)
     colours = display[corner[1]:corner[1] + mask.shape[0], corner[0]:corner[0] + mask.shape[1]][mask]
     return (smoothstep(solid, *SOLIDITIES) * smoothstep(sides[1] / sides[0], *SIDE_RATIOS)
-            * smoothstep(area / (width * height), *AREA_SHARES)
-            * smoothstep(float(colours.min(axis=1).mean()), *WHITENESSES)
+            * smoothstep(area / (width * height), *area_shares)
+            * smoothstep(_core_whiteness(colours), *WHITENESSES)
             * smoothstep(_surrounding_level(mask, corner, display), *SURROUNDING_LEVELS))
+
+
+def _core_whiteness(colours: NDArray[np.float32]) -> float:
+    """Return the mean least channel of the whitest pixels: CORE_SHARE of `colours` (n, 3), at least one pixel."""
+    whiteness = np.sort(colours.min(axis=1))
+    return float(whiteness[-max(round(CORE_SHARE * len(whiteness)), 1):].mean())
 
 
 def _surrounding_level(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:

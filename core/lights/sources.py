@@ -19,7 +19,7 @@ from ..capture.camera import Floats
 from ..conventions.smoothstep import smoothstep
 from ..images.picture import Picture
 from .detection import Detection, Mask, measure_detection
-from .exposure import MAX_AREA_SHARE, open_by_disc, shape_score
+from .exposure import open_by_disc, shape_score
 
 OPENING_RATIO = 0.75
 """Radius of the opening that removes spikes and separates spots, relative to the thickest part's."""
@@ -27,6 +27,9 @@ MIN_THICKNESS = 0.55
 """Thickness of a part, relative to the thickest of its spot, from which it is a source of its own."""
 MIN_RADIUS = 0.0018
 """Smallest radius of a spot, in frame diagonals; one pixel at least."""
+AREA_SHARES = 0.05, 0.015
+"""Shares of the frame from which a spot is no light, and up to which every one may be: larger than for `exposure.py`,
+since the softness tells a low sun with its glow from clipped sky and walls."""
 CLIPPED = 0.98
 """Display value from which pixels are clipped, unless the whole shot stays below it."""
 HARD, SOFT = 0.04, 0.16
@@ -88,9 +91,9 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
         if area < min_area:
             continue
         region = labels[top:top + height, left:left + width] == label
-        for mask, corner in _thick_parts(region, MAX_AREA_SHARE * clipped.size):
+        for mask, corner in _thick_parts(region, AREA_SHARES[0] * clipped.size):
             corner = (left + corner[0], top + corner[1])
-            shape = shape_score(mask, corner, scaled)
+            shape = shape_score(mask, corner, scaled, AREA_SHARES)
             soft = smoothstep(_softness(mask, corner, luminance, diagonal / REFERENCE), HARD, SOFT)
             detection = measure_detection(mask, corner, picture, scaled, shape)
             if picture.encoding == "linear":

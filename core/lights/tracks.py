@@ -34,6 +34,13 @@ MIN_FRAMES = 4
 """Smallest number of frames that must show a light; in a long shot it is a tenth of the frames."""
 GHOST_ERROR, MIN_GHOST_MOTION = 0.008, 0.03
 """Largest median distance of a ghost from the line through its light, and the least motion of that light, diagonals."""
+MIN_SHARED = 0.7
+"""Part of the frames of a ghost or a reflection in which its light must be followed too."""
+REFLECTION_OFFSET, MIN_REFLECTION_DISTANCE = 0.02, 0.03
+"""Largest median horizontal and least vertical distance of a reflection below its light, diagonals."""
+REFLECTION_RADIUS, REFLECTION_HEIGHT = 0.6, 1.3
+"""Radius of a reflection relative to its light's, and ratio of height to width, of which a reflection has one: smaller
+or taller than these."""
 TOLERATED_ERROR = 3.0
 """Expected error, pixels of a frame with a diagonal of REFERENCE, at which a place is as good as doubtful."""
 RECOVERY, MAX_RECOVERY = 0.012, 0.06
@@ -114,6 +121,8 @@ def track_lights(capture: Capture, progress: Progress | None = None) -> TrackFin
     lamps = [chain for chain in long_chains if chain.evidence >= MIN_EVIDENCE]
     ghosts = [chain for chain in lamps if _is_ghost(chain, lamps, np.array([camera.cx, camera.cy]), diagonal)]
     lamps = [chain for chain in lamps if chain not in ghosts]
+    reflections = [chain for chain in lamps if _is_reflection(chain, long_chains, diagonal)]
+    lamps = [chain for chain in lamps if chain not in reflections]
     doubtful_chains = [chain for chain in long_chains if MIN_EVIDENCE > chain.evidence >= 0.5 * MIN_EVIDENCE]
     progress.stage("follow lights", len(lamps) + len(doubtful_chains))
     tracked, motion = [], BackgroundMotion(capture)
@@ -121,7 +130,7 @@ def track_lights(capture: Capture, progress: Progress | None = None) -> TrackFin
         tracked.append(_to_light(chain, capture, diagonal, motion if chain in lamps else None))
         progress.advance()
     lights, doubtful = tracked[:len(lamps)], tracked[len(lamps):]
-    return TrackFindings(lights, doubtful, sources, _messages(lights, doubtful, len(ghosts), sources))
+    return TrackFindings(lights, doubtful, sources, _messages(lights, doubtful, len(ghosts), len(reflections), sources))
 
 
 def clip_level(capture: Capture) -> float:
@@ -137,9 +146,9 @@ def clip_level(capture: Capture) -> float:
     return min(CLIPPED, 0.985 * max(peaks))
 
 
-def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], ghosts: int,
+def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], ghosts: int, reflections: int,
               sources: Sequence[Sequence[Source]]) -> list[str]:
-    """Return the sentences for the user. ghosts: number of chains that are ghosts of the lights."""
+    """Return the sentences for the user. ghosts, reflections: numbers of chains that are ghosts or reflections."""
     number = sum(map(len, sources))
     messages = [f"{number} bright spots in {sum(map(bool, sources))} of {len(sources)} frames, of which "
                 f"{len(lights)} {'is a light' if len(lights) == 1 else 'are lights'} that could be followed."]
@@ -150,6 +159,8 @@ def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], 
                             f"frames where its place is doubtful (first {frames[0]}).")
     if ghosts:
         messages.append(f"{ghosts} more follow another light through the middle of the picture and are its ghosts.")
+    if reflections:
+        messages.append(f"{reflections} more stay below another light and are its reflections on the ground.")
     if doubtful:
         messages.append(f"{len(doubtful)} moving bright things look too little like lamps and are left out.")
     if not lights:
@@ -164,11 +175,9 @@ def _is_ghost(chain: Chain, lights: Sequence[Chain], centre: Floats, diagonal: f
     diagonal: length of the frame's diagonal, pixels.
     """
     for light in lights:
-        shared = sorted(set(chain.frames) & set(light.frames))
-        if light is chain or len(shared) < max(3, 0.7 * len(chain.frames)):
+        ghost_sources, light_sources = _shared_sources(chain, light)
+        if not ghost_sources:
             continue
-        ghost_sources, light_sources = ([each.sources[each.frames.index(frame)] for frame in shared]
-                                        for each in (chain, light))
         ghost, source = (np.array([spot.xy for spot in sources]) - centre for sources in (ghost_sources, light_sources))
         radius, light_radius = (np.median([spot.detection.radius for spot in sources])
                                 for sources in (ghost_sources, light_sources))
@@ -184,6 +193,36 @@ def _is_ghost(chain: Chain, lights: Sequence[Chain], centre: Floats, diagonal: f
         if error < GHOST_ERROR * diagonal and abs(ratios[0] - 1) > 0.05:
             return True
     return False
+
+
+def _is_reflection(chain: Chain, others: Sequence[Chain], diagonal: float) -> bool:
+    """Return whether a chain is the reflection of another one of `others` on wet ground, water or a floor.
+
+    A reflection stays straight below its light, in a picture that is not tilted. It is smaller than the light, or
+    drawn out in height. diagonal: length of the frame's diagonal, pixels.
+    """
+    for light in others:
+        sources, light_sources = _shared_sources(chain, light)
+        if not sources:
+            continue
+        offset = np.median([source.xy - other.xy for source, other in zip(sources, light_sources, strict=True)], axis=0)
+        radius, light_radius = (np.median([source.detection.radius for source in each])
+                                for each in (sources, light_sources))
+        height = np.median([source.detection.mask.shape[0] / source.detection.mask.shape[1] for source in sources])
+        if (abs(offset[0]) < REFLECTION_OFFSET * diagonal and offset[1] > MIN_REFLECTION_DISTANCE * diagonal
+                and (radius < REFLECTION_RADIUS * light_radius or height > REFLECTION_HEIGHT)):
+            return True
+    return False
+
+
+def _shared_sources(chain: Chain, other: Chain) -> tuple[list[Source], list[Source]]:
+    """Return the sources of two chains in the frames that both have, two empty lists if the second lacks too many of
+    the first one's."""
+    shared = sorted(set(chain.frames) & set(other.frames))
+    if other is chain or len(shared) < max(3, MIN_SHARED * len(chain.frames)):
+        return [], []
+    first, second = ([each.sources[each.frames.index(frame)] for frame in shared] for each in (chain, other))
+    return first, second
 
 
 def _to_light(chain: Chain, capture: Capture, diagonal: float, motion: BackgroundMotion | None) -> TrackedLight:

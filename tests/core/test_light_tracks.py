@@ -122,6 +122,35 @@ class TestFollowing:
         assert len(findings.lights) == 1 and any("ghosts" in text for text in findings.messages)
         assert abs(places(findings)[0][0] - 60) < 1
 
+    @pytest.mark.parametrize(("offset", "radius", "count"), [(0.0, 2.5, 1), (40.0, 2.5, 2), (0.0, 5.0, 2)])
+    def test_a_reflection_on_the_ground_is_no_lamp(self, tmp_path: Path, offset: float, radius: float, count: int
+                                                   ) -> None:
+        """What is smaller and straight below a lamp is its reflection; a lamp as large, or beside it, is none."""
+        def frame(i: int) -> NDArray[np.float64]:
+            x = 60 + 12 * i
+            return np.maximum(lit([(x, 45, 1.0)], 5.0), lit([(x + offset, 130 - i, 0.8)], radius))
+
+        findings = track_lights(make_shot(tmp_path, 12, frame))
+        assert len(findings.lights) == count and abs(places(findings)[0][1] - 45) < 1
+        assert any("reflections" in text for text in findings.messages) == (count == 1)
+
+    def test_a_lamp_that_left_the_frame_is_not_another_that_appears_elsewhere(self, tmp_path: Path) -> None:
+        def lamps(i: int) -> list[Lamp]:
+            leaving = [(200.0 + 5 * i, 120.0 + 6 * i, 1.0)] if i < 12 else []
+            return leaving + ([(60.0 + i, 40.0 + i, 1.0)] if i >= 26 else [])
+
+        findings = track_lights(make_shot(tmp_path, 36, lambda i: lit(lamps(i))))
+        assert [light.support[0] for light in findings.lights] in (["0001.png", "0027.png"], ["0027.png", "0001.png"])
+
+    def test_a_large_sun_in_a_bright_sky_is_a_light(self, tmp_path: Path) -> None:
+        def frame(i: int) -> NDArray[np.float64]:
+            v, u = np.mgrid[:SIZE[1], :SIZE[0]] + 0.5
+            away = np.hypot(u - 150 - i, v - 60)
+            return (0.1 + 8.0 * np.exp(-away / 8) + 0.5 * np.exp(-away / 40))[..., None] * np.array([1.0, 0.8, 0.55])
+
+        (light,) = track_lights(make_shot(tmp_path, 8, frame)).lights
+        assert len(light.support) == 8 and light.radius > 15
+
     def test_frames_without_a_lamp_say_so(self, tmp_path: Path) -> None:
         findings = track_lights(make_shot(tmp_path, 5, lambda _: lit([])))
         assert not findings.lights and any("No light was found" in text for text in findings.messages)

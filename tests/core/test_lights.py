@@ -70,6 +70,14 @@ class TestExposure:
         assert found.radius == pytest.approx(radius, rel=0.25)
         assert found.score > 0.8 and not found.is_cut
 
+    def test_a_coloured_lamp_is_white_at_its_core_only(self) -> None:
+        """Its glow clips in one channel, far out of the core."""
+        scene = with_disc(backdrop(), (150, 100), 4, colour=(1.0, 0.45, 0.15), glare=4.0)
+        (found,) = ExposureDetector().detect(stored(scene))
+        assert found.radius > 6 and np.linalg.norm(found.xy - (150, 100)) < 0.3
+        orange = with_disc(backdrop(), (150, 100), 8, radiance=2.0, colour=(1.0, 0.45, 0.15), glare=0.5)
+        assert not ExposureDetector().detect(stored(orange)), "a bright orange thing clips, but is nowhere white"
+
     def test_the_colour_of_a_detection_is_that_of_its_glow(self) -> None:
         scene = with_disc(np.full((240, 320, 3), 0.1), (150, 100), 7)
         (found,) = ExposureDetector().detect(stored(scene))

@@ -102,7 +102,7 @@ def _run_to_end(trainer: FlareTrainer, run: Run, progress: Progress) -> None:
             raise
         _finish(trainer, run, progress)
     if len(trainer.losses) == len(trainer.views):  # every view was used
-        _report(outlier_warnings(trainer.losses), run, progress)
+        _report(outlier_warnings(trainer.losses, trainer.settings.uses_plates), run, progress)
     _log(run, f"finished at iteration {trainer.iteration}")
 
 

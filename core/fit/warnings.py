@@ -62,18 +62,20 @@ def footage_warnings(capture: Capture, settings: FitSettings, views: Sequence[Vi
     return tuple(warnings)
 
 
-def outlier_warnings(losses: Mapping[str, float]) -> tuple[str, ...]:
+def outlier_warnings(losses: Mapping[str, float], uses_plates: bool = False) -> tuple[str, ...]:
     """Return a sentence that names the frames whose last loss is many times the median; () if none or too many are.
 
-    losses: last loss of each frame, by name.
+    losses: last loss of each frame, by name. uses_plates: whether the scene is plates.
     """
     median = float(np.median(list(losses.values()))) if losses else 0.0
     names = [name for name, loss in losses.items() if loss > max(OUTLIER_RATIO * median, MIN_OUTLIER_LOSS)]
     if not names or len(names) > max(MAX_OUTLIER_SHARE * len(losses), 1):
         return ()
     more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
-    return (f"{', '.join(names[:MAX_NAMES])}{more}: the fit does not reproduce the shot; it may be of "
-            "another scene, or its camera may be wrong. Take it out of the capture, and fit again.",)
+    advice = ("the place of a light may be wrong there, or the plate. Correct the light in lights.json, or put a clean "
+              "frame in removed/, and fit again." if uses_plates else
+              "it may be of another scene, or its camera may be wrong. Take it out of the capture, and fit again.")
+    return (f"{', '.join(names[:MAX_NAMES])}{more}: the fit does not reproduce the shot; {advice}",)
 
 
 def moved_light_warnings(capture: Capture, flare: FlareModel) -> tuple[str, ...]:

@@ -42,7 +42,7 @@ DISTANCE_SCALE = 0.1
 """Distance, diagonals, that costs as much as the whole gate when tracks are joined: gates of fast lights are wide."""
 JOIN_DISTANCE, JOIN_SPEED = 0.08, 0.75
 """Largest distance of the places that two joined tracks predict in the middle of the gap: diagonals, plus a share of
-the way through the gap at the larger speed, at the gap or median."""
+the way through the gap at the largest of the speeds next to the gap and the median speeds of both tracks."""
 MAX_SINGLE_GAP = 6
 """Largest gap, frames, to a track of one frame."""
 MAX_DIFFERENCE = 1.0

@@ -27,7 +27,7 @@ MIN_THICKNESS = 0.55
 """Thickness of a part, relative to the thickest of its spot, from which it is a source of its own."""
 MIN_RADIUS = 0.0018
 """Smallest radius of a spot, in frame diagonals; one pixel at least."""
-AREA_SHARES = 0.05, 0.015
+SHOT_AREA_SHARES = 0.05, 0.015
 """Shares of the frame from which a spot is no light, and up to which every one may be: larger than for `exposure.py`,
 since the softness tells a low sun with its glow from clipped sky and walls."""
 CLIPPED = 0.98
@@ -91,9 +91,9 @@ def find_sources(picture: Picture, clipped_from: float = CLIPPED) -> list[Source
         if area < min_area:
             continue
         region = labels[top:top + height, left:left + width] == label
-        for mask, corner in _thick_parts(region, AREA_SHARES[0] * clipped.size):
+        for mask, corner in _thick_parts(region, SHOT_AREA_SHARES[0] * clipped.size):
             corner = (left + corner[0], top + corner[1])
-            shape = shape_score(mask, corner, scaled, AREA_SHARES)
+            shape = shape_score(mask, corner, scaled, SHOT_AREA_SHARES)
             soft = smoothstep(_softness(mask, corner, luminance, diagonal / REFERENCE), HARD, SOFT)
             detection = measure_detection(mask, corner, picture, scaled, shape)
             if picture.encoding == "linear":

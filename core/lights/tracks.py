@@ -2,10 +2,10 @@
 """Follows lights through the frames of a shot: places on the picture, brightness and confidence by frame.
 
 `sources.py` finds candidates in each frame, `association.py` chains them. A chain is a light if its sources look like
-lamps in most frames and it is no ghost of another light. Between the frames that show a light `path_interpolation.py`
-completes its path; beyond them it goes on at constant velocity until it is well out of the frame. A static light goes
-with the background instead (`background_motion.py`). Each such place has an expected error, which becomes its
-confidence.
+lamps in most frames, and it is neither a ghost nor a reflection of another light. Between the frames that show a light
+`path_interpolation.py` completes its path; beyond them it goes on at constant velocity until it is well out of the
+frame. A static light goes with the background instead (`background_motion.py`). Each such place has an expected error,
+which becomes its confidence.
 
 Brightness is the height of the glow around the light's place in unclipped rings, with one profile for the whole shot:
 I[t, r] = on[t] G[r] + background[t], by alternating least squares.
@@ -36,11 +36,12 @@ GHOST_ERROR, MIN_GHOST_MOTION = 0.008, 0.03
 """Largest median distance of a ghost from the line through its light, and the least motion of that light, diagonals."""
 MIN_SHARED = 0.7
 """Part of the frames of a ghost or a reflection in which its light must be followed too."""
-REFLECTION_OFFSET, MIN_REFLECTION_DISTANCE = 0.02, 0.03
-"""Largest median horizontal and least vertical distance of a reflection below its light, diagonals."""
+REFLECTION_OFFSET, MIN_REFLECTION_DISTANCE = 0.025, 0.03
+"""Largest horizontal distance (90 % of the frames) and least vertical distance (median) of a reflection from its light,
+diagonals."""
 REFLECTION_RADIUS, REFLECTION_HEIGHT = 0.6, 1.3
-"""Radius of a reflection relative to its light's, and ratio of height to width, of which a reflection has one: smaller
-or taller than these."""
+"""Radius of a reflection relative to its light's, below which it may have any shape, and ratio of height to width from
+which any smaller radius will do."""
 TOLERATED_ERROR = 3.0
 """Expected error, pixels of a frame with a diagonal of REFERENCE, at which a place is as good as doubtful."""
 RECOVERY, MAX_RECOVERY = 0.012, 0.06
@@ -121,7 +122,7 @@ def track_lights(capture: Capture, progress: Progress | None = None) -> TrackFin
     lamps = [chain for chain in long_chains if chain.evidence >= MIN_EVIDENCE]
     ghosts = [chain for chain in lamps if _is_ghost(chain, lamps, np.array([camera.cx, camera.cy]), diagonal)]
     lamps = [chain for chain in lamps if chain not in ghosts]
-    reflections = [chain for chain in lamps if _is_reflection(chain, long_chains, diagonal)]
+    reflections = [chain for chain in lamps if _is_reflection(chain, lamps, diagonal)]
     lamps = [chain for chain in lamps if chain not in reflections]
     doubtful_chains = [chain for chain in long_chains if MIN_EVIDENCE > chain.evidence >= 0.5 * MIN_EVIDENCE]
     progress.stage("follow lights", len(lamps) + len(doubtful_chains))
@@ -160,10 +161,11 @@ def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], 
     if ghosts:
         messages.append(f"{ghosts} more follow another light through the middle of the picture and are its ghosts.")
     if reflections:
-        messages.append(f"{reflections} more stay below another light and are its reflections on the ground.")
+        messages.append("1 more stays below another light and is its reflection on the ground." if reflections == 1 else
+                        f"{reflections} more stay below another light and are its reflections on the ground.")
     if doubtful:
         messages.append(f"{len(doubtful)} moving bright things look too little like lamps and are left out.")
-    if not lights:
+    if not lights and not reflections:
         messages.append("No light was found: none is in frame for long enough, or none is over-exposed.")
     return messages
 
@@ -198,19 +200,21 @@ def _is_ghost(chain: Chain, lights: Sequence[Chain], centre: Floats, diagonal: f
 def _is_reflection(chain: Chain, others: Sequence[Chain], diagonal: float) -> bool:
     """Return whether a chain is the reflection of another one of `others` on wet ground, water or a floor.
 
-    A reflection stays straight below its light, in a picture that is not tilted. It is smaller than the light, or
-    drawn out in height. diagonal: length of the frame's diagonal, pixels.
+    A reflection stays straight below its light, in a picture that is not tilted. It is much smaller than the light, or
+    smaller and drawn out in height. diagonal: length of the frame's diagonal, pixels.
     """
     for light in others:
         sources, light_sources = _shared_sources(chain, light)
         if not sources:
             continue
-        offset = np.median([source.xy - other.xy for source, other in zip(sources, light_sources, strict=True)], axis=0)
+        offsets = np.array([source.xy - other.xy for source, other in zip(sources, light_sources, strict=True)])
+        aside, below = np.quantile(abs(offsets[:, 0]), 0.9), np.median(offsets[:, 1])
         radius, light_radius = (np.median([source.detection.radius for source in each])
                                 for each in (sources, light_sources))
         height = np.median([source.detection.mask.shape[0] / source.detection.mask.shape[1] for source in sources])
-        if (abs(offset[0]) < REFLECTION_OFFSET * diagonal and offset[1] > MIN_REFLECTION_DISTANCE * diagonal
-                and (radius < REFLECTION_RADIUS * light_radius or height > REFLECTION_HEIGHT)):
+        is_straight_below = aside < REFLECTION_OFFSET * diagonal and below > MIN_REFLECTION_DISTANCE * diagonal
+        largest = light_radius if height > REFLECTION_HEIGHT else REFLECTION_RADIUS * light_radius
+        if is_straight_below and radius < largest:
             return True
     return False
 

@@ -69,7 +69,8 @@ class ImportSettings:
 class Imported:
     """The objects that an import made. notes: warnings.
 
-    collection: the collection in the scene. unlinked: the collection of the objects that the scene does not have yet.
+    collection: the collection in the scene. unlinked: the collection of the objects that the scene does not
+    have yet, which `link_objects_in_steps` removes.
     """
 
     root: Any
@@ -138,9 +139,8 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     FrameError."""
     settings = settings or ImportSettings()
     imported = finish(import_in_steps(scene, folder, settings))
-    notes = show_frames_in_renders(scene, settings)
     finish(link_objects_in_steps(imported))
-    return replace(imported, notes=(*imported.notes, *notes))
+    return replace(imported, notes=(*imported.notes, *show_frames_in_renders(scene, settings)))
 
 
 def show_frames_in_renders(scene: Any, settings: ImportSettings) -> list[str]:

@@ -123,7 +123,8 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         return outcome.status
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """End the import and the timer; an import that is not finished leaves nothing.
+        """End the import and the timer. An import that has not given the scene its camera yet leaves nothing; a later
+        one is completed.
 
         An import that has ended is left as it is.
         """
@@ -142,6 +143,8 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
         """
         imported = yield from import_in_steps(context.scene, path, settings)
         self._is_complete = True
+        if self._in_steps:
+            context.workspace.status_text_set(f"Importing {self._name}")
         try:
             fits.clear_other_run(context.scene)
             fits.expose_cameras(context.scene, fits.run_folder(context.scene))
@@ -158,7 +161,7 @@ class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
             yield PAUSE
             yield from link_objects_in_steps(imported)
         except BaseException:  # GeneratorExit too: what is imported stays
-            with contextlib.suppress(ReferenceError):
+            with contextlib.suppress(ReferenceError):  # deleted or undone meanwhile
                 finish(link_objects_in_steps(imported))
             raise
 

@@ -112,6 +112,7 @@ def test_many_bad_frames_are_no_outliers() -> None:
     assert outlier_warnings(losses) == outlier_warnings({}) == ()
     assert outlier_warnings({**losses, "a": 0.39, "b": 0.41})[0].startswith("b: ")
     few = {f"odd {number}": 1.0 for number in range(4)}
+    assert "camera" not in outlier_warnings({**losses, "b": 0.41}, uses_plates=True)[0], "plates need no cameras"
     assert "odd 0, odd 1, odd 2, odd 3: " in outlier_warnings({**losses, **few})[0]
     assert outlier_warnings({**losses, **few, "odd 4": 1.0}) == ()
     assert outlier_warnings({"a": 0.0, "b": 0.0, "c": 1e-4}) == (), "nothing that can be seen"

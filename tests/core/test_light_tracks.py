@@ -132,11 +132,18 @@ class TestFollowing:
 
         findings = track_lights(make_shot(tmp_path, 12, frame))
         assert len(findings.lights) == count and abs(places(findings)[0][1] - 45) < 1
-        assert any("reflections" in text for text in findings.messages) == (count == 1)
+        assert any("reflection on" in text for text in findings.messages) == (count == 1)
+
+    def test_a_lamp_below_a_white_thing_or_a_smaller_lamp_is_no_reflection(self, tmp_path: Path) -> None:
+        box, lamp = (138, 40, 168, 62), (150.0, 130.0, 1.0)
+        for number, frame in enumerate((lit([lamp], 3.0, boxes=[box]),
+                                        np.maximum(lit([(150.0, 40.0, 1.0)], 3.0), lit([lamp], 6.0)))):
+            findings = track_lights(make_shot(tmp_path / str(number), 8, lambda _i, frame=frame: frame))
+            assert lamp[1] in [round(float(places(findings, light)[0][1])) for light in range(len(findings.lights))]
 
     def test_a_lamp_that_left_the_frame_is_not_another_that_appears_elsewhere(self, tmp_path: Path) -> None:
         def lamps(i: int) -> list[Lamp]:
-            leaving = [(200.0 + 5 * i, 120.0 + 6 * i, 1.0)] if i < 12 else []
+            leaving = [(200.0 + 5 * i + 5 * (i % 2), 120.0 + 6 * i, 1.0)] if i < 12 else []
             return leaving + ([(60.0 + i, 40.0 + i, 1.0)] if i >= 26 else [])
 
         findings = track_lights(make_shot(tmp_path, 36, lambda i: lit(lamps(i))))

@@ -111,7 +111,7 @@ def triangulate_pair(first: Camera, second: Camera, pixels: Floats, other_pixels
     than MAX_ERROR_PX from both pixels.
     """
     points, cosines, is_in_front = triangulate_midpoints(first.position, first.rays(pixels),
-                                                           second.position, second.rays(other_pixels))
+                                                         second.position, second.rays(other_pixels))
     is_sound = is_in_front & (np.arccos(cosines.clip(-1, 1)) > MIN_ANGLE)
     for camera, observed in ((first, pixels), (second, other_pixels)):
         places, depth = camera.project(points)

@@ -86,7 +86,11 @@ class Chain:
         """Return the median speed, pixels per frame; 0 for a single frame."""
         if len(self.frames) < 2:
             return 0.0
-        return float(np.median(np.linalg.norm(np.diff(self.places, axis=0), axis=1) / np.diff(self.frames)))
+        return float(np.median(np.linalg.norm(self._velocities(), axis=1)))
+
+    def _velocities(self) -> Floats:
+        """Return (n - 1, 2) pixels per frame, from each source to the next."""
+        return np.asarray(np.diff(self.places, axis=0) / np.diff(self.frames)[:, None])
 
     def predict(self, frame: int) -> Floats:
         """Return the place (2,) in a frame after the chain's last or before its first one, at constant velocity."""
@@ -101,12 +105,11 @@ class Chain:
         The result is clipped to MIN_ACCELERATION and MAX_ACCELERATION; for fewer than three frames it is the former.
         diagonal: length of the frames' diagonal, pixels.
         """
-        places, frames = self.places, np.array(self.frames)
+        frames = np.array(self.frames)
         low, high = MIN_ACCELERATION * diagonal, MAX_ACCELERATION * diagonal
         if len(frames) < 3:
             return low
-        rates = np.diff(places, axis=0) / np.diff(frames)[:, None]
-        changes = np.linalg.norm(np.diff(rates, axis=0), axis=1) / (0.5 * (frames[2:] - frames[:-2]))
+        changes = np.linalg.norm(np.diff(self._velocities(), axis=0), axis=1) / (0.5 * (frames[2:] - frames[:-2]))
         return float(np.clip(1.5 * np.quantile(changes, 0.8), low, high))
 
 

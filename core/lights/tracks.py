@@ -165,7 +165,7 @@ def _messages(lights: Sequence[TrackedLight], doubtful: Sequence[TrackedLight], 
                         f"{reflections} more stay below another light and are its reflections on the ground.")
     if doubtful:
         messages.append(f"{len(doubtful)} moving bright things look too little like lamps and are left out.")
-    if not lights and not reflections:
+    if not lights:
         messages.append("No light was found: none is in frame for long enough, or none is over-exposed.")
     return messages
 
@@ -197,31 +197,31 @@ def _is_ghost(chain: Chain, lights: Sequence[Chain], centre: Floats, diagonal: f
     return False
 
 
-def _is_reflection(chain: Chain, others: Sequence[Chain], diagonal: float) -> bool:
-    """Return whether a chain is the reflection of another one of `others` on wet ground, water or a floor.
+def _is_reflection(chain: Chain, lights: Sequence[Chain], diagonal: float) -> bool:
+    """Return whether a chain is the reflection of another one of `lights` on wet ground, water or a floor.
 
     A reflection stays straight below its light, in a picture that is not tilted. It is much smaller than the light, or
     smaller and drawn out in height. diagonal: length of the frame's diagonal, pixels.
     """
-    for light in others:
+    for light in lights:
         sources, light_sources = _shared_sources(chain, light)
         if not sources:
             continue
-        offsets = np.array([source.xy - other.xy for source, other in zip(sources, light_sources, strict=True)])
+        offsets = np.array([source.xy - above.xy for source, above in zip(sources, light_sources, strict=True)])
         aside, below = np.quantile(abs(offsets[:, 0]), 0.9), np.median(offsets[:, 1])
         radius, light_radius = (np.median([source.detection.radius for source in each])
                                 for each in (sources, light_sources))
         height = np.median([source.detection.mask.shape[0] / source.detection.mask.shape[1] for source in sources])
         is_straight_below = aside < REFLECTION_OFFSET * diagonal and below > MIN_REFLECTION_DISTANCE * diagonal
-        largest = light_radius if height > REFLECTION_HEIGHT else REFLECTION_RADIUS * light_radius
-        if is_straight_below and radius < largest:
+        max_radius = light_radius if height > REFLECTION_HEIGHT else REFLECTION_RADIUS * light_radius
+        if is_straight_below and radius < max_radius:
             return True
     return False
 
 
 def _shared_sources(chain: Chain, other: Chain) -> tuple[list[Source], list[Source]]:
-    """Return the sources of two chains in the frames that both have, two empty lists if the second lacks too many of
-    the first one's."""
+    """Return the sources of two chains in the frames that both have; two empty lists if `other` lacks too many of the
+    frames of `chain`, or is `chain` itself."""
     shared = sorted(set(chain.frames) & set(other.frames))
     if other is chain or len(shared) < max(3, MIN_SHARED * len(chain.frames)):
         return [], []

@@ -97,9 +97,9 @@ def bake():
     shot("07_baking")
     took = yield from wait(lambda: not job.running, 300)
     assert job.state == "done", job.error
+    yield from wait(lambda: module("compositor.flare_node").find_node(scene) is not None, 30)  # set up in steps
     yield 1
     shot("08_baked")
-    assert module("compositor.flare_node").find_node(scene) is not None
     done("baked", bake_s=round(took, 1), warnings=job.warnings)
 
 

@@ -97,7 +97,10 @@ facts["the stranger lives"] = sleeper.poll() is None
 facts["asked by the file alone"] = (found.folder / jobs.STOP).exists()
 
 # ---- of this scene, and of none ---------------------------------------------------------------------
-sleepers = [subprocess.Popen([sys.executable, "-c", "import time; time.sleep(100)"]) for _ in range(3)]
+sleepers = [subprocess.Popen([sys.executable, "-c", "import time; print(flush=True); time.sleep(100)"],
+                             stdout=subprocess.PIPE) for _ in range(3)]
+for process in sleepers:
+    process.stdout.readline()  # a Python that still starts may ignore a signal
 own, other, bake = (begun(name, GOES_ON, pid=process.pid, kind=kind) for name, process, kind in zip(
     ("own", "other", "layers"), sleepers, ("fit", "fit", "bake"), strict=True))
 shots, scene = part("flare_addon.shots"), empty()

@@ -38,13 +38,14 @@ def scene_loss(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor
     loss.
 
     It is a quantile loss, plus a penalty on the scene's light near the lights, plus an L1 loss in the discs. With
-    `progress`, 0..1, brighter frames pull the scene up less and the penalty grows. lights: (n, 3), world. discs:
-    (height, width), the lights' clipped pixels, or None.
+    `progress`, 0..1, brighter frames pull the scene up less, and the penalty grows until `low_sh_until`. lights: (n,
+    3), world. discs: (height, width), the lights' clipped pixels, or None.
     """
     ramp = _ramp(progress)
     loss = settings.scene_weight * quantile_loss(scene, targets.frame, settings.excess_weight * (1 - ramp))
     proximity = torch.from_numpy(light_proximity(targets.camera, lights, settings.light_radius)).to(scene.device)
-    loss = loss + settings.near_scene_penalty * ramp * (scene * proximity[..., None]).mean()
+    share = ramp if progress <= settings.low_sh_until else settings.final_near_share
+    loss = loss + settings.near_scene_penalty * share * (scene * proximity[..., None]).mean()
     # In the discs, the scene is fitted to the frame.
     if discs is not None:
         loss = loss + ((scene - targets.frame).abs() * discs[..., None]).mean()

@@ -145,7 +145,8 @@ class PlateTrainer(FlareTrainer):
         settings, view = self.settings, self._pick_view()
         targets, mask = self._device_frames.read(view)
         self.optimisers.set_rates(self.iteration)
-        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels)
+        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels,
+                             opacity_floor=self._opacity_floor)
         if flare is None:  # no light is in front of the camera
             return {}
         picture = composite(self._background(view, targets), flare, settings.blend, self.frames.display_white)

@@ -52,16 +52,18 @@ def pose_and_intrinsics(camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def render_flare(flare: FlareModel | None, blend: Blend, camera: Camera, kernels: Kernels = "auto", *,
-                 scene: Scene | None = None, visibility: VisibilitySettings | None = None) -> Splats | None:
+                 scene: Scene | None = None, visibility: VisibilitySettings | None = None,
+                 opacity_floor: float = 0.0) -> Splats | None:
     """Render the flares of all lights as one set of splats; None if no light is in front of the camera.
 
-    With `visibility`, each flare is scaled by the visibility of its light behind `scene`.
+    With `visibility`, each flare is scaled by the visibility of its light behind `scene`. opacity_floor: least opacity
+    of a Gaussian, before that scaling.
     """
     if flare is None:
         return None
     pose, intrinsics = pose_and_intrinsics(camera)
     visibilities = _visibilities(flare, camera, scene, visibility, kernels)
-    gaussians = concatenate(flare(pose, visibilities, camera.frame))
+    gaussians = concatenate(flare(pose, visibilities, camera.frame, opacity_floor))
     if gaussians is None:
         return None
     return splat_flare(gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels,

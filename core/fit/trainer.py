@@ -153,7 +153,8 @@ class Trainer(FlareTrainer):
         scene_only = self._is_scene_only(targets)
         flare = None if scene_only else render_flare(self.flare, settings.blend, flare_targets.camera,
                                                      settings.kernels, scene=self.scene,
-                                                     visibility=settings.flare.active_visibility)
+                                                     visibility=settings.flare.active_visibility,
+                                                     opacity_floor=self._opacity_floor)
         light_discs = self._light_discs_of(view, flare_targets)
         background = self._flare_background(flare_targets, scene_picture, light_discs)
         composite_picture = composite(background, flare, settings.blend, self.frames.display_white)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -120,10 +120,11 @@ class LightFlare(nn.Module):
         """The device of the parameters."""
         return self.gaussians["positions"].device
 
-    def forward(self, view: ViewOfLight) -> PlaneGaussians:
+    def forward(self, view: ViewOfLight, opacity_floor: float = 0.0) -> PlaneGaussians:
         """Return the flare's Gaussians in this view (paper, eq. 1 to 3), on the normalised plane.
 
-        Raises ValueError for a light behind the camera: it has no flare (paper, "Flare Representation").
+        opacity_floor: opacity, 0..1, that fainter Gaussians are given (`_RaiseToFloor`). Raises ValueError for a light
+        behind the camera: it has no flare (paper, "Flare Representation").
         """
         if view.depth <= 0:
             raise ValueError("a light behind the camera has no flare")
@@ -150,6 +151,8 @@ class LightFlare(nn.Module):
         else:
             covariances = placement.covariance_of_ellipse(scales, rotations)
         opacities, rings, arcs = deformed("opacity_logits").sigmoid()[:, 0], None, None
+        if opacity_floor:
+            opacities = cast(Tensor, _RaiseToFloor.apply(opacities, opacity_floor))
         if form.rings:
             rings = _to_rings(deformed("rings"))
         if form.arcs and rings is not None:
@@ -184,6 +187,25 @@ class LightFlare(nn.Module):
         """
         rays = torch.cat([means, torch.ones_like(means[:, :1])], -1)
         return colours(rays @ rotation, sh.unflatten(-1, (-1, 3)), self.form.sh_degree)
+
+
+class _RaiseToFloor(torch.autograd.Function):
+    """The larger of opacities (n,) and a floor, with the gradient of the result where that would increase an opacity
+    below the floor, else 0.
+
+    Adam changes a colour at a constant rate, and so the light of a Gaussian at a rate in proportion to its opacity. A
+    flare whose first Gaussians fade therefore learns more slowly than the scene, which then takes its light for good.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, opacities: Tensor, floor: float) -> Tensor:
+        ctx.save_for_backward(opacities >= floor)
+        return opacities.clamp(min=floor)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        (is_above,) = ctx.saved_tensors
+        return torch.where(is_above | (gradient < 0), gradient, 0), None
 
 
 def _to_rings(raw: Tensor) -> Tensor:
@@ -318,16 +340,16 @@ class FlareModel(nn.Module):
         return torch.stack(corrections) if corrections else torch.zeros(0, 2)
 
     def forward(self, world_to_camera: Tensor, visibilities: Mapping[str, Tensor] | None = None,
-                frame: str = "") -> dict[str, PlaneGaussians]:
+                frame: str = "", opacity_floor: float = 0.0) -> dict[str, PlaneGaussians]:
         """Return the Gaussians of every light in front of the camera, by the light's name.
 
         Opacities are multiplied by the visibility of the light, 0..1, and by its brightness in `frame`. If this product
         is below MIN_TRAINING_VISIBILITY, the light's Gaussians get no gradient: there is next to nothing to learn, and
         Adam would learn the error of the visibility at full rate. world_to_camera: (4, 4). visibilities: by the light's
-        name; None if all are 1.
+        name; None if all are 1. opacity_floor: as for `LightFlare.forward`.
         """
         lights = zip(self.names, self.lights, self.views(world_to_camera, frame), strict=True)
-        flares = {name: flare(view) for name, flare, view in lights if view.depth > 0}
+        flares = {name: flare(view, opacity_floor) for name, flare, view in lights if view.depth > 0}
         shares = self.shares(visibilities, frame)
         if shares is None:
             return flares

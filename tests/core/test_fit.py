@@ -333,6 +333,32 @@ def test_ambiguous_light_goes_to_the_flare_but_a_light_disc_to_the_scene(capture
     assert (brighter[~discs] > darker[~discs] * 1.5).all(), "no frame is darker than the scene"
 
 
+def test_the_penalty_near_a_light_falls_when_the_scenes_colours_change_freely(capture: Capture) -> None:
+    """Of a scene that is darker than the frame, only the penalty near the lights has a gradient."""
+    targets, lights = Frames(capture).targets(capture.views[0]), np.array([light.xyz for light in capture.lights])
+    settings = SplitSettings(low_sh_until=0.7, final_near_share=0.5)
+
+    def slope(progress: float) -> float:
+        scene = (targets.frame - 0.1).requires_grad_()
+        scene_loss(scene, targets, lights, None, settings, progress).backward()
+        assert scene.grad is not None
+        return float(scene.grad.sum())
+
+    assert slope(0.7) > 0
+    assert slope(0.71) == slope(1.0) == pytest.approx(0.5 * slope(0.7), rel=1e-4)
+
+
+@pytest.mark.parametrize(("mode", "floor"), [("estimated", 0.004), ("split", 0.004), ("default", 0.0)])
+def test_opacities_have_a_floor_while_a_scene_without_clean_frames_could_take_the_flares_light(
+        capture: Capture, mode: Any, floor: float) -> None:
+    settings = preset("draft", mode=mode, iterations=100)
+    trainer = Trainer(capture, settings)
+    trainer.iteration = settings.flare.density.stop
+    assert trainer._opacity_floor == floor
+    trainer.iteration += 1
+    assert trainer._opacity_floor == 0, "the model that is written is the one that was fitted"
+
+
 def test_a_visible_light_hidden_by_the_scene_from_everywhere_is_uncovered(
         capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = Trainer(capture, quick(**{"flare.occlusion": True}))

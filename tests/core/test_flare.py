@@ -24,7 +24,7 @@ from core.flare.deformation import QueryRange
 from core.flare.density import DensitySettings, clone_and_prune
 from core.flare.encoding import HashGrid, frequency_encoding
 from core.flare.file import FlareFile
-from core.flare.model import OURS, PAPER, FlareModel, LightFlare, ViewOfLight, plane_scale
+from core.flare.model import OURS, PAPER, FlareModel, LightFlare, ViewOfLight, _RaiseToFloor, plane_scale
 from core.gaussians import Splats, rasterization
 from core.gaussians.optimiser import Adam
 from core.gaussians.rendering import arc_strengths
@@ -488,3 +488,23 @@ def test_light_is_added_with_the_gradients_of_its_definition(taught: bool) -> No
     expected = torch.autograd.grad(encode(decode(inner) + light), (inner, light) if taught else (light,), wanted)
     for a, b in zip(found, expected, strict=True):
         torch.testing.assert_close(a, b)
+
+
+# ---- floor of the opacity -------------------------------------------------------------------------
+
+
+def test_a_floor_changes_only_fainter_gaussians() -> None:
+    model = some_flare(OURS)
+    (view,) = model.views(pose())
+    plain, raised = model.lights[0](view).opacities, model.lights[0](view, 0.05).opacities
+    assert (plain < 0.05).any() and (plain > 0.05).any()
+    assert torch.equal(raised, plain.clamp(min=0.05))
+
+
+@pytest.mark.parametrize(("opacity", "gradient", "expected"), [
+    (0.001, -1.0, -1.0), (0.001, 1.0, 0.0), (0.2, -1.0, -1.0), (0.2, 1.0, 1.0)])
+def test_a_gradient_raises_what_is_below_the_floor_but_does_not_lower_it(opacity: float, gradient: float,
+                                                                         expected: float) -> None:
+    opacities = torch.full((3,), opacity, requires_grad=True)
+    _RaiseToFloor.apply(opacities, 0.01).backward(torch.full((3,), gradient))
+    assert opacities.grad is not None and opacities.grad.tolist() == [expected] * 3

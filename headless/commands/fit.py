@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
+from ...core.capture import REMOVED
 from ...core.choices import Blend, Mode, Model, Preset
 from ...core.errors import CaptureError, SettingsError
 from ...core.system.progress import Progress
@@ -176,14 +177,16 @@ def adapt_to_absent_flare(capture: Capture, settings: FitSettings, progress: Pro
     from ...core.removal.jobs.provenance import has_exact_clean_frames, has_unchanged_clean_frames
 
     modes = ("default",) if is_resumed else ("default", "estimated")
-    if settings.mode not in modes or settings.uses_plates or settings.scene.frozen or has_exact_clean_frames(capture):
+    if settings.mode not in modes or settings.scene.frozen or has_exact_clean_frames(capture):
         return capture, settings
     if not has_unchanged_clean_frames(capture, progress):
         return capture, settings
     names = [light.name for light in capture.lights]
     others = f" Of the {len(names)} lights, the fit uses only {names[0]}." if len(names) > 1 else ""
+    hint = (f"If the frames do show a flare, put clean frames from elsewhere into {capture.folder / REMOVED}."
+            if settings.uses_plates else "To search for a flare all the same, use --mode split.")
     progress.say(f"`remove` has found no flare in the frames of {capture.folder}, so the fit uses them as exact clean "
-                 f"frames, and its flare stays dark.{others} To search for a flare all the same, use --mode split.")
+                 f"frames, and its flare stays dark.{others} {hint}")
     return capture.with_lights(capture.lights[:1]), replace(settings, mode="default")
 
 

@@ -2,9 +2,14 @@
 """`shot` goes from frames to the layers of their flare, and goes on where it was stopped."""
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
+import pytest
+
+from core.bake.exr import read_layers
 from core.fit import Run
+from tests.core.removal_cases import network_file
 from tests.core.test_fit_plates import make_shot
 from tests.headless.test_solve_and_lights import run
 
@@ -28,6 +33,21 @@ def test_shot_makes_run_layers_and_clean_frames(tmp_path: Path) -> None:
     status, events = run(*request)
     assert status == 0 and Run.open(result["run"]).fingerprint == before
     assert any("finished already" in event["text"] for event in events if event["type"] == "say")
+
+
+def test_a_shot_without_flare_stays_dark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The network removes nothing: plates from other frames would make a flare of what moves."""
+    monkeypatch.setenv("FIT_FLARE_WEIGHTS", str(network_file(tmp_path / "net.safetensors", bias=-1.0)))
+    folder, out = make_shot(tmp_path / "frames", count=FRAMES), tmp_path / "out"
+    shutil.rmtree(folder / "removed", ignore_errors=True)
+    status, events = run("shot", folder, "--out", out, "--scene", "plates", "--focal", 90, "--iterations", 20)
+    assert status == 0, events
+    says = [event["text"] for event in events if event["type"] == "say"]
+    assert any("found no flare in the frames" in text and "put clean frames from elsewhere into" in text
+               for text in says)
+    for path in sorted((out / "layers").glob("layers.*.exr")):
+        layers = read_layers(path)
+        assert layers.scene.any() and not layers.flare.any(), "to the last bit"
 
 
 def test_shot_names_a_source_that_is_missing(tmp_path: Path) -> None:

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The scene alone (`fit --mode 3dgs`) against gsplat's training, on the same capture, frames and iterations.
+
+    python benchmarks/scene_quality.py CAPTURE [--iterations 2400] [--size 480] [--out FOLDER]
+
+gsplat's rasterizer needs a GPU. So its training runs here over our rasterizer, which draws the same pictures: gsplat's
+own `DefaultStrategy`, with the settings of its `examples/simple_trainer.py` (initial Gaussians, learning rates, losses,
+degrees of the harmonics), every schedule scaled to the iterations as its `steps_scaler` does. Both are scored on the
+held-out views at the size of the fit. Cameras are not normalised: positions and scales are relative to gsplat's
+`scene_scale` in this world.
+"""
+from __future__ import annotations
+
+import argparse
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks import report
+from core.capture import Camera, Capture
+from core.conventions.run_files import EVALUATION
+from core.errors import RunError
+from core.fit.frames import Frames
+from core.gaussians import Rendering, rasterization
+from core.gaussians.loss import l1_ssim
+from core.gaussians.ordering import nearest_distances
+from core.gaussians.spherical_harmonics import dc_from_colour
+from core.system.files import read_json
+
+# Settings of gsplat's simple_trainer.py and of its DefaultStrategy.
+FULL_ITERATIONS, SH_INTERVAL, SH_DEGREE = 30_000, 1000, 3
+INITIAL_OPACITY, SSIM_SHARE, NEAR = 0.1, 0.2, 0.01
+RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
+FINAL_MEANS_RATE = 0.01
+"""Factor of the positions' rate at the end; it falls exponentially."""
+REFINE_START, REFINE_STOP, REFINE_EVERY, RESET_EVERY = 500, 15_000, 100, 3000
+SCENE_SCALE_FACTOR = 1.1
+
+
+class GsplatTraining:
+    """gsplat's training of a scene, one view per `step`."""
+
+    def __init__(self, capture: Capture, width: int, iterations: int, seed: int = 0) -> None:
+        from gsplat.strategy import DefaultStrategy
+
+        torch.manual_seed(seed)
+        self.frames = Frames(capture, width, frames_only=True)
+        self.views, self.held_out = capture.split(None)
+        self.iterations, self.iteration, self.order = iterations, 0, list[int]()
+        factor = iterations / FULL_ITERATIONS
+        self.sh_interval = max(int(SH_INTERVAL * factor), 1)
+        positions = np.array([view.camera.position for view in capture.views])
+        scene_scale = SCENE_SCALE_FACTOR * float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+        self.parameters = torch.nn.ParameterDict(self._initial_gaussians(capture))
+        self.optimisers = {
+            name: torch.optim.Adam([{"params": self.parameters[name], "name": name,
+                                     "lr": rate * (scene_scale if name == "means" else 1)}], eps=1e-15)
+            for name, rate in RATES.items()}
+        self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.optimisers["means"],
+                                                               FINAL_MEANS_RATE ** (1 / iterations))
+        self.strategy = DefaultStrategy(
+            refine_start_iter=int(REFINE_START * factor), refine_stop_iter=int(REFINE_STOP * factor),
+            refine_every=max(int(REFINE_EVERY * factor), 1), reset_every=max(int(RESET_EVERY * factor), 1))
+        self.state: dict[str, Any] = self.strategy.initialize_state(scene_scale=scene_scale)
+
+    @staticmethod
+    def _initial_gaussians(capture: Capture) -> dict[str, torch.nn.Parameter]:
+        """Return the first Gaussians, one for each point of the capture, by gsplat's names of their parameters."""
+        means = torch.from_numpy(capture.points.xyz).float()
+        colours = torch.from_numpy(capture.points.rgb).float() / 255
+        count = len(means)
+        spacing = nearest_distances(means).square().mean(1).sqrt().clamp_min(1e-7)
+        sh = torch.zeros(count, (SH_DEGREE + 1) ** 2, 3)
+        sh[:, 0] = dc_from_colour(colours)
+        rows = {"means": means, "scales": spacing.log()[:, None].repeat(1, 3),
+                "quats": torch.rand(count, 4), "opacities": torch.full((count,), INITIAL_OPACITY).logit(),
+                "sh0": sh[:, :1], "shN": sh[:, 1:]}
+        return {name: torch.nn.Parameter(values.contiguous()) for name, values in rows.items()}
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return len(self.parameters["means"])
+
+    def render(self, camera: Camera, sh_degree: int = SH_DEGREE) -> Rendering:
+        """Render the scene in display values."""
+        rows = self.parameters
+        return rasterization(rows["means"], rows["quats"], rows["scales"], rows["opacities"],
+                             torch.cat([rows["sh0"], rows["shN"]], 1),
+                             torch.from_numpy(camera.world_to_camera).float(),
+                             torch.from_numpy(camera.intrinsics).float(), camera.width, camera.height,
+                             sh_degree=sh_degree, near=NEAR, depth=False, raw=True)
+
+    def step(self) -> None:
+        """Make one iteration on the next view of a random order."""
+        if not self.order:
+            self.order = torch.randperm(len(self.views)).tolist()
+        targets = self.frames.targets(self.views[self.order.pop()])
+        camera = targets.camera
+        rendering = self.render(camera, min(self.iteration // self.sh_interval, SH_DEGREE))
+        loss = l1_ssim(rendering.colour, targets.frame, 1 - SSIM_SHARE)
+        loss.backward()
+        # What gsplat's rasterizer reports of one camera; its strategy reads the gradient by the projected centres.
+        centres = rendering.centres[None].clone()
+        centres.grad = rendering.centre_gradients[None]
+        info = {"width": camera.width, "height": camera.height, "n_cameras": 1, "gaussian_ids": None,
+                "radii": rendering.radii[None, :, None].expand(-1, -1, 2), "means2d": centres}
+        for optimiser in self.optimisers.values():
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+        self.schedule.step()
+        self.strategy.step_post_backward(self.parameters, self.optimisers, self.state, self.iteration, info)
+        self.iteration += 1
+
+    @torch.no_grad()
+    def score(self) -> float:
+        """Return the mean PSNR of the held-out views, dB, in display values."""
+        scores = []
+        for view in self.held_out:
+            targets = self.frames.targets(view)
+            error = (self.render(targets.camera).colour.clamp(0, 1) - targets.frame).square().mean()
+            scores.append(-10 * float(error.log10()))
+        return statistics.mean(scores)
+
+
+def train_gsplat(capture: Path, size: int, iterations: int) -> tuple[float, int]:
+    """Run gsplat's training; return the mean PSNR of the held-out views, dB, and the number of Gaussians."""
+    training = GsplatTraining(Capture.open(capture), size, iterations)
+    for iteration in range(iterations):
+        training.step()
+        if iteration % 200 == 0:
+            print(f"gsplat's training: {iteration}/{iterations}, {training.count} Gaussians", flush=True)
+    return training.score(), training.count
+
+
+def fit_scene(capture: Path, size: int, iterations: int, out: Path) -> tuple[float, int]:
+    """Fit the scene alone by the commands; return the mean PSNR of the held-out views, dB, and the number of Gaussians.
+    Raises CalledProcessError."""
+    program = report.ROOT / "headless" / "run.py"
+    subprocess.run([sys.executable, program, "fit", capture, "--out", out, "--mode", "3dgs", "--preset", "standard",
+                    "--size", str(size), "--iterations", str(iterations)], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([sys.executable, program, "eval", out], check=True, stdout=subprocess.DEVNULL)
+    from core.fit.run import Run
+
+    scores = read_json(out / EVALUATION, RunError)
+    return float(scores["composite"]["psnr"]), len(Run.open(out).scene.means)  # type: ignore[union-attr]
+
+
+def main() -> None:
+    """Train both scenes in turn, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--iterations", type=int, default=2400)
+    parser.add_argument("--size", type=int, default=480, help="longer side of the pictures, px")
+    parser.add_argument("--out", type=Path, help="folder of the run (default: a temporary one)")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        rows = [("fit --mode 3dgs", *fit_scene(args.capture, args.size, args.iterations,
+                                               args.out or Path(temporary) / "run")),
+                ("gsplat's training", *train_gsplat(args.capture, args.size, args.iterations))]
+    print(report.conditions())
+    print(report.table(("scene", "PSNR of held-out views, dB", "Gaussians"),
+                       [[name, f"{psnr:.2f}", f"{count:,}"] for name, psnr, count in rows]))
+
+
+if __name__ == "__main__":
+    main()

@@ -174,19 +174,19 @@ def adapt_to_absent_flare(capture: Capture, settings: FitSettings, progress: Pro
 
     capture: with the clean frames that a fit with these settings needs. A resumed run keeps its mode.
     """
-    from ...core.removal.jobs.provenance import has_exact_clean_frames, has_unchanged_clean_frames
+    from ...core.removal.jobs.provenance import has_exact_clean_frames, has_no_visible_flare
 
     modes = ("default",) if is_resumed else ("default", "estimated")
     if settings.mode not in modes or settings.scene.frozen or has_exact_clean_frames(capture):
         return capture, settings
-    if not has_unchanged_clean_frames(capture, progress):
+    if not has_no_visible_flare(capture, progress):
         return capture, settings
     names = [light.name for light in capture.lights]
     others = f" Of the {len(names)} lights, the fit uses only {names[0]}." if len(names) > 1 else ""
     hint = (f"If the frames do show a flare, put clean frames from elsewhere into {capture.folder / REMOVED}."
             if settings.uses_plates else "To search for a flare all the same, use --mode split.")
-    progress.say(f"`remove` has found no flare in the frames of {capture.folder}, so the fit uses them as exact clean "
-                 f"frames, and its flare stays dark.{others} {hint}")
+    progress.say(f"`remove` has found no flare in the frames of {capture.folder}, so the fit takes these for exact "
+                 f"clean frames, and its flare stays dark.{others} {hint}")
     return capture.with_lights(capture.lights[:1]), replace(settings, mode="default")
 
 

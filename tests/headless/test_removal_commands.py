@@ -11,10 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fit_flare.core.capture import Capture
 from fit_flare.core.images.read import read_picture
 from fit_flare.core.images.write import write_png
 from fit_flare.core.removal.jobs.manifest import MANIFEST
+from fit_flare.core.removal.jobs.provenance import has_no_visible_flare
 from fit_flare.core.removal.training.run import read_recipe
+from fit_flare.core.system.progress import Progress
 from fit_flare.headless import cli
 
 from tests.core.removal_cases import network_file
@@ -241,3 +244,15 @@ def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys:
     assert cli.main(["fit", str(bare), "--out", str(tmp_path / "worked on"), "--iterations", "2"]) == 0
     assert 'mode = "default"' in (tmp_path / "worked on" / "config.toml").read_text(encoding="utf-8")
     assert "mode estimated" not in capsys.readouterr().err, "someone has gone on from them by hand"
+
+
+@pytest.mark.parametrize(("codes", "expected"), [(0, True), (4, True), (5, False)])
+def test_a_flare_of_a_few_codes_in_one_frame_is_none(capture: Path, tmp_path: Path, codes: int, expected: bool) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
+    shutil.copytree(bare / "images", bare / "removed")
+    path = sorted((bare / "removed").iterdir())[-1]
+    clean = read_picture(path).display()
+    clean[3, 4, 1] += (codes if clean[3, 4, 1] < 0.5 else -codes) / 255
+    write_png(path, clean)
+    assert has_no_visible_flare(Capture.open(bare), Progress()) is expected

@@ -16,6 +16,9 @@ from ...images.read import read_picture
 from ...system.progress import Progress
 from .manifest import Manifest
 
+MAX_INVISIBLE = 4.5 / 255
+"""Largest difference in display values between a frame and its clean frame that counts as no flare."""
+
 
 def has_exact_clean_frames(capture: Capture) -> bool:
     """Return whether a capture has clean frames that a fit may take as exact.
@@ -38,15 +41,17 @@ def check_clean_frames_current(capture: Capture) -> None:
                            "again.")
 
 
-def has_unchanged_clean_frames(capture: Capture, progress: Progress) -> bool:
-    """Return whether the clean frames of a capture are its frames to the last bit: `remove` has found no flare in any.
+def has_no_visible_flare(capture: Capture, progress: Progress) -> bool:
+    """Return whether `remove` has found no flare in any frame of a capture: no channel of a pixel differs from its
+    clean frame by more than MAX_INVISIBLE.
 
     Raises Cancelled.
     """
     progress.stage("compare the clean frames", len(capture.views))
     for view in capture.views:
-        frame, clean = read_picture(capture.frame_path(view)), read_picture(capture.clean_frame_path(view))
-        if not np.array_equal(frame.pixels, clean.pixels):
+        frame, clean = (read_picture(path).display()
+                        for path in (capture.frame_path(view), capture.clean_frame_path(view)))
+        if frame.shape != clean.shape or np.abs(frame - clean).max() > MAX_INVISIBLE:
             return False
         progress.advance()
     return True

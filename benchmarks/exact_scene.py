@@ -31,8 +31,7 @@ class ExactSceneTrainer(Trainer):
         if targets.clean is None:
             raise CaptureError(f"{self.capture.folder} has no flare-free frames; the exact scene must be known.")
         self.optimisers.set_rates(self.iteration)
-        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels,
-                             opacity_floor=self._opacity_floor)
+        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels)
         loss = l1_ssim(composite(targets.clean, flare, settings.blend), targets.frame, 1 - settings.ssim_share)
         if loss.requires_grad:
             loss.backward()

@@ -123,13 +123,6 @@ class FlareTrainer(abc.ABC):
         seed = (self.settings.seed * 1_000_003 + purpose) * 1_000_003 + number
         return torch.Generator().manual_seed(seed % (1 << 62))
 
-    @property
-    def _opacity_floor(self) -> float:
-        """Least opacity of flare Gaussians in this iteration; 0 after their number has changed for the last time, so
-        that the model that is written is the one that was fitted."""
-        settings = self.settings.flare
-        return settings.opacity_floor if self.iteration <= settings.density.stop else 0.0
-
     def _change_flare_density(self) -> None:
         """Clone and prune the Gaussians of each light's flare, in iterations that the settings name; else do
         nothing."""

@@ -145,8 +145,7 @@ class PlateTrainer(FlareTrainer):
         settings, view = self.settings, self._pick_view()
         targets, mask = self._device_frames.read(view)
         self.optimisers.set_rates(self.iteration)
-        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels,
-                             opacity_floor=self._opacity_floor)
+        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels)
         if flare is None:  # no light is in front of the camera
             return {}
         picture = composite(self._background(view, targets), flare, settings.blend, self.frames.display_white)

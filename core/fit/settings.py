@@ -67,9 +67,6 @@ class SceneRates:
 class FlareSettings:
     """The flare: its form, the number of Gaussians a light starts with, density control, rates, occlusion.
 
-    opacity: that of the first Gaussians. opacity_floor: while their number changes, fainter Gaussians are drawn with
-    this opacity, so that a flare whose light the scene took can come back.
-
     detection: False puts every light at the centroid of the points plus uniform noise (ablation). occlusion: scale each
     flare by the visibility of its light behind the scene (`visibility`).
 
@@ -85,7 +82,6 @@ class FlareSettings:
     form: FlareForm = PAPER
     count: int = 200
     opacity: float = 0.05
-    opacity_floor: float = 0.0
     density: DensitySettings = field(default_factory=DensitySettings)
     rates: FlareRates = field(default_factory=FlareRates)
     detection: bool = True
@@ -139,7 +135,8 @@ class SplitSettings:
     scene's colours have degree `sh_degree` for the share `low_sh_until` of the iterations, since they could follow a
     flare if they changed freely with direction. After that, the penalty is multiplied by `final_near_share`: scenes
     whose colours change freely become darker about a light, and the flare becomes a veil. sky: add far points at the
-    start.
+    start. opacity_floor: while the number of flare Gaussians changes, fainter ones are drawn with this opacity, so that
+    a flare whose light the scene took can come back.
 
     When the flare starts, the scene is tested for convergence: flares only add light, while errors have both signs. If
     the squared excess of the frames over the scene is less than `converged_ratio` times their squared deficit, the
@@ -160,6 +157,7 @@ class SplitSettings:
     sh_degree: int = 1
     low_sh_until: float = 0.7
     sky: bool = True
+    opacity_floor: float = 0.004
     converged_ratio: float = 26.0
     diverged_ratio: float = 18.0
     far_flare_penalty: float = 0.1
@@ -307,7 +305,6 @@ BOUNDS: dict[str, Bounds] = {
     "coarse_to_fine.flare_width": _FROM_0, "coarse_to_fine.flare_until": _UNIT,
 
     "flare.count": Bounds(1, MAX_GAUSSIANS), "flare.opacity": _OPEN_UNIT,
-    "flare.opacity_floor": Bounds(0, 1, exclusive_maximum=True),
     "flare.scene_only_until": Bounds(0, 1, exclusive_maximum=True), "flare.correction_weight": _NON_NEGATIVE,
     **{f"flare.form.{name}": bounds for name, bounds in FORM_BOUNDS.items()},
     "flare.density.start": _FROM_0, "flare.density.stop": _FROM_0, "flare.density.every": _FROM_1,
@@ -338,6 +335,7 @@ BOUNDS: dict[str, Bounds] = {
     **dict.fromkeys((f"split.{name}" for name in (
         "converged_ratio", "diverged_ratio", "far_flare_penalty", "scene_weight", "near_scene_penalty")),
         _NON_NEGATIVE),
+    "split.opacity_floor": Bounds(0, 1, exclusive_maximum=True),
     "split.low_sh_until": _UNIT, "split.final_near_share": _UNIT, "split.sh_degree": Bounds(0, 3),
 
     "brightness.roughness_weight": _NON_NEGATIVE, "brightness.prior_weight": _NON_NEGATIVE,
@@ -402,8 +400,6 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
         # Light that adds is fainter than what covers: a ghost is a hundredth of white, not a tenth of opaque.
         density = replace(settings.flare.density, clone_above=5e-4, prune_below=2e-4)
         settings = replace(settings, flare=replace(settings.flare, opacity=0.01, density=density))
-        if mode in PARALLAX_MODES:
-            settings = replace(settings, flare=replace(settings.flare, opacity_floor=0.004))
     return settings.validated()
 
 

@@ -403,6 +403,17 @@ class Trainer(FlareTrainer):
         return loss + far_flare_penalty(added, estimated_flare, self._excess_ratio, targets.camera, lights,
                                         settings.split)
 
+    @property
+    def _opacity_floor(self) -> float:
+        """Least opacity of flare Gaussians in this iteration, 0 with exact clean frames.
+
+        It is 0 after their number has changed for the last time, so that the model that is written is the one that was
+        fitted.
+        """
+        settings = self.settings
+        has_floor = settings.uses_parallax and self.iteration <= settings.flare.density.stop
+        return settings.split.opacity_floor if has_floor else 0.0
+
     def _sh_degree(self) -> int:
         """Return the degree of the scene's spherical harmonics in this iteration.
 

@@ -31,15 +31,16 @@ from core.capture import Camera, Capture
 from core.conventions.run_files import EVALUATION
 from core.errors import RunError
 from core.fit.frames import Frames
+from core.fit.run import Run
 from core.gaussians import Rendering, rasterization
 from core.gaussians.loss import l1_ssim
-from core.gaussians.ordering import nearest_distances
-from core.gaussians.spherical_harmonics import dc_from_colour
+from core.gaussians.scene import SceneGaussians
+from core.metrics.pictures import psnr
 from core.system.files import read_json
 
 # Settings of gsplat's simple_trainer.py and of its DefaultStrategy.
 FULL_ITERATIONS, SH_INTERVAL, SH_DEGREE = 30_000, 1000, 3
-INITIAL_OPACITY, SSIM_SHARE, NEAR = 0.1, 0.2, 0.01
+SSIM_SHARE, NEAR = 0.2, 0.01
 RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
 FINAL_MEANS_RATE = 0.01
 """Factor of the positions' rate at the end; it falls exponentially."""
@@ -56,7 +57,7 @@ class GsplatTraining:
         torch.manual_seed(seed)
         self.frames = Frames(capture, width, frames_only=True)
         self.views, self.held_out = capture.split(None)
-        self.iterations, self.iteration, self.order = iterations, 0, list[int]()
+        self.iteration, self.order = 0, list[int]()
         factor = iterations / FULL_ITERATIONS if scaled else 1.0
         self.sh_interval = max(int(SH_INTERVAL * factor), 1)
         positions = np.array([view.camera.position for view in capture.views])
@@ -75,17 +76,13 @@ class GsplatTraining:
 
     @staticmethod
     def _initial_gaussians(capture: Capture) -> dict[str, torch.nn.Parameter]:
-        """Return the first Gaussians, one for each point of the capture, by gsplat's names of their parameters."""
-        means = torch.from_numpy(capture.points.xyz).float()
-        colours = torch.from_numpy(capture.points.rgb).float() / 255
-        count = len(means)
-        spacing = nearest_distances(means).square().mean(1).sqrt().clamp_min(1e-7)
-        sh = torch.zeros(count, (SH_DEGREE + 1) ** 2, 3)
-        sh[:, 0] = dc_from_colour(colours)
-        rows = {"means": means, "scales": spacing.log()[:, None].repeat(1, 3),
-                "quats": torch.rand(count, 4), "opacities": torch.full((count,), INITIAL_OPACITY).logit(),
-                "sh0": sh[:, :1], "shN": sh[:, 1:]}
-        return {name: torch.nn.Parameter(values.contiguous()) for name, values in rows.items()}
+        """Return the first Gaussians by gsplat's names of their parameters. Ours are the same but for the rotations,
+        which do not matter yet, since the Gaussians are round."""
+        scene = SceneGaussians.from_points(capture.points)
+        sh = scene.sh.detach()
+        rows = {"means": scene.means, "scales": scene.log_scales, "quats": scene.quaternions,
+                "opacities": scene.opacity_logits, "sh0": sh[:, :1], "shN": sh[:, 1:]}
+        return {name: torch.nn.Parameter(values.detach().clone()) for name, values in rows.items()}
 
     @property
     def count(self) -> int:
@@ -128,8 +125,7 @@ class GsplatTraining:
         scores = []
         for view in self.held_out:
             targets = self.frames.targets(view)
-            error = (self.render(targets.camera).colour.clamp(0, 1) - targets.frame).square().mean()
-            scores.append(-10 * float(error.log10()))
+            scores.append(psnr(self.render(targets.camera).colour.clamp(0, 1).numpy(), targets.frame.numpy()))
         return statistics.mean(scores)
 
 
@@ -150,10 +146,9 @@ def fit_scene(capture: Path, size: int, iterations: int, out: Path) -> tuple[flo
     subprocess.run([sys.executable, program, "fit", capture, "--out", out, "--mode", "3dgs", "--preset", "standard",
                     "--size", str(size), "--iterations", str(iterations)], check=True, stdout=subprocess.DEVNULL)
     subprocess.run([sys.executable, program, "eval", out], check=True, stdout=subprocess.DEVNULL)
-    from core.fit.run import Run
-
-    scores = read_json(out / EVALUATION, RunError)
-    return float(scores["composite"]["psnr"]), len(Run.open(out).scene.means)  # type: ignore[union-attr]
+    scene = Run.open(out).scene
+    assert isinstance(scene, SceneGaussians)
+    return float(read_json(out / EVALUATION, RunError)["composite"]["psnr"]), len(scene)
 
 
 def main() -> None:

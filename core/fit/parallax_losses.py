@@ -44,8 +44,8 @@ def scene_loss(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor
     ramp = _ramp(progress)
     loss = settings.scene_weight * quantile_loss(scene, targets.frame, settings.excess_weight * (1 - ramp))
     proximity = torch.from_numpy(light_proximity(targets.camera, lights, settings.light_radius)).to(scene.device)
-    share = ramp if progress <= settings.low_sh_until else settings.final_near_share
-    loss = loss + settings.near_scene_penalty * share * (scene * proximity[..., None]).mean()
+    final_share = 1 if progress <= settings.low_sh_until else settings.final_near_share
+    loss = loss + settings.near_scene_penalty * ramp * final_share * (scene * proximity[..., None]).mean()
     # In the discs, the scene is fitted to the frame.
     if discs is not None:
         loss = loss + ((scene - targets.frame).abs() * discs[..., None]).mean()

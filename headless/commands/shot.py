@@ -62,7 +62,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture, kind = _open_capture(args, progress)
     settings = _fit_settings(args, kind, capture, progress)
     capture = fit.with_supervision(capture, settings, progress)
-    capture, settings = fit.adapt_to_absent_flare(capture, settings, progress)
+    capture, settings = fit.adapt_to_absent_flare(capture, settings, progress, is_resumed=_has_run(args))
     run_ = fit_capture(capture, settings, out / RUN, progress, resume=True)
     scores = _score_held_out(run_, progress)
     capture = run_.open_capture()
@@ -154,18 +154,24 @@ def _prepare_frames_folder(args: argparse.Namespace, progress: Progress) -> Path
 def _fit_settings(args: argparse.Namespace, kind: str, capture: Capture, progress: Progress) -> Any:
     """Return the settings of the fit: of an existing run, which is then resumed, else new ones. kind: "plates" for a
     scene of plates."""
-    from ...core.conventions.run_files import CONFIG
     from ...core.fit import Run, preset
     from ...core.fit.overrides import override_settings
     from ...core.fit.settings import adapt_to_plates
 
-    if (args.out / RUN / CONFIG).is_file():
+    if _has_run(args):
         return Run.open(args.out / RUN).settings
     mode = fit.default_mode(capture, False, progress)
     settings = preset(args.preset, mode=mode, iterations=args.iterations)
     if kind == "plates":
         settings = adapt_to_plates(settings)
     return override_settings(settings, {"width": args.size, "holdout": fit.parse_holdout(args.holdout)})
+
+
+def _has_run(args: argparse.Namespace) -> bool:
+    """Return whether the fit has begun before, and is resumed."""
+    from ...core.conventions.run_files import CONFIG
+
+    return (args.out / RUN / CONFIG).is_file()
 
 
 def _score_held_out(run_: Run, progress: Progress) -> dict[str, Any]:

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 import torch
 from fit_flare.core.capture import Capture
+from fit_flare.core.images.picture import Picture
 from fit_flare.core.images.read import read_picture
 from fit_flare.core.images.write import write_png
+from fit_flare.core.removal.jobs import provenance
 from fit_flare.core.removal.jobs.manifest import MANIFEST
 from fit_flare.core.removal.jobs.provenance import has_no_visible_flare
 from fit_flare.core.removal.training.run import read_recipe
@@ -256,3 +258,14 @@ def test_a_flare_of_a_few_codes_in_one_frame_is_none(capture: Path, tmp_path: Pa
     clean[3, 4, 1] += (codes if clean[3, 4, 1] < 0.5 else -codes) / 255
     write_png(path, clean)
     assert has_no_visible_flare(Capture.open(bare), Progress()) is expected
+
+
+def test_pixels_without_a_value_do_not_hide_a_flare_beside_them(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read_with_nan(path: Path) -> Picture:
+        """Return a grey picture with a NaN; the frame is brighter than the clean frame."""
+        pixels = np.full((4, 6, 3), 0.2 if "removed" in path.parts else 0.5, np.float32)
+        pixels[1, 2] = np.nan
+        return Picture(pixels, "linear")
+
+    monkeypatch.setattr(provenance, "read_picture", read_with_nan)
+    assert not has_no_visible_flare(Capture.open(capture), Progress())

@@ -48,6 +48,7 @@ def test_a_shot_without_flare_stays_dark(tmp_path: Path, monkeypatch: pytest.Mon
     for path in sorted((out / "layers").glob("layers.*.exr")):
         layers = read_layers(path)
         assert layers.scene.any() and not layers.flare.any(), "to the last bit"
+    assert run("shot", folder, "--out", out, "--scene", "plates")[0] == 0, "it goes on with the settings of its run"
 
 
 def test_shot_names_a_source_that_is_missing(tmp_path: Path) -> None:

@@ -16,8 +16,9 @@ from ...images.read import read_picture
 from ...system.progress import Progress
 from .manifest import Manifest
 
-MAX_INVISIBLE = 4.5 / 255
-"""Largest difference in display values between a frame and its clean frame that counts as no flare."""
+MAX_INVISIBLE_DIFFERENCE = 4.5 / 255
+"""Largest difference in display values between a frame and its clean frame that counts as no flare: four codes of 8
+bits."""
 
 
 def has_exact_clean_frames(capture: Capture) -> bool:
@@ -43,7 +44,7 @@ def check_clean_frames_current(capture: Capture) -> None:
 
 def has_no_visible_flare(capture: Capture, progress: Progress) -> bool:
     """Return whether `remove` has found no flare in any frame of a capture: no channel of a pixel differs from its
-    clean frame by more than MAX_INVISIBLE.
+    clean frame by more than MAX_INVISIBLE_DIFFERENCE. NaN counts as no difference.
 
     Raises Cancelled.
     """
@@ -51,7 +52,7 @@ def has_no_visible_flare(capture: Capture, progress: Progress) -> bool:
     for view in capture.views:
         frame, clean = (read_picture(path).display()
                         for path in (capture.frame_path(view), capture.clean_frame_path(view)))
-        if frame.shape != clean.shape or np.abs(frame - clean).max() > MAX_INVISIBLE:
+        if frame.shape != clean.shape or (np.abs(frame - clean) > MAX_INVISIBLE_DIFFERENCE).any():
             return False
         progress.advance()
     return True

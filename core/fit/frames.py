@@ -26,6 +26,8 @@ SAMPLED_FRAMES = 12
 DEVICE_MEMORY = 4 << 30
 """Bytes of a GPU's memory for frames: 1380 frames of 480x270 with their clean frames, 86 of 1920x1080. On small GPUs it
 is a quarter of what is free."""
+HOST_MEMORY = 1 << 28
+"""Bytes of the CPU's memory for frames as display values: 86 frames of 480x270 with their clean frames."""
 BORDER_MARGIN = 1
 """Lines beside a border that resizing mixes with it."""
 
@@ -233,32 +235,42 @@ class Frames:
 
 
 class DeviceFrames:
-    """The frames of a fit on its device. On a GPU they stay there, up to `memory` bytes; others are copied each time.
+    """The frames of a fit on its device, as display values. The latest used ones stay there, up to `memory` bytes; the
+    others are converted, and on a GPU copied, each time. Callers must not change them in place.
     """
 
-    def __init__(self, frames: Frames, device: torch.device) -> None:
-        """Take the frames, none of which is read yet."""
+    def __init__(self, frames: Frames, device: torch.device, memory: int | None = None) -> None:
+        """Take the frames, none of which is read yet. memory: bytes; None for the device's default."""
+        if memory is None:
+            memory = HOST_MEMORY
+            if device.type == "cuda":
+                memory = min(DEVICE_MEMORY, torch.cuda.mem_get_info(device)[0] // 4)
         self.device = device
-        self._frames, self._free_bytes = frames, DEVICE_MEMORY
-        if device.type == "cuda":
-            self._free_bytes = min(DEVICE_MEMORY, torch.cuda.mem_get_info(device)[0] // 4)
+        self._frames, self._free_bytes = frames, memory
         self._reduced = {1: frames}
+        # By view and reduction; the latest used is last.
         self._stored: dict[tuple[str, int], MaskedTargets] = {}
 
     def read(self, view: View, reduction: int = 1) -> MaskedTargets:
         """Return `Frames.targets` and `Frames.mask` of a view, on the device; at the working size divided by
         `reduction`."""
-        if (view.name, reduction) in self._stored:
-            return self._stored[view.name, reduction]
-        if reduction not in self._reduced:
-            self._reduced[reduction] = self._frames.reduced(reduction)
-        frames = self._reduced[reduction]
-        targets, mask = frames.targets(view), frames.mask(view)
-        if self.device.type == "cpu":
-            return targets, mask
-        copied = targets.to(self.device), None if mask is None else mask.to(self.device)
-        num_bytes = sum(part.numel() * part.element_size() for part in (*copied[0][1:], copied[1]) if part is not None)
-        if num_bytes <= self._free_bytes:
-            self._free_bytes -= num_bytes
-            self._stored[view.name, reduction] = copied
-        return copied
+        key = view.name, reduction
+        stored = self._stored.pop(key, None)
+        if stored is None:
+            if reduction not in self._reduced:
+                self._reduced[reduction] = self._frames.reduced(reduction)
+            frames = self._reduced[reduction]
+            targets, mask = frames.targets(view), frames.mask(view)
+            stored = targets.to(self.device), None if mask is None else mask.to(self.device)
+            self._free_bytes -= _num_bytes(stored)
+        self._stored[key] = stored
+        while self._free_bytes < 0:
+            oldest = next(iter(self._stored))
+            self._free_bytes += _num_bytes(self._stored.pop(oldest))
+        return stored
+
+
+def _num_bytes(targets: MaskedTargets) -> int:
+    """Return the size in memory of pictures and mask, bytes."""
+    parts = (*targets[0][1:], targets[1])
+    return sum(part.numel() * part.element_size() for part in parts if part is not None)

@@ -78,6 +78,7 @@ class Classic:
         self.scene, self.optimiser, self.generator = scene, optimiser, generator
         self.extent = extent
         self.settings = settings or ClassicSettings()
+        self._is_over = False  # after `stop`, when nothing reads the statistics
         self._reset_statistics()
 
     def _reset_statistics(self) -> None:
@@ -92,6 +93,8 @@ class Classic:
     def observe(self, rendering: Rendering) -> None:
         """Accumulate, for each visible Gaussian, the norm of the loss's gradient by its projected centre, and a
         count."""
+        if self._is_over:
+            return
         height, width = rendering.alpha.shape
         # From px^-1 to normalised device coordinates, in which the picture is 2 wide and 2 high.
         norms = torch.hypot(*(rendering.centre_gradients * rendering.alpha.new_tensor([width / 2, height / 2])).T)
@@ -104,6 +107,7 @@ class Classic:
         """Clone, split and prune Gaussians every `every` iterations, and lower all opacities to at most `reset_to`
         every `reset_every` iterations. Return whether rows were added or removed."""
         settings = self.settings
+        self._is_over = iteration >= settings.stop
         if iteration > settings.stop:
             return False
         changed = False

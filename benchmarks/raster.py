@@ -257,7 +257,7 @@ STAGES = {
     "tiles and depth order": ("list_sorted", "scatter_entries"),
     "raster, forward": ("raster",),
     "raster, backward": ("raster_backward",),
-    "projection, backward, and Adam": ("project_backward", "_step_all"),
+    "projection, backward, and Adam": ("project_backward", "adam_kernel"),
     "loss": ("loss_and_gradient",),
 }
 STAGE_CASES = (ITERATION_CASES[0], ITERATION_CASES[3])

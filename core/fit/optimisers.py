@@ -2,12 +2,15 @@
 """The optimisers of scene and flare, and their learning rates along a fit; `trainer` steps them."""
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn import Parameter
 
 from ..flare.encoding import TABLE
 from ..flare.model import FlareModel
+from ..gaussians.kernels import fused_kernels
 from ..gaussians.optimiser import Adam
 from ..gaussians.scene import COEFFICIENTS, SceneGaussians
 from .checkpoint import State
@@ -107,6 +110,28 @@ def _decay(first: float, last: float, progress: float) -> float:
     return first * (last / first) ** min(max(progress, 0.0), 1.0)
 
 
+class GridAdam(torch.optim.SparseAdam):
+    """SparseAdam, by the fused CPU kernel where it is available."""
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> None:
+        """Step the rows that the gradients hold."""
+        tables = [(group, table) for group in self.param_groups for table in group["params"] if table.grad is not None]
+        kernels = [fused_kernels(table) for _, table in tables]
+        if closure is not None or any(fused is None for fused in kernels):
+            super().step(closure)
+            return
+        for (group, table), fused in zip(tables, kernels, strict=True):
+            assert fused is not None
+            state = self.state[table]
+            if not state:
+                state["step"] = 0
+                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(table), torch.zeros_like(table)
+            state["step"] += 1
+            fused.sparse_adam_step(table.data, table.grad, state["exp_avg"], state["exp_avg_sq"], state["step"],
+                                   float(group["lr"]), *group["betas"], group["eps"])
+
+
 class FlareOptimisers:
     """The optimisers of a flare: `dense` for networks and Gaussians, `grids`, which updates only the rows of the hash
     grids that a view touched, and `brightness`, None for lights that stay on."""
@@ -135,7 +160,7 @@ class FlareOptimisers:
             rate = gaussian_rates[row_name] if ".gaussians." in name else rates.network
             rate_by_name[name] = rate * (flare.lights[int(name.split(".")[0])].scale if row_name in PLANE_ROWS else 1)
         self.dense = Adam(dense, rate_by_name)
-        self.grids = torch.optim.SparseAdam(tables, lr=rates.grids)
+        self.grids = GridAdam(tables, lr=rates.grids)
         lights = flare.frame_lights
         self.brightness = (None if lights is None else
                            torch.optim.SparseAdam([lights.brightness.weight], lr=rates.brightness))

@@ -111,7 +111,7 @@ class Trainer(FlareTrainer):
         if self.flare is not None:
             self.flare.move_to(self.device)
         self._light_discs: dict[tuple[str, int], Tensor | None] = {}
-        """On a GPU, the light discs of views that were used, by name and width of the picture."""
+        """Light discs of views that were used, by name and width of the picture, on the CPU: see `_light_discs_of`."""
 
         # Optimisers and strategy hold the parameters of the models.
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
@@ -156,8 +156,8 @@ class Trainer(FlareTrainer):
                                                      visibility=settings.flare.active_visibility,
                                                      opacity_floor=self._opacity_floor)
         light_discs = self._light_discs_of(view, flare_targets)
-        background = self._flare_background(flare_targets, scene_picture, light_discs)
-        composite_picture = composite(background, flare, settings.blend, self.frames.display_white)
+        background = self._flare_background(flare_targets, scene_picture)
+        composite_picture = composite(background, flare, settings.blend, self.frames.display_white, light_discs)
         # The losses of composite and scene, and the penalties.
         l1_weight = 1 - settings.ssim_share
         composite_target = self._composite_target(flare_targets, composite_picture.detach(), light_discs)
@@ -299,30 +299,33 @@ class Trainer(FlareTrainer):
         flare_started = self.iteration > self.settings.flare.scene_only_until * self.settings.iterations
         return self.settings.supervised and self.fits_scene and targets.clean is not None and not flare_started
 
-    def _flare_background(self, targets: Targets, scene: Tensor, light_discs: Tensor | None) -> Tensor:
-        """Return what the flare is composited over: the clean frame until `separate_until`, then the scene; black in
-        the lights' discs.
+    def _flare_background(self, targets: Targets, scene: Tensor) -> Tensor:
+        """Return what the flare is composited over, except in the lights' discs, where it is black: the clean frame
+        until `separate_until`, then the scene.
 
         At first the faint parts of a flare would drown in the errors of the scene. Later the scene, on which all views
         agree, is better than one clean frame with its residual flare, except above white, where the scene's errors stay
-        larger than a flare. light_discs: (height, width), or None.
+        larger than a flare.
         """
-        behind = scene
-        if self.settings.supervised and targets.clean is not None and self.settings.separate_until:
-            behind = targets.clean if self._is_separate else torch.where(targets.clean > 1, targets.clean, scene)
-        return behind if light_discs is None else behind.masked_fill(light_discs[..., None], 0)
+        if not (self.settings.supervised and targets.clean is not None and self.settings.separate_until):
+            return scene
+        if self._is_separate:
+            return targets.clean
+        return scene if self.frames.display_white == 1 else torch.where(targets.clean > 1, targets.clean, scene)
 
     def _light_discs_of(self, view: View, targets: Targets) -> Tensor | None:
-        """Return `_light_disc_mask` of a view. On a GPU it is computed once for each size, on the CPU, since nothing in
-        it changes."""
-        if self.device.type == "cpu":
-            return self._light_disc_mask(targets)
+        """Return `_light_disc_mask` of a view, None for an empty mask. It is computed once for each size, since nothing
+        in it changes; the numbers of its few pixels are kept."""
         key = view.name, targets.camera.width
         if key not in self._light_discs:
-            discs = self._light_disc_mask(targets)
-            self._light_discs[key] = None if discs is None else discs.cpu()
-        discs = self._light_discs[key]
-        return None if discs is None else discs.to(self.device)
+            mask = self._light_disc_mask(targets)
+            self._light_discs[key] = torch.nonzero(mask.flatten())[:, 0].cpu() if mask is not None else None
+        pixels = self._light_discs[key]
+        if pixels is None or not len(pixels):
+            return None
+        discs = torch.zeros(targets.frame.shape[:2], dtype=torch.bool)
+        discs.view(-1)[pixels] = True
+        return discs.to(self.device)
 
     def _light_disc_mask(self, targets: Targets) -> Tensor | None:
         """Return (height, width), True in the clipped disc of each light; None if the blend or the mode uses no discs.

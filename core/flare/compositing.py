@@ -12,7 +12,7 @@ Layers are scene-linear in both, and scene + flare = composite in every pixel. `
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ from ..colour.srgb_torch import decode, decode_with_slope, encode_with_slope
 from ..conventions.exposures import colour_scale
 from ..conventions.pixel_grid import PixelGrid
 from ..gaussians import Splats, over, splat
+from ..gaussians.kernels import fused_kernels
 from ..gaussians.rasterizer import Resolution
 from . import placement
 from .placement import PlaneGaussians
@@ -65,26 +66,37 @@ def _concatenate_rows(parts: list[tuple[Tensor | None, int]], plain: Tensor) -> 
     return torch.cat([plain.expand(count, -1) if rows is None else rows for rows, count in parts])
 
 
-def composite(scene: Tensor, flare: Splats | None, blend: Blend, white: float = 1.0) -> Tensor:
+def composite(scene: Tensor, flare: Splats | None, blend: Blend, white: float = 1.0,
+              black: Tensor | None = None) -> Tensor:
     """Return the composite (height, width, 3) of scene and flare, display values.
 
     scene: (height, width, 3), display values. flare: splats of all lights, None without any. white: display value at
-    which added light is clipped.
+    which added light is clipped. black: (height, width), True where the flare is composited over black, or None.
     """
-    if flare is None:
-        return scene
-    if blend == "over":
-        return over(flare, scene)
-    added: Tensor = _AddLight.apply(scene, flare.colour, white)
+    if flare is not None and blend == "add":
+        return add_light(scene, flare.colour, white, black)
+    behind = scene if black is None else scene.masked_fill(black[..., None], 0)
+    return behind if flare is None else over(flare, behind)
+
+
+def add_light(scene: Tensor, light: Tensor, white: float, black: Tensor | None = None, *,
+              kernels: Literal["auto", "torch"] = "auto") -> Tensor:
+    """Return encode(decode(scene) + light), clipped to 0..white before and after, display values (height, width, 3).
+
+    light: (height, width, 3), scene-linear. black: as for `composite`. The clips have a straight-through gradient: the
+    true one is zero there, and a pixel that is too bright must be able to become darker. kernels: "torch" disables the
+    fused CPU kernel.
+    """
+    fused = fused_kernels(scene) if kernels == "auto" and light.dtype == scene.dtype else None
+    added = None if fused is None else fused.add_light(scene, light, white, black)
+    if added is None:
+        behind = scene if black is None else scene.masked_fill(black[..., None], 0)
+        added = cast(Tensor, _AddLight.apply(behind, light, white))
     return added
 
 
 class _AddLight(torch.autograd.Function):
-    """encode(decode(scene) + light), clipped to 0..white before and after, with a straight-through gradient of the
-    clips.
-
-    The true gradient of a clip is zero there, and a pixel that is too bright must be able to become darker.
-    """
+    """The definition of `add_light`, without its mask."""
 
     @staticmethod
     def forward(ctx: Any, scene: Tensor, light: Tensor, white: float) -> Tensor:

@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ..gaussians.kernels import fused_kernels
 from ..look.network import BANDS, CAMERA_BITS, CAMERA_GROWTH, LIGHT_BITS, LIGHT_GROWTH
 from .encoding import HashGrid, frequency_encoding
 
@@ -113,13 +115,27 @@ class DeformationNetwork(nn.Module):
 
         features: of the view, from `view_features`.
         """
+        return dict(zip(self.names, self.offsets(positions, latent, features).split(self.widths, -1), strict=True))
+
+    def offsets(self, positions: Tensor, latent: Tensor | None, features: Tensor, *,
+                kernels: Literal["auto", "torch"] = "auto") -> Tensor:
+        """Return the offsets of all heads (n, sum of the widths), in their order; the inputs are those of `forward`.
+
+        kernels: "torch" disables the fused CPU kernel."""
+        view = self.view_layer(features)
+        fused = fused_kernels(positions) if kernels == "auto" else None
+        if fused is not None:
+            layers = [(layer.weight, layer.bias) for layer in (*self.layers, self.head)]
+            offsets = fused.deform(positions, latent, BANDS, view, self.gaussian_layer.weight, layers)
+            if offsets is not None:
+                return offsets
         encoded = frequency_encoding(positions, BANDS)
         if latent is not None:
             encoded = torch.cat([encoded, latent], -1)
-        x = functional.relu(self.gaussian_layer(encoded) + self.view_layer(features))
+        x = functional.relu(self.gaussian_layer(encoded) + view)
         for layer in self.layers:
             x = functional.relu(layer(x))
-        return dict(zip(self.names, self.head(x).split(self.widths, -1), strict=True))
+        return cast(Tensor, self.head(x))
 
     def light_correction(self, features: Tensor) -> Tensor:
         """Return delta_l (2,), the correction of the light's place (paper, eq. 4).

@@ -8,10 +8,12 @@ tables give sparse gradients, for an optimiser that updates those rows only.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from ..gaussians.kernels import FusedKernels, fused_kernels
 from ..look.network import CORNERS, PRIMES
 
 TABLE = "table.weight"
@@ -37,6 +39,7 @@ class HashGrid(nn.Module):
         resolutions; base: the coarsest resolution; features: numbers of a row."""
         super().__init__()
         self.levels, self.features = levels, features
+        self._layout: Any = None  # of the CPU kernels, once it is used
         size = 1 << table_bits
         resolutions = [math.floor(base * growth**level) for level in range(levels)]
         rows = [min((resolution + 1) ** 3, size) for resolution in resolutions]
@@ -56,6 +59,18 @@ class HashGrid(nn.Module):
 
     def forward(self, point: Tensor) -> Tensor:
         """Interpolate the grid at a point (3,) in 0..1."""
+        fused = fused_kernels(self.table.weight)
+        return self.interpolate(point) if fused is None else self._interpolate_fused(fused, point)
+
+    def _interpolate_fused(self, kernels: FusedKernels, point: Tensor) -> Tensor:
+        """Return `interpolate` of a point, by the CPU kernels."""
+        if self._layout is None:
+            parts = self._resolutions, self._starts, self._rows, self._primes, self._corners
+            self._layout = kernels.GridLayout(*(part.numpy() for part in parts))
+        return kernels.interpolate_grid(self.table.weight, point, self._layout)
+
+    def interpolate(self, point: Tensor) -> Tensor:
+        """Interpolate the grid at a point (3,) in 0..1, by torch: the definition."""
         indices, weights = self._corner_rows(point.detach())
         rows = self.table(indices)  # (levels, 8, features)
         return (rows * weights[..., None]).sum(1).reshape(-1)

@@ -335,8 +335,11 @@ class FlareModel(nn.Module):
         only views with a hidden light touch, by full steps.
         """
         views = self.views(world_to_camera, frame)
-        corrections = [flare.network.light_correction(flare.network.view_features(view.camera, view.light).detach())
-                       for flare, view in zip(self.lights, views, strict=True) if view.depth > 0]
+        lights = [(flare.network, view) for flare, view in zip(self.lights, views, strict=True) if view.depth > 0]
+        with torch.no_grad():
+            features = [network.view_features(view.camera, view.light) for network, view in lights]
+        corrections = [network.light_correction(of_view)
+                       for (network, _), of_view in zip(lights, features, strict=True)]
         return torch.stack(corrections) if corrections else torch.zeros(0, 2)
 
     def forward(self, world_to_camera: Tensor, visibilities: Mapping[str, Tensor] | None = None,

@@ -10,9 +10,11 @@ visibilities are relative to those of the training views that see most of the li
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -21,6 +23,7 @@ from torch import Tensor
 
 from ..choices import Kernels
 from ..gaussians import rasterization
+from ..gaussians.kernels import fused_kernels
 from ..gaussians.scene import SceneGaussians
 from ..look import PlacedLight
 from ..look.shot import LIGHT_MARGIN, LIGHT_RADIUS
@@ -147,17 +150,24 @@ def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings
     return _visibilities(scene, eye, [light], settings or VisibilitySettings(), kernels)[0]
 
 
-class _Occluders(NamedTuple):
-    """Gaussians that may hide a light, with the parameters of `SceneGaussians`."""
+class _SelectRows(torch.autograd.Function):
+    """Rows of several tensors, by one list of row numbers for each light.
 
-    means: Tensor
-    quaternions: Tensor
-    log_scales: Tensor
-    opacity_logits: Tensor
+    The gradients of all lights are added up in one tensor of the size of the input.
+    """
 
-    def select(self, rows: Tensor) -> _Occluders:
-        """Return the Gaussians at these rows."""
-        return _Occluders(*(part[rows] for part in self))
+    @staticmethod
+    def forward(ctx: Any, rows_by_light: Sequence[Tensor], *parts: Tensor) -> tuple[Tensor, ...]:
+        """Return the selected rows of each part, light after light. Rows are not repeated in a list."""
+        ctx.rows_by_light, ctx.shapes = rows_by_light, [part.shape for part in parts]
+        return tuple(part.index_select(0, rows) for rows in rows_by_light for part in parts)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        sums = [gradients[0].new_zeros(shape) for shape in ctx.shapes]
+        for number, gradient in enumerate(gradients):
+            sums[number % len(sums)].index_add_(0, ctx.rows_by_light[number // len(sums)], gradient)
+        return (None, *sums)
 
 
 class _SightLine(NamedTuple):
@@ -176,57 +186,55 @@ def _visibilities(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor], 
                   kernels: Kernels) -> list[Tensor]:
     """Return the `light_visibility` of each light (3,) from a camera at `eye` (3,).
 
-    The Gaussians that may hide any of the lights are selected together: the gradient of each selection has the size of
-    the whole scene.
+    The Gaussians that may hide a light are selected for all lights together: the gradient of each selection has the
+    size of the whole scene.
     """
     sight_lines = [_sight_line(scene, eye, light, settings) for light in lights]
-    clear = scene.means.new_ones(())
-    all_rows = [sight_line.rows for sight_line in sight_lines if sight_line is not None]
-    if not all_rows:
-        return [clear for _ in lights]
-    rows = torch.unique(torch.cat(all_rows)) if len(all_rows) > 1 else all_rows[0]
-    occluders = _Occluders(scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits).select(rows)
-    visibilities = []
-    for sight_line in sight_lines:
-        if sight_line is None:
-            visibilities.append(clear)
-            continue
-        is_subset = len(sight_line.rows) < len(rows)
-        light_occluders = occluders.select(torch.searchsorted(rows, sight_line.rows)) if is_subset else occluders
-        near = _near_plane(scene, sight_line.distance)
-        visibilities.append(_mean_transmittance(light_occluders, sight_line.pose, near, settings, kernels))
-    return visibilities
+    rows = [line.rows for line in sight_lines if line is not None]
+    parts = scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits
+    selected = iter(cast(tuple[Tensor, ...], _SelectRows.apply(rows, *parts)) if rows else ())
+    return [scene.means.new_ones(()) if line is None else
+            _mean_transmittance([next(selected) for _ in parts], line.pose, _near_plane(scene, line.distance), settings,
+                                kernels)
+            for line in sight_lines]
 
 
 def _sight_line(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings) -> _SightLine | None:
     """Return the line of sight from `eye` (3,) to a light (3,); None for a light at the eye, which nothing hides."""
-    direction = (light - eye).float()
-    distance = float(direction.norm())
+    direction = (light - eye).float().numpy()
+    distance = float(np.linalg.norm(direction))
     if distance <= 0:
         return None
-    pose = _look_along(eye.float(), direction / distance)
+    pose = _look_along(eye.float().numpy(), direction / np.float32(distance))
     return _SightLine(pose, distance, _occluder_rows(scene, pose, distance, settings))
 
 
-def _mean_transmittance(occluders: _Occluders, pose: Tensor, near: float, settings: VisibilitySettings,
+def _mean_transmittance(occluders: Sequence[Tensor], pose: Tensor, near: float, settings: VisibilitySettings,
                         kernels: Kernels) -> Tensor:
     """Return the mean transmittance (scalar, 0..1) of Gaussians over a light's soft disk.
 
-    pose: (4, 4), world to camera, of the small camera that looks at the light. near: its near plane, world units.
+    occluders: means, quaternions, log_scales and opacity_logits of `SceneGaussians`. pose: (4, 4), world to camera, of
+    the small camera that looks at the light. near: its near plane, world units.
     """
+    means, quaternions, log_scales, opacity_logits = occluders
     size, half = settings.pixels, settings.pixels / 2
     # The picture's edge is at twice the disk's radius, which is the window's standard deviation.
     focal = half / (2 * settings.radius)
     intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
     # Colours are not needed, and their gradient would cost most.
-    colourless = occluders.means.new_zeros(len(occluders.means), 1, 3)
-    alpha = rasterization(occluders.means, occluders.quaternions, occluders.log_scales.exp(),
-                          occluders.opacity_logits.sigmoid(), colourless, pose.to(colourless),
-                          intrinsics.to(colourless), size, size, near=near, depth=False, kernels=kernels).alpha
-    offset = torch.arange(size, device=alpha.device) + 0.5 - half
-    window = torch.exp(-0.5 * (offset / (half / 2)) ** 2)
+    colourless = means.new_zeros(len(means), 1, 3)
+    alpha = rasterization(means, quaternions, log_scales, opacity_logits, colourless, pose.to(means),
+                          intrinsics.to(means), size, size, near=near, depth=False, kernels=kernels, raw=True).alpha
+    return ((1 - alpha) * _disk_weights(size).to(means)).sum()
+
+
+@cache
+def _disk_weights(size: int) -> Tensor:
+    """Return the weights (size, size) of the pixels of a light's soft disk; they sum to 1."""
+    offset = torch.arange(size) + 0.5 - size / 2
+    window = torch.exp(-0.5 * (offset / (size / 4)) ** 2)
     weights = window[:, None] * window
-    return ((1 - alpha) * weights).sum() / weights.sum()
+    return weights / weights.sum()
 
 
 def _near_plane(scene: SceneGaussians, distance: float) -> float:
@@ -238,27 +246,21 @@ def _near_plane(scene: SceneGaussians, distance: float) -> float:
 def _occluder_rows(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
     """Return the rows of Gaussians between camera and light that may touch the small picture, without the far layer.
 
-    pose: world_to_camera (4, 4) of the small camera. distance: from camera to light. On the CPU it uses numpy, which
-    takes a third of torch's time here.
+    pose: world_to_camera (4, 4) of the small camera. distance: from camera to light.
     """
-    if not scene.means.is_cpu:
-        return _occluder_rows_on_device(scene, pose.to(scene.means), distance, settings)
-    means, scales, camera_pose = (part.detach().numpy() for part in (scene.means, scene.log_scales, pose))
-    # Sums of columns, since a product of matrices this narrow waits for the threads of the BLAS.
-    x, y, depth = (sum(means[:, axis] * row[axis] for axis in range(3)) + row[3] for row in camera_pose[:3])
-    reach = 3 * np.exp(np.maximum(np.maximum(scales[:, 0], scales[:, 1]), scales[:, 2]))
-    between = (depth > _near_plane(scene, distance)) & (depth < (1 - settings.margin) * distance)
-    if scene.far is not None:
-        between &= ~scene.far.contains(scene.means).numpy()
-    off_axis = np.sqrt(x * x + y * y)
+    fused = fused_kernels(scene.means)
+    far = scene.far
     # The picture's corners are at 2 sqrt(2) radii from its middle.
-    return torch.from_numpy(np.flatnonzero(between & (off_axis < depth * settings.radius * 4 + reach)))
+    rows = None if fused is None else fused.find_occluders(
+        scene.means, scene.log_scales, pose, (_near_plane(scene, distance), (1 - settings.margin) * distance),
+        4 * settings.radius, (0.0, 0.0, 0.0) if far is None else far.centre,
+        math.inf if far is None else far.min_distance)
+    return _find_occluders(scene, pose.to(scene.means), distance, settings) if rows is None else rows
 
 
 @torch.no_grad()
-def _occluder_rows_on_device(scene: SceneGaussians, pose: Tensor, distance: float,
-                             settings: VisibilitySettings) -> Tensor:
-    """Return the rows of `_occluder_rows` for a scene on a GPU, computed there. pose: (4, 4), on the scene's device."""
+def _find_occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
+    """Return the rows of `_occluder_rows`, computed by torch: the definition. pose: (4, 4), on the scene's device."""
     x, y, depth = (scene.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     reach = 3 * scene.log_scales.amax(-1).exp()
     between = (depth > _near_plane(scene, distance)) & (depth < (1 - settings.margin) * distance)
@@ -267,12 +269,13 @@ def _occluder_rows_on_device(scene: SceneGaussians, pose: Tensor, distance: floa
     return torch.nonzero(between & (torch.hypot(x, y) < depth * settings.radius * 4 + reach))[:, 0]
 
 
-def _look_along(position: Tensor, forward: Tensor) -> Tensor:
-    """Return world_to_camera (4, 4) of a camera that looks along the unit vector `forward`, with any roll."""
-    helper = torch.eye(3)[int(forward.abs().argmin())]
-    right = torch.linalg.cross(helper, forward)
-    right = right / right.norm()
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    pose = torch.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
-    return pose
+def _look_along(position: NDArray[np.float32], forward: NDArray[np.float32]) -> Tensor:
+    """Return world_to_camera (4, 4) of a camera at a position (3,) that looks along the unit vector `forward` (3,),
+    with any roll."""
+    helper = np.eye(3, dtype=np.float32)[int(np.abs(forward).argmin())]
+    right = np.cross(helper, forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, :3] = right, np.cross(forward, right), forward
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return torch.from_numpy(pose)

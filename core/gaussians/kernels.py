@@ -77,7 +77,22 @@ class FusedKernels(Protocol):
     """Functions of the CPU kernels beyond a kernel set; a step is made by `AdamStep` and otherwise opaque."""
 
     def l1_ssim(self, image: Tensor, target: Tensor, lam: float) -> Tensor: ...
+    def interpolate_grid(self, table: Tensor, point: Tensor, layout: Any) -> Tensor: ...
+    def GridLayout(self, resolutions: Any, starts: Any, rows: Any, primes: Any, corners: Any) -> Any: ...
+    def sparse_adam_step(
+        self, parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: float,
+        beta1: float, beta2: float, epsilon: float,
+    ) -> None: ...  # fmt: skip
     def over(self, colour: Tensor, t: Tensor, behind: Tensor) -> Tensor | None: ...
+    def add_light(self, scene: Tensor, light: Tensor, white: float, black: Tensor | None) -> Tensor | None: ...
+    def deform(
+        self, positions: Tensor, latent: Tensor | None, bands: int, view: Tensor, encoded_weight: Tensor,
+        layers: Sequence[tuple[Tensor, Tensor]],
+    ) -> Tensor | None: ...  # fmt: skip
+    def find_occluders(
+        self, means: Tensor, log_scales: Tensor, pose: Tensor, depths: tuple[float, float], slope: float,
+        centre: tuple[float, ...], max_distance: float,
+    ) -> Tensor | None: ...  # fmt: skip
     def upsample(
         self, colour: Tensor, t: Tensor, factor: int, width: int, height: int
     ) -> tuple[Tensor, Tensor] | None: ...
@@ -94,7 +109,7 @@ class FusedKernels(Protocol):
 def fused_kernels(like: Tensor) -> FusedKernels | None:
     """Return the CPU kernels if they support tensors of the device and type of `like`, else None.
 
-    For the loss, the optimiser and layers, which have a torch version too."""
+    They have a torch version too."""
     if not like.is_cpu or like.dtype != torch.float32:
         return None
     kernels = _load_kernel_set("cpu")

@@ -8,11 +8,18 @@ From the bottom up: `compilation` and `threads` (machine code and the threads th
 """
 from __future__ import annotations
 
+from .added_light import add_light
+from .deformation import deform
+from .hash_grid import GridLayout, interpolate_grid, sparse_adam_step
 from .layers import over, upsample
 from .loss import l1_ssim
+from .occluders import find_occluders
 from .optimiser import AdamStep, adam_steps
 from .scene import rasterize_scene
 from .splats import splat
 from .stepping import offer_steps
 
-__all__ = ["AdamStep", "adam_steps", "l1_ssim", "offer_steps", "over", "rasterize_scene", "splat", "upsample"]
+__all__ = [
+    "AdamStep", "GridLayout", "adam_steps", "add_light", "deform", "find_occluders", "interpolate_grid", "l1_ssim",
+    "offer_steps", "over", "rasterize_scene", "sparse_adam_step", "splat", "upsample",
+]  # fmt: skip

@@ -17,7 +17,7 @@ from .buffers import Array
 from .compilation import inlined, kernel
 from .threads import parallel
 from .tiles import flat
-from .vector import LANES, atomic_increment, fma, load, load_scalar, sqrt, store
+from .vector import LANES, atomic_increment, float_array, fma, load, load_scalar, sqrt, store
 
 MIN_TASK_SIZE = 1 << 13
 """Smallest number of values that a thread steps at a time."""
@@ -71,34 +71,34 @@ def step_array(parameter, gradient, first, second, rates, constants):
         parameter[i] -= rates[i % period] * correction1 * first[i] / (math.sqrt(second[i]) * correction2 + epsilon)
 
 
+# Columns of the table of `adam_kernel`: addresses of a parameter, its gradient, moments and learning rates; numbers of
+# its values, of its rates and of the values of a task; its first task.
+PARAMETER, GRADIENT, FIRST, SECOND, RATES, SIZE, PERIOD, TASK_SIZE, FIRST_TASK = range(9)
+
+
 @kernel
-def adam_kernel(counter, parameter, gradient, first, second, rates, task_size, constants):
-    """Make an Adam step on a parameter, on all threads; arrays are flat.
+def adam_kernel(counter, table, constants, tasks):
+    """Make an Adam step on each of k parameters, on all threads.
 
-    counter: index of the next task; rates: learning rates, repeated along the parameter; task_size: numbers of a task,
-    a multiple of the size of rates; constants: the array that `unpack_constants` reads."""
+    counter: index of the next task, of `tasks`. table: (k, 9), the columns PARAMETER ... FIRST_TASK; the rates are
+    repeated along the parameter, and TASK_SIZE is a multiple of their number. constants: (k, NUM_CONSTANTS), rows that
+    `unpack_constants` reads.
+    """
+    row, last_row = 0, table.shape[0] - 1
     while True:
-        start = atomic_increment(counter) * task_size
-        end = min(start + task_size, parameter.size)
-        if start >= end:
+        task = atomic_increment(counter)
+        if task >= tasks:
             break
+        while row < last_row and task >= table[row + 1, FIRST_TASK]:
+            row += 1
+        start = (task - table[row, FIRST_TASK]) * table[row, TASK_SIZE]
+        size = min(table[row, TASK_SIZE], table[row, SIZE] - start)
+        offset = 4 * start
         step_array(
-            parameter[start:end], gradient[start:end], first[start:end], second[start:end], rates,
-            unpack_constants(constants),
+            float_array(table[row, PARAMETER] + offset, size), float_array(table[row, GRADIENT] + offset, size),
+            float_array(table[row, FIRST] + offset, size), float_array(table[row, SECOND] + offset, size),
+            float_array(table[row, RATES], table[row, PERIOD]), unpack_constants(constants[row]),
         )  # fmt: skip
-
-
-class _KernelArguments(NamedTuple):
-    """Arguments of `adam_kernel`, in its order."""
-
-    counter: Array
-    parameter: Array
-    gradient: Array
-    first: Array
-    second: Array
-    rates: Array
-    task_size: int
-    constants: Array
 
 
 class AdamStep(NamedTuple):
@@ -114,17 +114,20 @@ class AdamStep(NamedTuple):
 
 
 def adam_steps(steps: Sequence[AdamStep], *, beta1: float, beta2: float, epsilon: float) -> None:
-    """Make all steps in one parallel call: a thread that finds no more work on one parameter takes the next."""
-    calls = [_kernel_arguments(step, beta1, beta2, epsilon) for step in steps]
-    tasks = sum(-(-call.parameter.size // call.task_size) for call in calls)
-    parallel(_step_all, calls, limit=tasks if adam_kernel.overloads else 1)  # compiled by one thread
+    """Make all steps in one parallel call: a thread that finds no more work on one parameter takes the next.
 
-
-def _step_all(counter: Array, calls: Sequence[_KernelArguments]) -> None:
-    """Step all parameters on this thread together with the others. The first call counts by the counter of `parallel`,
-    for which idle threads watch; each other call has its own."""
-    for number, call in enumerate(calls):
-        adam_kernel(*(call if number else call._replace(counter=counter)))
+    Gradients are contiguous float32, too."""
+    table, arrays, tasks = np.empty((len(steps), 9), np.int64), [], 0
+    for row, step in enumerate(steps):
+        assert step.gradient is not None
+        rates = repeat_rates(step.rate)
+        arrays.append(rates)  # the table has its address alone
+        size, task_size = step.parameter.numel(), -(-MIN_TASK_SIZE // rates.size) * rates.size
+        addresses = (tensor.data_ptr() for tensor in step[:4] if tensor is not None)
+        table[row] = *addresses, rates.ctypes.data, size, rates.size, task_size, tasks
+        tasks += -(-size // task_size)
+    constants = np.array([adam_constants(step.step, beta1, beta2, epsilon) for step in steps], np.float32)
+    parallel(adam_kernel, table, constants, tasks, limit=tasks)
 
 
 def repeat_rates(rate: float | Tensor) -> Array:
@@ -146,14 +149,3 @@ def adam_constants(step: int, beta1: float, beta2: float, epsilon: float) -> tup
     """Return the constants of `unpack_constants`; step: counts from 1."""
     unbiased = 1 / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step)
     return beta1, 1 - beta1, beta2, 1 - beta2, *unbiased, epsilon
-
-
-def _kernel_arguments(step: AdamStep, beta1: float, beta2: float, epsilon: float) -> _KernelArguments:
-    """Return the arguments of `adam_kernel` for a step, with a new counter."""
-    assert step.gradient is not None
-    rates = repeat_rates(step.rate)
-    task_size = -(-MIN_TASK_SIZE // rates.size) * rates.size
-    parameter, gradient, first, second = (flat(t) for t in (step.parameter, step.gradient, step.first, step.second))
-    constants = np.array(adam_constants(step.step, beta1, beta2, epsilon), np.float32)
-    counter = np.zeros(1, np.int64)
-    return _KernelArguments(counter, parameter, gradient, first, second, rates, task_size, constants)

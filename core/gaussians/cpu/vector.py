@@ -20,6 +20,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.np import arrayobj
 
 from .compilation import inlined
 
@@ -183,6 +184,22 @@ def load_scalar(typing_context, array, index):  # noqa: ARG001
         return builder.load(_address(context, builder, sig.args[0], *args))
 
     return array.dtype(array, types.int64), emit
+
+
+@intrinsic
+def float_array(typing_context, address, size):  # noqa: ARG001
+    """Return the float32 array of `size` numbers at an address in memory, int64, which the caller keeps alive."""
+    result = types.Array(types.float32, 1, "C")
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        array, item_size = context.make_array(result)(context, builder), ir.Constant(ir.IntType(64), 4)
+        arrayobj.populate_array(
+            array, builder.inttoptr(args[0], _FLOAT.as_pointer()), cgutils.pack_array(builder, [args[1]]),
+            cgutils.pack_array(builder, [item_size]), item_size, None,
+        )  # fmt: skip
+        return array._getvalue()
+
+    return result(types.int64, types.int64), emit
 
 
 @intrinsic

@@ -114,13 +114,12 @@ class GridAdam(torch.optim.SparseAdam):
     """SparseAdam, by the fused CPU kernel where it is available."""
 
     @torch.no_grad()
-    def step(self, closure: Any = None) -> None:
+    def step(self, closure: Any = None) -> Any:
         """Step the rows that the gradients hold."""
         tables = [(group, table) for group in self.param_groups for table in group["params"] if table.grad is not None]
         kernels = [fused_kernels(table) for _, table in tables]
         if closure is not None or any(fused is None for fused in kernels):
-            super().step(closure)
-            return
+            return super().step(closure)
         for (group, table), fused in zip(tables, kernels, strict=True):
             assert fused is not None
             state = self.state[table]
@@ -128,8 +127,10 @@ class GridAdam(torch.optim.SparseAdam):
                 state["step"] = 0
                 state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(table), torch.zeros_like(table)
             state["step"] += 1
+            beta1, beta2 = group["betas"]
             fused.sparse_adam_step(table.data, table.grad, state["exp_avg"], state["exp_avg_sq"], state["step"],
-                                   float(group["lr"]), *group["betas"], group["eps"])
+                                   float(group["lr"]), beta1, beta2, group["eps"])
+        return None
 
 
 class FlareOptimisers:

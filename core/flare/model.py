@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
+from ..gaussians.kernels import fused_kernels
 from ..gaussians.spherical_harmonics import colours
 from ..look.form import FlareForm
 from ..look.plane import PLANE_DEPTH
@@ -128,8 +129,35 @@ class LightFlare(nn.Module):
         """
         if view.depth <= 0:
             raise ValueError("a light behind the camera has no flare")
-        form, rows = self.form, self.gaussians
         features = self.network.view_features(view.camera, view.light)
+        light = view.light
+        if self.form.light_correction:
+            light = light + self.scale * self.network.light_correction(features)
+        placed = self._place_fused(features, light, opacity_floor)
+        return self._place(features, light, view.rotation, opacity_floor) if placed is None else placed
+
+    def _place_fused(self, features: Tensor, light: Tensor, opacity_floor: float) -> PlaneGaussians | None:
+        """Return the result of `_place` by the fused CPU kernels; None if they are not available for the form."""
+        form, rows, network = self.form, self.gaussians, self.network
+        fused = fused_kernels(rows["positions"])
+        if fused is None or form.solid or form.sh_degree or not form.static_offset:
+            return None
+        if tuple(zip(network.names, network.widths, strict=True)) != fused.PLACED_COLUMNS:
+            return None
+        deltas = network.offsets(rows["positions"], rows["latent"] if form.latent else None, features)
+        placed = fused.place(deltas, light, self.scale, *(rows[name] for name in (
+            "positions", "log_scales", "rotations", "opacity_logits", "sh", "rings", "offsets")))
+        if placed is None:
+            return None
+        gaussians = PlaneGaussians(*placed)
+        return gaussians._replace(opacities=_raise_to_floor(gaussians.opacities, opacity_floor))
+
+    def _place(self, features: Tensor, light: Tensor, rotation: Tensor, opacity_floor: float) -> PlaneGaussians:
+        """Return the Gaussians on the plane, by torch: the definition.
+
+        features: of the view. light: (2,), its corrected place. rotation: (3, 3), world to camera.
+        """
+        form, rows = self.form, self.gaussians
         latent = rows["latent"] if form.latent else None
         deltas = self.network(rows["positions"], latent, features)  # delta_x of the paper, by the name of x
 
@@ -137,9 +165,6 @@ class LightFlare(nn.Module):
             """Return canonical rows plus the network's offsets for this view."""
             return rows[name] + deltas[name]
 
-        light = view.light
-        if form.light_correction:
-            light = light + self.scale * self.network.light_correction(features)
         means = placement.on_line(deformed("positions"), light) if form.line else deformed("positions")
         if "plane_offset" in deltas:
             means = means + self.scale * deltas["plane_offset"]
@@ -150,16 +175,15 @@ class LightFlare(nn.Module):
             covariances = placement.project_covariances(means, scales, rotations)
         else:
             covariances = placement.covariance_of_ellipse(scales, rotations)
-        opacities, rings, arcs = deformed("opacity_logits").sigmoid()[:, 0], None, None
-        if opacity_floor:
-            opacities = cast(Tensor, _RaiseToFloor.apply(opacities, opacity_floor))
+        opacities = _raise_to_floor(deformed("opacity_logits").sigmoid()[:, 0], opacity_floor)
+        rings = arcs = None
         if form.rings:
             rings = _to_rings(deformed("rings"))
         if form.arcs and rings is not None:
             opacities = opacities * placement.opacity_gain(deformed("arcs"), rings)
             arcs = placement.arcs_of_ellipse(deformed("arcs"), scales, rotations)
-        return PlaneGaussians(means, covariances, opacities, self._colours(deformed("sh"), means, view.rotation),
-                              rings, arcs)
+        flare_colours = self._colours(deformed("sh"), means, rotation)
+        return PlaneGaussians(means, covariances, opacities, flare_colours, rings, arcs)
 
     def state_without_scale(self) -> dict[str, Tensor]:
         """Return the state of an equal flare whose `scale` is 1.
@@ -206,6 +230,11 @@ class _RaiseToFloor(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         (is_above,) = ctx.saved_tensors
         return torch.where(is_above | (gradient < 0), gradient, 0), None
+
+
+def _raise_to_floor(opacities: Tensor, floor: float) -> Tensor:
+    """Return opacities (n,) of at least `floor`, with the gradient of `_RaiseToFloor`; unchanged for a floor of 0."""
+    return cast(Tensor, _RaiseToFloor.apply(opacities, floor)) if floor else opacities
 
 
 def _to_rings(raw: Tensor) -> Tensor:

@@ -273,9 +273,14 @@ def _look_along(position: NDArray[np.float32], forward: NDArray[np.float32]) -> 
     """Return world_to_camera (4, 4) of a camera at a position (3,) that looks along the unit vector `forward` (3,),
     with any roll."""
     helper = np.eye(3, dtype=np.float32)[int(np.abs(forward).argmin())]
-    right = np.cross(helper, forward)
+    right = _cross(helper, forward)
     right /= np.linalg.norm(right)
     pose = np.eye(4, dtype=np.float32)
-    pose[:3, :3] = right, np.cross(forward, right), forward
+    pose[:3, :3] = right, _cross(forward, right), forward
     pose[:3, 3] = -pose[:3, :3] @ position
     return torch.from_numpy(pose)
+
+
+def _cross(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the cross product of two vectors (3,), in a tenth of the time of numpy.cross."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]], np.float32)

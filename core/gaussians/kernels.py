@@ -74,7 +74,11 @@ class StepsInBackward(Protocol):
 
 
 class FusedKernels(Protocol):
-    """Functions of the CPU kernels beyond a kernel set; a step is made by `AdamStep` and otherwise opaque."""
+    """Functions of the CPU kernels beyond a kernel set; a step is made by `AdamStep` and otherwise opaque.
+
+    PLACED_COLUMNS: names and widths of the network's offsets that `place` takes."""
+
+    PLACED_COLUMNS: tuple[tuple[str, int], ...]
 
     def l1_ssim(self, image: Tensor, target: Tensor, lam: float) -> Tensor: ...
     def interpolate_grid(self, table: Tensor, point: Tensor, layout: Any) -> Tensor: ...
@@ -83,6 +87,10 @@ class FusedKernels(Protocol):
         self, parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: float,
         beta1: float, beta2: float, epsilon: float,
     ) -> None: ...  # fmt: skip
+    def place(
+        self, deltas: Tensor, light: Tensor, scale: float, positions: Tensor, log_scales: Tensor, rotations: Tensor,
+        opacity_logits: Tensor, sh: Tensor, rings: Tensor, offsets: Tensor,
+    ) -> tuple[Tensor, ...] | None: ...  # fmt: skip
     def over(self, colour: Tensor, t: Tensor, behind: Tensor) -> Tensor | None: ...
     def add_light(self, scene: Tensor, light: Tensor, white: float, black: Tensor | None) -> Tensor | None: ...
     def deform(

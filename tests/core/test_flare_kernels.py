@@ -13,6 +13,7 @@ from core.flare import visibility
 from core.flare.compositing import add_light
 from core.flare.deformation import DeformationNetwork, QueryRange
 from core.flare.encoding import HashGrid
+from core.flare.model import OURS, LightFlare, ViewOfLight
 from core.flare.visibility import VisibilitySettings
 from core.gaussians.far_sphere import FarSphere
 from core.gaussians.kernels import is_available
@@ -165,3 +166,32 @@ def test_the_steps_of_grids_equal_those_of_torch() -> None:
     fused, plain = (optimiser.state[table] for optimiser, table in zip(optimisers, tables, strict=True))
     assert fused["step"] == plain["step"]
     assert relative_error(fused["exp_avg_sq"], plain["exp_avg_sq"].double()) < 1e-6
+
+
+@pytest.mark.parametrize("floor", [0.0, 0.5])
+def test_placed_gaussians_and_their_gradients_equal_the_definition(floor: float, monkeypatch: pytest.MonkeyPatch
+                                                                   ) -> None:
+    generator = torch.manual_seed(3)
+    flare = LightFlare(OURS, QueryRange((-1.0,) * 3, (1.0,) * 3, (1.0,) * 3), 200, generator, scale=0.7)
+    for parameter in flare.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    with torch.no_grad():
+        flare.gaussians["rings"][:20, 1] *= 20  # some widths are clipped
+        flare.gaussians["sh"][:50] -= 2  # and some colours
+    exact = copy.deepcopy(flare).double()
+    results = []
+    for model in (flare, exact):
+        dtype = model.gaussians["sh"].dtype
+        view = ViewOfLight(torch.rand(3, generator=torch.manual_seed(1)).to(dtype), torch.eye(3, dtype=dtype),
+                           torch.tensor([0.2, -0.1], dtype=dtype), 1.0)
+        placed = model(view, floor)
+        parts = [part for part in placed if part is not None]
+        weights = [torch.randn(part.shape, generator=torch.manual_seed(number)) for number, part in enumerate(parts)]
+        torch.stack([(part * weight).sum() for part, weight in zip(parts, weights, strict=True)]).sum().backward()
+        results.append([*(part.detach() for part in parts), *(
+            parameter.grad.to_dense() for parameter in model.parameters() if parameter.grad is not None)])
+    assert len(results[0]) == len(results[1]) > 20
+    for value, expected in zip(*results, strict=True):
+        assert relative_error(value, expected) < 2e-5
+    monkeypatch.setattr(flare, "_place", None)
+    flare(ViewOfLight(torch.rand(3), torch.eye(3), torch.rand(2), 1.0))  # drawn by the kernels alone

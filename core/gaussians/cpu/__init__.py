@@ -15,11 +15,14 @@ from .layers import over, upsample
 from .loss import l1_ssim
 from .occluders import find_occluders
 from .optimiser import AdamStep, adam_steps
+from .placement import COLUMNS as PLACED_COLUMNS
+from .placement import place
 from .scene import rasterize_scene
 from .splats import splat
 from .stepping import offer_steps
 
 __all__ = [
-    "AdamStep", "GridLayout", "adam_steps", "add_light", "deform", "find_occluders", "interpolate_grid", "l1_ssim",
-    "offer_steps", "over", "rasterize_scene", "sparse_adam_step", "splat", "upsample",
+    "PLACED_COLUMNS", "AdamStep", "GridLayout", "adam_steps", "add_light", "deform", "find_occluders",
+    "interpolate_grid", "l1_ssim", "offer_steps", "over", "place", "rasterize_scene", "sparse_adam_step", "splat",
+    "upsample",
 ]  # fmt: skip

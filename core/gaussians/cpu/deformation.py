@@ -249,7 +249,7 @@ class _Sizes(NamedTuple):
     encoded: int
     outputs: int
     head: int
-    count: int
+    gaussians: int
 
 
 def _pad(width: int) -> int:
@@ -308,12 +308,13 @@ class _Deform(torch.autograd.Function):
         we, w2, w3, wh = (w.detach().numpy() for w in ctx.saved_tensors)
         shapes = ((HIDDEN, sizes.encoded), (HIDDEN, HIDDEN), (HIDDEN, HIDDEN), (sizes.head, HIDDEN))
         sums = np.zeros((torch.get_num_threads(), sum(rows * (width + 1) for rows, width in shapes)), np.float32)
-        d_positions, d_positions_flat = buffers.tensor_and_array(sizes.count, sizes.position)
-        d_latent, d_latent_flat = (buffers.tensor_and_array(sizes.count, sizes.latent) if ctx.has_latent
+        d_positions, d_positions_flat = buffers.tensor_and_array(sizes.gaussians, sizes.position)
+        d_latent, d_latent_flat = (buffers.tensor_and_array(sizes.gaussians, sizes.latent) if ctx.has_latent
                                    else (None, EMPTY))
         parallel(
-            deform_backward_kernel, flat(d_offsets), sizes.outputs, sizes.head, *sizes[:4], sizes.count, *ctx.arrays,
-            _pack(we), _pack(w2), _pack(w3), _pack(_pad_rows(wh, sizes.head)), sums, d_positions_flat, d_latent_flat,
+            deform_backward_kernel, flat(d_offsets), sizes.outputs, sizes.head, *sizes[:4], sizes.gaussians,
+            *ctx.arrays, _pack(we), _pack(w2), _pack(w3), _pack(_pad_rows(wh, sizes.head)), sums, d_positions_flat,
+            d_latent_flat,
             scratch=BLOCK * (sizes.head + 2 * HIDDEN + sizes.encoded),
         )  # fmt: skip
         total, gradients, first = sums.sum(0), [], 0

@@ -3,7 +3,8 @@
 
 A plate is predicted at a bounded working size; its flare is upsampled and subtracted from the plate's codes in linear
 light. Where the network predicts less than a threshold the flare is exactly 0, and the codes are exactly the plate's.
-Light discs stay (`light_discs`). `jobs` runs it on folders and captures, `evaluation` on test pictures.
+Light discs stay (`light_discs`). Streaks are corrected by what the frame shows along them (`streaks`). `jobs` runs it
+on folders and captures, `evaluation` on test pictures.
 """
 from __future__ import annotations
 
@@ -49,6 +50,7 @@ from .plate_light import (
     to_network_plate,
 )
 from .prediction import FlarePrediction, TtaPrediction
+from .streaks import correct_streaks
 from .test_time_augmentation import merge_flare, predict_with_tta, shot_confidence
 
 WORKING_SIZE = 480
@@ -57,7 +59,7 @@ MIN_FLARE = 0.002
 """What a flare adds to display values, up to which there is none: half a code of 8 bits."""
 MIN_MEAN_FLARE = 0.0005
 """Gate (`gate_by_mean`) of the network's predictions, display values: it predicts small flares where there are none."""
-REVISION = 5
+REVISION = 6
 """Raised whenever the same plate, weights and settings give another result, so that existing results are made again."""
 Glow = Literal["keep", "keep at lights", "remove"]
 """What to do with the glow about lights: keep all of it; keep the part that lights at night have with a clean lens too
@@ -235,7 +237,9 @@ class Remover:
         keep_glow = self.glow == "keep at lights" and not inside_matte
         flare = flare * (1 - retained_fraction(prediction.display, flare, prediction.glow_fraction,
                                                keep_glow=keep_glow))
-        return np.where(flare > 0, self.amount * flare_to_linear(prediction.display, flare), np.float32(0))
+        linear = correct_streaks(prediction.display, flare_to_linear(prediction.display, flare),
+                                 1.0 if inside_matte else float(prediction.confidence))
+        return np.where(flare > 0, self.amount * linear, np.float32(0))
 
 
 def _subtract_upsampled(plate: Plate, maps: GuidedFilterMaps, matte: Pixels | None, codes: NDArray[Any],

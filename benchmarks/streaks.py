@@ -119,7 +119,7 @@ def find_places(photo: Pixels, count: int, random: np.random.Generator) -> list[
             places.append((random.uniform(0.05, 0.95) * width, random.uniform(0.05, 0.8) * height))
             continue
         places.append((float(x), float(y)))
-        cv2.circle(brightness, (int(x), int(y)), width // 10, 0.0, -1)
+        cv2.circle(brightness, (int(x), int(y)), width // 10, (0.0,), -1)
     return places
 
 

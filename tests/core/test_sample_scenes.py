@@ -29,7 +29,7 @@ from core.system.progress import Progress
 from sample_scenes.capture_files import expose, write_layer
 from sample_scenes.description import Pinhole, look_at
 from sample_scenes.flares import LENS_SETUPS, LensSetup, render_flare
-from sample_scenes.over_photos import add_flares
+from sample_scenes.over_photos import add_flares, measure_sky_share
 from sample_scenes.scenes import SCENES
 from tests.core.captures import make_capture
 
@@ -235,13 +235,38 @@ def test_flares_are_added_to_photographs(tmp_path: Path) -> None:
     for view, source in zip(made.views, capture.views, strict=True):
         np.testing.assert_allclose(view.camera.world_to_camera, source.camera.world_to_camera, atol=1e-9)
         assert view.camera.fx == pytest.approx(source.camera.fx * 0.75)
-        removed, flare = made.clean_frame(view), made.truth_flare(view)
-        assert removed and flare and flare.pixels.max() > 0.5
+        removed, flare, scene = made.clean_frame(view), made.truth_flare(view), made.truth_scene(view)
+        assert removed and flare and scene and flare.pixels.max() > 0.5
+        np.testing.assert_allclose(scene.display(), removed.display(), atol=0.02)
         np.testing.assert_allclose(removed.display(), capture.frame(source, (48, 36)).display(), atol=0.51 / 255)
         both = srgb_from_linear(np.clip(removed.linear() + flare.pixels, 0, 1))
         np.testing.assert_allclose(made.frame(view).display(), both, atol=0.51 / 255)
         place = view.camera.project(np.array([[0.3, -0.2, 1.0]]))[0][0]
         assert made.frame(view).display()[int(place[1]), int(place[0])].min() > 0.8
+
+
+def test_a_sun_over_photographs_is_far_and_shines_where_the_sky_is_bright(tmp_path: Path) -> None:
+    make_capture(tmp_path / "photos", 3)
+    capture = Capture.open(tmp_path / "photos")
+    camera = capture.views[0].camera.scaled(48)
+    direction = camera.rays(np.array([[20.0, 12.0]]))[0]
+    add_flares(capture, tmp_path / "out", ROUND, 7 * direction, (1.0, 0.8, 0.6), 2.0, 48, Progress(), is_sun=True)
+    made = Capture.open(tmp_path / "out")
+    offset = made.lights[0].xyz - capture.centre
+    assert np.linalg.norm(offset) == pytest.approx(1000 * capture.extent)
+    np.testing.assert_allclose(offset / np.linalg.norm(offset), direction, atol=1e-9)
+    shares = json.loads((tmp_path / "out" / "truth" / "visible_share.json").read_text())
+    assert shares.keys() == {view.name for view in made.views}
+    flare = made.truth_flare(made.views[0])
+    assert flare is not None and shares[made.views[0].name]["light"] == 0 and not flare.pixels.any()  # before no sky
+
+    sky = np.zeros((camera.height, camera.width, 3), np.float32)
+    sky[:, :20] = 0.95  # the disc's left half
+    assert measure_sky_share(sky, camera, made.lights[0].xyz) == pytest.approx(0.5, abs=0.25)
+    sky[:] = (0.3, 0.5, 0.95)
+    assert measure_sky_share(sky, camera, made.lights[0].xyz) == 1
+    out_of_frame = capture.centre + 1000 * camera.rays(np.array([[-20.0, 12.0]]))[0]
+    assert measure_sky_share(np.zeros_like(sky), camera, out_of_frame) == 1
 
 
 def test_look_at_centres_the_target() -> None:

@@ -29,6 +29,7 @@ from core.fit import metering
 from core.fit.frames import Frames
 from core.images.read import read_picture
 from core.images.write import write_png
+from core.lights.exposure import open_by_disc
 from core.lights.found_light import FAR
 from core.system.files import write_json
 from core.system.progress import Progress
@@ -81,7 +82,8 @@ def add_flares(capture: Capture, out: Path, setup: LensSetup, light: NDArray[np.
 def measure_sky_share(photo: NDArray[np.float32], camera: Camera, light: NDArray[np.float64]) -> float:
     """Return the share, 0..1, of a sun's disc behind which a photograph shows the sky; 1 for a sun out of the frame.
 
-    photo: display values (height, width, 3). camera: of the photograph's size. light: the sun's place, world (3,).
+    A bright patch smaller than the disc, such as a glint on bark, is no sky. photo: display values (height, width, 3).
+    camera: of the photograph's size. light: the sun's place, world (3,).
     """
     pixels, depth = camera.project(light[None])
     if not camera.contains(pixels, depth)[0]:
@@ -89,7 +91,8 @@ def measure_sky_share(photo: NDArray[np.float32], camera: Camera, light: NDArray
     v, u = np.mgrid[:camera.height, :camera.width] + 0.5
     radius = max(SUN_RADIUS * float(np.hypot(*camera.size)), 1.0)
     disc = np.hypot(u - pixels[0, 0], v - pixels[0, 1]) <= radius
-    return round(float((photo[disc].max(axis=1) >= SKY_LEVEL).mean()), 4)
+    sky = open_by_disc((photo.max(axis=2) >= SKY_LEVEL).astype(np.uint8), int(radius))
+    return round(float(sky[disc].mean()), 4)
 
 
 def _write_model(capture: Capture, folder: Path, width: int) -> None:

@@ -265,6 +265,9 @@ def test_a_sun_over_photographs_is_far_and_shines_where_the_sky_is_bright(tmp_pa
     assert measure_sky_share(sky, camera, made.lights[0].xyz) == pytest.approx(0.5, abs=0.25)
     sky[:] = (0.3, 0.5, 0.95)
     assert measure_sky_share(sky, camera, made.lights[0].xyz) == 1
+    glint = np.zeros((180, 240, 3), np.float32)
+    glint[59:61, 99:101] = 1  # at the sun's place, smaller than its disc
+    assert measure_sky_share(glint, camera.scaled(240), made.lights[0].xyz) == 0
     out_of_frame = capture.centre + 1000 * camera.rays(np.array([[-20.0, 12.0]]))[0]
     assert measure_sky_share(np.zeros_like(sky), camera, out_of_frame) == 1
 

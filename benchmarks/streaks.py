@@ -137,7 +137,8 @@ def read_photo(path: Path) -> Pixels:
 
 def darkening(result: Pixels, case: StreakCase) -> float:
     """Return how much darker than the truth a result is along the streaks, codes: the 95th percentile."""
-    return float(np.quantile((case.truth - result).mean(-1)[case.streaks] * 255, 0.95))
+    darker = (case.truth - result).mean(-1)[case.streaks] * 255
+    return float(np.quantile(darker, 0.95)) if len(darker) else 0.0
 
 
 def main(args: argparse.Namespace) -> None:

@@ -235,8 +235,10 @@ class Frames:
 
 
 class DeviceFrames:
-    """The frames of a fit on its device, as display values. The latest used ones stay there, up to `memory` bytes; the
-    others are converted, and on a GPU copied, each time. Callers must not change them in place.
+    """The frames of a fit on its device, as display values. They stay there, up to `memory` bytes; the others are
+    converted, and on a GPU copied, each time. Callers must not change them in place.
+
+    A fit shows every view once in a round, in random order, so keeping the latest would keep few that are shown again.
     """
 
     def __init__(self, frames: Frames, device: torch.device, memory: int | None = None) -> None:
@@ -248,26 +250,29 @@ class DeviceFrames:
         self.device = device
         self._frames, self._free_bytes = frames, memory
         self._reduced = {1: frames}
-        # By view and reduction; the latest used is last.
+        # By view and reduction.
         self._stored: dict[tuple[str, int], MaskedTargets] = {}
 
     def read(self, view: View, reduction: int = 1) -> MaskedTargets:
         """Return `Frames.targets` and `Frames.mask` of a view, on the device; at the working size divided by
         `reduction`."""
         key = view.name, reduction
-        stored = self._stored.pop(key, None)
-        if stored is None:
-            if reduction not in self._reduced:
-                self._reduced[reduction] = self._frames.reduced(reduction)
-            frames = self._reduced[reduction]
-            targets, mask = frames.targets(view), frames.mask(view)
-            stored = targets.to(self.device), None if mask is None else mask.to(self.device)
-            self._free_bytes -= _num_bytes(stored)
-        self._stored[key] = stored
-        while self._free_bytes < 0:
-            oldest = next(iter(self._stored))
-            self._free_bytes += _num_bytes(self._stored.pop(oldest))
-        return stored
+        if key in self._stored:
+            return self._stored[key]
+        if reduction not in self._reduced:
+            self._reduced[reduction] = self._frames.reduced(reduction)
+        frames = self._reduced[reduction]
+        targets, mask = frames.targets(view), frames.mask(view)
+        copied = targets.to(self.device), None if mask is None else mask.to(self.device)
+        num_bytes = _num_bytes(copied)
+        for other in [other for other in self._stored if other[1] != reduction]:
+            if num_bytes <= self._free_bytes:
+                break
+            self._free_bytes += _num_bytes(self._stored.pop(other))  # a size that the fit has left
+        if num_bytes <= self._free_bytes:
+            self._free_bytes -= num_bytes
+            self._stored[key] = copied
+        return copied
 
 
 def _num_bytes(targets: MaskedTargets) -> int:

@@ -117,7 +117,7 @@ class FusedKernels(Protocol):
 def fused_kernels(like: Tensor) -> FusedKernels | None:
     """Return the CPU kernels if they support tensors of the device and type of `like`, else None.
 
-    They have a torch version too."""
+    Each has a definition in torch, which callers use in place of None."""
     if not like.is_cpu or like.dtype != torch.float32:
         return None
     kernels = _load_kernel_set("cpu")

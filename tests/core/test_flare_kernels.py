@@ -75,6 +75,21 @@ def test_the_occluders_of_a_light_are_those_of_the_definition(count: int, has_fa
         assert torch.equal(line.rows, visibility._find_occluders(scene, line.pose, line.distance, settings))
 
 
+def test_selected_rows_and_their_gradients_equal_indexing() -> None:
+    """Lights that share occluders add their gradients; a light without occluders has none."""
+    rows = [torch.tensor([0, 3, 4]), torch.tensor([3, 1]), torch.zeros(0, dtype=torch.int64)]
+    parts = [torch.randn(5, 3, dtype=torch.float64, requires_grad=True),
+             torch.randn(5, dtype=torch.float64, requires_grad=True)]
+    selected = visibility._SelectRows.apply(rows, *parts)
+    expected = [part[numbers] for numbers in rows for part in parts]
+    assert all(torch.equal(a, b) for a, b in zip(selected, expected, strict=True))
+    weights = [torch.randn_like(part) for part in expected]
+    gradients, expected_gradients = (
+        torch.autograd.grad(sum((w * part).sum() for w, part in zip(weights, outputs, strict=True)), parts)
+        for outputs in (selected, expected))
+    assert all(torch.allclose(a, b) for a, b in zip(gradients, expected_gradients, strict=True))
+
+
 def test_the_gradient_of_visibilities_equals_the_definition() -> None:
     generator = torch.Generator().manual_seed(1)
     scene = SceneGaussians.empty(300)

@@ -4,7 +4,8 @@
 From the bottom up: `compilation` and `threads` (machine code and the threads that run it), `buffers` (memory),
 `vector` (16 lanes as a type), then the kernels, each with its mathematics in its module head: `spherical_harmonics`,
 `projection`, `binning`, `raster_forward`, `raster_backward`. `scene` runs them in order as one autograd function.
-`flare` and `splats` do the same for 2D Gaussians.
+`flare` and `splats` do the same for 2D Gaussians. `deformation`, `hash_grid` and `placement` compute a flare's
+Gaussians, `added_light` composites it, `occluders` finds what may hide its light.
 """
 from __future__ import annotations
 

@@ -47,7 +47,8 @@ def interpolate_kernel(point, table, features, resolutions, starts, rows, primes
         for corner in range(8):
             weight, dense, scrambled, stride = ONE, np.int64(0), np.int64(0), np.int64(1)
             for axis in range(3):
-                scaled = min(max(point[axis], np.float32(0)), ONE) * np.float32(resolution)
+                inside = point[axis] if point[axis] > 0 else np.float32(0)  # also for NaN: an index must be a number
+                scaled = min(inside, ONE) * np.float32(resolution)
                 low = min(math.floor(scaled), np.float32(resolution) - ONE)  # 1 lies in the last cell
                 fraction = scaled - np.float32(low)
                 place = np.int64(low) + corners[corner, axis]

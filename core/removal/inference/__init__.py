@@ -9,8 +9,9 @@ A plate goes through these steps, in this order; `neighbours.ShotPredictor` runs
 3. Filter in time: `temporal` corrects the prediction with those of neighbouring frames, aligned by `optical_flow`.
 4. Confidence: `confidence` weighs whether the prediction is a flare at all.
 5. Keep lights: `light_discs` leaves the light discs, and part of the glow about them at night, in the frame.
-6. Upsample: `guided_filter` brings the flare to the plate's size.
-7. Subtract: `plate_light` takes it from the plate's codes in linear light.
+6. Correct streaks: `streaks` clamps predicted streaks to what the frame shows along them.
+7. Upsample: `guided_filter` brings the flare to the plate's size.
+8. Subtract: `plate_light` takes it from the plate's codes in linear light.
 
 `jobs` calls them for folders and captures and writes the results. `diffusion` is another model behind the same steps.
 """

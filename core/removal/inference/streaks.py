@@ -4,11 +4,12 @@
 A network of working size leaves half of a thin streak in one place and takes too much in another. But a streak is a
 ridge of light on a line from its light: along it the frame is brighter than on both sides, and the amount changes
 slowly. So where the predicted flare has such a ridge, the frame's own ridge is measured in a strip about it: what the
-frame has above the line between the strip's edges, by the median along the streak, which the scene's detail hardly
-moves. The predicted ridge is then clamped to the confidence interval of the measured one. Over a busy scene the
-interval is wide, and the prediction stays; over an even one, the streak goes as a whole and no dark line stays.
+frame has above the line between the strip's edges. The predicted ridge is then clamped to the range between the running
+quartiles along the streak, which the scene's detail widens. Over a busy scene the range is wide, and the prediction
+stays; over an even one, most of the streak goes, and only a faint line stays where too much was predicted.
 
-Only predicted ridges are corrected, so a frame without predicted streaks is unchanged.
+Only predicted ridges are corrected, so a frame without predicted streaks is unchanged. A bright or dark object of the
+scene that lies along a predicted streak counts as a part of it, or hides it. Frames are corrected one by one.
 
 `remover.Remover.linear_flare` calls `correct_streaks`.
 """
@@ -37,8 +38,9 @@ DIRECTIONS = 720
 """Directions about a light in which streaks are looked for."""
 WIDEST_STREAK = 16
 """Greatest angle that a streak covers as seen from its light, degrees."""
-MIN_RIDGE = 0.002
-"""Smallest mean ridge of a predicted streak, linear light."""
+MIN_RIDGE = 0.001
+"""Smallest mean ridge of a predicted streak, linear light; from there to twice as much the correction grows from none
+to the whole."""
 RIDGE_REACH = 0.12
 """Length over which that mean is taken, relative to the frame's long side."""
 STRIP_WIDTH = 2.5
@@ -51,12 +53,12 @@ MAX_HALF_ANGLE = 0.7
 """Greatest angle between the middle and an edge of a strip as seen from the light, radians."""
 MAX_GAIN = 3.0
 """Greatest factor by which a predicted ridge is raised."""
-MEDIAN_LENGTH = 0.05
-"""Length of the running median along a streak, relative to the frame's long side."""
+WINDOW_LENGTH, MAX_WINDOW = 0.05, 49
+"""Length of the window of the running quartiles, relative to the frame's long side, and its bound, pixels."""
 CORRELATION_LENGTH = 4.0
 """Distance at which the scene's detail is independent, pixels."""
 INTERVAL = 1.5
-"""Half the confidence interval of the measured ridge, in standard errors."""
+"""Standard errors of the median by which the range between the quartiles is widened on each side."""
 FADE = 8
 """Length over which the correction fades in and out at the ends of a streak, pixels."""
 CLIPPED = 0.98
@@ -123,7 +125,7 @@ def _find_streaks(flare: Pixels, light: tuple[float, float], radius: float) -> l
     """Return the streaks of one light: directions in which the predicted flare (h, w, 3) has a ridge."""
     import cv2
 
-    long_side = max(flare.shape)
+    long_side = max(flare.shape[:2])
     start, reach = DISC_MARGIN[0] * radius + DISC_MARGIN[1] * long_side, round(RIDGE_REACH * long_side)
     amount = np.ascontiguousarray(flare.mean(-1))
     radii = round(start) + 2 * reach
@@ -170,14 +172,16 @@ def _correct_streak(display: Pixels, light: Pixels, flare: Pixels, streak: _Stre
         shift += _ridge_shift(_above_edges(_sample(flare, *_strip_places(streak, offset, shift))).mean(-1), streak)
     x, y = _strip_places(streak, offset, shift)
     predicted, seen = _sample(flare, x, y), _sample(light, x, y)
-    known = ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-             & (_sample(display, x, y).max(-1) < CLIPPED))
-    window = round(MEDIAN_LENGTH * max(height, width)) | 1
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    has_edges = inside[:, :2].all(1) & inside[:, -2:].all(1)  # without both edges there is nothing to compare with
+    known = inside & has_edges[:, None] & (_sample(display, x, y).max(-1) < CLIPPED)
+    window = min(round(WINDOW_LENGTH * max(height, width)), MAX_WINDOW) | 1
     own = _above_edges(predicted)
     change = _clamp_ridge(own, seen, predicted, _running_quartiles(_above_edges(seen), known, window), confidence) - own
     from_ends = np.minimum(np.arange(length), length - np.arange(length)) / FADE
     from_edges = (1 - np.abs(offset)) * half / 2
     change *= (np.clip(from_ends, 0, 1)[:, None] * np.clip(from_edges, 0, 1))[..., None]
+    change *= min(streak.strength / MIN_RIDGE - 1, 1)
     area = tuple(slice(max(0, int(values.min()) - 1), max(0, int(values.max()) + 2)) for values in (y, x))
     _add_strip(flare, change, streak, shift, area)
     np.clip(flare[area], 0, light[area], out=flare[area])

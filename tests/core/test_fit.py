@@ -120,7 +120,8 @@ def test_a_light_disc_is_black_behind_its_additive_flare(capture: Capture) -> No
     clean, scene = targets._replace(clean=white), torch.full_like(white, 0.25)
     for progress, behind in ((1, white), (trainer.settings.iterations, scene)):
         trainer.iteration = progress
-        seen = trainer._flare_background(clean, scene, trainer._light_disc_mask(clean))
+        background, discs = trainer._flare_background(clean, scene), trainer._light_discs_of(trainer.views[0], clean)
+        seen = composite(background, None, "add", black=discs)
         assert not seen[y, x].any()
         expected = behind.clone()
         expected[y, x] = 0

@@ -150,7 +150,8 @@ def test_a_light_disc_above_white_is_kept_where_frames_differ(bright: Capture) -
     above_white.frame[at] = 2.0
     sources = trainer._light_disc_mask(above_white)
     assert sources is not None and sources[at] and sources.sum() == 1
-    assert not trainer._flare_background(above_white, torch.ones_like(picture), sources)[at].any()
+    background = trainer._flare_background(above_white, torch.ones_like(picture))
+    assert not composite(background, None, "add", MAX_WHITE, sources)[at].any()
     for drawn, wanted in ((0.5, 1.0), (3.0, 3.0)):  # at least white, and as bright as what is round it makes it
         target = trainer._composite_target(above_white, torch.full_like(picture, drawn), sources)
         assert (target[at] == wanted).all()
@@ -165,7 +166,7 @@ def test_the_flare_background_above_white_is_the_clean_frame_to_the_end(bright: 
     scene, hot = torch.full_like(targets.frame, 0.25), targets.clean > 1
     assert hot.any() and not hot.all()
     trainer.iteration = trainer.settings.iterations
-    behind = trainer._flare_background(targets, scene, None)
+    behind = trainer._flare_background(targets, scene)
     assert torch.equal(behind[hot], targets.clean[hot])
     assert (behind[~hot] == 0.25).all()
 

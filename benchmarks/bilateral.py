@@ -74,8 +74,8 @@ class BilateralTrainer(Trainer):
         self.schedule.step()
         return figures
 
-    def _flare_background(self, targets: Targets, scene: Tensor,  # noqa: ARG002 - the base class calls it with these
-                          light_discs: Tensor | None) -> Tensor:  # noqa: ARG002
+    def _flare_background(self, targets: Targets,  # noqa: ARG002 - the base class calls it with it
+                          scene: Tensor) -> Tensor:
         """Return the scene through the grid of its view, which the trainer compares with the frame."""
         return self.grids(self._view_index(self._pick_view()), scene)
 

@@ -237,8 +237,9 @@ class Remover:
         keep_glow = self.glow == "keep at lights" and not inside_matte
         flare = flare * (1 - retained_fraction(prediction.display, flare, prediction.glow_fraction,
                                                keep_glow=keep_glow))
-        linear = correct_streaks(prediction.display, flare_to_linear(prediction.display, flare),
-                                 1.0 if inside_matte else float(prediction.confidence))
+        linear = flare_to_linear(prediction.display, flare)
+        if not prediction.has_neighbours:  # these show more of what a streak covers than the frame itself
+            linear = correct_streaks(prediction.display, linear, 1.0 if inside_matte else float(prediction.confidence))
         return np.where(flare > 0, self.amount * linear, np.float32(0))
 
 

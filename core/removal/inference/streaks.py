@@ -9,7 +9,8 @@ quartiles along the streak, which the scene's detail widens. Over a busy scene t
 stays; over an even one, most of the streak goes, and only a faint line stays where too much was predicted.
 
 Only predicted ridges are corrected, so a frame without predicted streaks is unchanged. A bright or dark object of the
-scene that lies along a predicted streak counts as a part of it, or hides it. Frames are corrected one by one.
+scene that lies along a predicted streak counts as a part of it, or hides it. A frame of a shot is unchanged as well:
+its neighbours show more of what a streak covers.
 
 `remover.Remover.linear_flare` calls `correct_streaks`.
 """

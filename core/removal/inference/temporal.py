@@ -112,7 +112,7 @@ def filter_in_time(frame: FramePrediction, neighbours: Sequence[Neighbour],
         reference = _clean_estimate(frame)
         residual = _residual_flare(reference, [_warped_neighbour(reference, neighbour) for neighbour in neighbours])
         flare = np.clip(flare + upsample(residual, display), 0, display)
-    return FlarePrediction(display, flare, confidence, prediction.glow_fraction)
+    return FlarePrediction(display, flare, confidence, prediction.glow_fraction, bool(neighbours))
 
 
 class _CleanEstimate(NamedTuple):

@@ -9,9 +9,9 @@ or threes, slightly curved, whose two sides differ in length, whose colour chang
 All is added in linear light, then clipped, as a camera does.
 
 It prints, and writes to DIR/streaks.json: the PSNR of the photographs with flare and of the results, over whole
-pictures and over the streaks (pixels to which a streak adds 4 codes or more); and how much darker than the truth the
-results are along the streaks, codes of 8 bits, 95th percentile by picture. DIR/streaks.png shows the pictures that are
-darkened most: with flare, result, truth.
+pictures and over the streaks (pixels to which a streak adds 4 codes or more, not clipped in the truth); and how much
+darker than the truth the results are along the streaks, codes of 8 bits, 95th percentile by picture. DIR/streaks.png
+shows the pictures that are darkened most: with flare, result, truth.
 """
 from __future__ import annotations
 
@@ -33,16 +33,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.colour.srgb import Pixels
-from core.images.listing import SUFFIXES
 from core.images.read import read_picture
 from core.images.write import write_png
 from core.metrics.pictures import psnr
 from core.removal.inference.remover import WORKING_SIZE, Remover
+from core.removal.training.backgrounds import PHOTO_SUFFIXES, list_pictures
 
 LONG_SIDE = 640
 """Long side of the pictures, pixels."""
 STREAK_CODES = 4
 """What a streak adds to a pixel that belongs to it, at least, codes of 8 bits."""
+DARK_CODES = 4
+"""Darkness along a streak, codes of 8 bits, up to which it counts as none."""
 GAMMA = 2.2
 """Gamma of the display values."""
 SHOWN = 8
@@ -80,8 +82,8 @@ def draw_case(photo: Pixels, random: np.random.Generator) -> StreakCase:
                  )[..., None] * tint
         for axis, length in zip(axes, lengths, strict=True):
             streaks += draw_streak(dx, dy, axis, length, width, random) * (power * random.uniform(0.1, 0.7)) * tint
-    truth, frame = to_codes(scene), to_codes(scene + glow + streaks)
-    without = to_codes(scene + glow)
+    truth, frame = to_display(scene), to_display(scene + glow + streaks)
+    without = to_display(scene + glow)
     marked = (frame - without).max(-1) * 255 >= STREAK_CODES
     return StreakCase(frame, truth, marked & (truth.min(-1) < 0.98))
 
@@ -107,7 +109,7 @@ def draw_streak(dx: Pixels, dy: Pixels, axis: float, length: float, width: int, 
 
 def find_places(photo: Pixels, count: int, random: np.random.Generator) -> list[tuple[float, float]]:
     """Return places of lights (x, y), pixels: the brightest spots of a photograph, each a tenth of its width apart
-    from the others, or random ones where it has no spots above 0.85."""
+    from the others, or random ones where it has no spots above 0.85, or more than a twentieth of it is that bright."""
     import cv2
 
     height, width = photo.shape[:2]
@@ -123,7 +125,7 @@ def find_places(photo: Pixels, count: int, random: np.random.Generator) -> list[
     return places
 
 
-def to_codes(linear: Pixels) -> Pixels:
+def to_display(linear: Pixels) -> Pixels:
     """Convert linear light to display values, clipped and rounded to 8 bits."""
     return np.asarray(np.round(np.clip(linear, 0, 1) ** (1 / GAMMA) * 255) / 255, np.float32)
 
@@ -145,7 +147,7 @@ def main(args: argparse.Namespace) -> None:
     """Score all photographs, and write scores and sheet."""
     import cv2
 
-    paths = sorted(path for folder in args.photos for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    paths = sorted(path for folder in args.photos for path in list_pictures(folder, PHOTO_SUFFIXES, "all"))
     random = np.random.default_rng(args.seed)
     chosen = [paths[k] for k in sorted(random.permutation(len(paths))[:args.count])]
     remover = Remover(args.weights, working_size=args.working_size)
@@ -164,8 +166,8 @@ def main(args: argparse.Namespace) -> None:
     means = {key: np.mean([row[key] for row in rows], 0).tolist() for key in ("psnr", "streak_psnr")}
     darker = [row["darker"] for row in rows]
     print(f"PSNR {means['psnr'][0]:.2f} -> {means['psnr'][1]:.2f}, over streaks {means['streak_psnr'][0]:.2f} -> "
-          f"{means['streak_psnr'][1]:.2f}; darker by more than {STREAK_CODES} codes: "
-          f"{sum(value > STREAK_CODES for value in darker)} of {len(darker)}, median {np.median(darker):.1f}")
+          f"{means['streak_psnr'][1]:.2f}; darker by more than {DARK_CODES} codes: "
+          f"{sum(value > DARK_CODES for value in darker)} of {len(darker)}, median {np.median(darker):.1f}")
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "streaks.json").write_text(json.dumps({"means": means, "pictures": rows}, indent=1), encoding="utf-8")
     worst = [picture for _, picture in sorted(pictures, key=lambda pair: -pair[0])[:SHOWN]]

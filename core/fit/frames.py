@@ -250,8 +250,8 @@ class DeviceFrames:
         self.device = device
         self._frames, self._free_bytes = frames, memory
         self._reduced = {1: frames}
-        # By view and reduction.
         self._stored: dict[tuple[str, int], MaskedTargets] = {}
+        """Frames that stay, by the view's name and the reduction."""
 
     def read(self, view: View, reduction: int = 1) -> MaskedTargets:
         """Return `Frames.targets` and `Frames.mask` of a view, on the device; at the working size divided by
@@ -277,5 +277,4 @@ class DeviceFrames:
 
 def _num_bytes(targets: MaskedTargets) -> int:
     """Return the size in memory of pictures and mask, bytes."""
-    parts = (*targets[0][1:], targets[1])
-    return sum(part.numel() * part.element_size() for part in parts if part is not None)
+    return sum(part.nbytes for part in (*targets[0][1:], targets[1]) if part is not None)

@@ -117,11 +117,10 @@ class GridAdam(torch.optim.SparseAdam):
     def step(self, closure: Any = None) -> Any:
         """Step the rows that the gradients hold."""
         tables = [(group, table) for group in self.param_groups for table in group["params"] if table.grad is not None]
-        kernels = [fused_kernels(table) for _, table in tables]
-        if closure is not None or any(fused is None for fused in kernels):
+        fused = fused_kernels(tables[0][1]) if tables and closure is None else None
+        if fused is None:
             return super().step(closure)
-        for (group, table), fused in zip(tables, kernels, strict=True):
-            assert fused is not None
+        for group, table in tables:
             state = self.state[table]
             if not state:
                 state["step"] = 0

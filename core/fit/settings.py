@@ -67,6 +67,8 @@ class SceneRates:
 class FlareSettings:
     """The flare: its form, the number of Gaussians a light starts with, density control, rates, occlusion.
 
+    opacity: that of the first Gaussians.
+
     detection: False puts every light at the centroid of the points plus uniform noise (ablation). occlusion: scale each
     flare by the visibility of its light behind the scene (`visibility`).
 

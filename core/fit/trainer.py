@@ -110,8 +110,9 @@ class Trainer(FlareTrainer):
         self._scene.to(self.device)
         if self.flare is not None:
             self.flare.move_to(self.device)
-        self._light_discs: dict[tuple[str, int], Tensor | None] = {}
-        """Light discs of views that were used, by name and width of the picture, on the CPU: see `_light_discs_of`."""
+        self._disc_pixels: dict[tuple[str, int], Tensor] = {}
+        """Numbers of the pixels in the light discs of views that were used, on the CPU, by name and width of the
+        picture."""
 
         # Optimisers and strategy hold the parameters of the models.
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
@@ -314,14 +315,17 @@ class Trainer(FlareTrainer):
         return scene if self.frames.display_white == 1 else torch.where(targets.clean > 1, targets.clean, scene)
 
     def _light_discs_of(self, view: View, targets: Targets) -> Tensor | None:
-        """Return `_light_disc_mask` of a view, None for an empty mask. It is computed once for each size, since nothing
-        in it changes; the numbers of its few pixels are kept."""
+        """Return `_light_disc_mask` of a view, None where no pixel is in a disc.
+
+        The mask is computed once for each size, since nothing in it changes; the numbers of its few pixels are kept.
+        """
         key = view.name, targets.camera.width
-        if key not in self._light_discs:
+        if key not in self._disc_pixels:
             mask = self._light_disc_mask(targets)
-            self._light_discs[key] = torch.nonzero(mask.flatten())[:, 0].cpu() if mask is not None else None
-        pixels = self._light_discs[key]
-        if pixels is None or not len(pixels):
+            self._disc_pixels[key] = (torch.zeros(0, dtype=torch.int64) if mask is None else
+                                      mask.flatten().nonzero()[:, 0].cpu())
+        pixels = self._disc_pixels[key]
+        if not len(pixels):
             return None
         discs = torch.zeros(targets.frame.shape[:2], dtype=torch.bool)
         discs.view(-1)[pixels] = True

@@ -189,7 +189,7 @@ def _visibilities(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor], 
     The Gaussians that may hide a light are selected for all lights together: the gradient of each selection has the
     size of the whole scene.
     """
-    sight_lines = [_sight_line(scene, eye, light, settings) for light in lights]
+    sight_lines = [_sight_line(scene, eye, light, settings, kernels) for light in lights]
     rows = [line.rows for line in sight_lines if line is not None]
     parts = scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits
     selected = iter(cast(tuple[Tensor, ...], _SelectRows.apply(rows, *parts)) if rows else ())
@@ -199,14 +199,15 @@ def _visibilities(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor], 
             for line in sight_lines]
 
 
-def _sight_line(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings) -> _SightLine | None:
+def _sight_line(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings,
+                kernels: Kernels = "auto") -> _SightLine | None:
     """Return the line of sight from `eye` (3,) to a light (3,); None for a light at the eye, which nothing hides."""
     direction = (light - eye).float().numpy()
     distance = float(np.linalg.norm(direction))
     if distance <= 0:
         return None
     pose = _look_along(eye.float().numpy(), direction / np.float32(distance))
-    return _SightLine(pose, distance, _occluder_rows(scene, pose, distance, settings))
+    return _SightLine(pose, distance, _occluder_rows(scene, pose, distance, settings, kernels))
 
 
 def _mean_transmittance(occluders: Sequence[Tensor], pose: Tensor, near: float, settings: VisibilitySettings,
@@ -243,12 +244,13 @@ def _near_plane(scene: SceneGaussians, distance: float) -> float:
     return min(1e-3 * distance, scene.near)
 
 
-def _occluder_rows(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
+def _occluder_rows(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings,
+                   kernels: Kernels) -> Tensor:
     """Return the rows of Gaussians between camera and light that may touch the small picture, without the far layer.
 
     pose: world_to_camera (4, 4) of the small camera. distance: from camera to light.
     """
-    fused = fused_kernels(scene.means)
+    fused = None if kernels == "torch" else fused_kernels(scene.means)
     far = scene.far
     # The picture's corners are at 2 sqrt(2) radii from its middle.
     rows = None if fused is None else fused.find_occluders(

@@ -74,7 +74,8 @@ class StepsInBackward(Protocol):
 
 
 class FusedKernels(Protocol):
-    """Functions of the CPU kernels beyond a kernel set; a step is made by `AdamStep` and otherwise opaque.
+    """Functions of the CPU kernels beyond a kernel set. A step is made by `AdamStep`, the layout of a
+    hash grid by `GridLayout`; both are otherwise opaque.
 
     PLACED_COLUMNS: names and widths of the network's offsets that `place` takes."""
 

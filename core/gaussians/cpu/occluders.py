@@ -15,7 +15,7 @@ from .vector import (
     any_of,
     atomic_increment,
     deinterleave,
-    exp2,
+    exp,
     fma,
     lane_index,
     load,
@@ -31,7 +31,7 @@ ROWS_PER_TASK = 1 << 12
 """Gaussians that a thread tests at a time."""
 REACH = np.float32(3)
 """Standard deviations up to which a Gaussian hides a light."""
-LOG2_E, ONE, ZERO = np.float32(1.4426950408889634), np.float32(1), np.float32(0)
+ONE, ZERO = np.float32(1), np.float32(0)
 
 
 @inlined
@@ -62,7 +62,7 @@ def find_occluders_kernel(counter, flags, means, log_scales, line, rows, counts)
             across = fma(x, line[0], fma(y, line[1], fma(z, line[2], splat(line[3]))))
             down = fma(x, line[4], fma(y, line[5], fma(z, line[6], splat(line[7]))))
             scale_x, scale_y, scale_z = _load_points(log_scales, first)
-            reach = exp2(maximum(maximum(scale_x, scale_y), scale_z) * LOG2_E) * REACH
+            reach = exp(maximum(maximum(scale_x, scale_y), scale_z)) * REACH
             off_axis = sqrt(fma(across, across, down * down))
             far_x, far_y, far_z = x - line[15], y - line[16], z - line[17]
             far = fma(far_x, far_x, fma(far_y, far_y, far_z * far_z))

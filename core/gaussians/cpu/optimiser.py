@@ -74,15 +74,16 @@ def step_array(parameter, gradient, first, second, rates, constants):
 # Columns of the table of `adam_kernel`: addresses of a parameter, its gradient, moments and learning rates; numbers of
 # its values, of its rates and of the values of a task; its first task.
 PARAMETER, GRADIENT, FIRST, SECOND, RATES, SIZE, PERIOD, TASK_SIZE, FIRST_TASK = range(9)
+NUM_COLUMNS = 9
 
 
 @kernel
 def adam_kernel(counter, table, constants, tasks):
     """Make an Adam step on each of k parameters, on all threads.
 
-    counter: index of the next task, of `tasks`. table: (k, 9), the columns PARAMETER ... FIRST_TASK; the rates are
-    repeated along the parameter, and TASK_SIZE is a multiple of their number. constants: (k, NUM_CONSTANTS), rows that
-    `unpack_constants` reads.
+    counter: index of the next task, of `tasks`. table: (k, NUM_COLUMNS), the columns PARAMETER ... FIRST_TASK; the
+    rates are repeated along the parameter, and TASK_SIZE is a multiple of their number. constants: (k, NUM_CONSTANTS),
+    rows that `unpack_constants` reads.
     """
     row, last_row = 0, table.shape[0] - 1
     while True:
@@ -117,13 +118,13 @@ def adam_steps(steps: Sequence[AdamStep], *, beta1: float, beta2: float, epsilon
     """Make all steps in one parallel call: a thread that finds no more work on one parameter takes the next.
 
     Gradients are contiguous float32, too."""
-    table, arrays, tasks = np.empty((len(steps), 9), np.int64), [], 0
+    table, arrays, tasks = np.empty((len(steps), NUM_COLUMNS), np.int64), [], 0
     for row, step in enumerate(steps):
         assert step.gradient is not None
         rates = repeat_rates(step.rate)
         arrays.append(rates)  # the table has its address alone
         size, task_size = step.parameter.numel(), -(-MIN_TASK_SIZE // rates.size) * rates.size
-        addresses = (tensor.data_ptr() for tensor in step[:4] if tensor is not None)
+        addresses = (tensor.data_ptr() for tensor in (step.parameter, step.gradient, step.first, step.second))
         table[row] = *addresses, rates.ctypes.data, size, rates.size, task_size, tasks
         tasks += -(-size // task_size)
     constants = np.array([adam_constants(step.step, beta1, beta2, epsilon) for step in steps], np.float32)

@@ -9,7 +9,8 @@ A plate goes through these steps, in this order; `neighbours.ShotPredictor` runs
 3. Filter in time: `temporal` corrects the prediction with those of neighbouring frames, aligned by `optical_flow`.
 4. Confidence: `confidence` weighs whether the prediction is a flare at all.
 5. Keep lights: `light_discs` leaves the light discs, and part of the glow about them at night, in the frame.
-6. Correct streaks: `streaks` clamps predicted streaks to what the frame shows along them.
+6. Correct streaks, where step 3 has not corrected the prediction: `streaks` clamps predicted streaks to what the
+   frame shows along them.
 7. Upsample: `guided_filter` brings the flare to the plate's size.
 8. Subtract: `plate_light` takes it from the plate's codes in linear light.
 

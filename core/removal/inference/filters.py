@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Resampling and blurs that `confidence`, `optical_flow` and `temporal` share."""
+"""Resampling and blurs that `confidence`, `optical_flow`, `streaks` and `temporal` share."""
 from __future__ import annotations
 
 import numpy as np

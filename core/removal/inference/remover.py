@@ -3,7 +3,8 @@
 
 A plate is predicted at a bounded working size; its flare is upsampled and subtracted from the plate's codes in linear
 light. Where the network predicts less than a threshold the flare is exactly 0, and the codes are exactly the plate's.
-Light discs stay (`light_discs`). Streaks are corrected by what the frame shows along them (`streaks`). `jobs` runs it
+Light discs stay (`light_discs`). Where no neighbours have corrected the flare, streaks are
+corrected by what the frame shows along them (`streaks`). `jobs` runs it
 on folders and captures, `evaluation` on test pictures.
 """
 from __future__ import annotations

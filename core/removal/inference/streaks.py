@@ -5,14 +5,15 @@ A network of working size leaves half of a thin streak in one place and takes to
 ridge of light on a line from its light: along it the frame is brighter than on both sides, and the amount changes
 slowly. So where the predicted flare has such a ridge, the frame's own ridge is measured in a strip about it: what the
 frame has above the line between the strip's edges. The predicted ridge is then clamped to the range between the running
-quartiles along the streak, which the scene's detail widens. Over a busy scene the range is wide, and the prediction
-stays; over an even one, most of the streak goes, and only a faint line stays where too much was predicted.
+quartiles along the streak, widened by 1.5 standard errors of the median on each side. The scene's detail widens it,
+too. Over a busy scene the range is wide, and the prediction stays; over an even one, most of the streak goes, and only
+a faint line stays where too much was predicted.
 
 Only predicted ridges are corrected, so a frame without predicted streaks is unchanged. A bright or dark object of the
-scene that lies along a predicted streak counts as a part of it, or hides it. A frame of a shot is unchanged as well:
-its neighbours show more of what a streak covers.
+scene that lies along a predicted streak counts as a part of it, or hides it.
 
-`remover.Remover.linear_flare` calls `correct_streaks`.
+`remover.Remover.linear_flare` calls `correct_streaks`, except for frames that neighbours have corrected: these show
+more of what a streak covers. Pixels are those of the working size.
 """
 from __future__ import annotations
 
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from ...colour.srgb import Pixels
 from ..model.image_formation import GAMMA
+from .filters import blur
 
 MIN_LIGHT_BRIGHTNESS = 0.85
 """Smallest brightness (mean of the three display values) of a light that streaks may come from."""
@@ -33,11 +35,11 @@ MAX_LIGHTS, MAX_STREAKS = 8, 16
 """Greatest numbers of lights, those with the most predicted flare about them, and of streaks in a frame."""
 LIGHT_SURROUND = 0.03
 """Width of the surroundings of a light in which its predicted flare is measured, relative to the frame's long side."""
-DISC_MARGIN = (1.5, 0.012)
+STREAK_START = (1.5, 0.012)
 """A streak begins at this multiple of its light's radius, plus this share of the frame's long side."""
 DIRECTIONS = 720
 """Directions about a light in which streaks are looked for."""
-WIDEST_STREAK = 16
+MAX_STREAK_ANGLE = 16
 """Greatest angle that a streak covers as seen from its light, degrees."""
 MIN_RIDGE = 0.001
 """Smallest mean ridge of a predicted streak, linear light; from there to twice as much the correction grows from none
@@ -58,10 +60,12 @@ WINDOW_LENGTH, MAX_WINDOW = 0.05, 49
 """Length of the window of the running quartiles, relative to the frame's long side, and its bound, pixels."""
 CORRELATION_LENGTH = 4.0
 """Distance at which the scene's detail is independent, pixels."""
-INTERVAL = 1.5
+MAX_STANDARD_ERRORS = 1.5
 """Standard errors of the median by which the range between the quartiles is widened on each side."""
 FADE = 8
 """Length over which the correction fades in and out at the ends of a streak, pixels."""
+EDGE_FADE = 2
+"""Samples across a strip over which the correction fades at its edges."""
 CLIPPED = 0.98
 """Display value from which on a pixel is clipped."""
 
@@ -95,16 +99,16 @@ def correct_streaks(display: Pixels, flare: Pixels, confidence: float = 1.0) -> 
     """
     if not flare.any():
         return flare
-    light = np.asarray(display, np.float32) ** GAMMA
-    streaks = [streak for place, radius in _find_lights(display, flare)
+    linear = np.asarray(display, np.float32) ** GAMMA
+    streaks = [streak for place, radius in _find_bright_spots(display, flare)
                for streak in _find_streaks(flare, place, radius)]
     corrected = np.array(flare, np.float32)
     for streak in sorted(streaks, key=lambda streak: -streak.strength)[:MAX_STREAKS]:
-        _correct_streak(display, light, corrected, streak, confidence)
+        _correct_streak(display, linear, corrected, streak, confidence)
     return corrected
 
 
-def _find_lights(display: Pixels, flare: Pixels) -> list[tuple[tuple[float, float], float]]:
+def _find_bright_spots(display: Pixels, flare: Pixels) -> list[tuple[tuple[float, float], float]]:
     """Return place (x, y) and radius, pixels, of the bright spots with the most predicted flare about them."""
     import cv2
 
@@ -127,17 +131,17 @@ def _find_streaks(flare: Pixels, light: tuple[float, float], radius: float) -> l
     import cv2
 
     long_side = max(flare.shape[:2])
-    start, reach = DISC_MARGIN[0] * radius + DISC_MARGIN[1] * long_side, round(RIDGE_REACH * long_side)
+    start, reach = STREAK_START[0] * radius + STREAK_START[1] * long_side, round(RIDGE_REACH * long_side)
     amount = np.ascontiguousarray(flare.mean(-1))
     radii = round(start) + 2 * reach
     polar = np.asarray(cv2.warpPolar(amount, (radii, DIRECTIONS), light, radii,
                                      cv2.INTER_LINEAR | cv2.WARP_FILL_OUTLIERS))[:, round(start):]
-    window = round(WIDEST_STREAK / 360 * DIRECTIONS) | 1
+    window = round(MAX_STREAK_ANGLE / 360 * DIRECTIONS) | 1
     padded = np.concatenate([polar[-2 * window:], polar, polar[:2 * window]])
     ridge = padded - np.asarray(cv2.morphologyEx(padded, cv2.MORPH_OPEN, np.ones((window, 1), np.uint8)))
     # Mean ridge by direction, (DIRECTIONS + 2 window,), over three parts of the radii.
-    inner, outer, far = (np.asarray(cv2.GaussianBlur(part.mean(1)[None], (0, 0), 1.5))[0] for part in
-                         np.split(ridge[window:-window], (reach // 2, reach), axis=1))
+    inner, outer, far = (blur(part.mean(1)[None], 1.5)[0]
+                         for part in np.split(ridge[window:-window], (reach // 2, reach), axis=1))
     near = np.minimum(inner, outer)  # a streak is long, a bright spot beside the light is not
     streaks = []
     for peak in range(window, window + DIRECTIONS):
@@ -157,12 +161,12 @@ def _half_width(profile: NDArray[np.float32], distance: float) -> float:
     return STRIP_WIDTH / 2 * directions * 2 * math.pi / DIRECTIONS * distance
 
 
-def _correct_streak(display: Pixels, light: Pixels, flare: Pixels, streak: _Streak, confidence: float) -> None:
+def _correct_streak(display: Pixels, linear: Pixels, flare: Pixels, streak: _Streak, confidence: float) -> None:
     """Clamp the ridge of one streak of a linear flare to what the frame shows; writes to `flare`.
 
-    display, light: the frame, display values and linear light. flare: linear. All (h, w, 3).
+    display, linear: the frame, display values and linear light. flare: linear light. All (h, w, 3).
     """
-    height, width = light.shape[:2]
+    height, width = linear.shape[:2]
     length = _length_inside(streak, width, height)
     if length < 2 * MIN_HALF_STRIP:
         return
@@ -172,7 +176,7 @@ def _correct_streak(display: Pixels, light: Pixels, flare: Pixels, streak: _Stre
     for _ in range(2):
         shift += _ridge_shift(_above_edges(_sample(flare, *_strip_places(streak, offset, shift))).mean(-1), streak)
     x, y = _strip_places(streak, offset, shift)
-    predicted, seen = _sample(flare, x, y), _sample(light, x, y)
+    predicted, seen = _sample(flare, x, y), _sample(linear, x, y)
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     has_edges = inside[:, :2].all(1) & inside[:, -2:].all(1)  # without both edges there is nothing to compare with
     known = inside & has_edges[:, None] & (_sample(display, x, y).max(-1) < CLIPPED)
@@ -180,12 +184,12 @@ def _correct_streak(display: Pixels, light: Pixels, flare: Pixels, streak: _Stre
     own = _above_edges(predicted)
     change = _clamp_ridge(own, seen, predicted, _running_quartiles(_above_edges(seen), known, window), confidence) - own
     from_ends = np.minimum(np.arange(length), length - np.arange(length)) / FADE
-    from_edges = (1 - np.abs(offset)) * half / 2
+    from_edges = (1 - np.abs(offset)) * half / EDGE_FADE
     change *= (np.clip(from_ends, 0, 1)[:, None] * np.clip(from_edges, 0, 1))[..., None]
     change *= min(streak.strength / MIN_RIDGE - 1, 1)
     area = tuple(slice(max(0, int(values.min()) - 1), max(0, int(values.max()) + 2)) for values in (y, x))
     _add_strip(flare, change, streak, shift, area)
-    np.clip(flare[area], 0, light[area], out=flare[area])
+    np.clip(flare[area], 0, linear[area], out=flare[area])
 
 
 def _clamp_ridge(own: Pixels, seen: Pixels, predicted: Pixels, measured: tuple[Pixels, Pixels, Pixels],
@@ -199,7 +203,7 @@ def _clamp_ridge(own: Pixels, seen: Pixels, predicted: Pixels, measured: tuple[P
 
     low, high, error = measured
     known = np.isfinite(error)
-    error = np.where(known, INTERVAL * error, 0)
+    error = np.where(known, MAX_STANDARD_ERRORS * error, 0)
     least = confidence * np.minimum(_unimodal(np.maximum(low - error, 0)), MAX_GAIN * own)
     # Nothing is made darker than what is beside the streak.
     least = np.minimum(least, own + np.maximum(cv2.blur(_above_edges(seen - predicted), (3, 3)), 0))
@@ -269,7 +273,9 @@ def _running_quartiles(strip: Pixels, known: NDArray[np.bool_], window: int) -> 
                  for share in (0.25, 0.75))
     unknown = samples < window / 2
     low, high = (np.where(unknown, 0, quartile) for quartile in (low, high))
-    error = 1.2533 * (high - low) / 1.349 / np.sqrt(samples / CORRELATION_LENGTH)
+    # Of normally distributed values the quartiles are 1.349 standard deviations apart, and the median's error is
+    # sqrt(pi / 2) of the mean's.
+    error = math.sqrt(math.pi / 2) * (high - low) / 1.349 / np.sqrt(samples / CORRELATION_LENGTH)
     return low, high, np.where(unknown, np.float32(np.inf), error)
 
 

@@ -69,6 +69,19 @@ def test_both_eyes_are_cleaned(flare_everywhere: Path, tmp_path: Path, header: d
         np.testing.assert_allclose(before[name].astype(float) - after[name], flare[name], atol=2e-3)
 
 
+@pytest.mark.parametrize(("count", "corrected"), [(1, 2), (3, 0)])
+def test_streaks_are_corrected_in_both_eyes_or_in_none(flare_everywhere: Path, tmp_path: Path, count: int,
+                                                       corrected: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame by itself has them corrected in each eye; in a shot, neighbours have corrected the first eye."""
+    calls = []
+    monkeypatch.setattr("core.removal.inference.remover.correct_streaks",
+                        lambda *arguments: calls.append(1) or arguments[1])
+    paths = [write(tmp_path / f"{number:04d}.exr", RGB + RIGHT, multiView=["left", "right"])
+             for number in range(count)]
+    clean_plates(paths, tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
+    assert len(calls) == corrected
+
+
 @pytest.mark.parametrize("colours", ["RGB", "Y"])
 def test_both_eyes_are_cleaned_where_none_is_at_the_root(colours: str, flare_everywhere: Path, tmp_path: Path) -> None:
     path = write(tmp_path / "a.exr", [f"{eye}.{colour}" for eye in ("left", "right") for colour in f"{colours}A"])

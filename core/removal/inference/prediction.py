@@ -35,7 +35,7 @@ class FlarePrediction(NamedTuple):
     flare: what a flare adds to them, if there is one, (h, w, 3).
     confidence: how sure it is that this is a flare, not the scene or its grade, 0..1.
     glow_fraction: share of the flare that is glow about lights, 0..1, (h, w, 3).
-    has_neighbours: neighbouring frames corrected the flare.
+    has_neighbours: neighbouring frames corrected the flare of the frame's first view.
     """
 
     display: Pixels

@@ -197,9 +197,11 @@ class Remover:
                                shot_confidence([(prediction, 1.0)], self.sensitivity.log_odds_bias),
                                prediction.glow_fraction)
 
-    def predict_other_views(self, plate: Plate) -> list[FlarePrediction]:
-        """Predict the flares of the views of a stereo plate after the first one; [] for a plate of one view."""
-        return [self.predict(self.to_network_input(view)) for _, view in split_views(plate)[1:]]
+    def predict_other_views(self, plate: Plate, first: FlarePrediction) -> list[FlarePrediction]:
+        """Predict the flares of the views of a stereo plate after the first one; [] for a plate of one view. first: the
+        prediction of the first view, so that the streaks of all views are corrected, or none."""
+        return [self.predict(self.to_network_input(view))._replace(has_neighbours=first.has_neighbours)
+                for _, view in split_views(plate)[1:]]
 
     def remove_views(self, plate: Plate, predictions: Sequence[FlarePrediction], matte: Pixels | None = None
                      ) -> list[tuple[NDArray[Any], NDArray[np.float16]]]:

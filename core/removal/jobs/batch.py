@@ -147,7 +147,7 @@ class _PlateCleaner:
         matte = None
         if self._mattes:
             matte = self._mattes.read(frame.name, read_data_window(frame.source), read_exif(frame.source)[0])
-        predictions = [prediction, *self._remover.predict_other_views(plate)]
+        predictions = [prediction, *self._remover.predict_other_views(plate, prediction)]
         return PreparedResults(lambda: self._write(frame, plate, predictions, matte),
                                float(prediction.confidence) if matte is None else None)
 

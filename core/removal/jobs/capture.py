@@ -47,7 +47,7 @@ class _FrameCleaner:
         plate, prediction = self._predictor.predict(frame.source)
         if frame.name in self._flared_names:
             prediction = prediction._replace(confidence=np.float32(1))
-        predictions = [prediction, *self._remover.predict_other_views(plate)]
+        predictions = [prediction, *self._remover.predict_other_views(plate, prediction)]
         return PreparedResults(
             lambda: write_view_results(frame.results, plate, self._remover.remove_views(plate, predictions)),
             float(prediction.confidence))

@@ -7,7 +7,7 @@ units.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,11 +75,25 @@ class SceneDescription:
     samples: int = 40
     held_out: tuple[int, ...] = field(default=())
     """Numbers of views that are held out besides every eighth."""
+    step: int = 1
+    """Difference of the numbers of two successive views."""
 
     @property
     def numbers(self) -> NDArray[np.int64]:
         """The views' numbers on the path; a file is called after its view's."""
-        return self.first_number + np.arange(self.views)
+        return self.first_number + self.step * np.arange(self.views)
+
+    def resampled(self, width: int | None, every: int) -> SceneDescription:
+        """Return the capture with pictures of another width, px, and only every so many of its views.
+
+        None keeps the width. A wider picture gets fewer samples per pixel, 8 at least, since it shows the same noise
+        smaller.
+        """
+        camera = self.camera
+        ratio = 1.0 if width is None else width / camera.width
+        return replace(self, camera=camera.scaled(round(camera.width * ratio), round(camera.height * ratio)),
+                       samples=max(min(self.samples, 8), round(self.samples / max(ratio, 1))),
+                       views=-(-self.views // every), step=self.step * every)
 
     @property
     def stems(self) -> list[str]:

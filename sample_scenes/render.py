@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Make a sample capture: `python sample_scenes/render.py [--scene desk] [--out FOLDER]`.
+"""Make a sample capture: `python sample_scenes/render.py [--scene desk] [--out FOLDER] [--width PX] [--every N]`.
 
 Renders the scene with Cycles, traces the flares, adds them in linear light, exposes the frames, matches features and
 triangulates the points. Views that exist already are kept, so an interrupted run resumes; delete truth/flare, images
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +86,7 @@ def write_lights_and_split(scene: SceneDescription, out: Path) -> None:
     write_json(out / LIGHTS, {"lights": [
         {"name": light.name, "xyz": list(light.xyz), "radius": light.radius, "colour": list(light.colour)}
         for light in scene.lights]})
-    held_out = sorted(set(scene.stems[4::8]) | {f"{number:04d}" for number in scene.held_out})
+    held_out = sorted(set(scene.stems[4::8]) | {f"{number:04d}" for number in scene.held_out} & set(scene.stems))
     write_json(out / "split.json", {"test": [f"{stem}{FRAME_SUFFIX}" for stem in held_out]})
 
 
@@ -99,14 +100,26 @@ def make_capture(scene: SceneDescription, out: Path, progress: Progress) -> None
     write_model(scene, out, progress)
 
 
+def _at_least(least: int) -> Callable[[str], int]:
+    """Return the reader of an argument that is a whole number of at least `least`."""
+    def number(text: str) -> int:
+        if int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text} is less than {least}")
+        return int(text)
+    return number
+
+
 def main() -> int:
     """Make the capture that the arguments name; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, help="capture folder to write; else build/sample_scenes/SCENE")
     parser.add_argument("--scene", choices=sorted(SCENES), default="desk")
+    parser.add_argument("--width", type=_at_least(32), metavar="PX", help="width of the pictures; else the scene's")
+    parser.add_argument("--every", type=_at_least(1), default=1, metavar="N", help="render only every N-th view")
     args = parser.parse_args()
     out = args.out or CACHE / args.scene
-    return run_command(lambda progress: make_capture(SCENES[args.scene], out, progress))
+    scene = SCENES[args.scene].resampled(args.width, args.every)
+    return run_command(lambda progress: make_capture(scene, out, progress))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -57,8 +56,9 @@ def light_visibilities(scene: SceneGaussians, model: FlareModel, world_to_camera
     frame: name of the frame, for lights that move.
     """
     pose = world_to_camera.double()
+    lights = model.positions_in(frame)
     camera = -pose[:3, :3].T @ pose[:3, 3]
-    visibilities = _visibilities(scene, camera, list(model.positions_in(frame)), settings, kernels)
+    visibilities = _visibilities(scene, camera.expand(len(lights), 3), lights, settings, kernels)
     return {name: relative_to_clear(visibility, clear)
             for name, visibility, clear in zip(model.names, visibilities, model.clear, strict=True)}
 
@@ -116,15 +116,11 @@ def clear_visibilities(scene: SceneGaussians, model: FlareModel, poses: Sequence
     A quantile below MIN_CLEAR becomes 0, for unknown: the scene hides the light from everywhere, for example if the
     light lies inside an object. frames: name of each pose's frame, needed if lights move.
     """
-    eyes = [-pose[:3, :3].double().T @ pose[:3, 3].double() for pose in poses]
-    places = [model.positions_in(frame) for frame in frames or [""] * len(poses)]
-    quantiles = []
-    for number in range(len(model.names)):
-        visibilities = torch.stack([
-            light_visibility(scene, eye, lights[number], settings, kernels)
-            for eye, lights in zip(eyes, places, strict=True)])
-        quantiles.append(visibilities.quantile(CLEAR_QUANTILE))
-    clear = torch.stack(quantiles).clamp(max=1)
+    eyes = torch.stack([-pose[:3, :3].double().T @ pose[:3, 3].double() for pose in poses])
+    lights = torch.stack([model.positions_in(frame).double() for frame in frames or [""] * len(poses)])  # (views, l, 3)
+    visibilities = _visibilities(scene, eyes[:, None].expand_as(lights).reshape(-1, 3), lights.reshape(-1, 3), settings,
+                                 kernels)
+    clear = visibilities.view(lights.shape[:2]).quantile(CLEAR_QUANTILE, dim=0).clamp(max=1)
     return clear.masked_fill(clear < MIN_CLEAR, 0)
 
 
@@ -136,8 +132,10 @@ def occlusion_loss(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor],
     negative logarithm of the visibilities: behind many layers, the visibility itself hardly changes with a single
     layer. None without lights.
     """
-    visibilities = [light_visibility(scene, eye, light, settings, kernels) for light in lights]
-    return -OCCLUSION_WEIGHT * (torch.stack(visibilities) + MIN_VISIBILITY).log().sum() if visibilities else None
+    if not lights:
+        return None
+    visibilities = _visibilities(scene, eye.expand(len(lights), 3), torch.stack(list(lights)), settings, kernels)
+    return -OCCLUSION_WEIGHT * (visibilities + MIN_VISIBILITY).log().sum()
 
 
 def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings | None = None,
@@ -147,86 +145,45 @@ def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings
     A small camera that looks from the eye at the light rasterizes the Gaussians in between; the visibility is the mean
     transmittance over a Gaussian window, the light's soft disk.
     """
-    return _visibilities(scene, eye, [light], settings or VisibilitySettings(), kernels)[0]
+    return _visibilities(scene, eye[None], light[None], settings or VisibilitySettings(), kernels)[0]
 
 
-class _SelectRows(torch.autograd.Function):
-    """Rows of several tensors, by one list of row numbers for each light.
-
-    The gradients of all lights are added up in one tensor of the size of the input.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, rows_by_light: Sequence[Tensor], *parts: Tensor) -> tuple[Tensor, ...]:
-        """Return the selected rows of each part, light after light. Rows are not repeated in a list."""
-        ctx.rows_by_light, ctx.shapes = rows_by_light, [part.shape for part in parts]
-        return tuple(part.index_select(0, rows) for rows in rows_by_light for part in parts)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        sums = [gradients[0].new_zeros(shape) for shape in ctx.shapes]
-        for number, gradient in enumerate(gradients):
-            sums[number % len(sums)].index_add_(0, ctx.rows_by_light[number // len(sums)], gradient)
-        return (None, *sums)
+def _visibilities(scene: SceneGaussians, eyes: Tensor, lights: Tensor, settings: VisibilitySettings,
+                  kernels: Kernels) -> Tensor:
+    """Return (m,), the `light_visibility` of each light from a camera; eyes, lights: (m, 3)."""
+    fused = fused_kernels(scene.means) if kernels in ("auto", "cpu") else None
+    far = scene.far
+    visibilities = None if fused is None else fused.mean_transmittances(
+        scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits, eyes, lights,
+        _disk_weights(settings.pixels), near=scene.near, margin=settings.margin, radius=settings.radius,
+        centre=(0.0, 0.0, 0.0) if far is None else far.centre,
+        max_distance=math.inf if far is None else far.min_distance)
+    if visibilities is None:
+        return torch.stack([_mean_transmittance(scene, eye, light, settings, kernels)
+                            for eye, light in zip(eyes, lights, strict=True)])
+    return visibilities
 
 
-class _SightLine(NamedTuple):
-    """The line of sight to a light.
-
-    pose: (4, 4), world to camera, of a small camera that looks along it. distance: of the light, world units. rows: of
-    the scene's Gaussians that may hide the light.
-    """
-
-    pose: Tensor
-    distance: float
-    rows: Tensor
-
-
-def _visibilities(scene: SceneGaussians, eye: Tensor, lights: Sequence[Tensor], settings: VisibilitySettings,
-                  kernels: Kernels) -> list[Tensor]:
-    """Return the `light_visibility` of each light (3,) from a camera at `eye` (3,).
-
-    The Gaussians that may hide a light are selected for all lights together: the gradient of each selection has the
-    size of the whole scene.
-    """
-    sight_lines = [_sight_line(scene, eye, light, settings, kernels) for light in lights]
-    rows = [line.rows for line in sight_lines if line is not None]
-    parts = scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits
-    selected = iter(cast(tuple[Tensor, ...], _SelectRows.apply(rows, *parts)) if rows else ())
-    return [scene.means.new_ones(()) if line is None else
-            _mean_transmittance([next(selected) for _ in parts], line.pose, _near_plane(scene, line.distance), settings,
-                                kernels)
-            for line in sight_lines]
-
-
-def _sight_line(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings,
-                kernels: Kernels = "auto") -> _SightLine | None:
-    """Return the line of sight from `eye` (3,) to a light (3,); None for a light at the eye, which nothing hides."""
+def _mean_transmittance(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings,
+                        kernels: Kernels) -> Tensor:
+    """Return the mean transmittance (scalar, 0..1) of the Gaussians between a camera at `eye` and a light, (3,) each,
+    over the light's soft disk: the definition. It is 1 for a light at the eye."""
     direction = (light - eye).float().numpy()
     distance = float(np.linalg.norm(direction))
     if distance <= 0:
-        return None
-    pose = _look_along(eye.float().numpy(), direction / np.float32(distance))
-    return _SightLine(pose, distance, _occluder_rows(scene, pose, distance, settings, kernels))
-
-
-def _mean_transmittance(occluders: Sequence[Tensor], pose: Tensor, near: float, settings: VisibilitySettings,
-                        kernels: Kernels) -> Tensor:
-    """Return the mean transmittance (scalar, 0..1) of Gaussians over a light's soft disk.
-
-    occluders: means, quaternions, log_scales and opacity_logits of `SceneGaussians`. pose: (4, 4), world to camera, of
-    the small camera that looks at the light. near: its near plane, world units.
-    """
-    means, quaternions, log_scales, opacity_logits = occluders
+        return scene.means.new_ones(())
+    pose = _look_along(eye.float().numpy(), direction / np.float32(distance)).to(scene.means)
+    rows = _find_occluders(scene, pose, distance, settings)
     size, half = settings.pixels, settings.pixels / 2
     # The picture's edge is at twice the disk's radius, which is the window's standard deviation.
     focal = half / (2 * settings.radius)
     intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
     # Colours are not needed, and their gradient would cost most.
-    colourless = means.new_zeros(len(means), 1, 3)
-    alpha = rasterization(means, quaternions, log_scales, opacity_logits, colourless, pose.to(means),
-                          intrinsics.to(means), size, size, near=near, depth=False, kernels=kernels, raw=True).alpha
-    return ((1 - alpha) * _disk_weights(size).to(means)).sum()
+    colourless = scene.means.new_zeros(len(rows), 1, 3)
+    alpha = rasterization(scene.means[rows], scene.quaternions[rows], scene.log_scales[rows],
+                          scene.opacity_logits[rows], colourless, pose, intrinsics.to(pose), size, size,
+                          near=_near_plane(scene, distance), depth=False, kernels=kernels, raw=True).alpha
+    return ((1 - alpha) * _disk_weights(size).to(pose)).sum()
 
 
 @cache
@@ -244,25 +201,13 @@ def _near_plane(scene: SceneGaussians, distance: float) -> float:
     return min(1e-3 * distance, scene.near)
 
 
-def _occluder_rows(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings,
-                   kernels: Kernels) -> Tensor:
-    """Return the rows of Gaussians between camera and light that may touch the small picture, without the far layer.
-
-    pose: world_to_camera (4, 4) of the small camera. distance: from camera to light.
-    """
-    fused = None if kernels == "torch" else fused_kernels(scene.means)
-    far = scene.far
-    # The picture's corners are at 2 sqrt(2) radii from its middle.
-    rows = None if fused is None else fused.find_occluders(
-        scene.means, scene.log_scales, pose, (_near_plane(scene, distance), (1 - settings.margin) * distance),
-        4 * settings.radius, (0.0, 0.0, 0.0) if far is None else far.centre,
-        math.inf if far is None else far.min_distance)
-    return _find_occluders(scene, pose.to(scene.means), distance, settings) if rows is None else rows
-
-
 @torch.no_grad()
 def _find_occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
-    """Return the rows of `_occluder_rows`, computed by torch: the definition. pose: (4, 4), on the scene's device."""
+    """Return the rows of Gaussians between camera and light that may touch the small picture, without the far layer.
+
+    pose: world_to_camera (4, 4) of the small camera, on the scene's device. distance: from camera to light.
+    """
+    # The picture's corners are at 2 sqrt(2) radii from its middle.
     x, y, depth = (scene.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     reach = 3 * scene.log_scales.amax(-1).exp()
     between = (depth > _near_plane(scene, distance)) & (depth < (1 - settings.margin) * distance)

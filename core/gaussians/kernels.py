@@ -98,9 +98,10 @@ class FusedKernels(Protocol):
         self, positions: Tensor, latent: Tensor | None, bands: int, view: Tensor, encoded_weight: Tensor,
         layers: Sequence[tuple[Tensor, Tensor]],
     ) -> Tensor | None: ...  # fmt: skip
-    def find_occluders(
-        self, means: Tensor, log_scales: Tensor, pose: Tensor, depths: tuple[float, float], slope: float,
-        centre: tuple[float, ...], max_distance: float,
+    def mean_transmittances(
+        self, means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, eyes: Tensor,
+        lights: Tensor, disk: Tensor, *, near: float, margin: float, radius: float, centre: tuple[float, ...],
+        max_distance: float,
     ) -> Tensor | None: ...  # fmt: skip
     def upsample(
         self, colour: Tensor, t: Tensor, factor: int, width: int, height: int

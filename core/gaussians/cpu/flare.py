@@ -29,6 +29,7 @@ import numpy as np
 from .. import rendering
 from .binning import CULLED_KEY, exclusive_sum
 from .compilation import inlined, kernel
+from .ellipse import MARGIN
 from .layout import (
     ALPHA_MIN,
     BLUE,
@@ -75,7 +76,7 @@ from .layout import (
     X,
     Y,
 )
-from .projection import MARGIN, RUN_LOG2_RANGE, RUN_MAX
+from .projection import RUN_LOG2_RANGE, RUN_MAX
 from .raster_backward import PADDED_ROW, SCRATCH, V_BLUE, V_GREEN, V_RED, init_tile_backward, moments, row_gradient
 from .raster_backward import ROW as ROW_BACKWARD
 from .raster_backward import STATE as STATE_BACKWARD

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..rendering import Rendering
-from . import buffers, layout, projection, raster_backward, raster_forward, stepping
+from . import buffers, ellipse, layout, projection, raster_backward, raster_forward, stepping
 from .buffers import Array
 from .threads import parallel
 from .tiles import EMPTY, TileGrid, bin_gaussians, flat
@@ -46,8 +46,8 @@ class _Rasterize(torch.autograd.Function):
         Puts centres and radii into options.projected, and zeros into centre_gradients (n, 2). colour_slopes are written
         for the backward pass alone."""
         n, w, h = len(means), options.width, options.height
-        camera = np.empty(projection.CAMERA, np.float32)
-        projection.pack_camera(
+        camera = np.empty(ellipse.CAMERA, np.float32)
+        ellipse.pack_camera(
             flat(world_to_camera), flat(intrinsics), w, h, options.near, options.dilation, camera
         )
         records, gaussian_depths, max_tiles, first_slots, small_tiles, small_rows = buffers.empty_many(

@@ -369,3 +369,15 @@ def test_the_split_holds_out_hard_views(sample: Capture) -> None:
             places, depth = view.camera.project(np.array([light.xyz for light in sample.lights]))
             outside += bool(((places < 0) | (places > (480, 270))).any() and (depth > 0).all())
         assert outside >= 2
+
+
+def test_a_capture_can_be_rendered_wider_and_with_fewer_views() -> None:
+    """Each view that is left is the same but for its pixels."""
+    scene = SCENES["desk"]
+    wide = scene.resampled(1920, 7)
+    assert wide.camera == scene.camera.scaled(1920, 1080) and wide.samples < scene.samples
+    assert wide.stems == scene.stems[::7]
+    assert np.array_equal(wide.poses, scene.poses[::7])
+    assert wide.resampled(None, 2).stems == scene.stems[::14]
+    assert scene.resampled(None, 1) == scene
+    assert scene.resampled(scene.camera.width // 4, 1).samples == scene.samples

@@ -2,9 +2,9 @@
 """Compiles functions with numba on their first call, and caches the machine code on disk for the next start.
 
 The cache lies in a folder of the user, so that the package itself may be read-only; the environment variable
-FIT_FLARE_CACHE names another folder. The folder's last part is a fingerprint of all sources beside the function, since
-numba detects changes only in the file of a function and not in the files it calls, and of the package's full name,
-which numba stores and which differs inside Blender.
+FIT_FLARE_CACHE names another folder. The folder's last part is a fingerprint of all sources beside the function and of
+those whose constants the machine code contains, since numba detects changes only in the file of a function and not in
+the files it calls; and of the package's full name, which numba stores and which differs inside Blender.
 """
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ from pathlib import Path
 from typing import Any
 
 import numba
+
+PROGRAM = Path(__file__).resolve().parents[1]
+"""Folder of the package `core`."""
+CONSTANT_PACKAGES = ("conventions", "colour")
+"""Packages whose constants kernels contain, beside those of the package above the kernels."""
 
 
 def compile_cached(function: Callable[..., Any], **options: Any) -> Any:
@@ -61,11 +66,12 @@ def _user_folder() -> Path:
 
 
 def _fingerprint(package: str, sources: Path) -> str:
-    """Return a hash of numba's version, the package's name and its sources."""
+    """Return a hash of numba's version, the package's name, its sources and those of its constants."""
     # The machine code names the modules it came from, and the tree may be imported under several names.
     digest = hashlib.sha256(f"{numba.__version__} {package}".encode())
-    for source in sorted(sources.glob("*.py")):
-        digest.update(source.read_bytes())
+    for folder in (sources, sources.parent, *(PROGRAM / name for name in CONSTANT_PACKAGES)):
+        for source in sorted(folder.glob("*.py")):
+            digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
 

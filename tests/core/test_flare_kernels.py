@@ -57,6 +57,19 @@ def test_light_added_over_a_constant_scene_has_no_gradient_for_it() -> None:
         assert torch.equal(add_light(scene, light, 1.0), add_light(scene, light.detach().requires_grad_(), 1.0))
 
 
+@pytest.mark.parametrize("has_black", [True, False])
+def test_added_light_keeps_nan_and_clips_infinity(has_black: bool) -> None:
+    """A diverged flare or scene stays visible to the check of the loss."""
+    scene, light = torch.full((4, 8, 3), 0.5), torch.full((4, 8, 3), 0.25)
+    light[0, 0, 1], light[1, 1] = float("nan"), float("inf")
+    scene[2, 2, 0] = float("nan")
+    black = torch.zeros(4, 8, dtype=torch.bool)
+    black[0, 0] = black[1, 1] = True
+    result = add_light(scene, light, 1.0, black if has_black else None)
+    assert torch.equal(result.isnan(), light.isnan() | scene.isnan())
+    assert torch.equal(result[1, 1], torch.ones(3)) and torch.equal(result[3], result[3, :1].expand(8, 3))
+
+
 @pytest.mark.parametrize(("count", "has_far_layer", "opacity_logit"), [
     (16, False, 2.0), (37, True, 0.0), (300, False, -3.0), (5000, True, -5.0), (4100, False, -5.0),
     (8200, False, -5.0)])  # counts about whole chunks

@@ -54,6 +54,24 @@ def test_a_tree_that_is_imported_by_two_names_has_two_caches(tmp_path: Path) -> 
     assert first != second and hits == 0
 
 
+@pytest.mark.parametrize("changed", ["program/kernels/a.py", "program/above.py", "program/colour/curve.py"])
+def test_each_source_of_a_kernel_and_of_its_constants_changes_the_cache(
+        changed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("program/kernels/a.py", "program/above.py", "program/colour/curve.py", "program/other/b.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("GAMMA = 2.4\n")
+    monkeypatch.setattr(kernel_cache, "PROGRAM", tmp_path / "program")
+
+    def fingerprint() -> str:
+        return kernel_cache._fingerprint("program.kernels", tmp_path / "program" / "kernels")
+
+    before = fingerprint()
+    (tmp_path / "program/other/b.py").write_text("GAMMA = 2.2\n")
+    assert fingerprint() == before
+    (tmp_path / changed).write_text("GAMMA = 2.2\n")
+    assert fingerprint() != before
+
+
 def test_an_unusable_folder_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("FIT_FLARE_CACHE", str(tmp_path / "file"))

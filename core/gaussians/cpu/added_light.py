@@ -4,10 +4,11 @@
 
 A scene's value is decoded to linear light, light is added, and the sum is encoded (`core.colour.srgb_torch`). A power
 x^p is 2^(p log2 x). The forward pass keeps the derivatives of the result by light and scene, so that the backward pass
-is one product each. Clips have a straight-through gradient.
+is one product each. Clips have a straight-through gradient. NaN stays NaN.
 """
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from .vector import LANES, atomic_increment, exp2, fma, load, log2, maximum, min
 PIXELS_PER_TASK = 1 << 12
 """Fewest pixels that a thread processes at a time, in a picture that has so many."""
 NO_MASK = np.empty(0, np.bool_)
+INFINITY = np.float32(np.inf)
 
 ZERO, TOE_SLOPE, INVERSE_TOE_SLOPE = np.float32(0), np.float32(curve.TOE_SLOPE), np.float32(1 / curve.TOE_SLOPE)
 DISPLAY_TOE, LINEAR_TOE = np.float32(curve.DISPLAY_TOE), np.float32(curve.LINEAR_TOE)
@@ -48,16 +50,17 @@ def add_light_kernel(counter, scene, light, black, white, tasks, display, scene_
         first_pixel, end_pixel = pixels * task // tasks, pixels * (task + 1) // tasks
         for block in range(3 * first_pixel, 3 * end_pixel, LANES):
             i = min(block, 3 * end_pixel - LANES)  # the last block overlaps the one before
-            behind = minimum(maximum(load(scene, i), ZERO), white)
+            behind = minimum(splat(white), maximum(splat(ZERO), load(scene, i)))  # NaN, as second, stays NaN
             base = fma(behind, INVERSE_SCALE, splat(SHIFT))
             power = exp2(log2(base) * DECODE_POWER)
             is_low = behind <= DISPLAY_TOE
             linear = where(is_low, behind * INVERSE_TOE_SLOPE, base * power) + load(light, i)
-            bright = maximum(linear, LINEAR_TOE)
+            bright = maximum(splat(LINEAR_TOE), linear)
             root = exp2(log2(bright) * ENCODE_POWER)
             is_dark = linear <= LINEAR_TOE
             encoded = where(is_dark, linear * TOE_SLOPE, fma(root, SCALE, splat(-OFFSET)))
-            store(display, i, minimum(maximum(encoded, ZERO), white))
+            clipped = minimum(splat(white), maximum(splat(ZERO), encoded))
+            store(display, i, where(linear <= INFINITY, clipped, linear))  # log2 of NaN is a number
             if light_slope.size > 0:
                 slope = where(is_dark, splat(TOE_SLOPE), root * ENCODE_SLOPE / bright)
                 store(light_slope, i, slope)
@@ -70,7 +73,7 @@ def add_light_kernel(counter, scene, light, black, white, tasks, display, scene_
                         is_dark = light[i] <= LINEAR_TOE
                         root = max(light[i], LINEAR_TOE) ** ENCODE_POWER
                         encoded = light[i] * TOE_SLOPE if is_dark else root * SCALE - OFFSET
-                        display[i] = min(max(encoded, ZERO), white)
+                        display[i] = encoded if math.isnan(encoded) else min(max(encoded, ZERO), white)
                         if light_slope.size > 0:
                             light_slope[i] = TOE_SLOPE if is_dark else root * ENCODE_SLOPE / light[i]
                         if scene_slope.size > 0:

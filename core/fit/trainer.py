@@ -243,11 +243,9 @@ class Trainer(FlareTrainer):
 
     @property
     def _steps_in_backward(self) -> bool:
-        """Return whether all gradients of the scene come from one rendering, so that the backward pass may take the
-        optimiser's step."""
-        settings = self.settings
-        return (self.fits_scene and settings.scene.strategy == "classic"
-                and settings.flare.active_visibility is None)
+        """Return whether all gradients of the scene come from one rendering and the visibilities of the lights, so that
+        the backward pass may take the optimiser's step."""
+        return self.fits_scene and self.settings.scene.strategy == "classic"
 
     def _update_clear_visibility(self) -> None:
         """Update the lights' clear visibility (that behind the scene where nothing hides them) every CLEAR_INTERVAL

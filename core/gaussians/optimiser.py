@@ -82,8 +82,8 @@ class Adam:
         then need not write to memory. The CPU kernels do so.
 
         These steps equal those of `step`, which afterwards steps the other parameters; gradients of stepped parameters
-        stay None. Only for a scene whose whole gradient comes from one `rasterization`: raises RunError if a parameter
-        gets a gradient after its step.
+        stay None. Only for a scene whose whole gradient comes from one `rasterization`, and from visibilities of lights
+        that were computed after it: raises RunError if a parameter gets a gradient after its step.
         """
         fused: FusedKernels | None = None
         offered_steps: dict[str, Any] = {}

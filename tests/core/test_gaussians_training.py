@@ -17,6 +17,7 @@ from core.capture import Camera, PointCloud
 from core.errors import RunError, SettingsError
 from core.fit.optimisers import Optimisers
 from core.fit.settings import FitSettings
+from core.flare.visibility import light_visibility
 from core.gaussians import Adam, Rendering, SceneGaussians, kernels, l1_ssim, ssim
 from core.gaussians.densification import Classic, ClassicSettings, Mcmc, McmcSettings, relocated_opacity_and_scale
 from core.gaussians.optimiser import TorchStep, adam_step, adam_steps
@@ -218,8 +219,12 @@ def test_the_rate_decays_exponentially() -> None:
 CAMERA = Camera(36, 28, 40.0, 40.0, 18.0, 14.0, np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]))
 
 
+EYE, LIGHT = torch.tensor([0.0, 0, -4]), torch.tensor([0.1, 0.2, 3])
+
+
+@pytest.mark.parametrize("has_light", [False, True])
 @pytest.mark.parametrize("n", [10, 60, 1029, 1060, 2100])
-def test_steps_in_backward_equal_separate_steps(n: int) -> None:
+def test_steps_in_backward_equal_separate_steps(n: int, has_light: bool) -> None:
     """Chunks of Gaussians of which the last is short, and numbers too few for a vector, which are not stepped there."""
     target = torch.rand(28, 36, 3, generator=torch.Generator().manual_seed(1))
 
@@ -229,6 +234,9 @@ def test_steps_in_backward_equal_separate_steps(n: int) -> None:
         optimiser.zero_grad()
         for degree in (1, 3, 3):
             loss = l1_ssim(scene.render(CAMERA, degree).colour, target, 0.8)
+            if has_light:
+                for light in (LIGHT, -LIGHT):
+                    loss = loss + light_visibility(scene, EYE, light)
             with optimiser.step_in_backward() if early else nullcontext():
                 loss.backward()
             optimiser.step()
@@ -242,6 +250,21 @@ def test_steps_in_backward_equal_separate_steps(n: int) -> None:
         assert torch.allclose(dict(scene.named_parameters())[name], parameter, atol=1e-5), name
         for a, b in zip(optimiser.moments[name], later.moments[name], strict=True):
             assert torch.allclose(a, b, rtol=1e-4, atol=1e-9), name
+
+
+def test_without_a_rendering_the_gradient_of_a_visibility_is_stepped_later() -> None:
+    scene, optimiser = some_scene(100)
+    optimiser.zero_grad()
+    light_visibility(scene, EYE, LIGHT).backward()
+    expected = scene.log_scales.grad
+    optimiser.zero_grad()
+    with optimiser.step_in_backward():
+        light_visibility(scene, EYE, LIGHT).backward()
+    assert expected is not None and scene.log_scales.grad is not None
+    assert torch.equal(scene.log_scales.grad, expected) and float(expected.abs().max()) > 0
+    before = scene.log_scales.clone()
+    optimiser.step()
+    assert not torch.equal(scene.log_scales, before)
 
 
 @pytest.mark.skipif(not kernels.is_available("cpu"), reason="the CPU kernels step early")

@@ -329,16 +329,27 @@ def _project_block_backward(
         )
 
 
+@inlined
+def _add_array(sums, values):
+    """Add values to the first numbers of an array."""
+    vector_end = values.size - values.size % LANES
+    for i in range(0, vector_end, LANES):
+        store(sums, i, load(sums, i) + load(values, i))
+    for i in range(vector_end, values.size):
+        sums[i] += values[i]
+
+
 @kernel
 def project_backward(
     counter, scratch, parameters, sh_width, degree, raw, camera, records, colour_slopes, gradients, first_slots,
-    counts, d_parameters, d_centres, d_camera, with_camera, first_moments, second_moments, rates, constants,
+    counts, d_parameters, d_centres, d_camera, with_camera, first_moments, second_moments, rates, constants, added,
 ):  # fmt: skip
     """Write the gradients of all inputs from the rasterizer's gradient rows.
 
     parameters: means, quats, scales, opacities, and sh if they are stepped; d_parameters: the gradients of all five. If
     these are empty, the parameters are stepped by their gradients instead, chunk by chunk; first_moments,
-    second_moments, rates, constants: of Adam, an array for each parameter. gradients: one row for each pair of
+    second_moments, rates, constants: of Adam, an array for each parameter; added: gradients that are added to these,
+    empty for none. gradients: one row for each pair of
     Gaussian and tile; Gaussian i has counts[i] rows from first_slots[i] on. d_camera (chunks, CAMERA_SUMS): sums of
     each chunk, if with_camera. counter: index of the next chunk, from the end; scratch: workspace of SCRATCH numbers,
     or of STEP_SCRATCH if parameters are stepped. The module head lists the others."""
@@ -379,6 +390,8 @@ def project_backward(
             for i in range(len(parameters)):
                 width = parameters[i].size // n
                 start_number, end_number = start * width, end * width
+                if added[i].size > 0:
+                    _add_array(targets[i], added[i][start_number:end_number])
                 step_array(
                     parameters[i][start_number:end_number], targets[i], first_moments[i][start_number:end_number],
                     second_moments[i][start_number:end_number], rates[i], unpack_constants(constants[i]),

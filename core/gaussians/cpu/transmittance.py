@@ -57,6 +57,7 @@ from .ellipse import (
 from .ellipse import DILATION as DILATION_AT
 from .layout import ALPHA_MIN, ONE, OPACITY, OPACITY_MAX, RECORD, ZERO, A, D, G, K, X, Y
 from .raster_forward import POWER_MIN
+from .stepping import add_gradients
 from .threads import parallel
 from .tiles import flat
 from .vector import (
@@ -263,6 +264,8 @@ class _MeanTransmittances(torch.autograd.Function):
         gradients, arrays = zip(*(buffers.tensor_and_array(*part.shape) for part in parameters), strict=True)
         parallel(transmittance_backward_kernel, *map(flat, parameters), ctx.lines, ctx.size, _pixel_centres(ctx.size),
                  ctx.chunks, weights, *arrays, scratch=2 * SQUARE, limit=ctx.chunks)
+        if add_gradients(parameters, gradients):
+            return (None,) * (2 + len(parameters))
         return (None, None, *gradients)
 
 

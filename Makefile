@@ -9,7 +9,7 @@ AGAIN = sh -c 'for pause in $(PAUSES); do "$$@" && exit; sleep $$pause; done; "$
 PYTHON313 ?= $(shell for python in python3.13 "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/3.13.*/bin/python3.13; do \
 	"$$python" -c "import ensurepip, venv" 2> /dev/null && echo "$$python" && break; done)
 
-.PHONY: demo pictures test check setup package clean
+.PHONY: demo pictures test check kernels setup package clean
 
 demo: .venv/.ready
 	.venv/bin/python headless/run.py demo
@@ -20,8 +20,13 @@ pictures: demo
 	.venv/bin/python -c "import cv2; cv2.imwrite('docs/lights.jpg', cv2.imread('build/demo/capture/lights/sheet1.png')[:606], [cv2.IMWRITE_JPEG_QUALITY, 88])"
 	.venv/bin/python sample_scenes/make_library.py --sheet docs/library.jpg
 
-test: setup check
+test: setup
+	$(MAKE) --jobs 2 check kernels
 	.venv/bin/python -m pytest -n logical --maxprocesses 4 --dist loadfile
+
+# Machine code of the kernels, so that the tests' processes do not each compile it.
+kernels: .venv/.ready
+	.venv/bin/python -m tests.compile_kernels
 
 check: .venv/.ready
 	.venv/bin/ruff check .

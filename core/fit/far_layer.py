@@ -5,8 +5,9 @@ far points that the scene starts from there. `initialise` calls it.
 Structure from motion has no points there, and a scene that grows over such places from near points has wrong depths
 there. A sphere sweep decides: it projects each direction into the frames, as a point on an infinite sphere and as
 points on some near spheres about the cameras, and compares the frames there. In a far direction the frames agree on the
-infinite sphere and differ on the near ones. In a plain direction, such as a clear sky, they agree on all, so it is
-decided like the directions with contrast about it. On a near surface they agree on none.
+infinite sphere and differ on the near ones. In a plain direction they agree on all, so it is decided like the
+directions with contrast about it. On a near surface they agree on none. In an even sky, a far light decides
+(`plain_sky`).
 """
 from __future__ import annotations
 
@@ -16,18 +17,31 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..capture import Camera, Capture, PointCloud, View
 from ..colour.srgb_torch import expose
 from ..gaussians.far_sphere import FarSphere
-from ..gaussians.scene import SceneGaussians
+from ..gaussians.scene import INITIAL_OPACITY, SceneGaussians
 from ..images.picture import Picture
 from .frames import Frames, Targets, subsample
-from .sky import fibonacci_directions
+from .plain_sky import Sky, far_lights, find_plain_sky, widened
+from .sweep_views import (
+    SWEEP_WIDTH,
+    Booleans,
+    Floats,
+    SweepView,
+    Values,
+    bilinear,
+    camera_centre,
+    camera_spread,
+    make_sweep_view,
+    nearest_indices,
+    project_sphere,
+    visible_directions,
+)
 
-SWEEP_VIEWS, SWEEP_WIDTH = 24, 120
-"""Approximate number of views of the sweep, and their width in pixels."""
+SWEEP_VIEWS = 24
+"""Approximate number of views of the sweep."""
 PITCH_PX = 1.7
 """Distance of neighbouring directions of the sweep, pixels of its pictures."""
 PATCH_PITCHES = 3.0
@@ -58,33 +72,19 @@ FARTHEST_QUANTILE = 0.99
 POINT_PITCH_PX = 4.0
 """Distance of neighbouring far points, pixels of the fit's frames."""
 MAX_POINTS = 16_000
+SKY_OPACITY = 0.5
+"""Opacity that Gaussians of the sky about a far light start with. Those that something hides in all views keep it."""
 COLOUR_QUANTILE = 0.25
 """Quantile of the views' colours that a far point takes where the frames have a flare: flares only add light."""
-
-DIRECTIONS_AT_ONCE = 4096
-"""Directions that are compared with others at a time; bounds the memory."""
-
-Floats = NDArray[np.float64]
-Values = NDArray[np.float32]
-Booleans = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class FarLayer:
-    """The far points of a capture, and the sphere that they lie on."""
+    """The far points (n) of a capture, the sphere that they lie on, and the opacities (n,) that they start with."""
 
     sphere: FarSphere
     points: PointCloud
-
-
-@dataclass(frozen=True, eq=False)
-class SweepView:
-    """A view of the sweep: its small camera, its picture (height, width, 3), display values, and which pixels (height,
-    width) count, None for all."""
-
-    camera: Camera
-    picture: Values
-    counts: Booleans | None
+    opacities: Floats
 
 
 def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) -> FarLayer | None:
@@ -95,17 +95,31 @@ def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) ->
     """
     sampled = subsample(views, SWEEP_VIEWS)
     cameras = [view.camera.scaled(min(SWEEP_WIDTH, view.camera.width)) for view in sampled]
-    spread = _camera_spread(cameras)
+    spread = camera_spread(cameras)
     if not len(capture.points) or not spread or capture.is_rotation_only:
         return None
-    patches = classify_patches([_make_sweep_view(view, frames) for view in sampled])
-    if patches is None:
+    sweep_views = [make_sweep_view(view, frames) for view in sampled]
+    patches = classify_patches(sweep_views)
+    sky = _find_sky(capture, sweep_views)
+    if patches is None and sky is None:
         return None
-    distances = np.linalg.norm(capture.points.xyz - _camera_centre(cameras), axis=1)
+    distances = np.linalg.norm(capture.points.xyz - camera_centre(cameras), axis=1)
     focal = max(frames.camera(view).focal_length for view in sampled)  # the longest lens shows the most parallax
     radius = max(RADIUS_FACTOR * float(np.quantile(distances, FARTHEST_QUANTILE)), spread * focal / MAX_PARALLAX_PX)
-    sphere = FarSphere(tuple(map(float, _camera_centre(cameras))), radius)
-    return FarLayer(sphere, _make_far_points(sphere, patches, sampled, frames))
+    sphere = FarSphere(tuple(map(float, camera_centre(cameras))), radius)
+    return FarLayer(sphere, *_make_far_points(sphere, _FarParts(patches, sky), sampled, frames))
+
+
+def _find_sky(capture: Capture, views: list[SweepView]) -> Sky | None:
+    """Return the sky about the far lights of a capture; None without such a light, or if no view shows it in an even
+    sky."""
+    cameras = [view.camera for view in views]
+    places = np.array([light.xyz for light in capture.lights if not light.moves]).reshape(-1, 3)
+    lights = far_lights(places, capture.points.xyz, cameras)
+    if not len(lights):
+        return None
+    pitch = PITCH_PX / float(np.median([camera.focal_length for camera in cameras]))
+    return find_plain_sky(views, lights, capture.points.xyz, pitch)
 
 
 def far_layer_messages(scene: SceneGaussians) -> tuple[str, ...]:
@@ -125,7 +139,24 @@ class Patches:
 
     def are_far(self, directions: Floats) -> Booleans:
         """Return (m,) whether the patches of directions (m, 3) are far."""
-        return self.is_far[_nearest_indices(directions, self.directions)]
+        return self.is_far[nearest_indices(directions, self.directions)]
+
+
+@dataclass(frozen=True, eq=False)
+class _FarParts:
+    """What is far in a capture: patches by the sphere sweep, and the sky about a far light; None without."""
+
+    patches: Patches | None
+    sky: Sky | None
+
+    def contain(self, directions: Floats) -> Booleans:
+        """Return (m,) whether directions (m, 3) are far."""
+        is_far = np.zeros(len(directions), bool)
+        if self.patches is not None:
+            is_far |= self.patches.are_far(directions)
+        if self.sky is not None:
+            is_far |= self.sky.contains(directions)
+        return is_far
 
 
 def classify_patches(views: list[SweepView]) -> Patches | None:
@@ -158,15 +189,15 @@ def sweep_patches(views: list[SweepView]) -> SweepCosts:
     cameras = [view.camera for view in views]
     focal = float(np.median([camera.focal_length for camera in cameras]))
     pitch = PITCH_PX / focal
-    directions = _visible_directions(cameras, pitch)
-    patch_directions = _visible_directions(cameras, PATCH_PITCHES * pitch)
-    patch_indices = _nearest_indices(directions, patch_directions)
+    directions = visible_directions(cameras, pitch)
+    patch_directions = visible_directions(cameras, PATCH_PITCHES * pitch)
+    patch_indices = nearest_indices(directions, patch_directions)
     sizes = np.bincount(patch_indices, minlength=len(patch_directions))  # directions in each patch
     parallaxes = (0.0, BARE_PARALLAX_PX, *PARALLAXES_PX)  # of the spheres: infinite, bare parallax, near
     costs = np.full((len(parallaxes), len(patch_directions)), np.nan)
     for row, parallax in zip(costs, parallaxes, strict=True):
         # A point at distance r has a parallax of focal * spread / r pixels.
-        cost, visible = _disagreement(views, directions, parallax / focal / _camera_spread(cameras))
+        cost, visible = _disagreement(views, directions, parallax / focal / camera_spread(cameras))
         sums = np.bincount(patch_indices, np.where(visible, cost, 0), len(patch_directions))
         visible_counts = np.bincount(patch_indices, visible, len(patch_directions))
         is_visible = (visible_counts > 0) & (visible_counts >= MIN_VISIBLE_SHARE * sizes)
@@ -194,21 +225,6 @@ def _classify_by_neighbours(costs: SweepCosts) -> Booleans:
     return is_far | has_contrast & (costs.infinite < MAX_COST)
 
 
-def _make_sweep_view(view: View, frames: Frames) -> SweepView:
-    """Return a view for the sweep, small and at the usual exposure: its clean frame if the fit has one, else its
-    frame."""
-    camera, frame, clean = frames.targets(view)
-    small = camera.scaled(min(SWEEP_WIDTH, camera.width))
-    picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
-    values = Picture(picture, "srgb").resized(*small.size).display()
-    mask = frames.mask(view)
-    counts = None
-    if mask is not None:
-        share = Picture(mask.numpy().astype(np.float32), "linear").resized(*small.size).pixels
-        counts = np.asarray(share > 0.99)  # a small pixel counts only if all pixels that it averages do
-    return SweepView(small, values, counts)
-
-
 def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: float) -> tuple[Floats, Booleans]:
     """Return for points in directions (n, 3) on a sphere about the cameras how much the views disagree, and whether at
     least MIN_VIEWS see each, (n,) both.
@@ -217,12 +233,12 @@ def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: fl
     see the point. A group is robust: something near may hide a direction in most views. inverse_radius: 1 / radius of
     the sphere, 0 for an infinite one.
     """
-    centre = _camera_centre([view.camera for view in views])
+    centre = camera_centre([view.camera for view in views])
     values = np.full((len(views), len(directions), 3), np.nan, np.float32)
     for row, view in zip(values, views, strict=True):
-        inside, places = _project_sphere(view.camera, centre, directions, inverse_radius)
+        inside, places = project_sphere(view.camera, centre, directions, inverse_radius)
         x, y = np.minimum(places.astype(int), np.array(view.camera.size) - 1).T
-        row[inside] = _bilinear(view.picture, places)
+        row[inside] = bilinear(view.picture, places)
         if view.counts is not None:
             row[np.flatnonzero(inside)[~view.counts[y, x]]] = np.nan
     view_counts = np.isfinite(values[..., 0]).sum(0)
@@ -238,34 +254,10 @@ def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: fl
     return cost, visible
 
 
-def _bilinear(picture: Values, places: Floats) -> Values:
-    """Return bilinear samples (n, 3) of a picture at places (n, 2), pixels."""
-    height, width = picture.shape[:2]
-    x, y = np.clip(places[:, 0] - 0.5, 0, width - 1), np.clip(places[:, 1] - 0.5, 0, height - 1)
-    left, top = x.astype(int), y.astype(int)
-    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    u, v = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
-    upper = picture[top, left] * (1 - u) + picture[top, right] * u
-    lower = picture[bottom, left] * (1 - u) + picture[bottom, right] * u
-    return np.asarray(upper * (1 - v) + lower * v)
-
-
-def _project_sphere(camera: Camera, centre: Floats, directions: Floats, inverse_radius: float
-                    ) -> tuple[Booleans, Floats]:
-    """Return which points (n,) of a sphere about `centre`, in directions (n, 3), lie on the camera's frame, and their
-    places (m, 2), pixels. inverse_radius: 1 / radius of the sphere, 0 for an infinite one."""
-    rotation = camera.world_to_camera[:3, :3]
-    # The point relative to the camera, over the radius: (centre + radius * direction - position) / radius.
-    local = (directions + inverse_radius * (centre - camera.position)) @ rotation.T
-    in_front = local[:, 2] > 1e-6
-    with np.errstate(divide="ignore", invalid="ignore"):
-        places = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    inside = in_front & camera.contains(np.where(in_front[:, None], places, -1))
-    return inside, places[inside]
-
-
-def _make_far_points(sphere: FarSphere, patches: Patches, views: Sequence[View], frames: Frames) -> PointCloud:
-    """Return about MAX_POINTS points at most, on the far sphere in the far patches, in the colours of the frames.
+def _make_far_points(sphere: FarSphere, far_parts: _FarParts, views: Sequence[View], frames: Frames
+                     ) -> tuple[PointCloud, Floats]:
+    """Return about MAX_POINTS points at most, on the far sphere in the far parts, in the colours of the frames, and
+    their opacities.
 
     Colours are at the usual exposure: the median over the views where all have clean frames, else a low quantile, since
     a flare only adds light.
@@ -274,18 +266,44 @@ def _make_far_points(sphere: FarSphere, patches: Patches, views: Sequence[View],
     focal = float(np.median([target.camera.focal_length for target in targets]))
     pitch = POINT_PITCH_PX / focal
     cameras = [target.camera for target in targets]
-    directions = _visible_directions(cameras, pitch)
-    directions = directions[patches.are_far(directions)]
+    seeing_cameras = cameras if far_parts.sky is None else [widened(camera) for camera in cameras]
+    directions = visible_directions(seeing_cameras, pitch)
+    directions = directions[far_parts.contain(directions)]
     if len(directions) > MAX_POINTS:
-        directions = _visible_directions(cameras, pitch * (len(directions) / MAX_POINTS) ** 0.5)
-        directions = directions[patches.are_far(directions)]
+        directions = visible_directions(seeing_cameras, pitch * (len(directions) / MAX_POINTS) ** 0.5)
+        directions = directions[far_parts.contain(directions)]
     colours = _sample_colours(directions, views, targets, frames)
+    opacities = np.full(len(directions), INITIAL_OPACITY)
+    if far_parts.sky is not None:
+        in_sky = far_parts.sky.contains(directions)
+        opacities[in_sky] = SKY_OPACITY
+        colours[:, in_sky] = _sky_colours(colours[:, in_sky], directions[in_sky], cameras, far_parts.sky)
     is_exact = all(target.clean is not None for target in targets)
     visible = np.isfinite(colours[..., 0]).any(0)
     chosen_colours = np.nanquantile(colours[:, visible], 0.5 if is_exact else COLOUR_QUANTILE, axis=0)
     xyz = np.array(sphere.centre) + sphere.radius * directions[visible]
-    return PointCloud(xyz.astype(np.float32), (chosen_colours.clip(0, 1) * 255 + 0.5).astype(np.uint8),
-                      np.zeros(len(xyz), np.float32))
+    points = PointCloud(xyz.astype(np.float32), (chosen_colours.clip(0, 1) * 255 + 0.5).astype(np.uint8),
+                        np.zeros(len(xyz), np.float32))
+    return points, opacities[visible]
+
+
+def _sky_colours(colours: Values, directions: Floats, cameras: list[Camera], sky: Sky) -> Values:
+    """Return the colours (views, n, 3) of sky directions (n, 3): NaN in the views in which something near hides the
+    sky.
+
+    A direction in which no view shows the sky has the colours of the nearest one with sky.
+    """
+    shows_sky = np.zeros(colours.shape[:2], bool)
+    for row, camera, mask in zip(shows_sky, cameras, sky.masks, strict=True):
+        height, width = mask.shape
+        small = camera.scaled(width)
+        inside, places = project_sphere(small, camera.position, directions, 0.0)
+        x, y = np.minimum(places.astype(int), (width - 1, height - 1)).T
+        row[inside] = mask[y, x]
+    shows_sky &= np.isfinite(colours[..., 0])
+    has_colour = shows_sky.any(0)
+    sky_colours = np.where(shows_sky[:, has_colour, None], colours[:, has_colour], np.float32(np.nan))
+    return np.asarray(sky_colours[:, nearest_indices(directions, directions[has_colour])])
 
 
 def _sample_colours(directions: Floats, views: Sequence[View], targets: Sequence[Targets], frames: Frames) -> Values:
@@ -297,54 +315,9 @@ def _sample_colours(directions: Floats, views: Sequence[View], targets: Sequence
         small = camera.scaled(max(round(camera.width * PITCH_PX / POINT_PITCH_PX), 8))
         picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
         values = Picture(picture, "srgb").resized(*small.size).display()
-        inside, places = _project_sphere(small, camera.position, directions, 0.0)
-        row[inside] = _bilinear(values, places)
+        inside, places = project_sphere(small, camera.position, directions, 0.0)
+        row[inside] = bilinear(values, places)
         if (mask := frames.mask(view)) is not None:
             x, y = np.minimum((places / small.width * camera.width).astype(int), np.array(camera.size) - 1).T
             row[np.flatnonzero(inside)[~mask.numpy()[y, x]]] = np.nan
     return colours
-
-
-def _camera_centre(cameras: list[Camera]) -> Floats:
-    """Return (3,), the mean position of cameras."""
-    return np.asarray(np.mean([camera.position for camera in cameras], axis=0))
-
-
-def _camera_spread(cameras: list[Camera]) -> float:
-    """Return the largest distance of a camera from the mean position, world units."""
-    return max(float(np.linalg.norm(camera.position - _camera_centre(cameras))) for camera in cameras)
-
-
-def _visible_directions(cameras: list[Camera], pitch: float) -> Floats:
-    """Return unit vectors (n, 3) that some camera sees, about `pitch` radians from each other.
-
-    The directions are those of a Fibonacci lattice (Swinbank and Purser 2006), which covers the sphere evenly, about
-    the mean viewing direction.
-    """
-    forwards = np.array([camera.forward for camera in cameras])
-    axis = forwards.mean(0)
-    # Where cameras look all around, their mean direction means nothing, and any axis will do.
-    axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 0.1 else forwards[0]
-    reach = [np.arccos((forward @ axis).clip(-1, 1)) + np.arctan(camera.corner_radius)
-             for forward, camera in zip(forwards, cameras, strict=True)]
-    lowest = float(np.cos(min(max(reach), np.pi)))
-    count = max(int(2 * np.pi * (1 - lowest) / (pitch * pitch)), 1)  # area of the cap over that of one direction
-    helper = np.eye(3)[int(np.abs(axis).argmin())]
-    right = np.cross(helper, axis)
-    right /= np.linalg.norm(right)
-    directions = fibonacci_directions(count, lowest) @ np.stack([right, np.cross(axis, right), axis])
-    visible = np.zeros(count, bool)
-    for camera in cameras:
-        visible |= _project_sphere(camera, camera.position, directions, 0.0)[0]
-    return directions[visible]
-
-
-def _nearest_indices(directions: Floats, others: Floats) -> NDArray[np.int64]:
-    """Return for each of the unit vectors `directions` (n, 3) the index (n,) of the nearest of `others` (m, 3)."""
-    indices = np.zeros(len(directions), np.int64)
-    columns = torch.from_numpy(others.T.astype(np.float32))
-    for start in range(0, len(directions), DIRECTIONS_AT_ONCE):
-        block = slice(start, start + DIRECTIONS_AT_ONCE)
-        cosines = torch.from_numpy(directions[block].astype(np.float32)) @ columns
-        indices[block] = cosines.argmax(1).numpy()
-    return indices

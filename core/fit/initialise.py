@@ -85,7 +85,7 @@ def _scene_from_points(capture: Capture, settings: FitSettings, views: tuple[Vie
     sky = layer is None and settings.uses_parallax and settings.split.sky
     scene = SceneGaussians.from_points(add_sky_points(capture, views, frames) if sky else capture.points)
     if layer is not None:
-        scene.add_far_layer(layer.points, layer.sphere)
+        scene.add_far_layer(layer.points, layer.sphere, torch.from_numpy(layer.opacities))
     return scene
 
 

@@ -2,8 +2,6 @@
 """The scene as 3D Gaussians, with the unconstrained parameters that a fit optimises."""
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -90,12 +88,13 @@ class SceneGaussians(nn.Module):
         )
 
     @torch.no_grad()
-    def add_far_layer(self, points: PointCloud, sphere: FarSphere, opacity: float = INITIAL_OPACITY) -> None:
+    def add_far_layer(self, points: PointCloud, sphere: FarSphere, opacity: float | Tensor = INITIAL_OPACITY
+                      ) -> None:
         """Add a far layer: a Gaussian at each point, as `from_points` makes them, but of this opacity; sets `far`.
 
-        points: on the sphere."""
+        points: on the sphere. opacity: of all, or (n,) of each."""
         layer = SceneGaussians.from_points(points)
-        layer.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
+        layer.opacity_logits.copy_(torch.logit(torch.as_tensor(opacity, dtype=torch.float64)))
         for name, parameter in self.named_parameters():
             parameter.data = torch.cat([parameter.data, layer.get_parameter(name).data])
         self.far = sphere

@@ -90,10 +90,20 @@ def write_lights_and_split(scene: SceneDescription, out: Path) -> None:
     write_json(out / "split.json", {"test": [f"{stem}{FRAME_SUFFIX}" for stem in held_out]})
 
 
+def _check_size(scene: SceneDescription, out: Path) -> None:
+    """Raise CaptureError if the folder has a layer of another size, since views that exist are kept."""
+    for layer in sorted((out / "truth" / "scene").glob("*.exr"))[:1]:
+        height, width = read_picture(layer).pixels.shape[:2]
+        if (width, height) != (scene.camera.width, scene.camera.height):
+            raise CaptureError(f"{layer} has {width}x{height} pixels, not the {scene.camera.width}x"
+                               f"{scene.camera.height} of this capture; name another folder with --out.")
+
+
 def make_capture(scene: SceneDescription, out: Path, progress: Progress) -> None:
     """Make the whole capture folder."""
     from sample_scenes.colmap_model import write_model
 
+    _check_size(scene, out)
     render_scene(scene, out, progress)
     add_flares(scene, out, progress)
     write_lights_and_split(scene, out)

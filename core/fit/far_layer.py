@@ -7,7 +7,7 @@ there. A sphere sweep decides: it projects each direction into the frames, as a 
 points on some near spheres about the cameras, and compares the frames there. In a far direction the frames agree on the
 infinite sphere and differ on the near ones. In a plain direction they agree on all, so it is decided like the
 directions with contrast about it. On a near surface they agree on none. In an even sky, a far light decides
-(`plain_sky`).
+(`even_sky`).
 """
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from ..colour.srgb_torch import expose
 from ..gaussians.far_sphere import FarSphere
 from ..gaussians.scene import INITIAL_OPACITY, SceneGaussians
 from ..images.picture import Picture
+from .even_sky import Sky, far_lights, find_even_sky, widened
 from .frames import Frames, Targets, subsample
-from .plain_sky import Sky, far_lights, find_plain_sky, widened
 from .sweep_views import (
     SWEEP_WIDTH,
     Booleans,
@@ -71,7 +71,7 @@ points over the spread of the cameras, pixels of the fit's frames."""
 FARTHEST_QUANTILE = 0.99
 POINT_PITCH_PX = 4.0
 """Distance of neighbouring far points, pixels of the fit's frames."""
-MAX_POINTS = 16_000
+MAX_POINTS, MAX_CANDIDATES = 16_000, 64_000
 SKY_OPACITY = 0.5
 """Opacity that Gaussians of the sky about a far light start with. Those that something hides in all views keep it."""
 COLOUR_QUANTILE = 0.25
@@ -88,10 +88,10 @@ class FarLayer:
 
 
 def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) -> FarLayer | None:
-    """Return the far layer of a capture, by a sphere sweep over some of the views.
+    """Return the far layer of a capture: what a sphere sweep over some of the views finds far, and the sky about a far
+    light.
 
-    None if too little that the views see lies beyond their parallax, or if this cannot be decided: without points, or
-    with all cameras in one place.
+    None if neither is found, or if this cannot be decided: without points, or with all cameras in one place.
     """
     sampled = subsample(views, SWEEP_VIEWS)
     cameras = [view.camera.scaled(min(SWEEP_WIDTH, view.camera.width)) for view in sampled]
@@ -119,7 +119,7 @@ def _find_sky(capture: Capture, views: list[SweepView]) -> Sky | None:
     if not len(lights):
         return None
     pitch = PITCH_PX / float(np.median([camera.focal_length for camera in cameras]))
-    return find_plain_sky(views, lights, capture.points.xyz, pitch)
+    return find_even_sky(views, lights, capture.points.xyz, pitch)
 
 
 def far_layer_messages(scene: SceneGaussians) -> tuple[str, ...]:
@@ -144,7 +144,8 @@ class Patches:
 
 @dataclass(frozen=True, eq=False)
 class _FarParts:
-    """What is far in a capture: patches by the sphere sweep, and the sky about a far light; None without."""
+    """The far parts of a capture: patches by the sphere sweep, and the sky about a far light; None for one that it
+    lacks."""
 
     patches: Patches | None
     sky: Sky | None
@@ -264,9 +265,9 @@ def _make_far_points(sphere: FarSphere, far_parts: _FarParts, views: Sequence[Vi
     """
     targets = [frames.targets(view) for view in views]
     focal = float(np.median([target.camera.focal_length for target in targets]))
-    pitch = POINT_PITCH_PX / focal
     cameras = [target.camera for target in targets]
     seeing_cameras = cameras if far_parts.sky is None else [widened(camera) for camera in cameras]
+    pitch = max(POINT_PITCH_PX / focal, _least_pitch(far_parts, seeing_cameras))
     directions = visible_directions(seeing_cameras, pitch)
     directions = directions[far_parts.contain(directions)]
     if len(directions) > MAX_POINTS:
@@ -285,6 +286,17 @@ def _make_far_points(sphere: FarSphere, far_parts: _FarParts, views: Sequence[Vi
     points = PointCloud(xyz.astype(np.float32), (chosen_colours.clip(0, 1) * 255 + 0.5).astype(np.uint8),
                         np.zeros(len(xyz), np.float32))
     return points, opacities[visible]
+
+
+def _least_pitch(far_parts: _FarParts, cameras: list[Camera]) -> float:
+    """Return the distance of neighbouring directions, radians, at which the far parts hold about MAX_CANDIDATES.
+
+    They are measured by the directions of small pictures: in large frames, the lattice of the points has millions.
+    """
+    small = [camera.scaled(min(SWEEP_WIDTH, camera.width)) for camera in cameras]
+    pitch = PITCH_PX / float(np.median([camera.focal_length for camera in small]))
+    count = int(far_parts.contain(visible_directions(small, pitch)).sum())
+    return pitch * float(np.sqrt(count / MAX_CANDIDATES))
 
 
 def _sky_colours(colours: Values, directions: Floats, cameras: list[Camera], sky: Sky) -> Values:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The small views in which `far_layer` and `plain_sky` look for what is far, and the directions that these see."""
+"""The small views in which `far_layer` and `even_sky` look for what is far, and the directions that these see."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from .sky import fibonacci_directions
 
 SWEEP_WIDTH = 120
 """Width of the views, pixels."""
-DIRECTIONS_AT_ONCE = 4096
-"""Directions that are compared with others at a time; bounds the memory."""
+PAIRS_AT_ONCE = 1 << 24
+"""Pairs of directions that are compared at a time; bounds the memory."""
 
 Floats = NDArray[np.float64]
 Values = NDArray[np.float32]
@@ -77,8 +77,9 @@ def nearest_indices(directions: Floats, others: Floats) -> NDArray[np.int64]:
     """Return for each of the unit vectors `directions` (n, 3) the index (n,) of the nearest of `others` (m, 3)."""
     indices = np.zeros(len(directions), np.int64)
     columns = torch.from_numpy(others.T.astype(np.float32))
-    for start in range(0, len(directions), DIRECTIONS_AT_ONCE):
-        block = slice(start, start + DIRECTIONS_AT_ONCE)
+    rows = max(PAIRS_AT_ONCE // max(len(others), 1), 1)
+    for start in range(0, len(directions), rows):
+        block = slice(start, start + rows)
         cosines = torch.from_numpy(directions[block].astype(np.float32)) @ columns
         indices[block] = cosines.argmax(1).numpy()
     return indices

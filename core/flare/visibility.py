@@ -3,7 +3,8 @@
 
 A small camera at the view's position looks straight at the light, in the frame or not, and rasterizes the scene
 Gaussians before it; the transmittance left over a soft disk is the visibility. It is differentiable by the scene's
-Gaussians, and fades as a light with a size fades.
+Gaussians, and fades as a light with a size fades. This is the definition. On the CPU,
+`core.gaussians.cpu.transmittance` computes all lines of sight at once, without a rasterizer.
 
 A fitted scene hides every light a little: Gaussians that show the lamp, or a sky without depth, stand before it. So
 visibilities are relative to those of the training views that see most of the light (`FlareModel.clear`).
@@ -142,8 +143,8 @@ def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings
                      kernels: Kernels = "auto") -> Tensor:
     """Return the visibility (scalar, 0..1) of a light at `light` (3,) from a camera at `eye` (3,); world units.
 
-    A small camera that looks from the eye at the light rasterizes the Gaussians in between; the visibility is the mean
-    transmittance over a Gaussian window, the light's soft disk.
+    A small camera looks from the eye at the light. The visibility is the mean transmittance of the Gaussians in
+    between, over a Gaussian window: the light's soft disk.
     """
     return _visibilities(scene, eye[None], light[None], settings or VisibilitySettings(), kernels)[0]
 
@@ -151,6 +152,8 @@ def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings
 def _visibilities(scene: SceneGaussians, eyes: Tensor, lights: Tensor, settings: VisibilitySettings,
                   kernels: Kernels) -> Tensor:
     """Return (m,), the `light_visibility` of each light from a camera; eyes, lights: (m, 3)."""
+    if not len(lights):
+        return scene.means.new_ones(0)
     fused = fused_kernels(scene.means) if kernels in ("auto", "cpu") else None
     far = scene.far
     visibilities = None if fused is None else fused.mean_transmittances(
@@ -180,9 +183,11 @@ def _mean_transmittance(scene: SceneGaussians, eye: Tensor, light: Tensor, setti
     intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
     # Colours are not needed, and their gradient would cost most.
     colourless = scene.means.new_zeros(len(rows), 1, 3)
-    alpha = rasterization(scene.means[rows], scene.quaternions[rows], scene.log_scales[rows],
-                          scene.opacity_logits[rows], colourless, pose, intrinsics.to(pose), size, size,
-                          near=_near_plane(scene, distance), depth=False, kernels=kernels, raw=True).alpha
+    means, quaternions, log_scales, opacity_logits = (
+        part.index_select(0, rows)
+        for part in (scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits))
+    alpha = rasterization(means, quaternions, log_scales, opacity_logits, colourless, pose, intrinsics.to(pose), size,
+                          size, near=_near_plane(scene, distance), depth=False, kernels=kernels, raw=True).alpha
     return ((1 - alpha) * _disk_weights(size).to(pose)).sum()
 
 

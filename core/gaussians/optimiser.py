@@ -100,7 +100,8 @@ class Adam:
         for name in offer.claimed:
             self.steps[name] += 1
             if self.parameters[name].grad is not None:
-                raise RunError(f"{name} got a gradient after its step: the scene was rendered twice.")
+                raise RunError(f"{name} got a gradient after its step: the scene was rendered twice, "
+                               "or a visibility was computed before the rendering.")
 
     def _kernels_for(self, parameter: Tensor) -> FusedKernels | None:
         """Return the fused kernels if they can step this parameter, else None."""

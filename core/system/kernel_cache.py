@@ -2,9 +2,9 @@
 """Compiles functions with numba on their first call, and caches the machine code on disk for the next start.
 
 The cache lies in a folder of the user, so that the package itself may be read-only; the environment variable
-FIT_FLARE_CACHE names another folder. The folder's last part is a fingerprint of all sources beside the function and of
-those whose constants the machine code contains, since numba detects changes only in the file of a function and not in
-the files it calls; and of the package's full name, which numba stores and which differs inside Blender.
+FIT_FLARE_CACHE names another folder. The folder's last part is a fingerprint. It covers all sources beside the function
+and those whose constants the machine code contains, since numba detects changes only in the function's own file. It
+also covers the package's full name, which numba stores and which differs inside Blender.
 """
 from __future__ import annotations
 

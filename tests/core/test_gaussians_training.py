@@ -279,6 +279,11 @@ def test_a_gradient_after_its_step_raises() -> None:
     assert torch.equal(scene.means, before)
     with pytest.raises(RunError, match="rendered twice"), optimiser.step_in_backward():
         (scene.render(CAMERA).colour.sum() + scene.render(CAMERA).colour.sum()).backward()
+    scene, optimiser = some_scene(100)
+    optimiser.zero_grad()
+    early = light_visibility(scene, EYE, LIGHT)  # autograd goes back to what was computed last first
+    with pytest.raises(RunError, match="before the rendering"), optimiser.step_in_backward():
+        (scene.render(CAMERA).colour.sum() + early).backward()
 
 
 # Densification

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.colour.srgb import srgb_from_linear
-from core.errors import SettingsError
+from core.errors import CaptureError, SettingsError
 from core.images.read import read_picture
 from core.optics.aperture import Aperture
 from core.optics.flare import build_optics
@@ -30,6 +30,7 @@ from sample_scenes.capture_files import expose, write_layer
 from sample_scenes.description import Pinhole, look_at
 from sample_scenes.flares import LENS_SETUPS, LensSetup, render_flare
 from sample_scenes.over_photos import add_flares, measure_sky_share
+from sample_scenes.render import make_capture as make_sample_capture
 from sample_scenes.scenes import SCENES
 from tests.core.captures import make_capture
 
@@ -369,6 +370,14 @@ def test_the_split_holds_out_hard_views(sample: Capture) -> None:
             places, depth = view.camera.project(np.array([light.xyz for light in sample.lights]))
             outside += bool(((places < 0) | (places > (480, 270))).any() and (depth > 0).all())
         assert outside >= 2
+
+
+def test_a_folder_of_another_size_is_not_continued(tmp_path: Path) -> None:
+    scene = SCENES["desk"]
+    (tmp_path / "truth" / "scene").mkdir(parents=True)
+    write_layer(tmp_path / "truth" / "scene" / f"{scene.stems[0]}.exr", np.zeros((270, 480, 3), np.float32), 45)
+    with pytest.raises(CaptureError, match=r"480x270 pixels, not the 960x540 .* --out"):
+        make_sample_capture(scene.resampled(960, 1), tmp_path, Progress())
 
 
 def test_a_capture_can_be_rendered_wider_and_with_fewer_views() -> None:

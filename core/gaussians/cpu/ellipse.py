@@ -3,10 +3,10 @@
 
 16 Gaussians at a time, one in each lane; `projection` and `transmittance` call it.
 
-Forward (the definition is `..projection`): p = R m + t; with s = (p_x, p_y) / p_z, u = s held within the
+Forward (the definition is `..projection`): p = R m + t; with s = (p_x, p_y) / p_z, c = s held within the
 frustum's margin, and V = R Q the Gaussian's axes seen by the camera, the rows of T = J R Q S are
 
-    a = f_x / p_z (V_0 - u_x V_2) S,    b = f_y / p_z (V_1 - u_y V_2) S        covariance = T T^T + dilation I
+    a = f_x / p_z (V_0 - c_x V_2) S,    b = f_y / p_z (V_1 - c_y V_2) S        covariance = T T^T + dilation I
 
 Its determinant is |a x b|² + dilation (a² + b²) + dilation²: a sum of squares, without the cancellation that
 xx yy - xy² suffers for needles. For the same reason the profile is not that of the conic but of its square completed:
@@ -178,12 +178,12 @@ def _multiply_elements(a, s):
 
 @inlined
 def _image_axes(camera, v, scales, slopes, inverse_z):
-    """Return the rows a and b of T, and the clamped slopes u_x, u_y at which J is taken; v: rows of V."""
-    ux = minimum(maximum(slopes[0], camera[LOW_X]), camera[HIGH_X])
-    uy = minimum(maximum(slopes[1], camera[LOW_Y]), camera[HIGH_Y])
-    a = scaled(inverse_z * camera[FX], _multiply_elements(add_scaled(v[0], -ux, v[2]), scales))
-    b = scaled(inverse_z * camera[FY], _multiply_elements(add_scaled(v[1], -uy, v[2]), scales))
-    return a, b, ux, uy
+    """Return the rows a and b of T, and the held slopes c_x, c_y at which J is taken; v: rows of V."""
+    cx = minimum(maximum(slopes[0], camera[LOW_X]), camera[HIGH_X])
+    cy = minimum(maximum(slopes[1], camera[LOW_Y]), camera[HIGH_Y])
+    a = scaled(inverse_z * camera[FX], _multiply_elements(add_scaled(v[0], -cx, v[2]), scales))
+    b = scaled(inverse_z * camera[FY], _multiply_elements(add_scaled(v[1], -cy, v[2]), scales))
+    return a, b, cx, cy
 
 
 @inlined
@@ -233,18 +233,17 @@ def gradients_from_moments(fields, xy, yy, determinant):
     """Return the gradients of the centre and of the covariance xx, xy (which stands for both places), yy.
 
     fields: the summed gradient rows, one vector per field. With e = covariance^-1 d: dL/dcentre = sum g e,
-    dL/dcovariance = sum g e e^T / 2. In terms of u and d_y, e = (alpha u, alpha k u + d_y / yy) where alpha = yy /
-    det."""
+    dL/dcovariance = sum g e e^T / 2. In terms of u and d_y, e = (beta u, beta k u + d_y / yy) where beta = yy / det."""
     inverse_y = ONE / yy
     k = -xy * inverse_y
-    alpha = yy / determinant
-    alpha_k = alpha * k
-    d_x = alpha * fields[G_U]
-    d_y = fma(alpha_k, fields[G_U], inverse_y * fields[G_Y])
-    uu, uy, dd = alpha * fields[G_UU], inverse_y * fields[G_UY], inverse_y * inverse_y * fields[G_YY]
-    d_xx = alpha * uu * HALF
-    d_xy = fma(alpha_k, uu, alpha * uy)
-    d_yy = fma(alpha_k * k, uu, fma(alpha_k * TWO, uy, dd)) * HALF
+    beta = yy / determinant
+    beta_k = beta * k
+    d_x = beta * fields[G_U]
+    d_y = fma(beta_k, fields[G_U], inverse_y * fields[G_Y])
+    uu, uy, dd = beta * fields[G_UU], inverse_y * fields[G_UY], inverse_y * inverse_y * fields[G_YY]
+    d_xx = beta * uu * HALF
+    d_xy = fma(beta_k, uu, beta * uy)
+    d_yy = fma(beta_k * k, uu, fma(beta_k * TWO, uy, dd)) * HALF
     return d_x, d_y, d_xx, d_xy, d_yy
 
 
@@ -252,7 +251,7 @@ class Axes(NamedTuple):
     """The axes of 16 Gaussians seen by a camera, a vector or a tuple of vectors each; the module head has the letters.
 
     mean, point: m and p. is_in_front: whether p_z is beyond the near plane; inverse_z: 1 / p_z, 1 if not. slopes,
-    held_slopes: s and u. quaternion, inverse_norm: at length 1, and the inverse of its length. rotation: rows of Q.
+    held_slopes: s and c. quaternion, inverse_norm: at length 1, and the inverse of its length. rotation: rows of Q.
     seen: rows of V. scale: standard deviations. a, b: rows of T.
     """
 
@@ -282,8 +281,8 @@ def project_axes(means, quats, scales, raw, camera, first):
     quaternion, inverse_norm = _normalise(load4(quats, first))
     rotation = _rotation(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
     seen = _rotate_to_camera(camera, rotation)
-    a, b, ux, uy = _image_axes(camera, seen, scale, slopes, inverse_z)
-    return Axes(mean, point, is_in_front, inverse_z, slopes, (ux, uy), quaternion, inverse_norm, rotation, seen, scale,
+    a, b, cx, cy = _image_axes(camera, seen, scale, slopes, inverse_z)
+    return Axes(mean, point, is_in_front, inverse_z, slopes, (cx, cy), quaternion, inverse_norm, rotation, seen, scale,
                 a, b)
 
 
@@ -360,7 +359,7 @@ def axes_backward(axes, fields, camera, raw, d_depth):
     na, nb = scaled(inverse_z * camera[FX], da), scaled(inverse_z * camera[FY], db)
     n2 = add_scaled(scaled(-axes.held_slopes[0], na), -axes.held_slopes[1], nb)
     v2s = _multiply_elements(v[2], scale)
-    d_ux, d_uy = -dot(na, v2s), -dot(nb, v2s)
+    d_cx, d_cy = -dot(na, v2s), -dot(nb, v2s)
     d_scale = (
         fma(na[0], v[0][0], fma(nb[0], v[1][0], n2[0] * v[2][0])),
         fma(na[1], v[0][1], fma(nb[1], v[1][1], n2[1] * v[2][1])),
@@ -380,8 +379,8 @@ def axes_backward(axes, fields, camera, raw, d_depth):
 
     inside_x = (slopes[0] >= camera[LOW_X]) & (slopes[0] <= camera[HIGH_X])
     inside_y = (slopes[1] >= camera[LOW_Y]) & (slopes[1] <= camera[HIGH_Y])
-    d_sx = fma(dx, camera[FX], where(inside_x, d_ux, ZERO))
-    d_sy = fma(dy, camera[FY], where(inside_y, d_uy, ZERO))
+    d_sx = fma(dx, camera[FX], where(inside_x, d_cx, ZERO))
+    d_sy = fma(dy, camera[FY], where(inside_y, d_cy, ZERO))
     d_pz = d_depth - inverse_z * (fma(d_sx, slopes[0], d_sy * slopes[1]) + a_da + b_db)
     d_point = (d_sx * inverse_z, d_sy * inverse_z, d_pz)
     return AxesGradients((dx, dy), d_scale, d_quaternion, d_point, dv, (a_da, b_db))

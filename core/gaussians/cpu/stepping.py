@@ -3,8 +3,8 @@
 
 The projection's backward pass computes the gradients of some Gaussians at a time. Pending steps are made right there,
 while the gradients are in the cache, so that these are neither written to memory nor read again. `..optimiser.Adam`
-registers the steps (`offer_steps`); `scene` claims them (`claim_steps`). What computes a part of the gradients by
-itself, before `scene` does, adds it to the steps (`add_gradients`).
+registers the steps (`offer_steps`); `scene` claims them (`claim_steps`). An operation whose backward pass runs before
+that of `scene` adds its gradients to the steps (`add_gradients`).
 """
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Transmittance of the Gaussians between cameras and lights, forth and back; the definition is
+"""Transmittance of the Gaussians between cameras and lights, forward and backward; the definition is
 `core.flare.visibility`.
 
 A small camera looks along each line of sight. Each pixel of its picture gets the product of 1 - alpha over the
@@ -252,7 +252,7 @@ class _MeanTransmittances(torch.autograd.Function):
         products = buffers.empty(len(lines) * chunks * len(weights))
         parallel(transmittance_kernel, *arrays, lines, size, pixels, chunks, products, scratch=SQUARE,
                  limit=len(lines) * chunks)
-        weighted = np.maximum(products.reshape(len(lines), chunks, -1).prod(1), T_LEAST) * weights
+        weighted = np.maximum(products.reshape(len(lines), chunks, len(weights)).prod(1), T_LEAST) * weights
         ctx.save_for_backward(*parameters)
         ctx.lines, ctx.size, ctx.chunks, ctx.weighted = lines, size, chunks, weighted
         return torch.from_numpy(weighted.sum(1))
@@ -277,9 +277,9 @@ def mean_transmittances(
 
     means (n, 3), quaternions (n, 4), log_scales (n, 3), opacity_logits (n,): as of `SceneGaussians`. eyes, lights: (m,
     3). disk (size, size): weights of the pixels of a light's disk, whose radius at the picture's edge is 2 `radius`,
-    relative to the distance. Gaussians hide a light that lie beyond the depth `near`, or a thousandth of the light's
-    distance if that is less, and not within `margin` of the light's distance in front of it, nor farther than
-    max_distance from `centre`. All in world units. Differentiable by the Gaussians.
+    relative to the distance. A Gaussian counts if its depth is above the smaller of `near` and a thousandth of the
+    light's distance. It must lie before the last `margin`, a share, of that distance, and within max_distance of
+    `centre`. Lengths are in world units. Differentiable by the Gaussians.
     """
     if len(means) < LANES:
         return None

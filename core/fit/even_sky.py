@@ -33,9 +33,10 @@ MAX_LIGHT_PARALLAX_PX = 2.0
 MIN_LIGHT_DISTANCE, FARTHEST_QUANTILE = 3.0, 0.99
 """Smallest distance of a far light relative to that of the farthest points: in a small room, cameras close together
 show no parallax of a lamp either."""
-SEED_RADIUS, MIN_SEED_PX, MIN_SEED_SHARE = 0.03, 6, 0.5
-"""Radius, in frame widths, of the disc about a far light whose pixels are sky if the view shows the light. The frame
-must hold so many of its pixels, and this share of them must be smooth and bright."""
+SEED_RADIUS, MIN_SEED_PX, MIN_SMOOTH_SHARE, MIN_SEED_SHARE = 0.03, 6, 0.5, 0.3
+"""Radius of the surroundings of a far light, in frame widths, and how many of their pixels the frame must hold. If the
+view shows the light, the first share of these is smooth and bright, and a region that covers the second share is sky. A
+smaller region may be a wall beside the light."""
 MAX_STEP = 0.04
 """Largest difference of neighbouring pixels of a smooth region, display values of any channel."""
 MIN_LEVEL = 0.2
@@ -55,8 +56,9 @@ MIN_VIEW_SHARE = 0.12
 MIN_SKY_SHARE = 0.02
 """Share of the directions in view that must be sky for a capture to have one."""
 REACH, GROWTH = 0.1, 0.02
-"""Radius of the gaps that are filled in the sky, where something near hides it in all views but others may see it, and
-its growth at the edges; both in frame widths. The sky also goes on for REACH beyond the frames."""
+"""Radius of the gaps that are filled in the sky, and its growth at the edges, both in frame widths. In a gap, something
+near hides the sky in all views of the sweep, but not in every other view. The sky also goes on for REACH beyond the
+frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,18 +87,18 @@ def far_lights(lights: Floats, points: Values, cameras: list[Camera]) -> Floats:
     return lights[np.linalg.norm(lights - centre, axis=1) >= min_distance]
 
 
-def find_plain_sky(views: Sequence[SweepView], lights: Floats, points: Values, pitch: float) -> Sky | None:
+def find_even_sky(views: Sequence[SweepView], lights: Floats, points: Values, pitch: float) -> Sky | None:
     """Return the sky about far lights (m, 3), world units; None if no view shows a light in an even sky.
 
     points: (k, 3), those of the solve. pitch: distance of neighbouring directions, radians.
     """
-    discs = [_discs_about(view, lights) for view in views]
-    brightest = max((disc.level for view_discs in discs for disc in view_discs), default=0.0)
+    surroundings = [_light_surroundings(view, lights) for view in views]
+    brightest = max((around.level for view_surroundings in surroundings for around in view_surroundings), default=0.0)
     if brightest < MIN_LEVEL:
         return None
     regions = [_smooth_regions(view, points, MIN_SKY_LEVEL * brightest) for view in views]
-    masks = [_regions_about(view_discs, view_regions, MIN_SEED_LEVEL * brightest)
-             for view_discs, view_regions in zip(discs, regions, strict=True)]
+    masks = [_regions_about(view_surroundings, view_regions, MIN_SEED_LEVEL * brightest)
+             for view_surroundings, view_regions in zip(surroundings, regions, strict=True)]
     directions = visible_directions([widened(view.camera) for view in views], pitch)
     samples = [_Samples.of(view, view_regions, directions) for view, view_regions in zip(views, regions, strict=True)]
     _spread_to_other_views(masks, regions, samples)
@@ -113,7 +115,7 @@ def find_plain_sky(views: Sequence[SweepView], lights: Floats, points: Values, p
     return Sky(directions, _fill_gaps(directions, is_sky, in_view, width), closed)
 
 
-class _Disc(NamedTuple):
+class _Surroundings(NamedTuple):
     """The pixels (height, width) about a light in a view, and their median brightness, display values of the largest
     channel."""
 
@@ -123,8 +125,8 @@ class _Disc(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """What a view shows in the directions that it sees: their row numbers (m,), pixels x and y (m,), regions (m,) and
-    colours (m, 3)."""
+    """The samples of a view in the directions that it sees: their row numbers (m,), pixels x and y (m,), regions (m,)
+    and colours (m, 3)."""
 
     rows: NDArray[np.int64]
     x: NDArray[np.int64]
@@ -148,27 +150,32 @@ class _Samples:
         return mask[self.y, self.x]
 
 
-def _discs_about(view: SweepView, lights: Floats) -> list[_Disc]:
-    """Return the discs about those of the lights (m, 3) that are in the frame, none hidden by a mask."""
-    camera, discs = view.camera, []
+def _light_surroundings(view: SweepView, lights: Floats) -> list[_Surroundings]:
+    """Return the surroundings of those of the lights (m, 3) that are in the frame, none hidden by a mask."""
+    camera, surroundings = view.camera, []
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     for (light_x, light_y), depth in zip(*camera.project(lights), strict=True):
         pixels = np.hypot(x - light_x, y - light_y) <= SEED_RADIUS * camera.width
         if view.counts is not None:
             pixels &= view.counts
         if depth > 0 and pixels.sum() >= MIN_SEED_PX:
-            discs.append(_Disc(pixels, float(np.median(view.picture.max(-1)[pixels]))))
-    return discs
+            surroundings.append(_Surroundings(pixels, float(np.median(view.picture.max(-1)[pixels]))))
+    return surroundings
 
 
-def _regions_about(discs: Sequence[_Disc], regions: NDArray[np.int32], min_level: float) -> Booleans:
-    """Return the pixels (height, width) of the regions that touch a disc about a light which the view shows.
+def _regions_about(surroundings: Sequence[_Surroundings], regions: NDArray[np.int32], min_level: float) -> Booleans:
+    """Return the pixels (height, width) of the regions that cover much of the surroundings of a light which the view
+    shows.
 
     min_level: smallest brightness about such a light, display values.
     """
-    touched = [regions[disc.pixels] for disc in discs
-               if disc.level >= min_level and (regions[disc.pixels] > 0).mean() >= MIN_SEED_SHARE]
-    return (regions > 0) & np.isin(regions, np.concatenate(touched) if touched else 0)
+    sky: list[int] = []
+    for around in surroundings:
+        numbers, counts = np.unique(regions[around.pixels], return_counts=True)
+        shares = np.where(numbers > 0, counts / around.pixels.sum(), 0)
+        if around.level >= min_level and shares.sum() >= MIN_SMOOTH_SHARE:
+            sky.extend(numbers[shares >= MIN_SEED_SHARE].tolist())
+    return np.isin(regions, sky)
 
 
 def _smooth_regions(view: SweepView, points: Values, level: float) -> NDArray[np.int32]:
@@ -189,7 +196,8 @@ def _smooth_regions(view: SweepView, points: Values, level: float) -> NDArray[np
         is_smooth &= view.counts
     count, regions = cv2.connectedComponents(is_smooth.astype(np.uint8), connectivity=4)
     pixels, depth = view.camera.project(points)
-    x, y = pixels[view.camera.contains(pixels, depth)].astype(int).T
+    inside = pixels[view.camera.contains(pixels, depth)].astype(int)
+    x, y = np.minimum(inside, np.array(view.camera.size) - 1).T  # the frame contains its right and lower edge
     has_point = np.zeros(regions.shape, bool)
     has_point[y, x] = True
     sizes = np.bincount(regions.ravel(), minlength=count)

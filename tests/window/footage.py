@@ -40,7 +40,7 @@ def steps():
     job = fits.fit_job(scene)
     yield from wait(lambda: job.done > 20 or not job.running, 600)
     shot("03_fitting")
-    took = yield from wait(lambda: not job.running, 1500)
+    took = yield from wait(lambda: not job.running, 3600)
     assert job.state == "done", job.error
     yield 2
     shot("04_flare")
